@@ -1,0 +1,180 @@
+"""From one mesh to its Signature: eigenfunctions sampled in the interior and on the surface."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.geometry.coordinates import extend
+from igps.geometry.eigensolver import Spectrum, eigenpairs
+from igps.geometry.laplacian import Backend, laplacian
+from igps.geometry.mesh import Mesh, MeshError, area_vectors, simplify
+from igps.geometry.voxels import interior_samples
+
+
+@dataclass(frozen=True)
+class SignatureConfig:
+    """Every parameter that a Signature depends on.
+
+    Args:
+        n_eigenpairs: eigenpairs kept, without the constant one.
+        resolution: voxels along the longest side of the bounding box.
+        min_samples: the grid is refined until at least so many voxels lie inside; 0 keeps `resolution`.
+        n_surface_samples: area-weighted random samples of the surface.
+        backend: "cotangent" or "robust", see `laplacian`.
+        max_vertices: simplify larger meshes first; None keeps them.
+        accuracy: relative error that 99 % of the interior distances may have, which speeds up the mean value
+            coordinates; None evaluates them exactly.
+        seed: of the surface samples and of the eigensolver's start.
+    """
+
+    # Raise it whenever the same mesh and parameters would give another Signature: it is part of every cache key.
+    ALGORITHM_VERSION: ClassVar[int] = 1
+
+    n_eigenpairs: int = 250
+    resolution: int = 32
+    min_samples: int = 1000
+    n_surface_samples: int = 2000
+    backend: Backend = "cotangent"
+    max_vertices: int | None = None
+    accuracy: float | None = 1e-3
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least in (("n_eigenpairs", 1), ("resolution", 1), ("min_samples", 0), ("n_surface_samples", 1)):
+            value = getattr(self, name)
+            if value < least:
+                raise ValueError(f"{name}: expected at least {least}, got {value}.")
+        if self.backend not in ("cotangent", "robust"):
+            raise ValueError(f"backend: expected 'cotangent' or 'robust', got {self.backend!r}.")
+        if self.max_vertices is not None and self.max_vertices <= self.n_eigenpairs + 1:
+            raise ValueError(
+                f"max_vertices: expected more than n_eigenpairs + 1 = {self.n_eigenpairs + 1}, got {self.max_vertices}."
+            )
+        if self.accuracy is not None and not 0 < self.accuracy < 1:
+            raise ValueError(f"accuracy: expected None or a number between 0 and 1, got {self.accuracy}.")
+
+    @classmethod
+    def paper(cls) -> SignatureConfig:
+        """Rustamov 2010: 250 eigenpairs and a 32-voxel grid that is never refined."""
+        return cls(min_samples=0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The parameters by name, with the algorithm version."""
+        return {**asdict(self), "algorithm_version": self.ALGORITHM_VERSION}
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Points that carry the eigenfunctions.
+
+    Args:
+        points: (P, 3) float64, length.
+        eigenfunctions: (P, K) float32, 1/length, not scaled by any power of the eigenvalues.
+        attributes: named scalars of the points, each (P,) float32.
+    """
+
+    points: NDArray[np.float64]
+    eigenfunctions: NDArray[np.float32]
+    attributes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, eq=False)
+class Signature:
+    """What the descriptors need to know of one mesh.
+
+    The eigenfunctions are kept unscaled, so that every spectral embedding can be chosen without computing them again.
+
+    Args:
+        eigenvalues: (K,) float64 ascending, 1/length², without the zero of the constant eigenfunction.
+        interior: P voxel centres inside the body, eigenfunctions extended by mean value coordinates.
+        surface: area-weighted random points of the surface, eigenfunctions interpolated linearly.
+        area: of the surface, length².
+        volume: of the body, length³.
+        config: the parameters that made it.
+        name: of the mesh.
+        notes: what was done to the mesh before, in words.
+    """
+
+    eigenvalues: NDArray[np.float64]
+    interior: Samples
+    surface: Samples
+    area: float
+    volume: float
+    config: SignatureConfig
+    name: str = "mesh"
+    notes: tuple[str, ...] = ()
+
+    @property
+    def barycentroid(self) -> NDArray[np.float64]:
+        """(3,) interior sample of least potential Σ φₖ²/λₖ, a centre that hardly moves with pose (Rustamov 2010)."""
+        potential = np.square(self.interior.eigenfunctions, dtype=np.float64) @ (1 / self.eigenvalues)
+        return self.interior.points[int(np.argmin(potential))]
+
+
+def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Signature:
+    """Sample the eigenfunctions of a mesh in its interior and on its surface (Rustamov 2010, section 3).
+
+    Args:
+        mesh: the body.
+        config: `SignatureConfig()` if None.
+
+    Raises:
+        MeshError: too few vertices for the eigenpairs asked, or no interior sample.
+        ConvergenceError: the eigensolver failed.
+    """
+    config = config or SignatureConfig()
+    if config.max_vertices is not None:
+        mesh = simplify(mesh, config.max_vertices)
+    if len(mesh.vertices) < config.n_eigenpairs + 2:
+        raise MeshError(
+            f"{mesh.name}: {len(mesh.vertices)} vertices are too few for {config.n_eigenpairs} eigenpairs; at least "
+            f"{config.n_eigenpairs + 2} are needed. Subdivide the mesh or lower n_eigenpairs."
+        )
+    points = interior_samples(mesh, config.resolution, config.min_samples)
+    stiffness, mass = laplacian(mesh, config.backend)
+    spectrum = eigenpairs(stiffness, mass, config.n_eigenpairs, positions=mesh.vertices, seed=config.seed)
+    interior = _interior(mesh, spectrum, points, config.accuracy)
+    surface = _surface(mesh, spectrum, config.n_surface_samples, config.seed)
+    for where, samples in (("interior", interior), ("surface", surface)):
+        if not np.isfinite(samples.eigenfunctions).all():
+            raise MeshError(
+                f"{mesh.name}: the eigenfunctions are not finite at some {where} samples. The triangles are too "
+                "ill-shaped: pass backend='robust', or remesh."
+            )
+    return Signature(
+        eigenvalues=spectrum.eigenvalues,
+        interior=interior,
+        surface=surface,
+        area=mesh.area,
+        volume=mesh.volume,
+        config=config,
+        name=mesh.name,
+        notes=mesh.notes,
+    )
+
+
+def _interior(mesh: Mesh, spectrum: Spectrum, points: NDArray[np.float64], accuracy: float | None) -> Samples:
+    values = extend(mesh.vertices, mesh.faces, spectrum.eigenfunctions, points, accuracy=accuracy)
+    return Samples(points, np.asarray(values, dtype=np.float32))
+
+
+def _surface(mesh: Mesh, spectrum: Spectrum, n_samples: int, seed: int) -> Samples:
+    generator = np.random.default_rng(seed)
+    area = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1)
+    face = generator.choice(len(area), size=n_samples, p=area / area.sum())
+    # Uniform in a triangle (Osada et al. 2002, equation 1).
+    r = np.sqrt(generator.random(n_samples))
+    s = generator.random(n_samples)
+    weights = np.stack([1 - r, r * (1 - s), r * s], axis=1)
+    corner = mesh.faces[face]
+    points = np.einsum("pi,pij->pj", weights, mesh.vertices[corner])
+    values = np.einsum("pi,pik->pk", weights, spectrum.eigenfunctions[corner])
+    return Samples(points, values.astype(np.float32))

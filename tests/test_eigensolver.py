@@ -1,0 +1,290 @@
+"""The eigensolver against dense solvers, closed forms and invariances."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+import trimesh
+from scipy import sparse
+from scipy.linalg import eigh
+
+from igps.geometry import eigensolver
+from igps.geometry.eigensolver import ConvergenceError, Spectrum, eigenpairs
+
+Problem = tuple[sparse.csr_array, np.ndarray, np.ndarray]
+
+
+def cotangent_problem(mesh: trimesh.Trimesh) -> Problem:
+    """Cotangent stiffness, barycentric mass and positions, written without regard to speed."""
+    corners = np.asarray(mesh.vertices)[mesh.faces]
+    n_vertices = len(mesh.vertices)
+    stiffness = sparse.csr_array((n_vertices, n_vertices))
+    for corner in range(3):
+        one, two = (corner + 1) % 3, (corner + 2) % 3
+        a, b = corners[:, one] - corners[:, corner], corners[:, two] - corners[:, corner]
+        weight = 0.5 * (a * b).sum(1) / np.linalg.norm(np.cross(a, b), axis=1)
+        i, j = mesh.faces[:, one], mesh.faces[:, two]
+        entries = np.r_[weight, weight, -weight, -weight], (np.r_[i, j, i, j], np.r_[i, j, j, i])
+        stiffness = stiffness + sparse.csr_array(sparse.coo_array(entries, shape=(n_vertices, n_vertices)))
+    mass = np.bincount(mesh.faces.ravel(), np.repeat(mesh.area_faces / 3, 3), n_vertices)
+    return stiffness, mass, np.array(mesh.vertices)
+
+
+def torus(n_major: int = 48, n_minor: int = 24, jitter: float = 0.2) -> trimesh.Trimesh:
+    mesh = trimesh.creation.torus(1.0, 0.4, major_sections=n_major, minor_sections=n_minor)
+    mesh.vertices += np.random.default_rng(0).uniform(-jitter, jitter, mesh.vertices.shape) / n_minor
+    return mesh
+
+
+@pytest.fixture(scope="module")
+def torus_problem() -> Problem:
+    return cotangent_problem(torus())
+
+
+@pytest.fixture(scope="module")
+def torus_oracle(torus_problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    stiffness, mass, _ = torus_problem
+    return eigh(stiffness.toarray(), np.diag(mass))
+
+
+def assert_pairs(spectrum: Spectrum, problem: Problem, tolerance: float = 1e-7) -> None:
+    stiffness, mass, _ = problem
+    values, functions = spectrum.eigenvalues, spectrum.eigenfunctions
+    assert np.all(np.diff(values) >= 0)
+    residual = stiffness @ functions - mass[:, None] * functions * values
+    assert np.max(np.linalg.norm(residual / np.sqrt(mass)[:, None], axis=0) / values) <= 2 * tolerance
+    np.testing.assert_allclose(functions.T @ (mass[:, None] * functions), np.eye(len(values)), atol=1e-10)
+    assert np.abs(mass @ functions).max() < 1e-9 * np.sqrt(mass.sum())
+
+
+@pytest.mark.parametrize("n_eigenpairs", [1, 7, 100, 280])
+def test_agrees_with_a_dense_solver(
+    n_eigenpairs: int, torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray]
+) -> None:
+    stiffness, mass, positions = torus_problem
+    spectrum = eigenpairs(stiffness, mass, n_eigenpairs, positions=positions)
+    np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1 : n_eigenpairs + 1], rtol=1e-10)
+    assert_pairs(spectrum, torus_problem)
+
+
+def test_spans_the_space_of_the_dense_solver(
+    torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray]
+) -> None:
+    stiffness, mass, positions = torus_problem
+    values, functions = torus_oracle
+    cut = 60 + int(np.argmax(np.diff(values[60:90])))
+    spectrum = eigenpairs(stiffness, mass, cut, positions=positions)
+    overlap = functions[:, 1 : cut + 1].T @ (mass[:, None] * spectrum.eigenfunctions)
+    np.testing.assert_allclose(np.linalg.svd(overlap, compute_uv=False), 1, atol=1e-9)
+
+
+def test_sphere_has_multiplets_of_odd_size() -> None:
+    """l(l + 1) with multiplicity 2l + 1 on the unit sphere; the last multiplet is cut."""
+    mesh = trimesh.creation.icosphere(subdivisions=4)
+    problem = cotangent_problem(mesh)
+    spectrum = eigenpairs(problem[0], problem[1], 110, positions=problem[2])
+    degree = np.repeat(np.arange(1, 11), 2 * np.arange(1, 11) + 1)[:110]
+    np.testing.assert_allclose(spectrum.eigenvalues, degree * (degree + 1), rtol=0.045)
+    assert_pairs(spectrum, problem)
+
+
+def copies_of_a_patch(n_copies: int, side: int) -> Problem:
+    """Identical square grids tied to one vertex: almost every eigenvalue has multiplicity n_copies − 1."""
+    path = sparse.diags_array([np.ones(side - 1), np.ones(side - 1)], offsets=[-1, 1])
+    grid = sparse.kron(path, sparse.eye_array(side)) + sparse.kron(sparse.eye_array(side), path)
+    copies = sparse.coo_array(sparse.kron(sparse.eye_array(n_copies), grid))
+    tips = 1 + side**2 * np.arange(n_copies)
+    hub = np.zeros_like(tips)
+    rows, columns = np.r_[copies.coords[0] + 1, hub, tips], np.r_[copies.coords[1] + 1, tips, hub]
+    n_vertices = 1 + n_copies * side**2
+    adjacency = sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(n_vertices, n_vertices))
+    stiffness = sparse.csr_array(sparse.diags_array(adjacency.sum(axis=1)) - adjacency)
+    return stiffness, np.linspace(1, 1, n_vertices), np.zeros((n_vertices, 3))
+
+
+def test_multiplets_larger_than_the_block() -> None:
+    problem = copies_of_a_patch(n_copies=40, side=5)
+    values = np.linalg.eigvalsh(problem[0].toarray())
+    assert np.ptp(values[1:40]) < 1e-12 < 1e-3 < values[40] - values[39]
+    for n_eigenpairs in (38, 39, 60, 100):
+        spectrum = eigenpairs(problem[0], problem[1], n_eigenpairs)
+        np.testing.assert_allclose(spectrum.eigenvalues, values[1 : n_eigenpairs + 1], rtol=1e-10)
+        assert_pairs(spectrum, problem)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_scale_of_the_coordinates(scale: float, torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    one = eigenpairs(stiffness, mass, 50, positions=positions)
+    other = eigenpairs(stiffness, mass * scale**2, 50, positions=positions * scale)
+    np.testing.assert_allclose(other.eigenvalues * scale**2, one.eigenvalues, rtol=1e-10)
+    assert_pairs(other, (stiffness, mass * scale**2, positions))
+
+
+def test_same_seed_same_bits_other_seed_same_space(torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    one, again, other = (eigenpairs(stiffness, mass, 40, positions=positions, seed=seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(one.eigenfunctions, again.eigenfunctions)
+    assert not np.array_equal(one.eigenfunctions, other.eigenfunctions)
+    np.testing.assert_allclose(one.eigenvalues, other.eigenvalues, rtol=1e-10)
+
+
+def test_positions_change_only_the_work(torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    with_positions = eigenpairs(stiffness, mass, 60, positions=positions)
+    np.testing.assert_allclose(eigenpairs(stiffness, mass, 60).eigenvalues, with_positions.eigenvalues, rtol=1e-10)
+
+
+@pytest.mark.parametrize("n_vertices", [4, 12])
+def test_tiny_meshes(n_vertices: int) -> None:
+    tetrahedron = trimesh.Trimesh(np.eye(4)[:, :3], [[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
+    problem = cotangent_problem(tetrahedron if n_vertices == 4 else trimesh.creation.icosahedron())
+    spectrum = eigenpairs(*problem[:2], n_vertices - 2)
+    values = eigh(problem[0].toarray(), np.diag(problem[1]), eigvals_only=True)
+    np.testing.assert_allclose(spectrum.eigenvalues, values[1:-1], rtol=1e-10)
+    assert_pairs(spectrum, problem)
+
+
+def test_flat_triangles_with_huge_cotangents() -> None:
+    mesh = torus(jitter=0.0)
+    squashed = np.random.default_rng(3).choice(len(mesh.faces), 40, replace=False)
+    for a, b, c in mesh.faces[squashed]:
+        mesh.vertices[a] = (mesh.vertices[b] + mesh.vertices[c]) / 2 + 1e-5 * (mesh.vertices[a] - mesh.vertices[b])
+    problem = cotangent_problem(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
+    assert abs(problem[0]).max() > 1e3
+    spectrum = eigenpairs(problem[0], problem[1], 80, positions=problem[2])
+    values = eigh(problem[0].toarray(), np.diag(problem[1]), eigvals_only=True)
+    np.testing.assert_allclose(spectrum.eigenvalues, values[1:81], rtol=1e-7)
+
+
+def test_arpack_agrees(torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    one = eigenpairs(stiffness, mass, 80, positions=positions)
+    arpack = eigenpairs(stiffness, mass, 80, method="eigsh")
+    np.testing.assert_allclose(one.eigenvalues, arpack.eigenvalues, rtol=1e-9)
+    assert_pairs(arpack, torus_problem)
+
+
+def test_a_missed_pair_is_noticed_by_inertia(
+    torus_problem: Problem,
+    torus_oracle: tuple[np.ndarray, np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Hide the tenth pair twice: the solver must not return before it is back."""
+    leading = eigensolver._RitzPairs.leading
+    calls = []
+
+    def forgetful(self: eigensolver._RitzPairs, n_below: int, tolerance: float) -> object:
+        found = leading(self, n_below, tolerance)
+        calls.append(len(found))
+        return found[np.arange(len(found)) != 9] if len(calls) <= 2 else found
+
+    monkeypatch.setattr(eigensolver._RitzPairs, "leading", forgetful)
+    stiffness, mass, positions = torus_problem
+    with caplog.at_level(logging.DEBUG):
+        spectrum = eigenpairs(stiffness, mass, 80, positions=positions)
+    np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1:81], rtol=1e-10)
+    assert len(calls) >= 3
+    assert "eigenvalues found below" in caplog.text
+
+
+def fail(*arguments: object) -> None:
+    raise ConvergenceError("on purpose")
+
+
+def test_falls_back_to_arpack_with_a_warning(
+    torus_problem: Problem, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    stiffness, mass, positions = torus_problem
+    expected = eigenpairs(stiffness, mass, 30, positions=positions)
+    monkeypatch.setattr(eigensolver, "_lanczos", fail)
+    spectrum = eigenpairs(stiffness, mass, 30, positions=positions)
+    np.testing.assert_allclose(spectrum.eigenvalues, expected.eigenvalues, rtol=1e-10)
+    assert_pairs(spectrum, torus_problem)
+    assert "falling back to ARPACK: on purpose" in caplog.text
+
+
+def test_the_fallback_too_is_proved_complete(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    arpack = eigensolver._arpack
+
+    def lossy(*arguments: object) -> tuple[np.ndarray, np.ndarray]:
+        values, functions = arpack(*arguments)  # type: ignore[arg-type]
+        return np.delete(values, 4), np.delete(functions, 4, axis=1)
+
+    monkeypatch.setattr(eigensolver, "_lanczos", fail)
+    monkeypatch.setattr(eigensolver, "_arpack", lossy)
+    with pytest.raises(ConvergenceError, match="found 30 of 31"):
+        eigenpairs(*torus_problem[:2], 30)
+
+
+def test_wrong_pairs_are_not_returned(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    stiffness, mass, _ = torus_problem
+    values, vectors = np.arange(1.0, 11), np.linalg.qr(np.random.default_rng(0).normal(size=(len(mass), 10)))[0]
+    monkeypatch.setattr(eigensolver, "_lanczos", lambda *arguments: (values, vectors))
+    monkeypatch.setattr(eigensolver, "_arpack", lambda *arguments: (values, vectors))
+    monkeypatch.setattr(eigensolver, "_prove_complete", lambda *arguments: None)
+    with pytest.raises(ConvergenceError, match="10 of eigenpairs 1 to 10 have a relative residual above"):
+        eigenpairs(stiffness, mass, 10)
+
+
+def test_arguments_are_left_alone(torus_problem: Problem) -> None:
+    stiffness, mass, positions = (array.copy() for array in torus_problem)
+    spectrum = eigenpairs(stiffness, mass, 20, positions=positions)
+    assert (stiffness != torus_problem[0]).nnz == 0
+    np.testing.assert_array_equal(mass, torus_problem[1])
+    np.testing.assert_array_equal(positions, torus_problem[2])
+    assert not np.shares_memory(spectrum.mass, mass)
+
+
+def test_two_components_are_counted_at_any_scale() -> None:
+    one = trimesh.creation.icosphere(subdivisions=2)
+    two = trimesh.util.concatenate([one, one.copy().apply_translation([3, 0, 0])])
+    for scale in (1e-6, 1, 1e6):
+        stiffness, mass, _ = cotangent_problem(two)
+        with pytest.raises(ValueError, match="2 connected components"):
+            eigenpairs(stiffness, mass * scale**2, 10)
+
+
+def test_components_tied_by_rounding_alone_are_counted() -> None:
+    stiffness, mass, _ = cotangent_problem(trimesh.creation.icosphere(subdivisions=1))
+    both = sparse.lil_array(sparse.block_diag([stiffness, stiffness]))
+    both[0, len(mass)] = both[len(mass), 0] = -1e-17
+    with pytest.raises(ValueError, match="2 connected components"):
+        eigenpairs(sparse.csr_array(both), np.r_[mass, mass], 10)
+
+
+def test_what_is_refused(torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    n_vertices = len(mass)
+
+    def changed(value: float) -> np.ndarray:
+        return np.where(np.arange(n_vertices) == 3, value, mass)
+
+    broken = stiffness.copy()
+    broken.data[5] = np.nan
+    lopsided = stiffness.copy()
+    lopsided[0, lopsided.indices[1]] += 0.1
+    with pytest.raises(ValueError, match="n_eigenpairs must be at least 1"):
+        eigenpairs(stiffness, mass, 0)
+    with pytest.raises(ValueError, match="subdivide the mesh or ask for fewer"):
+        eigenpairs(stiffness, mass, n_vertices - 1)
+    with pytest.raises(ValueError, match="stiffness has entries that are not finite"):
+        eigenpairs(broken, mass, 5)
+    for bad in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="mass must be finite and positive"):
+            eigenpairs(stiffness, changed(bad), 5)
+    with pytest.raises(ValueError, match="symmetric"):
+        eigenpairs(lopsided, mass, 5)
+    with pytest.raises(ValueError, match="sum to zero"):
+        eigenpairs(stiffness + sparse.diags_array(mass), mass, 5)
+    with pytest.raises(ValueError, match="scipy sparse"):
+        eigenpairs(stiffness.toarray(), mass, 5)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"mass \(V,\)"):
+        eigenpairs(stiffness, mass[1:], 5)
+    with pytest.raises(ValueError, match="positions"):
+        eigenpairs(stiffness, mass, 5, positions=positions[1:])
+    with pytest.raises(ValueError, match="method"):
+        eigenpairs(stiffness, mass, 5, method="lobpcg")  # type: ignore[arg-type]
