@@ -1,0 +1,29 @@
+"""Tensors in, numbers out: distances between descriptors, rankings and retrieval scores."""
+
+from igps.retrieval.distances import Distance, chi_square, cosine, euclidean, hellinger
+from igps.retrieval.scores import (
+    Labels,
+    PrecisionRecallCurve,
+    RetrievalScores,
+    RetrievalScoresMetric,
+    precision_recall_curve,
+    retrieval_scores,
+)
+from igps.retrieval.search import SearchResult, rank, search
+
+__all__ = [
+    "Distance",
+    "Labels",
+    "PrecisionRecallCurve",
+    "RetrievalScores",
+    "RetrievalScoresMetric",
+    "SearchResult",
+    "chi_square",
+    "cosine",
+    "euclidean",
+    "hellinger",
+    "precision_recall_curve",
+    "rank",
+    "retrieval_scores",
+    "search",
+]

@@ -1,0 +1,233 @@
+"""Distances between every query and every gallery descriptor: tensors (Q, ...) and (G, ...) in, (Q, G) out.
+
+Smaller is closer, identical descriptors are at exactly zero, and a distance matrix of a set with itself is exactly
+symmetric. All functions are differentiable, run on the device of their inputs, and compute half precision in float32.
+Checking the entries for NaN and signs waits for the device once per argument.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+Distance = Callable[[Tensor, Tensor], Tensor]
+"""A distance function: queries (Q, ...) and gallery (G, ...) to distances (Q, G) ≥ 0, smaller is closer."""
+
+# A tile of (query, gallery, cell) triples is sized for the cache of a CPU; elsewhere for few, large kernel launches.
+# At most three temporaries of that size are alive at once, so that they stay below 256 MiB on any device.
+_CPU_TILE_BYTES = 2**20
+_DEVICE_TILE_BYTES = 48 * 2**20
+_CELLS_PER_TILE = 4096
+
+
+def chi_square(queries: Tensor, gallery: Tensor, weights: Tensor | None = None) -> Tensor:
+    """χ² distance ½ Σ w (a−b)² / (a+b) between histograms, over all cells, with the factor ½.
+
+    With the ½ (and w = 1) the distance of two histograms that each sum to 1 lies in [0, 1], and is 1 where they have no
+    cell in common. A cell empty in both adds nothing, and the gradients of such a cell are set to zero, where the
+    function has no derivative. Memory beyond inputs, result and gradients stays below 256 MiB, backward included.
+    First derivatives only. Source: Rustamov 2010 (comparison of histograms by χ²).
+
+    Args:
+        queries: (Q, ...) histograms, entries ≥ 0; all dimensions after the first are cells.
+        gallery: (G, ...) histograms of the same cells.
+        weights: non-negative weight of every cell, of a shape that broadcasts to the cells; None weighs all by 1.
+
+    Returns:
+        (Q, G) distances, without unit.
+
+    Raises:
+        ValueError: for shapes, dtypes or devices that do not fit, and for negative, NaN or infinite entries.
+    """
+    a, b = _as_rows(queries, gallery, non_negative=True)
+    w = None if weights is None else _cell_weights(weights, queries.shape[1:], a)
+    return _ChiSquare.apply(a, b, w)
+
+
+def hellinger(queries: Tensor, gallery: Tensor) -> Tensor:
+    """Hellinger distance √(½ Σ (√a−√b)²) between histograms, over all cells.
+
+    It lies in [0, 1] for histograms that sum to 1. Gradients are set to zero where they are infinite: at an empty cell
+    and at distance zero. Source: Hellinger 1909; Bhattacharyya 1943 for histograms.
+
+    Args:
+        queries: (Q, ...) histograms, entries ≥ 0; all dimensions after the first are cells.
+        gallery: (G, ...) histograms of the same cells.
+
+    Returns:
+        (Q, G) distances, without unit.
+
+    Raises:
+        ValueError: for shapes, dtypes or devices that do not fit, and for negative, NaN or infinite entries.
+    """
+    a, b = _as_rows(queries, gallery, non_negative=True)
+    return _row_distance(_root(a), _root(b)) / math.sqrt(2.0)
+
+
+def euclidean(queries: Tensor, gallery: Tensor) -> Tensor:
+    """Euclidean distance √(Σ (a−b)²) between descriptors; its gradient at distance zero is set to zero.
+
+    Args:
+        queries: (Q, ...) descriptors; all dimensions after the first are summed over.
+        gallery: (G, ...) descriptors of the same form.
+
+    Returns:
+        (Q, G) distances in the unit of the descriptors.
+
+    Raises:
+        ValueError: for shapes, dtypes or devices that do not fit, and for NaN or infinite entries.
+    """
+    return _row_distance(*_as_rows(queries, gallery, non_negative=False))
+
+
+def cosine(queries: Tensor, gallery: Tensor) -> Tensor:
+    """Cosine distance 1 − cos(a, b), in [0, 2], as ½ ‖a/‖a‖ − b/‖b‖‖², which does not cancel for near descriptors.
+
+    Args:
+        queries: (Q, ...) descriptors; all dimensions after the first are one vector.
+        gallery: (G, ...) descriptors of the same form.
+
+    Returns:
+        (Q, G) distances, without unit.
+
+    Raises:
+        ValueError: for shapes, dtypes or devices that do not fit, for NaN or infinite entries, and for a descriptor of
+            length zero, which has no direction.
+    """
+    a, b = _as_rows(queries, gallery, non_negative=False)
+    return _row_distance(_unit("queries", a), _unit("gallery", b)).square() / 2.0
+
+
+class _ChiSquare(torch.autograd.Function):
+    """χ² tile by tile; the backward pass recomputes its tiles, so that no (Q, G, cells) array is ever kept."""
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, b: Tensor, w: Tensor | None) -> Tensor:
+        ctx.save_for_backward(a, b, w)
+        distances = a.new_zeros(len(a), len(b))
+        for q, g, c in _tiles(a, b):
+            ratio, difference = _ratio(a[q, c], b[g, c])
+            terms = ratio.mul_(difference)
+            if w is not None:
+                terms.mul_(w[c])
+            distances[q, g] += terms.sum(-1)
+        return distances.mul_(0.5)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+        a, b, w = ctx.saved_tensors
+        grad_a, grad_b = torch.zeros_like(a), torch.zeros_like(b)
+        grad_w = torch.zeros_like(w) if ctx.needs_input_grad[2] else None
+        for q, g, c in _tiles(a, b):
+            # With u = (a−b)/(a+b): ∂/∂a (a−b)²/(a+b) = 2u − u², and ∂/∂b = −2u − u².
+            ratio, difference = _ratio(a[q, c], b[g, c])
+            first = ratio * grad[q, g, None]
+            if grad_w is not None:
+                grad_w[c] += difference.mul_(first).sum((0, 1))
+            del difference
+            second = ratio.mul_(first)
+            grad_a[q, c] += first.sum(1) - second.sum(1) / 2
+            grad_b[g, c] -= first.sum(0) + second.sum(0) / 2
+        if w is not None:
+            grad_a, grad_b = grad_a * w, grad_b * w
+        return grad_a, grad_b, None if grad_w is None else grad_w / 2
+
+
+def _ratio(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """(a−b)/(a+b), 0 where both are 0, and a−b, for all pairs of rows: both (Q, G, cells)."""
+    difference = a[:, None] - b
+    total = (a[:, None] + b).clamp_min_(torch.finfo(a.dtype).tiny)  # 0/tiny = 0: an empty cell needs no mask
+    return torch.div(difference, total, out=total), difference
+
+
+def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
+    """Slices of queries, gallery and cells that cover all triples, each tile of a bounded size."""
+    (n_queries, n_cells), n_gallery = a.shape, len(b)
+    n_bytes = _CPU_TILE_BYTES if a.device.type == "cpu" else _DEVICE_TILE_BYTES
+    cells = min(n_cells, _CELLS_PER_TILE)
+    pairs = max(1, n_bytes // (cells * a.element_size()))
+    rows = max(1, min(n_queries, max(math.isqrt(pairs), pairs // max(1, n_gallery))))
+    columns = max(1, min(n_gallery, pairs // rows))
+    for q in range(0, n_queries, rows):
+        for g in range(0, n_gallery, columns):
+            for c in range(0, n_cells, cells):
+                yield slice(q, q + rows), slice(g, g + columns), slice(c, c + cells)
+
+
+def _row_distance(a: Tensor, b: Tensor) -> Tensor:
+    # The faster form by a matrix product cancels: it leaves a diagonal that is not zero.
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _root(rows: Tensor) -> Tensor:
+    """Square root with a zero gradient at zero."""
+    filled = rows > 0
+    return torch.where(filled, torch.where(filled, rows, 1.0).sqrt(), 0.0)
+
+
+def _unit(name: str, rows: Tensor) -> Tensor:
+    # By the largest entry first: the sum of squares of tiny or huge entries leaves the range of the dtype.
+    largest = rows.detach().abs().amax(dim=1, keepdim=True)
+    empty = (largest == 0).sum().item()
+    if empty:
+        raise ValueError(
+            f"{name}: expected descriptors of non-zero length, {empty} of {len(rows)} are all zeros and have no "
+            "direction; remove them or use another distance"
+        )
+    scaled = rows / largest
+    return scaled / torch.linalg.vector_norm(scaled, dim=1, keepdim=True)
+
+
+def _as_rows(queries: Tensor, gallery: Tensor, *, non_negative: bool) -> tuple[Tensor, Tensor]:
+    """Both arguments checked, as (Q, cells) and (G, cells) of one dtype of at least 32 bits."""
+    for name, tensor in (("queries", queries), ("gallery", gallery)):
+        if tensor.ndim < 2 or tensor.shape[1:].numel() == 0:
+            raise ValueError(
+                f"{name}: expected shape (N, ...) with at least one entry a descriptor, got {tuple(tensor.shape)}; "
+                "a single descriptor takes a leading dimension, descriptor[None]"
+            )
+        _check_entries(name, tensor, non_negative=non_negative)
+    if queries.shape[1:] != gallery.shape[1:]:
+        raise ValueError(
+            f"gallery: expected descriptors of the shape of the queries, {tuple(queries.shape[1:])}, got "
+            f"{tuple(gallery.shape[1:])}; compute both with the same configuration"
+        )
+    if queries.device != gallery.device:
+        raise ValueError(
+            f"gallery: expected on {queries.device} as the queries, got {gallery.device}; move one of them"
+        )
+    dtype = torch.promote_types(torch.promote_types(queries.dtype, gallery.dtype), torch.float32)
+    return queries.flatten(1).to(dtype), gallery.flatten(1).to(dtype)
+
+
+def _cell_weights(weights: Tensor, cells: torch.Size, rows: Tensor) -> Tensor:
+    """Weights checked and broadcast to (cells,), in the dtype of the rows."""
+    if weights.device != rows.device:
+        raise ValueError(f"weights: expected on {rows.device} as the queries, got {weights.device}; move them")
+    _check_entries("weights", weights, non_negative=True)
+    try:
+        return weights.to(rows.dtype).broadcast_to(cells).reshape(-1)
+    except RuntimeError as error:
+        raise ValueError(
+            f"weights: expected a shape that broadcasts to the cells {tuple(cells)}, got {tuple(weights.shape)}"
+        ) from error
+
+
+def _check_entries(name: str, tensor: Tensor, *, non_negative: bool) -> None:
+    if not tensor.is_floating_point():
+        raise ValueError(f"{name}: expected a real floating dtype, got {tensor.dtype}; convert with .float()")
+    if tensor.numel() == 0:
+        return
+    low, high = torch.stack(torch.aminmax(tensor.detach())).tolist()  # both are NaN if any entry is
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise ValueError(f"{name}: expected finite entries, got NaN or infinity; look for the descriptor that has them")
+    if non_negative and low < 0:
+        raise ValueError(
+            f"{name}: expected entries ≥ 0, the smallest is {low:g}; embeddings are compared by euclidean or cosine"
+        )

@@ -1,0 +1,276 @@
+"""Retrieval scores of the Princeton Shape Benchmark and of SHREC, from distances and labels.
+
+Every score is computed for each query from the ranked gallery, ties in gallery order, and lies in [0, 1]. rel(k) is 1
+where the entry at rank k has the label of the query, R is the number of relevant entries in the gallery. A query with
+R = 0 has no defined score: it is NaN for that query and left out of every mean.
+"""
+
+from __future__ import annotations
+
+import numbers
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
+
+from igps.retrieval.distances import Distance, chi_square
+from igps.retrieval.search import rank
+
+Labels = Tensor | Sequence[Any]
+"""Class labels: an integer tensor (N,), or a sequence of N integers or strings."""
+
+SCORE_NAMES = ("nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map")
+
+E_MEASURE_RANKS = 32
+"""Ranks the E-measure looks at (Shilane et al. 2004)."""
+
+STANDARD_RECALL_LEVELS = tuple(level / 20 for level in range(1, 21))
+"""Recall levels 0.05, 0.10, …, 1 of a precision-recall curve."""
+
+
+@dataclass(frozen=True, eq=False)
+class RetrievalScores:
+    """Scores of every query, as fractions: (Q,) float64 on the CPU, NaN for a query without a relevant entry.
+
+    Attributes:
+        nn: nearest neighbour, rel(1).
+        ft: first tier, hits in the first R over R.
+        st: second tier, hits in the first 2R over R.
+        e: E-measure 2/(1/P + 1/R') of precision P and recall R' in the first 32 (or the whole, shorter gallery). A
+            perfect ranking reaches 1 only where R = 32.
+        dcg: discounted cumulative gain [rel(1) + Σ_{k≥2} rel(k)/log₂k] / [1 + Σ_{k=2..R} 1/log₂k].
+        adr: average dynamic recall (1/R) Σ_{i=1..R} (hits in the first i)/i.
+        adr_self: average dynamic recall of a ranking that keeps the query itself, as a hit, at rank 1, with R + 1 in
+            place of R: the form of SHREC'07. None where query and gallery sets are separate.
+        map: average precision, (1/R) Σ_k rel(k) · (hits in the first k)/k.
+        labels: the label of each query.
+        scored: (Q,) bool, False where the query has no relevant entry.
+    """
+
+    nn: Tensor
+    ft: Tensor
+    st: Tensor
+    e: Tensor
+    dcg: Tensor
+    adr: Tensor
+    adr_self: Tensor | None
+    map: Tensor
+    labels: tuple[Hashable, ...]
+    scored: Tensor
+
+    @property
+    def n_queries(self) -> int:
+        """Number of queries that are scored, over which the means go."""
+        return int(self.scored.sum())
+
+    @property
+    def n_excluded(self) -> int:
+        """Number of queries without a relevant entry, left out of the means."""
+        return len(self.labels) - self.n_queries
+
+    def mean(self) -> dict[str, float]:
+        """Mean of every score over the scored queries, as fractions; without adr_self where that is None."""
+        return self._mean_over(self.scored)
+
+    def per_class(self) -> dict[Hashable, dict[str, float]]:
+        """The means over the scored queries of each class, classes in order of appearance; only classes with one."""
+        queries: dict[Hashable, list[int]] = {}
+        for query, (label, scored) in enumerate(zip(self.labels, self.scored.tolist(), strict=True)):
+            if scored:
+                queries.setdefault(label, []).append(query)
+        return {label: self._mean_over(torch.tensor(members)) for label, members in queries.items()}
+
+    def _mean_over(self, queries: Tensor) -> dict[str, float]:
+        scores = {name: getattr(self, name) for name in SCORE_NAMES}
+        return {name: float(values[queries].mean()) for name, values in scores.items() if values is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class PrecisionRecallCurve:
+    """Interpolated precision at given recall levels, mean over the scored queries.
+
+    Attributes:
+        recall: (L,) float64 recall levels, ascending.
+        precision: (L,) float64, never ascending.
+        n_queries: number of queries in the mean.
+    """
+
+    recall: Tensor
+    precision: Tensor
+    n_queries: int
+
+
+def retrieval_scores(distances: Tensor, query_labels: Labels, gallery_labels: Labels | None = None) -> RetrievalScores:
+    """NN, FT, ST, E-measure, DCG, ADR and mAP of every query (see RetrievalScores).
+
+    Without gallery labels the queries are the gallery: every shape queries all others (leave-one-out), itself removed
+    from the ranking by its index whatever its distance, so that R = class size − 1. Give gallery labels only for a
+    gallery that does not hold the queries: a query found at distance zero would count as a hit.
+
+    Sources: Shilane, Min, Kazhdan, Funkhouser 2004 (Princeton Shape Benchmark); Typke, Veltkamp, Wiering 2006 (ADR).
+
+    Args:
+        distances: (Q, G), ≥ 0, smaller is closer; infinity is allowed.
+        query_labels: Q class labels.
+        gallery_labels: G class labels of a separate gallery; None for leave-one-out.
+
+    Raises:
+        ValueError: if the distances are not a (Q, G) matrix (square for leave-one-out) without NaN and negative
+            entries, the labels are not aligned with it, or no query has a relevant entry.
+    """
+    relevant, labels = _ranked_relevance(distances, query_labels, gallery_labels)
+    length = relevant.shape[1]
+    ranks = torch.arange(1, length + 2, dtype=torch.float64)
+    hits = relevant.cumsum(1)
+    n_relevant = hits[:, -1]
+    scored = n_relevant > 0
+    dynamic_recall = (hits / ranks[:-1]).cumsum(1)
+    discount = ranks[:-1].log2().reciprocal()
+    discount[0] = 1.0
+    ideal_gain = discount.cumsum(0)[n_relevant.long().clamp_min(1) - 1]
+    e_ranks = min(E_MEASURE_RANKS, length)
+
+    def at_rank(cumulated: Tensor, last: Tensor) -> Tensor:
+        return cumulated.gather(1, (last.long().clamp(1, cumulated.shape[1]) - 1)[:, None])[:, 0]
+
+    def defined(values: Tensor) -> Tensor:
+        return values.masked_fill(~scored, torch.nan)
+
+    adr_self = None
+    if gallery_labels is None:
+        hits_self = torch.cat([torch.ones_like(hits[:, :1]), hits + 1], dim=1)
+        adr_self = defined(at_rank((hits_self / ranks).cumsum(1), n_relevant + 1) / (n_relevant + 1))
+    return RetrievalScores(
+        nn=defined(relevant[:, 0]),
+        ft=defined(at_rank(hits, n_relevant) / n_relevant),
+        st=defined(at_rank(hits, 2 * n_relevant) / n_relevant),
+        e=defined(2 * hits[:, e_ranks - 1] / (e_ranks + n_relevant)),  # 2/(1/P + 1/R') with P = h/32, R' = h/R
+        dcg=defined((relevant * discount).sum(1) / ideal_gain),
+        adr=defined(at_rank(dynamic_recall, n_relevant) / n_relevant),
+        adr_self=adr_self,
+        map=defined((relevant * hits / ranks[:-1]).sum(1) / n_relevant),
+        labels=labels,
+        scored=scored,
+    )
+
+
+def precision_recall_curve(
+    distances: Tensor,
+    query_labels: Labels,
+    gallery_labels: Labels | None = None,
+    *,
+    recall_levels: Sequence[float] = STANDARD_RECALL_LEVELS,
+) -> PrecisionRecallCurve:
+    """Interpolated precision at standard recall levels, mean over the queries that have a relevant entry.
+
+    The precision at level r is the highest of all precisions at a recall of r or more. The default is the 20 levels
+    0.05, 0.10, …, 1 of the Princeton Shape Benchmark (Shilane et al. 2004); the 11 levels 0, 0.1, …, 1 are the other
+    usual choice. Distances and labels, and errors, as for retrieval_scores.
+
+    Raises:
+        ValueError: also if the recall levels are not ascending numbers in [0, 1].
+    """
+    recall = torch.tensor(list(recall_levels), dtype=torch.float64)
+    valid = recall.numel() > 0 and bool(((recall >= 0) & (recall <= 1)).all()) and bool((recall.diff() > 0).all())
+    if not valid:
+        raise ValueError(f"recall_levels: expected ascending numbers in [0, 1], got {list(recall_levels)}")
+    relevant, _ = _ranked_relevance(distances, query_labels, gallery_labels)
+    hits = relevant[relevant.any(1)].cumsum(1)
+    n_relevant = hits[:, -1:]
+    precision = hits / torch.arange(1, hits.shape[1] + 1, dtype=torch.float64)
+    interpolated = precision.flip(1).cummax(1).values.flip(1)
+    # A level of 3 · 0.1 of ten is three hits, although it rounds to more than 0.3.
+    hits_needed = (recall * n_relevant - 1e-6).ceil()
+    first_rank = torch.searchsorted(hits, hits_needed)
+    return PrecisionRecallCurve(recall, interpolated.gather(1, first_rank).mean(0), n_queries=len(hits))
+
+
+class RetrievalScoresMetric(Metric):
+    """Leave-one-out retrieval scores of all descriptors seen, accumulated over batches (see retrieval_scores).
+
+    `update` takes descriptors (N, ...) and integer labels (N,); `compute` returns the means as a dict of scalar
+    tensors, fractions. Call `update` and `compute`, not the metric itself: single batches seldom hold two of a class.
+    A distributed sampler must not pad with repeated shapes, as a repetition is a perfect match.
+
+    Args:
+        distance: the distance function that compares the descriptors.
+    """
+
+    is_differentiable = False
+    higher_is_better = True
+    full_state_update = False
+
+    descriptors: list[Tensor]
+    labels: list[Tensor]
+
+    def __init__(self, distance: Distance = chi_square, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.distance = distance
+        self.add_state("descriptors", default=[], dist_reduce_fx="cat")
+        self.add_state("labels", default=[], dist_reduce_fx="cat")
+
+    def update(self, descriptors: Tensor, labels: Tensor) -> None:
+        """Add descriptors (N, ...) and integer labels (N,); ValueError if they are not aligned."""
+        if labels.ndim != 1 or labels.is_floating_point() or descriptors.ndim < 2 or len(labels) != len(descriptors):
+            raise ValueError(
+                f"labels: expected one integer for each of the descriptors (N, ...), got {tuple(labels.shape)} of "
+                f"{labels.dtype} for descriptors {tuple(descriptors.shape)}"
+            )
+        self.descriptors.append(descriptors.detach())
+        self.labels.append(labels)
+
+    def compute(self) -> dict[str, Tensor]:
+        """Mean scores by name; ValueError if no two descriptors share a label."""
+        descriptors, labels = dim_zero_cat(self.descriptors), dim_zero_cat(self.labels)
+        scores = retrieval_scores(self.distance(descriptors, descriptors), labels)
+        return {name: torch.tensor(value, device=descriptors.device) for name, value in scores.mean().items()}
+
+
+def _ranked_relevance(
+    distances: Tensor, query_labels: Labels, gallery_labels: Labels | None
+) -> tuple[Tensor, tuple[Hashable, ...]]:
+    """rel(k) of every query as float64 (Q, G), or (Q, Q−1) without the query itself, on the CPU; the query labels."""
+    order = rank(distances).cpu()
+    n_queries, n_gallery = order.shape
+    queries = _label_tuple("query_labels", query_labels, n_queries)
+    if gallery_labels is None:
+        if n_queries != n_gallery:
+            raise ValueError(
+                f"distances: expected square for leave-one-out, got ({n_queries}, {n_gallery}); give gallery_labels "
+                "for a separate gallery"
+            )
+        gallery = queries
+        others = order != torch.arange(n_queries)[:, None]
+        order = order[others].view(n_queries, max(0, n_queries - 1))
+    else:
+        gallery = _label_tuple("gallery_labels", gallery_labels, n_gallery)
+    codes: dict[Hashable, int] = {}
+    query_codes = torch.tensor([codes.setdefault(label, len(codes)) for label in queries], dtype=torch.int64)
+    gallery_codes = torch.tensor([codes.setdefault(label, len(codes)) for label in gallery], dtype=torch.int64)
+    relevant = gallery_codes[order] == query_codes[:, None]
+    if not relevant.any():
+        raise ValueError(
+            f"query_labels: expected a query with a relevant entry, none of {n_queries} shares its label with "
+            f"{'another query' if gallery_labels is None else 'an entry of the gallery'}; there is nothing to score"
+        )
+    return relevant.double(), queries
+
+
+def _label_tuple(name: str, labels: Labels, n_expected: int) -> tuple[Hashable, ...]:
+    if isinstance(labels, Tensor):
+        if labels.ndim != 1:
+            raise ValueError(f"{name}: expected shape (N,), got {tuple(labels.shape)}")
+        labels = labels.tolist()
+    if isinstance(labels, str) or not all(isinstance(label, str | numbers.Integral) for label in labels):
+        raise ValueError(
+            f"{name}: expected an integer tensor (N,) or a sequence of integers or strings, got {labels!r}"
+        )
+    if len(labels) != n_expected:
+        raise ValueError(
+            f"{name}: expected {n_expected} labels, one for each of the distances' entries, got {len(labels)}"
+        )
+    return tuple(labels)

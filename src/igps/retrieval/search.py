@@ -1,0 +1,76 @@
+"""Rank a gallery against queries."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from igps.retrieval.distances import Distance, chi_square
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """The closest gallery entries of every query, closest first.
+
+    Attributes:
+        indices: (Q, top) int64, positions in the gallery.
+        distances: (Q, top), ascending along each row.
+    """
+
+    indices: Tensor
+    distances: Tensor
+
+
+def rank(distances: Tensor) -> Tensor:
+    """Gallery indices of every query, (Q, G) int64, closest first, from distances (Q, G); ties keep gallery order.
+
+    Raises:
+        ValueError: if distances is not a real matrix, or holds NaN or negative entries.
+    """
+    check_distances(distances)
+    return torch.sort(distances, dim=1, stable=True).indices
+
+
+def search(
+    query_descriptors: Tensor, gallery_descriptors: Tensor, *, top: int, distance: Distance = chi_square
+) -> SearchResult:
+    """The `top` closest gallery descriptors of every query, ties in gallery order.
+
+    A query that is itself in the gallery is found there like any other entry, at distance zero.
+
+    Args:
+        query_descriptors: (Q, ...) as the distance takes them.
+        gallery_descriptors: (G, ...).
+        top: how many to return for each query, 1 to G.
+        distance: the distance function.
+
+    Raises:
+        ValueError: if top is outside 1..G, or the distance refuses the descriptors.
+    """
+    n_gallery = len(gallery_descriptors)
+    if not 1 <= top <= n_gallery:
+        raise ValueError(f"top: expected 1 to {n_gallery}, the size of the gallery, got {top}")
+    distances = distance(query_descriptors, gallery_descriptors)
+    indices = rank(distances)[:, :top]
+    return SearchResult(indices=indices, distances=distances.gather(1, indices))
+
+
+def check_distances(distances: Tensor) -> None:
+    """Raise ValueError unless distances is a real (Q, G) matrix without NaN and negative entries; infinity may be."""
+    if distances.ndim != 2 or distances.is_complex() or distances.dtype == torch.bool:
+        raise ValueError(
+            f"distances: expected a real matrix (Q, G), got shape {tuple(distances.shape)} of {distances.dtype}; "
+            "compute it with a function of igps.retrieval.distances"
+        )
+    if distances.numel() == 0:
+        return
+    smallest = distances.detach().amin().item()  # NaN if any entry is
+    if smallest != smallest:
+        raise ValueError("distances: expected numbers, got NaN, which has no rank; look for the descriptor that has it")
+    if smallest < 0:
+        raise ValueError(
+            f"distances: expected entries ≥ 0 (smaller is closer), the smallest is {smallest:g}; give distances in "
+            "place of similarities, and clear rounding below zero by .clamp_min(0)"
+        )

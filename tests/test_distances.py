@@ -1,0 +1,207 @@
+"""Distances against scikit-learn, SciPy and closed forms; gradients against finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+from sklearn.metrics.pairwise import additive_chi2_kernel
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from igps.retrieval import Distance, chi_square, cosine, euclidean, hellinger
+
+ALL = [chi_square, hellinger, euclidean, cosine]
+ORACLES: dict[Distance, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    chi_square: lambda a, b: -additive_chi2_kernel(a, b) / 2,
+    hellinger: lambda a, b: cdist(np.sqrt(a), np.sqrt(b)) / np.sqrt(2),
+    euclidean: cdist,
+    cosine: lambda a, b: cdist(a, b, "cosine"),
+}
+
+
+def histograms(n: int, cells: tuple[int, ...], *, seed: int, filled: float = 0.6) -> Tensor:
+    """Random float64 histograms that sum to 1, a share of their cells empty."""
+    generator = torch.Generator().manual_seed(seed)
+    values = torch.rand(n, *cells, generator=generator, dtype=torch.float64)
+    values *= torch.rand(n, *cells, generator=generator) < filled
+    return values / values.flatten(1).sum(1).view(n, *[1] * len(cells))
+
+
+@pytest.mark.parametrize("distance", ALL)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 4e-6)])
+@pytest.mark.parametrize(("n_queries", "n_gallery", "cells"), [(7, 5, (3, 8)), (1, 90, (10, 64)), (3, 2, (9000,))])
+def test_agrees_with_another_library(
+    distance: Distance, dtype: torch.dtype, tolerance: float, n_queries: int, n_gallery: int, cells: tuple[int, ...]
+) -> None:
+    queries, gallery = histograms(n_queries, cells, seed=1), histograms(n_gallery, cells, seed=2)
+    expected = ORACLES[distance](queries.flatten(1).numpy(), gallery.flatten(1).numpy())
+    result = distance(queries.to(dtype), gallery.to(dtype))
+    assert result.shape == (n_queries, n_gallery)
+    assert result.dtype == dtype
+    np.testing.assert_allclose(result.double().numpy(), expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("distance", ALL)
+def test_a_set_with_itself_has_a_zero_diagonal_and_is_symmetric(distance: Distance) -> None:
+    shapes = histograms(60, (10, 64), seed=3).float()
+    distances = distance(shapes, shapes.clone())
+    assert torch.equal(distances.diagonal(), torch.zeros(60))
+    assert torch.equal(distances, distances.T)
+    assert (distances >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("distance", "farthest"), [(chi_square, 1.0), (hellinger, 1.0), (euclidean, 2**0.5), (cosine, 1)]
+)
+def test_histograms_without_a_common_cell_are_at_the_largest_distance(distance: Distance, farthest: float) -> None:
+    corners = torch.eye(3, dtype=torch.float64)
+    torch.testing.assert_close(distance(corners, corners), farthest * (1 - corners), rtol=0, atol=1e-15)
+
+
+def test_near_vectors_keep_their_cosine_distance() -> None:
+    angle = 1e-3
+    a = torch.tensor([[1.0, 0.0]])
+    b = torch.tensor([[np.cos(angle), np.sin(angle)]], dtype=torch.float32)
+    assert cosine(a, b).item() == pytest.approx(angle**2 / 2, rel=1e-4)  # 1 − cos in float32 would be 6 % off
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
+def test_cosine_ignores_length_even_at_the_ends_of_the_dtype(scale: float) -> None:
+    a, b = torch.tensor([[1.0, 1.0]]), torch.tensor([[1.0, 0.0]])
+    assert cosine(scale * a, scale * b).item() == pytest.approx(1 - 0.5**0.5, rel=1e-6)
+
+
+def test_chi_square_of_tiny_entries_does_not_underflow() -> None:
+    assert chi_square(torch.tensor([[1e-30]]), torch.tensor([[0.0]])).item() == pytest.approx(5e-31, rel=1e-6, abs=0)
+
+
+def test_half_precision_is_computed_in_float32() -> None:
+    queries = histograms(4, (5, 8), seed=4).half()
+    for distance in ALL:
+        torch.testing.assert_close(distance(queries, queries[:2]), distance(queries.float(), queries[:2].float()))
+
+
+def test_chi_square_weights_each_cell() -> None:
+    queries, gallery = histograms(4, (3, 8), seed=5), histograms(6, (3, 8), seed=6)
+    for shape in [(3, 8), (3, 1), (8,), ()]:
+        weights = 2 * torch.rand(shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+        expected = np.zeros((4, 6))
+        for q, g, i, j in np.ndindex(4, 6, 3, 8):
+            a, b = float(queries[q, i, j]), float(gallery[g, i, j])
+            if a + b > 0:
+                expected[q, g] += 0.5 * float(weights.broadcast_to(3, 8)[i, j]) * (a - b) ** 2 / (a + b)
+        np.testing.assert_allclose(chi_square(queries, gallery, weights).numpy(), expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("distance", ALL)
+def test_gradients_agree_with_finite_differences(distance: Distance) -> None:
+    queries, gallery = histograms(3, (2, 5), seed=8, filled=2), histograms(4, (2, 5), seed=9, filled=2)
+    queries, gallery = (10 * queries + 0.1).requires_grad_(), (10 * gallery + 0.1).requires_grad_()
+    assert torch.autograd.gradcheck(distance, (queries, gallery))
+
+
+def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_formula() -> None:
+    queries, gallery = histograms(40, (9000,), seed=10, filled=2), histograms(30, (9000,), seed=11, filled=2)
+    weights = torch.rand(9000, generator=torch.Generator().manual_seed(12), dtype=torch.float64)
+    upstream = torch.rand(40, 30, generator=torch.Generator().manual_seed(13), dtype=torch.float64)
+    arguments = [tensor.requires_grad_() for tensor in (queries, gallery, weights)]
+    gradients = torch.autograd.grad((chi_square(*arguments) * upstream).sum(), arguments)
+    a, b = queries[:, None], gallery[None]
+    plain = (weights * (a - b) ** 2 / (a + b)).sum(-1) / 2
+    for ours, expected in zip(gradients, torch.autograd.grad((plain * upstream).sum(), arguments), strict=True):
+        torch.testing.assert_close(ours, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_weights_of_fewer_dimensions_than_the_cells_pass_gradcheck() -> None:
+    queries, gallery = histograms(3, (2, 5), seed=14, filled=2), histograms(2, (2, 5), seed=15, filled=2)
+    weights = torch.tensor([[0.5], [2.0]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda w: chi_square(queries, gallery, w), (weights,))
+
+
+@pytest.mark.parametrize("distance", ALL)
+def test_gradients_are_finite_at_empty_cells_and_at_distance_zero(distance: Distance) -> None:
+    shapes = histograms(6, (3, 8), seed=16, filled=0.3).requires_grad_()
+    empty = (shapes.detach() == 0).all(0)
+    assert empty.any()  # a cell that is empty in every shape
+    distance(shapes, shapes).sum().backward()
+    assert shapes.grad is not None
+    assert torch.isfinite(shapes.grad).all()
+    assert torch.equal(shapes.grad[:, empty], torch.zeros(6, int(empty.sum()), dtype=torch.float64))
+
+
+def test_chi_square_never_holds_all_triples_of_query_gallery_and_cell() -> None:
+    class LargestBlock(TorchDispatchMode):
+        n_bytes = 0
+
+        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            result = func(*args, **(kwargs or {}))
+            if isinstance(result, Tensor) and result.ndim == 3:  # (queries, gallery, cells)
+                self.n_bytes = max(self.n_bytes, result.nbytes)
+            return result
+
+    for n_shapes, n_cells in [(100, 4096), (2, 500_000)]:  # all triples would be 164 MB and 8 MB
+        shapes = histograms(n_shapes, (n_cells,), seed=17).float().requires_grad_()
+        with LargestBlock() as largest:
+            chi_square(shapes, shapes, torch.ones(())).sum().backward()
+        assert 0 < largest.n_bytes <= 2**20
+
+
+@pytest.mark.parametrize("distance", ALL)
+def test_an_empty_set_of_queries_gives_an_empty_matrix(distance: Distance) -> None:
+    assert distance(torch.empty(0, 4), torch.ones(3, 4)).shape == (0, 3)
+
+
+@pytest.mark.parametrize("distance", ALL)
+def test_inputs_are_left_as_they_were(distance: Distance) -> None:
+    queries, gallery = histograms(5, (6,), seed=19), histograms(4, (6,), seed=20)
+    before = queries.clone(), gallery.clone()
+    distance(queries, gallery)
+    assert torch.equal(queries, before[0])
+    assert torch.equal(gallery, before[1])
+
+
+@pytest.mark.parametrize("distance", ALL)
+@pytest.mark.parametrize(
+    ("queries", "gallery", "message"),
+    [
+        (torch.ones(2, 3), torch.ones(2, 4), "gallery: expected descriptors of the shape"),
+        (torch.ones(3), torch.ones(2, 3), "queries: expected shape"),
+        (torch.ones(2, 3), torch.ones(2, 0), "gallery: expected shape"),
+        (torch.ones(2, 3, dtype=torch.int64), torch.ones(2, 3), "queries: expected a real floating dtype"),
+        (torch.ones(2, 3), torch.tensor([[1.0, float("nan"), 1.0]]), "gallery: expected finite entries"),
+        (torch.tensor([[1.0, float("inf"), 1.0]]), torch.ones(2, 3), "queries: expected finite entries"),
+    ],
+)
+def test_wrong_descriptors_are_refused(distance: Distance, queries: Tensor, gallery: Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        distance(queries, gallery)
+
+
+@pytest.mark.parametrize("distance", [chi_square, hellinger])
+def test_histogram_distances_refuse_negative_entries(distance: Distance) -> None:
+    with pytest.raises(ValueError, match="gallery: expected entries ≥ 0"):
+        distance(torch.ones(2, 3), torch.tensor([[0.5, -0.1, 0.6]]))
+
+
+def test_cosine_refuses_a_descriptor_without_direction() -> None:
+    with pytest.raises(ValueError, match="queries: expected descriptors of non-zero length, 1 of 2"):
+        cosine(torch.tensor([[0.0, 0.0], [1.0, 0.0]]), torch.ones(1, 2))
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        (torch.ones(4), "weights: expected a shape that broadcasts"),
+        (torch.ones(2, 1, 3), "weights: expected a shape that broadcasts"),
+        (torch.tensor([1.0, -1.0, 1.0]), "weights: expected entries ≥ 0"),
+        (torch.tensor([1.0, float("nan"), 1.0]), "weights: expected finite"),
+    ],
+)
+def test_wrong_weights_are_refused(weights: Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        chi_square(torch.ones(2, 3), torch.ones(2, 3), weights)

@@ -1,0 +1,331 @@
+"""Retrieval scores against hand-worked rankings, scikit-learn and loops over ranks."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sklearn.metrics import average_precision_score
+from torch import Tensor
+
+from igps.retrieval import (
+    RetrievalScoresMetric,
+    chi_square,
+    euclidean,
+    precision_recall_curve,
+    retrieval_scores,
+)
+from igps.retrieval.scores import SCORE_NAMES
+
+LOG3 = math.log2(3)
+
+
+def random_case(*, n: int, n_classes: int, seed: int, ties: bool = False) -> tuple[Tensor, Tensor]:
+    """Random distances (n, n), not symmetric, with every class of a size of its own."""
+    generator = torch.Generator().manual_seed(seed)
+    distances = torch.rand(n, n, generator=generator, dtype=torch.float64)
+    if ties:
+        distances = (distances * 5).floor()
+    labels = torch.randint(n_classes, (n,), generator=generator)
+    return distances, labels
+
+
+def ranked_relevance(distances: Tensor, labels: list[Any], query: int) -> list[bool]:
+    """Leave-one-out rel(1), rel(2), … of one query, by sorting (distance, index) pairs."""
+    others = sorted((float(distances[query, other]), other) for other in range(len(labels)) if other != query)
+    return [labels[other] == labels[query] for _, other in others]
+
+
+def scores_by_loops(relevant: list[bool]) -> dict[str, float]:
+    """All scores of one ranked list, straight from their definitions."""
+    n_relevant = sum(relevant)
+
+    def hits(first: int) -> int:
+        return sum(relevant[:first])
+
+    gain = ideal = 0.0
+    for k, rel in enumerate(relevant, start=1):
+        discount = 1.0 if k == 1 else 1 / math.log2(k)
+        gain += discount * rel
+        ideal += discount * (k <= n_relevant)
+    seen = min(32, len(relevant))
+    precision, recall = hits(seen) / seen, hits(seen) / n_relevant
+    with_self = [True, *relevant]
+    return {
+        "nn": float(relevant[0]),
+        "ft": hits(n_relevant) / n_relevant,
+        "st": hits(2 * n_relevant) / n_relevant,
+        "e": 2 / (1 / precision + 1 / recall) if precision else 0.0,
+        "dcg": gain / ideal,
+        "adr": sum(hits(i) / i for i in range(1, n_relevant + 1)) / n_relevant,
+        "adr_self": sum(sum(with_self[:i]) / i for i in range(1, n_relevant + 2)) / (n_relevant + 1),
+        "map": sum(hits(k) / k for k, rel in enumerate(relevant, start=1) if rel) / n_relevant,
+    }
+
+
+def line_distances(order: list[int], n: int) -> Tensor:
+    """Distances (n, n) in which query 0 ranks the others in the given order, and all other rows are that of index."""
+    distances = torch.arange(n, dtype=torch.float64).repeat(n, 1)
+    for position, other in enumerate(order, start=1):
+        distances[0, other] = position
+    return distances
+
+
+def test_hand_worked_leave_one_out_ranking() -> None:
+    # Query 0 of class a = {0, 1, 2, 3} among six others ranks: 1 (hit), 4, 2 (hit), 5, 6, 3 (hit), so R = 3.
+    labels = ["a", "a", "a", "a", "b", "b", "b"]
+    scores = retrieval_scores(line_distances([1, 4, 2, 5, 6, 3], 7), labels)
+    expected = {
+        "nn": 1.0,
+        "ft": 2 / 3,
+        "st": 1.0,
+        "e": 2 * 3 / (6 + 3),  # six ranks in all: P = 3/6, recall 1
+        "dcg": (1 + 1 / LOG3 + 1 / math.log2(6)) / (1 + 1 + 1 / LOG3),
+        "adr": float((Fraction(1, 1) + Fraction(1, 2) + Fraction(2, 3)) / 3),
+        "adr_self": float((1 + Fraction(2, 2) + Fraction(2, 3) + Fraction(3, 4)) / 4),
+        "map": float((Fraction(1, 1) + Fraction(2, 3) + Fraction(3, 6)) / 3),
+    }
+    for name, value in expected.items():
+        assert getattr(scores, name)[0].item() == pytest.approx(value, abs=1e-12), name
+
+
+def test_hand_worked_separate_gallery() -> None:
+    # One query of class 1 against 0, 1, 1, 0, 1 ranked as 0 (miss), 2 (hit), 1 (hit), 3, 4 (hit).
+    distances = torch.tensor([[0.1, 0.3, 0.2, 0.4, 0.5]])
+    scores = retrieval_scores(distances, [1], [0, 1, 1, 0, 1])
+    assert scores.adr_self is None
+    assert scores.mean() == pytest.approx(
+        {
+            "nn": 0.0,
+            "ft": 2 / 3,
+            "st": 1.0,
+            "e": 2 * 3 / (5 + 3),
+            "dcg": (1 + 1 / LOG3 + 1 / math.log2(5)) / (2 + 1 / LOG3),
+            "adr": (0 + 1 / 2 + 2 / 3) / 3,
+            "map": (1 / 2 + 2 / 3 + 3 / 5) / 3,
+        },
+        abs=1e-12,
+    )
+
+
+@pytest.mark.parametrize("ties", [False, True])
+@pytest.mark.parametrize(("n", "n_classes"), [(12, 3), (45, 4), (90, 2)])
+def test_agrees_with_loops_over_ranks(n: int, n_classes: int, ties: bool) -> None:
+    distances, labels = random_case(n=n, n_classes=n_classes, seed=n, ties=ties)
+    scores = retrieval_scores(distances, labels)
+    assert scores.n_queries == n
+    for query in range(n):
+        for name, value in scores_by_loops(ranked_relevance(distances, labels.tolist(), query)).items():
+            assert getattr(scores, name)[query].item() == pytest.approx(value, abs=1e-12), (name, query)
+
+
+def test_mean_average_precision_is_that_of_scikit_learn() -> None:
+    distances, labels = random_case(n=40, n_classes=4, seed=1)
+    expected = []
+    for query in range(40):
+        others = np.arange(40) != query
+        is_relevant = (labels == labels[query]).numpy()[others]
+        expected.append(average_precision_score(is_relevant, -distances[query].numpy()[others]))
+    np.testing.assert_allclose(retrieval_scores(distances, labels).map.numpy(), expected, atol=1e-12)
+
+
+def test_perfect_retrieval_scores_one_and_the_worst_misses_all_tiers() -> None:
+    labels = torch.arange(200).remainder(5)  # 40 a class: R = 39
+    same = (labels[:, None] == labels).double()
+    perfect = retrieval_scores(1 - same, labels).mean()
+    assert perfect.pop("e") == pytest.approx(2 * 32 / (32 + 39))
+    assert perfect == pytest.approx(dict.fromkeys(perfect, 1.0), abs=1e-12)
+    worst = retrieval_scores(same, labels).mean()
+    assert [worst[name] for name in ("nn", "ft", "st", "e", "adr")] == [0.0] * 5
+    assert worst["adr_self"] == pytest.approx(sum(1 / i for i in range(1, 41)) / 40)  # only the query itself is found
+
+
+def test_the_query_is_removed_by_its_index_whatever_its_distance() -> None:
+    distances, labels = random_case(n=20, n_classes=3, seed=2)
+    expected = retrieval_scores(distances, labels).mean()
+    for own in (0.0, 0.5, math.inf):
+        assert retrieval_scores(distances.fill_diagonal_(own), labels).mean() == expected
+
+
+def test_ties_break_by_index() -> None:
+    labels = [0, 1, 0, 1]
+    scores = retrieval_scores(torch.zeros(4, 4), labels)  # every query ranks the others 0, 1, 2, 3 without itself
+    assert scores.nn.tolist() == [0.0, 0.0, 1.0, 0.0]
+    assert scores.map.tolist() == pytest.approx([1 / 2, 1 / 3, 1.0, 1 / 2])
+
+
+def test_leave_one_out_is_a_separate_gallery_without_the_query() -> None:
+    distances, labels = random_case(n=15, n_classes=3, seed=3)
+    together = retrieval_scores(distances, labels)
+    for query in range(15):
+        others = torch.arange(15) != query
+        alone = retrieval_scores(distances[query, others][None], labels[query : query + 1], labels[others]).mean()
+        assert alone == pytest.approx({name: getattr(together, name)[query].item() for name in alone})
+
+
+def test_the_order_of_the_gallery_does_not_matter_without_ties() -> None:
+    distances, labels = random_case(n=30, n_classes=3, seed=4)
+    order = torch.randperm(30, generator=torch.Generator().manual_seed(5))
+    expected = retrieval_scores(distances, labels).mean()
+    assert retrieval_scores(distances[order][:, order], labels[order]).mean() == pytest.approx(expected, abs=1e-12)
+
+
+def test_only_the_order_of_distances_matters() -> None:
+    distances, labels = random_case(n=30, n_classes=3, seed=6)
+    expected = retrieval_scores(distances, labels).mean()
+    assert retrieval_scores(distances.square() * 7, labels).mean() == expected
+
+
+def test_strings_integers_and_tensors_label_alike() -> None:
+    distances, labels = random_case(n=20, n_classes=3, seed=7)
+    words = [["ant", "bear", "cup"][label] for label in labels]
+    expected = retrieval_scores(distances, labels).mean()
+    assert retrieval_scores(distances, words).mean() == expected
+    assert retrieval_scores(distances, labels.tolist()).mean() == expected
+    assert retrieval_scores(distances, labels.numpy()).mean() == expected
+
+
+def test_a_query_alone_in_its_class_is_left_out_and_counted() -> None:
+    distances, _ = random_case(n=7, n_classes=1, seed=8)
+    labels = ["a", "a", "lonely", "b", "b", "b", "single"]
+    scores = retrieval_scores(distances, labels)
+    assert (scores.n_queries, scores.n_excluded) == (5, 2)
+    assert scores.scored.tolist() == [True, True, False, True, True, True, False]
+    assert all(getattr(scores, name)[[2, 6]].isnan().all() for name in SCORE_NAMES)
+    loops = [scores_by_loops(ranked_relevance(distances, labels, query)) for query in (0, 1, 3, 4, 5)]
+    expected = {name: sum(values[name] for values in loops) / 5 for name in SCORE_NAMES}
+    assert scores.mean() == pytest.approx(expected)
+
+
+def test_per_class_means_are_those_of_the_members() -> None:
+    distances, _ = random_case(n=6, n_classes=1, seed=9)
+    labels = ["b", "a", "b", "a", "lonely", "a"]
+    scores = retrieval_scores(distances, labels)
+    per_class = scores.per_class()
+    assert list(per_class) == ["b", "a"]
+    for label, members in {"a": [1, 3, 5], "b": [0, 2]}.items():
+        expected = {name: getattr(scores, name)[members].mean().item() for name in SCORE_NAMES}
+        assert per_class[label] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("score", [retrieval_scores, precision_recall_curve])
+@pytest.mark.parametrize(
+    ("distances", "query_labels", "gallery_labels", "message"),
+    [
+        (torch.ones(2, 3), [0, 0], None, "square for leave-one-out"),
+        (torch.ones(3), [0, 0, 0], None, "distances: expected a real matrix"),
+        (torch.tensor([[0.0, float("nan")], [1.0, 0.0]]), [0, 0], None, "NaN"),
+        (-torch.eye(2), [0, 0], None, "similarities"),
+        (torch.ones(2, 2), [0], None, "query_labels: expected 2 labels"),
+        (torch.ones(2, 3), [0, 0], [0, 0], "gallery_labels: expected 3 labels"),
+        (torch.ones(2, 2), torch.zeros(2, 1, dtype=torch.int64), None, "query_labels: expected shape"),
+        (torch.ones(2, 2), torch.zeros(2), None, "query_labels: expected an integer tensor"),
+        (torch.ones(2, 2), [torch.tensor(0), torch.tensor(0)], None, "query_labels: expected an integer tensor"),
+        (torch.ones(2, 2), "aa", None, "query_labels: expected an integer tensor"),
+        (torch.ones(2, 2), ["a", "b"], None, "nothing to score"),
+        (torch.ones(1, 2), ["1"], [1, 1], "nothing to score"),
+        (torch.ones(1, 1), ["a"], None, "nothing to score"),
+        (torch.ones(0, 2), [], [1, 1], "nothing to score"),
+        (torch.ones(1, 0), [1], [], "nothing to score"),
+    ],
+)
+def test_what_cannot_be_scored_is_refused(
+    score: Any, distances: Tensor, query_labels: Any, gallery_labels: Any, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        score(distances, query_labels, gallery_labels)
+
+
+def test_hand_worked_precision_recall_curve() -> None:
+    # Hits at ranks 1, 3, 4, 6: precisions 1, 2/3, 3/4, 4/6 at recalls 1/4 … 1, the 2/3 lifted to the 3/4 behind it.
+    distances = torch.arange(6.0)[None]
+    curve = precision_recall_curve(distances, ["a"], list("abaaba"), recall_levels=[0, 0.2, 0.25, 0.5, 0.51, 1])
+    assert curve.precision.tolist() == pytest.approx([1, 1, 1, 3 / 4, 3 / 4, 4 / 6])
+    assert curve.recall.tolist() == [0, 0.2, 0.25, 0.5, 0.51, 1]
+    assert curve.n_queries == 1
+
+
+@pytest.mark.parametrize("levels", [[i / 10 for i in range(11)], None])
+def test_precision_recall_curve_agrees_with_loops(levels: list[float] | None) -> None:
+    distances, labels = random_case(n=41, n_classes=2, seed=10)
+    labels = torch.cat([labels[:-1], torch.tensor([9])])  # the last query has no relevant entry
+    curve = precision_recall_curve(distances, labels, **({} if levels is None else {"recall_levels": levels}))
+    expected = []
+    for level in levels or [i / 20 for i in range(1, 21)]:
+        best = []
+        for query in range(40):
+            relevant = ranked_relevance(distances, labels.tolist(), query)
+            n_relevant, hits, candidates = sum(relevant), 0, []
+            for k, rel in enumerate(relevant, start=1):
+                hits += rel
+                if Fraction(hits, n_relevant) >= Fraction(level).limit_denominator(100) and hits:
+                    candidates.append(hits / k)
+            best.append(max(candidates))
+        expected.append(sum(best) / 40)
+    assert curve.precision.tolist() == pytest.approx(expected, abs=1e-12)
+    assert curve.n_queries == 40
+
+
+def test_a_recall_level_that_is_a_number_of_hits_is_not_rounded_up() -> None:
+    # Three of ten hits lead, then a miss: the precision at a recall of 0.3 is 1, above it 10/11.
+    labels = [1] * 3 + [0] + [1] * 7
+    level = 3 * 0.1
+    assert level * 10 > 3  # in binary
+    curve = precision_recall_curve(torch.arange(11.0)[None], [1], labels, recall_levels=[level, 0.31])
+    assert curve.precision.tolist() == [1.0, 10 / 11]
+
+
+@pytest.mark.parametrize("levels", [[], [0.5, 0.1], [0.1, 0.1], [-0.1, 0.5], [0.5, 1.1], [float("nan")]])
+def test_wrong_recall_levels_are_refused(levels: list[float]) -> None:
+    with pytest.raises(ValueError, match="recall_levels: expected ascending"):
+        precision_recall_curve(torch.zeros(2, 2), [0, 0], recall_levels=levels)
+
+
+@pytest.mark.parametrize("distance", [chi_square, euclidean])
+def test_metric_over_batches_is_the_function_over_all(distance: Any) -> None:
+    generator = torch.Generator().manual_seed(11)
+    descriptors = torch.rand(30, 2, 8, generator=generator)
+    labels = torch.randint(3, (30,), generator=generator)
+    metric = RetrievalScoresMetric(distance)
+    for start in range(0, 30, 7):
+        metric.update(descriptors[start : start + 7].requires_grad_(), labels[start : start + 7])
+    result = metric.compute()
+    expected = retrieval_scores(distance(descriptors, descriptors).detach(), labels).mean()
+    assert {name: value.item() for name, value in result.items()} == pytest.approx(expected, abs=1e-6)
+    assert tuple(result) == SCORE_NAMES
+    assert not any(batch.requires_grad for batch in metric.descriptors)  # no batch keeps its graph alive
+
+
+def test_metric_starts_afresh_after_reset() -> None:
+    metric = RetrievalScoresMetric(euclidean)
+    metric.update(torch.tensor([[0.0], [1.0]]), torch.tensor([0, 1]))
+    metric.reset()
+    metric.update(torch.tensor([[0.0], [1.0], [5.0]]), torch.tensor([0, 0, 1]))
+    assert metric.compute()["nn"].item() == 1.0
+
+
+def test_metric_compares_by_chi_square_unless_told() -> None:
+    shapes, labels = torch.tensor([[0.4, 0.0], [0.0, 0.0], [0.2, 0.2]]), torch.tensor([0, 0, 1])
+    metric = RetrievalScoresMetric()
+    metric.update(shapes, labels)
+    expected = retrieval_scores(chi_square(shapes, shapes), labels).mean()
+    assert expected != retrieval_scores(euclidean(shapes, shapes), labels).mean()
+    assert {name: value.item() for name, value in metric.compute().items()} == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("descriptors", "labels"),
+    [
+        (torch.ones(3, 2), torch.tensor([0, 1])),
+        (torch.ones(2, 2), torch.tensor([0.0, 1.0])),
+        (torch.ones(2, 2), torch.tensor([[0], [1]])),
+        (torch.ones(2), torch.tensor([0, 1])),
+    ],
+)
+def test_metric_refuses_labels_that_are_not_aligned(descriptors: Tensor, labels: Tensor) -> None:
+    with pytest.raises(ValueError, match="labels: expected one integer for each"):
+        RetrievalScoresMetric().update(descriptors, labels)
