@@ -1,0 +1,126 @@
+"""A content-addressed store of Signatures on disk, one safetensors file each."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from igps.geometry.signature import Samples, Signature, SignatureConfig
+
+logger = logging.getLogger(__name__)
+
+_FORMAT = "igps-signature-1"
+_ROOMS = ("interior", "surface")
+T = TypeVar("T")
+
+
+def default_cache_dir() -> Path:
+    """The user's cache directory for Signatures: `$XDG_CACHE_HOME/igps`, or `~/.cache/igps`."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "igps"
+
+
+class SignatureCache:
+    """Signatures by key, shared safely by any number of processes.
+
+    A file is written beside its place and moved there in one step, so that a reader sees all of it or nothing, and a
+    killed run leaves no half of a file behind. Two processes that compute the same Signature write the same content.
+
+    Args:
+        directory: made if it is missing.
+    """
+
+    def __init__(self, directory: str | Path) -> None:
+        self.directory = Path(directory)
+
+    def path(self, key: str) -> Path:
+        """The file of a key, in one of 256 folders."""
+        return self.directory / key[:2] / f"{key}.safetensors"
+
+    def __contains__(self, key: str) -> bool:
+        """Whether a Signature is stored under `key`, by the file's header and length."""
+        return self._read(key, lambda file, metadata: True) is not None
+
+    def get(self, key: str) -> Signature | None:
+        """The Signature stored under `key`, or None if there is none or it cannot be trusted, which is logged."""
+        return self._read(key, _decode)
+
+    def _read(self, key: str, read: Callable[[Any, Mapping[str, str]], T]) -> T | None:
+        path = self.path(key)
+        try:
+            with safe_open(path, framework="numpy") as file:
+                metadata = file.metadata() or {}
+                if metadata.get("format") != _FORMAT or metadata.get("key") != key:
+                    raise ValueError(f"not a {_FORMAT} file of this key")
+                return read(file, metadata)
+        except FileNotFoundError:
+            return None
+        except (SafetensorError, ValueError, KeyError, TypeError, OSError) as error:
+            logger.warning("%s: cached signature is not usable (%s); it is computed again", path, error)
+            return None
+
+    def put(self, key: str, signature: Signature) -> None:
+        """Store a Signature under `key`."""
+        path = self.path(key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tensors, metadata = _encode(signature)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".partial")
+        os.close(handle)
+        try:
+            save_file(tensors, temporary, metadata={"format": _FORMAT, "key": key, **metadata})
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+
+
+def _encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    tensors: dict[str, np.ndarray] = {"eigenvalues": signature.eigenvalues}
+    for room in _ROOMS:
+        samples: Samples = getattr(signature, room)
+        tensors[f"{room}.points"] = samples.points
+        tensors[f"{room}.eigenfunctions"] = samples.eigenfunctions
+        for name, values in samples.attributes.items():
+            tensors[f"{room}.attributes.{name}"] = values
+    scalars = {
+        "area": signature.area,
+        "volume": signature.volume,
+        "config": signature.config.as_dict(),
+        "name": signature.name,
+        "notes": signature.notes,
+    }
+    # safetensors writes the buffer as it lies in memory.
+    contiguous = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
+    return contiguous, {name: json.dumps(value) for name, value in scalars.items()}
+
+
+def _decode(file: Any, metadata: Mapping[str, str]) -> Signature:
+    tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no Mapping: it cannot be iterated)
+    config: dict[str, Any] = json.loads(metadata["config"])
+    if config.pop("algorithm_version") != SignatureConfig.ALGORITHM_VERSION:
+        raise ValueError("made by another version of the algorithm")
+    rooms = {}
+    for room in _ROOMS:
+        prefix = f"{room}.attributes."
+        attributes = {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+        rooms[room] = Samples(tensors[f"{room}.points"], tensors[f"{room}.eigenfunctions"], attributes)
+        if len(rooms[room].points) != len(rooms[room].eigenfunctions):
+            raise ValueError(f"{room} points and eigenfunctions differ in number")
+    return Signature(
+        eigenvalues=tensors["eigenvalues"],
+        interior=rooms["interior"],
+        surface=rooms["surface"],
+        area=json.loads(metadata["area"]),
+        volume=json.loads(metadata["volume"]),
+        config=SignatureConfig(**config),
+        name=json.loads(metadata["name"]),
+        notes=tuple(json.loads(metadata["notes"])),
+    )

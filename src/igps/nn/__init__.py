@@ -1,0 +1,1 @@
+"""From Signatures to histograms and embeddings: differentiable, batched, on any device."""

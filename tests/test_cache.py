@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from igps.data.cache import SignatureCache, default_cache_dir
+from igps.geometry.signature import Samples, Signature, SignatureConfig
+
+KEY = "0123456789abcdef"
+
+
+@pytest.fixture
+def signature() -> Signature:
+    generator = np.random.default_rng(0)
+
+    def samples(n: int) -> Samples:
+        values = generator.random((n, 3)).astype(np.float32)
+        return Samples(generator.random((n, 3)), values, {"depth": values[:, 0].copy()})
+
+    return Signature(
+        np.array([1.0, 2.0, 3.5]), samples(7), samples(4), 3.25, 0.1, SignatureConfig(n_eigenpairs=3), "a", ("turned",)
+    )
+
+
+def test_round_trip_is_exact(tmp_path: Path, signature: Signature) -> None:
+    cache = SignatureCache(tmp_path)
+    assert KEY not in cache
+    assert cache.get(KEY) is None
+    cache.put(KEY, signature)
+    assert KEY in cache
+    restored = cache.get(KEY)
+    assert restored is not None
+    assert restored.config == signature.config
+    assert (restored.area, restored.volume) == (signature.area, signature.volume)
+    assert (restored.name, restored.notes) == (signature.name, signature.notes)
+    np.testing.assert_array_equal(restored.eigenvalues, signature.eigenvalues)
+    for room in ("interior", "surface"):
+        before, after = getattr(signature, room), getattr(restored, room)
+        np.testing.assert_array_equal(after.points, before.points)
+        np.testing.assert_array_equal(after.eigenfunctions, before.eigenfunctions)
+        np.testing.assert_array_equal(after.attributes["depth"], before.attributes["depth"])
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def overwrite(path: Path) -> None:
+    path.write_bytes(b"not a tensor file at all")
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def replace_by_foreign(path: Path) -> None:
+    save_file({"weights": np.zeros(3)}, path)
+
+
+def belongs_to_another_key(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(KEY.encode(), KEY[::-1].encode()))
+
+
+@pytest.mark.parametrize("damage", [truncate, overwrite, empty, replace_by_foreign, belongs_to_another_key])
+def test_damaged_or_foreign_file_is_noticed(
+    tmp_path: Path, signature: Signature, damage, caplog: pytest.LogCaptureFixture
+) -> None:  # type: ignore[no-untyped-def]
+    cache = SignatureCache(tmp_path)
+    cache.put(KEY, signature)
+    damage(cache.path(KEY))
+    with caplog.at_level(logging.WARNING):
+        assert KEY not in cache
+        assert cache.get(KEY) is None
+    assert str(cache.path(KEY)) in caplog.text
+    cache.put(KEY, signature)
+    assert cache.get(KEY) is not None
+
+
+def test_older_algorithm_is_not_trusted(tmp_path: Path, signature: Signature, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache = SignatureCache(tmp_path)
+    cache.put(KEY, signature)
+    monkeypatch.setattr(SignatureConfig, "ALGORITHM_VERSION", SignatureConfig.ALGORITHM_VERSION + 1)
+    assert cache.get(KEY) is None
+
+
+def test_failed_write_leaves_nothing(tmp_path: Path, signature: Signature, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("igps.data.cache.save_file", fail)
+    cache = SignatureCache(tmp_path)
+    with pytest.raises(OSError, match="disk full"):
+        cache.put(KEY, signature)
+    assert not list(tmp_path.rglob("*.*"))
+
+
+def test_default_directory_follows_the_convention(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert default_cache_dir() == tmp_path / "igps"

@@ -1,0 +1,275 @@
+"""Generated shapes: sound meshes, a stable benchmark, files that resume."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from igps.data.shapes import ArticulatedShapes, GeneratedShape, _Arc, _Box, _Cone, _Prism, _Ring, _Solid
+
+pytest.importorskip("skimage", reason="the extra 'shapes' is not installed")
+
+DEFAULTS = ["biped", "quadruped", "octopus", "spider", "hand", "snake", "plier", "mug"]
+# Of the grammar: one class of every family, with and without handles.
+GRAMMAR = range(12, 24)
+
+
+@pytest.fixture(scope="module")
+def default_shapes() -> list[GeneratedShape]:
+    """Three shapes of each of the eight default classes."""
+    return list(ArticulatedShapes(n_per_class=3))
+
+
+@pytest.fixture(scope="module")
+def grammar_shapes() -> list[GeneratedShape]:
+    """One shape of one class of every family."""
+    shapes = ArticulatedShapes(n_classes=GRAMMAR.stop, n_per_class=1, seed=3)
+    return [shapes[i] for i in GRAMMAR]
+
+
+@pytest.fixture(scope="module")
+def all_shapes(default_shapes: list[GeneratedShape], grammar_shapes: list[GeneratedShape]) -> list[GeneratedShape]:
+    return default_shapes + grammar_shapes
+
+
+def directed_edges(faces: NDArray[np.int64]) -> list[tuple[int, int]]:
+    return [(int(f[i]), int(f[(i + 1) % 3])) for f in faces for i in range(3)]
+
+
+def test_each_directed_edge_occurs_once_with_its_opposite(all_shapes: list[GeneratedShape]) -> None:
+    for shape in all_shapes:
+        count = Counter(directed_edges(shape.faces))
+        assert set(count.values()) == {1}, shape.name
+        assert all((b, a) in count for a, b in count), shape.name
+
+
+def test_the_faces_at_each_vertex_form_one_fan(all_shapes: list[GeneratedShape]) -> None:
+    for shape in all_shapes:
+        after: list[dict[int, int]] = [{} for _ in shape.vertices]
+        for a, b, c in shape.faces.tolist():
+            after[a][b], after[b][c], after[c][a] = c, a, b
+        for fan in after:
+            start = next(iter(fan))
+            around = [start]
+            while fan[around[-1]] != start:
+                around.append(fan[around[-1]])
+            assert len(around) == len(fan) >= 3, shape.name
+
+
+def test_one_component_of_the_recorded_genus(all_shapes: list[GeneratedShape]) -> None:
+    for shape in all_shapes:
+        edges = directed_edges(shape.faces)
+        parent = list(range(len(shape.vertices)))
+
+        def root(i: int, parent: list[int] = parent) -> int:
+            while parent[i] != i:
+                parent[i] = i = parent[parent[i]]
+            return i
+
+        for a, b in edges:
+            parent[root(a)] = root(b)
+        assert len({root(i) for i in range(len(parent))}) == 1, shape.name
+        assert len(shape.vertices) - len(edges) // 2 + len(shape.faces) == 2 - 2 * shape.genus, shape.name
+
+
+def test_genus_of_known_objects() -> None:
+    shapes = ArticulatedShapes(n_classes=10, n_per_class=1)
+    genus = {name: shapes[i].genus for i, name in enumerate(shapes.class_names) if name in ("biped", "mug", "glasses")}
+    assert genus == {"biped": 0, "mug": 1, "glasses": 2}
+
+
+def test_volume_is_positive(all_shapes: list[GeneratedShape]) -> None:
+    for shape in all_shapes:
+        assert trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume > 0.05, shape.name
+
+
+def test_arrays_and_triangles_are_sane(all_shapes: list[GeneratedShape]) -> None:
+    for shape in all_shapes:
+        assert shape.vertices.dtype == np.float64
+        assert shape.faces.dtype == np.int64
+        assert len(np.unique(shape.vertices, axis=0)) == len(shape.vertices)
+        assert 1800 <= len(shape.vertices) <= 4200, shape.name
+        angles = trimesh.Trimesh(shape.vertices, shape.faces, process=False).face_angles
+        assert np.degrees(angles.min()) > 5.0, shape.name
+        assert np.degrees(np.percentile(angles, 1)) > 20.0, shape.name
+
+
+def test_same_seed_same_arrays_other_seed_others(default_shapes: list[GeneratedShape]) -> None:
+    for i in (0, 4, 23):
+        again = ArticulatedShapes(n_per_class=3)[i]
+        np.testing.assert_array_equal(again.vertices, default_shapes[i].vertices)
+        np.testing.assert_array_equal(again.faces, default_shapes[i].faces)
+    other = ArticulatedShapes(n_per_class=3, seed=1)[0]
+    assert other.vertices.shape != default_shapes[0].vertices.shape or not np.allclose(
+        other.vertices, default_shapes[0].vertices
+    )
+
+
+def test_a_shape_does_not_depend_on_the_others(grammar_shapes: list[GeneratedShape]) -> None:
+    """Neither on those made before nor on how many there are: class 14 of 24 or 15, shape 0 of 1 or 4."""
+    alone = ArticulatedShapes(n_classes=15, n_per_class=4, seed=3)[14 * 4]
+    among = grammar_shapes[14 - GRAMMAR.start]
+    assert alone.name == among.name
+    np.testing.assert_array_equal(alone.vertices, among.vertices)
+    np.testing.assert_array_equal(alone.faces, among.faces)
+
+
+def test_shapes_of_a_class_differ(default_shapes: list[GeneratedShape]) -> None:
+    """In more than the rigid motion: their areas and volumes differ too."""
+    for start in range(0, 24, 3):
+        meshes = [trimesh.Trimesh(s.vertices, s.faces, process=False) for s in default_shapes[start : start + 3]]
+        compactness = [mesh.volume / mesh.area**1.5 for mesh in meshes]
+        assert np.ptp(compactness) > 1e-3 * np.mean(compactness), default_shapes[start].name
+
+
+def test_resolution_follows_n_vertices() -> None:
+    for n_vertices in (1200, 6000):
+        for i in (0, 7):
+            shape = ArticulatedShapes(n_per_class=1, n_vertices=n_vertices)[i]
+            assert 0.6 <= len(shape.vertices) / n_vertices <= 1.4
+
+
+def distance_histogram(shape: GeneratedShape) -> NDArray[np.float64]:
+    """D2 (Osada, Funkhouser, Chazelle and Dobkin 2002): distances of random surface points, over the area's root."""
+    mesh = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+    points, _ = trimesh.sample.sample_surface(mesh, 800, seed=0)
+    distances = np.linalg.norm(points[:400, None] - points[None, 400:], axis=2) / np.sqrt(mesh.area)
+    return np.histogram(distances, 32, (0.0, 1.6))[0] / distances.size
+
+
+def test_shapes_of_a_class_are_closer_than_others(default_shapes: list[GeneratedShape]) -> None:
+    histograms = np.array([distance_histogram(shape) for shape in default_shapes])
+    apart = np.abs(histograms[:, None] - histograms[None]).sum(axis=2)
+    labels = np.array([shape.label for shape in default_shapes])
+    same = labels[:, None] == labels[None]
+    within = apart[same & ~np.eye(len(labels), dtype=bool)].mean()
+    assert within < 0.6 * apart[~same].mean()
+
+
+def test_names_and_labels() -> None:
+    shapes = ArticulatedShapes(n_per_class=2)
+    assert shapes.class_names == DEFAULTS
+    assert len(shapes) == len(shapes.labels) == len(shapes.names) == 16
+    assert shapes.labels[:4] == ["biped", "biped", "quadruped", "quadruped"]
+    assert shapes.names[:3] == ["biped/00", "biped/01", "quadruped/00"]
+    last = shapes[-1]
+    assert (last.label, last.name) == ("mug", "mug/01")
+    many = ArticulatedShapes(n_classes=200, n_per_class=1)
+    assert len(set(many.class_names)) == 200
+    # The structure that the name tells, without its number, is not repeated either.
+    assert len({name.rsplit("-", 1)[0] for name in many.class_names}) == 200
+    assert many.class_names[:8] == DEFAULTS
+    assert ArticulatedShapes(n_classes=30).class_names == many.class_names[:30]
+
+
+@pytest.mark.parametrize("index", [16, -17])
+def test_no_such_shape(index: int) -> None:
+    with pytest.raises(IndexError, match=str(index)):
+        ArticulatedShapes(n_per_class=2)[index]
+
+
+@pytest.mark.parametrize("arguments", [{"n_classes": 0}, {"n_per_class": 0}, {"seed": -1}, {"n_vertices": 10}])
+def test_arguments_out_of_range_are_named(arguments: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        ArticulatedShapes(**arguments)
+
+
+def test_write_gives_the_same_meshes_and_resumes(tmp_path: Path) -> None:
+    shapes = ArticulatedShapes(n_classes=2, n_per_class=2, n_vertices=1500)
+    shapes.write(tmp_path)
+    files = sorted(tmp_path.rglob("*.off"))
+    assert [file.relative_to(tmp_path).as_posix() for file in files] == [
+        "biped/00.off",
+        "biped/01.off",
+        "quadruped/00.off",
+        "quadruped/01.off",
+    ]
+    read = trimesh.load(files[3], process=False)
+    np.testing.assert_array_equal(read.vertices, shapes[3].vertices)
+    np.testing.assert_array_equal(read.faces, shapes[3].faces)
+
+    before = {file: (file.read_bytes(), file.stat().st_mtime_ns) for file in files}
+    files[0].write_bytes(before[files[0]][0][:5000])  # as a full disk would leave it
+    files[1].unlink()
+    shapes.write(tmp_path)
+    assert sorted(p for p in tmp_path.rglob("*") if p.is_file()) == [*files, tmp_path / "shapes.json"]
+    assert all(file.read_bytes() == before[file][0] for file in files)
+    assert [file.stat().st_mtime_ns == before[file][1] for file in files] == [False, False, True, True]
+
+
+def test_write_refuses_a_folder_of_other_shapes(tmp_path: Path) -> None:
+    ArticulatedShapes(n_classes=1, n_per_class=1, n_vertices=1000).write(tmp_path)
+    with pytest.raises(ValueError, match="root="):
+        ArticulatedShapes(n_classes=1, n_per_class=1, n_vertices=1000, seed=1).write(tmp_path)
+
+
+def test_contact_sheet_shows_every_class(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="the extra 'plot' is not installed")
+    from matplotlib.image import imread
+
+    shapes = ArticulatedShapes(n_classes=4, n_per_class=2, n_vertices=1000)
+    shapes.contact_sheet(tmp_path / "sheet.png")
+    picture = imread(tmp_path / "sheet.png")[:, :, :3]
+    bluish = (picture[:, :, 2] - picture[:, :, 0] > 0.1).sum(axis=0)
+    width = bluish.size // 4
+    assert all(bluish[i * width : (i + 1) * width].sum() > 1000 for i in range(4))
+    with pytest.raises(ValueError, match="n_shown"):
+        shapes.contact_sheet(tmp_path / "sheet.png", n_shown=3)
+
+
+@pytest.mark.parametrize(("module", "extra"), [("skimage.measure", "shapes"), ("matplotlib.figure", "plot")])
+def test_a_missing_library_is_named_with_its_extra(
+    module: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ImportError, match=rf"interior-gps\[{extra}\]"):
+        ArticulatedShapes().contact_sheet(tmp_path / "sheet.png")
+
+
+POINTS = np.random.default_rng(0).uniform(-1.5, 1.5, (400, 3))
+
+
+def nearest_sphere(centres: NDArray[np.float64], radii: NDArray[np.float64]) -> NDArray[np.float64]:
+    return (np.linalg.norm(POINTS[:, None] - centres[None], axis=2) - radii).min(axis=1)
+
+
+def swept(solid: _Solid) -> NDArray[np.float64]:
+    """The distance to a union of very many balls along the solid's centre line."""
+    t = np.linspace(0.0, 1.0, 4001)
+    zero = np.zeros_like(t)
+    match solid:
+        case _Cone(length, start, end):
+            return nearest_sphere(np.column_stack([zero, zero, t * length]), start + t * (end - start))
+        case _Arc(bend, angle, start, end):
+            line = np.column_stack([zero, bend * (1 - np.cos(t * angle)), bend * np.sin(t * angle)])
+            return nearest_sphere(line, start + t * (end - start))
+        case _Ring(radius, tube, side):
+            x, z = radius * np.cos(2 * np.pi * t), radius * np.sin(2 * np.pi * t)
+            bows = np.column_stack([x, zero, z + np.sign(z) * side])
+            sides = [np.column_stack([zero + s * radius, zero, (2 * t - 1) * side]) for s in (-1, 1)]
+            return nearest_sphere(np.concatenate([bows, *sides]), np.full(1, tube))
+    raise AssertionError(solid)
+
+
+@pytest.mark.parametrize(
+    "solid",
+    [_Cone(0.9, 0.3, 0.1), _Cone(0.7, 0.1, 0.3), _Arc(0.6, 2.2, 0.15, 0.15), _Ring(0.5, 0.2), _Ring(0.4, 0.1, 0.3)],
+)
+def test_distance_to_swept_solids(solid: _Solid) -> None:
+    outside = swept(solid) > 0.0
+    np.testing.assert_allclose(solid.distance(*POINTS.T)[outside], swept(solid)[outside], atol=1e-3)
+
+
+@pytest.mark.parametrize("solid", [_Box((1.0, 0.6, 1.6), 0.1), _Prism(4, 0.9, 0.5, 0.05)])
+def test_flat_solids_have_their_volume(solid: _Solid) -> None:
+    """Of a box and of a square prism, by counting points; the rounding takes off little."""
+    points = np.random.default_rng(1).uniform(-1.0, 1.0, (400_000, 3))
+    volume = 8.0 * np.mean(solid.distance(*points.T) < 0.0)
+    expected = 0.96 if isinstance(solid, _Box) else 2.0 * 0.9**2 * 0.5
+    assert 0.94 * expected < volume < 1.01 * expected
