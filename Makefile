@@ -1,0 +1,38 @@
+# `make demo` and `make test` set up everything they need in .venv, on a fresh machine.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: demo test lint shrec07 bench clean
+
+demo: $(READY)
+	$(BIN)/igps demo --out build/demo
+
+test: $(READY)
+	$(BIN)/python -m pytest
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+# make shrec07 DATA=folder-of-meshes-with-labels.csv
+shrec07: $(READY)
+	@test -n "$(DATA)" || { echo "make shrec07 DATA=FOLDER: name the folder of the SHREC'07 meshes (with labels.csv)"; exit 2; }
+	$(BIN)/igps retrieve "$(DATA)" --paper --descriptor interior --out build/shrec07/interior
+	$(BIN)/igps retrieve "$(DATA)" --paper --descriptor gps --out build/shrec07/gps
+
+# torch comes first and pinned: the newest build would bring gigabytes of CUDA libraries.
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test,lint]"
+	touch $(READY)
+
+# make bench [DATA=folder-of-meshes-with-labels.csv]
+bench: $(READY)
+	$(BIN)/python tests/benchmarks/bench.py $(if $(DATA),--data "$(DATA)")
+
+clean:
+	rm -rf build $(VENV)

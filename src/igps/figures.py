@@ -1,0 +1,101 @@
+"""Pictures of results, saved as PNG. Needs matplotlib: pip install "interior-gps[plot]"."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.geometry.mesh import area_vectors, load_mesh, simplify
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Blue for a hit and orange for a miss stay apart for every kind of colour vision (Okabe and Ito 2008).
+_RELEVANT, _IRRELEVANT, _QUERY = "#0072B2", "#D55E00", "#444444"
+# A thumbnail shows no more detail than this, and drawing takes time with every face.
+_THUMBNAIL_VERTICES = 800
+
+
+def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8) -> None:
+    """One row per class: its first mesh as the query, then the meshes ranked nearest to it.
+
+    Args:
+        root: folder of the meshes.
+        ranking: the ranking.csv that `igps retrieve` wrote.
+        out: the PNG file.
+        top: results in a row.
+    """
+    results: dict[str, list[tuple[str, float, bool]]] = {}
+    with ranking.open(newline="") as file:
+        for row in csv.DictReader(file):
+            found = results.setdefault(row["query"], [])
+            if len(found) < top:
+                found.append((row["model"], float(row["distance"]), row["relevant"] == "1"))
+    # A class is a folder in the layouts that this figure is drawn for.
+    first = {name.split("/")[0]: name for name in sorted(results, reverse=True)}
+    queries = [first[label] for label in sorted(first)]
+    figure = _figure(1.25 * (top + 1), 1.45 * len(queries) + 0.6)
+    axes = figure.subplots(len(queries), top + 1, squeeze=False)
+    for row_axes, query in zip(axes, queries, strict=True):
+        draw_mesh(row_axes[0], root / query)
+        _frame(row_axes[0], f"query {query}", _QUERY)
+        for axis, (model, distance, relevant) in zip(row_axes[1:], results[query], strict=False):
+            draw_mesh(axis, root / model)
+            _frame(axis, f"{model}\n{distance:.3f}", _RELEVANT if relevant else _IRRELEVANT)
+    figure.suptitle(
+        "Query (left) and its nearest meshes with their chi-square distance; "
+        "blue: same class, orange and dashed: another",
+        fontsize=9,
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, dpi=110)
+
+
+def draw_mesh(axis: Axes, path: Path) -> None:
+    """Draw a mesh, shaded and seen along its thinnest principal axis."""
+    from matplotlib.collections import PolyCollection
+
+    mesh = load_mesh(path, allow_open=True)
+    if len(mesh.vertices) > _THUMBNAIL_VERTICES:
+        mesh = simplify(mesh, _THUMBNAIL_VERTICES)
+    vertices, faces = _seen_from_the_front(mesh.vertices), mesh.faces
+    normals = area_vectors(vertices, faces)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    front = np.nonzero(normals[:, 2] > 0)[0]
+    front = front[np.argsort(vertices[faces[front], 2].mean(axis=1))]  # the painter's algorithm: far faces first
+    light = normals[front] @ np.array([0.35, 0.45, 0.82])
+    grey = np.clip(0.35 + 0.6 * light, 0, 1)[:, None] * np.array([[0.86, 0.88, 0.92]])
+    axis.add_collection(
+        PolyCollection(list(vertices[faces[front], :2]), facecolors=grey, edgecolors=grey, linewidths=0.3)
+    )
+    reach = np.abs(vertices[:, :2]).max() * 1.08
+    axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])
+
+
+def _seen_from_the_front(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    centred = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    axes = np.linalg.svd(centred - centred.mean(axis=0), full_matrices=False)[2]
+    axes[2] = np.cross(axes[0], axes[1])
+    return centred @ axes[[1, 0, 2]].T * np.array([-1.0, 1.0, 1.0])
+
+
+def _frame(axis: Axes, title: str, colour: str) -> None:
+    axis.set_title(title, fontsize=5.5, pad=2)
+    for side in axis.spines.values():
+        side.set(color=colour, linewidth=1.6, linestyle="--" if colour == _IRRELEVANT else "-")
+
+
+def _figure(width: float, height: float) -> Figure:
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('figures need matplotlib: pip install "interior-gps[plot]".') from error
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)  # draws to a file without touching the user's pyplot state
+    return figure

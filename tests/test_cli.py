@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from igps.cli import main
+from igps.data.dataset import SignatureDataset
+from igps.geometry.signature import SignatureConfig
+from igps.nn.descriptor import VolumetricDescriptor
+from igps.nn.extraction import describe
+from igps.retrieval import chi_square, retrieval_scores
+
+SMALL = ["--signature.n_eigenpairs", "20", "--signature.resolution", "10", "--signature.min_samples", "0"]
+SMALL += ["--signature.n_surface_samples", "60", "--workers", "1"]
+CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Three balls and three long eggs."""
+    for label, ratio in (("ball", 1.0), ("egg", 2.2)):
+        for i in range(3):
+            body = trimesh.creation.icosphere(subdivisions=2)
+            body.vertices *= [1.0, 1.0 + 0.06 * i, ratio]
+            path = tmp_path / "meshes" / label / f"{i}.off"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            body.export(path)
+    return tmp_path / "meshes"
+
+
+def igps(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
+    main()
+
+
+def test_retrieve_prints_and_writes_what_python_computes(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    igps(monkeypatch, "retrieve", root, "--out", out, "--cache", tmp_path / "cache", *SMALL)
+    printed = capsys.readouterr().out
+
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
+    histograms = describe(dataset, VolumetricDescriptor.paper())
+    distances = chi_square(histograms, histograms)
+    expected = retrieval_scores(distances, dataset.files.labels or ())
+
+    scores = json.loads((out / "scores.json").read_text())
+    assert {"nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map", "n_queries", "per_class", "config"} == set(scores)
+    assert scores["n_queries"] == 6
+    assert {name: scores[name] for name in expected.mean()} == pytest.approx(expected.mean())
+    assert scores["per_class"]["egg"]["ft"] == pytest.approx(expected.per_class()["egg"]["ft"])
+    assert scores["config"]["resolution"] == 10
+    assert f"{100 * expected.mean()['ft']:.1f}" in printed
+    assert all(word in printed for word in ("NN", "ADR self", "mAP", "ball", "egg", "6 queries"))
+
+    with np.load(out / "distances.npz") as archive:
+        np.testing.assert_allclose(archive["distances"], distances, atol=1e-7)
+        assert archive["names"].tolist() == list(dataset.files.names)
+        assert archive["labels"].tolist() == ["ball"] * 3 + ["egg"] * 3
+    rows = list(csv.DictReader((out / "ranking.csv").open(newline="")))
+    assert len(rows) == 6 * 5
+    for i, name in enumerate(dataset.files.names):
+        ranked = [row for row in rows if row["query"] == name]
+        others = [j for j in torch.argsort(distances[i], stable=True).tolist() if j != i]
+        assert [row["model"] for row in ranked] == [dataset.files.names[j] for j in others]
+        assert [row["relevant"] for row in ranked] == [str(int(i // 3 == j // 3)) for j in others]
+    assert not (out / "failures.csv").exists()
+
+
+def test_gps_is_another_descriptor_on_the_same_cache(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("interior", "gps"):
+        arguments = ["--descriptor", name, "--out", tmp_path / name, "--cache", tmp_path / "cache", *SMALL]
+        igps(monkeypatch, "retrieve", root, *arguments)
+    interior, gps = (json.loads((tmp_path / name / "scores.json").read_text()) for name in ("interior", "gps"))
+    assert interior["config"].pop("descriptor") == "interior"
+    assert gps["config"].pop("descriptor") == "gps"
+    assert interior["config"] == gps["config"]
+    archives = [np.load(tmp_path / name / "distances.npz")["distances"] for name in ("interior", "gps")]
+    assert np.abs(archives[0] - archives[1]).max() > 1e-3
+    assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 6
+
+
+def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (root / "egg" / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    arguments = ["retrieve", root, "--cache", tmp_path / "cache", "--out", tmp_path / "out", *SMALL]
+    igps(monkeypatch, *arguments)
+    assert "1 of 7 meshes could not be used" in capsys.readouterr().out
+    (row,) = csv.DictReader((tmp_path / "out" / "failures.csv").open(newline=""))
+    assert row["file"] == "egg/bad.off"
+    assert "3 boundary edges" in row["error"]
+    assert json.loads((tmp_path / "out" / "scores.json").read_text())["n_queries"] == 6
+
+    with pytest.raises(SystemExit, match="1"):
+        igps(monkeypatch, *arguments, "--strict")
+    error = capsys.readouterr().err
+    assert "bad.off" in error
+    assert "Traceback" not in error
+
+    (root / "egg" / "bad.off").unlink()
+    igps(monkeypatch, *arguments)
+    assert not (tmp_path / "out" / "failures.csv").exists()
+
+
+def test_extract_files_and_folder(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = [root / "egg" / "1.off", root / "ball" / "0.off"]
+    common = ["--cache", tmp_path / "cache", *SMALL]
+    igps(monkeypatch, "extract", *files, "--out", tmp_path / "two.npz", *common)
+    igps(monkeypatch, "extract", root, "--out", tmp_path / "deep" / "all.npz", *common)
+    with np.load(tmp_path / "two.npz") as two, np.load(tmp_path / "deep" / "all.npz") as everything:
+        assert two["names"].tolist() == [str(f) for f in files]
+        assert two["features"].shape == (2, 10, 64)
+        np.testing.assert_allclose(two["features"].sum(axis=(1, 2)), 1, atol=1e-5)
+        assert everything["labels"].tolist() == ["ball"] * 3 + ["egg"] * 3
+        np.testing.assert_allclose(two["features"], everything["features"][[4, 0]], atol=1e-7)
+
+
+def test_query_lists_the_nearest(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wanted = tmp_path / "wanted.off"
+    wanted.write_bytes((root / "egg" / "1.off").read_bytes())
+    igps(monkeypatch, "query", wanted, "--gallery", root, "--top", "4", "--cache", tmp_path / "cache", *SMALL)
+    header, *lines = capsys.readouterr().out.splitlines()
+    assert header.split() == ["rank", "distance", "mesh", "class"]
+    assert len(lines) == 4
+    assert lines[0].split() == ["1", "0.0000", "egg/1.off", "egg"]
+    histograms = describe(SignatureDataset(root, CONFIG, tmp_path / "cache"), VolumetricDescriptor.paper())
+    distances = chi_square(histograms[4:5], histograms)[0]
+    names = [f"{label}/{i}.off" for label in ("ball", "egg") for i in range(3)]
+    nearest = torch.argsort(distances, stable=True)[:4].tolist()
+    assert [line.split()[2] for line in lines] == [names[i] for i in nearest]
+    assert [float(line.split()[1]) for line in lines] == pytest.approx(distances[nearest].tolist(), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["retrieve", "nowhere"], "no such folder"),
+        (["query", "nowhere.off", "--gallery", "ROOT"], "no such file|cannot be read"),
+        (["query", "ROOT/egg/1.off", "--gallery", "ROOT", "--top", "0"], "top"),
+        (["retrieve", "ROOT", "--paper"], "none of 6 meshes could be used.*too few for 250 eigenpairs"),
+    ],
+)
+def test_errors_are_one_line(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    arguments: list[str], message: str,
+) -> None:  # fmt: skip
+    logging.disable(logging.WARNING)
+    options = [] if "--paper" in arguments else SMALL
+    try:
+        with pytest.raises(SystemExit, match="1"):
+            igps(monkeypatch, *[a.replace("ROOT", str(root)) for a in arguments], "--cache", tmp_path, *options)
+    finally:
+        logging.disable(logging.NOTSET)
+    error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("igps: ")]
+    assert len(error) == 1
+    assert re.search(message, error[0])
+
+
+@pytest.mark.parametrize("command", ["retrieve", "extract", "query", "demo"])
+def test_help_explains_every_option(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        igps(monkeypatch, command, "--help")
+    text = capsys.readouterr().out
+    assert "--workers" in text
+    if command != "demo":
+        for word in ("--cache", "--strict", "--repair", "--signature.min_samples", "refined until"):
+            assert word in text, word

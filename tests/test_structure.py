@@ -1,0 +1,46 @@
+"""The imports run one way: geometry → data → nn → the command line; retrieval stands apart."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import igps
+
+PACKAGE = Path(igps.__file__).parent
+MAY_IMPORT = {
+    "geometry": {"geometry"},
+    "data": {"geometry", "data"},
+    "nn": {"geometry", "data", "nn", "retrieval"},
+    "retrieval": {"retrieval"},
+    "baselines": {"geometry", "data", "nn", "retrieval", "baselines"},
+}
+
+
+def imported_rooms(path: Path) -> set[str]:
+    rooms = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        else:
+            continue
+        rooms |= {name.split(".")[1] for name in names if name.startswith("igps.")}
+    return rooms
+
+
+@pytest.mark.parametrize("room", sorted(MAY_IMPORT))
+def test_imports_run_one_way(room: str) -> None:
+    files = sorted((PACKAGE / room).glob("*.py"))
+    assert files
+    for file in files:
+        assert imported_rooms(file) <= MAY_IMPORT[room], file
+
+
+def test_front_door_opens() -> None:
+    assert igps.__all__ == sorted(igps.__all__, key=str.casefold)
+    for name in igps.__all__:
+        assert hasattr(igps, name), name
