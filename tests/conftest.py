@@ -6,9 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from igps.geometry.mesh import Mesh, load_mesh
+
+# The meshes are small: on two threads they are hardly faster, and many times slower where another process takes a core.
+torch.set_num_threads(1)
 
 SHARED = Path(__file__).parents[2] / "shared"
 

@@ -6,12 +6,14 @@ import logging
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from scipy import sparse
 from scipy.linalg import eigh
 
 from igps.geometry import eigensolver
 from igps.geometry.eigensolver import ConvergenceError, Spectrum, eigenpairs
+from igps.geometry.factorization import dissect, factorize
 
 Problem = tuple[sparse.csr_array, np.ndarray, np.ndarray]
 
@@ -114,6 +116,43 @@ def test_multiplets_larger_than_the_block() -> None:
         assert_pairs(spectrum, problem)
 
 
+def test_more_copies_than_distinct_eigenvalues() -> None:
+    """Four distinct eigenvalues fill most of the space: the Krylov space of the start block is soon exhausted."""
+    problem = copies_of_a_patch(n_copies=300, side=2)
+    values = np.linalg.eigvalsh(problem[0].toarray())
+    spectrum = eigenpairs(problem[0], problem[1], 299)
+    np.testing.assert_allclose(spectrum.eigenvalues, values[1:300], rtol=1e-10)
+    assert_pairs(spectrum, problem)
+
+
+def test_krylov_basis_keeps_its_promises(torus_problem: Problem) -> None:
+    """Orthonormal rows, a projection that is the operator's, residuals that are the vectors'; also when widened."""
+    stiffness, mass, positions = torus_problem
+    matrix = sparse.csr_array(stiffness * mass.sum() / np.sqrt(mass)[:, None] / np.sqrt(mass))
+    factors = factorize(dissect(matrix, positions), matrix, 300.0)
+    krylov = eigensolver._Krylov(factors, np.sqrt(mass / mass.sum()), 40, np.random.default_rng(0))
+    for widen in (False, False, True, False, False):
+        krylov.expand()
+        if widen:
+            krylov.widen()
+    basis = krylov._basis[: krylov._stop]
+    torch.testing.assert_close(basis @ basis.T, torch.eye(len(basis), dtype=torch.float64), atol=1e-12, rtol=0)
+    inside = basis[1 : krylov.size + 1]
+    assert len(inside) == 3 * eigensolver.BLOCK_SIZE + 2 * 2 * eigensolver.BLOCK_SIZE
+    projected = inside @ factors.solve(inside.T.contiguous())
+    torch.testing.assert_close(
+        krylov._projected[1 : krylov.size + 1, 1 : krylov.size + 1], projected, atol=1e-12, rtol=0
+    )
+    ritz = krylov.ritz_pairs(300.0)
+    largest = torch.argsort((ritz.eigenvalues - 300).abs())[:40]
+    values, vectors = krylov.eigenvectors(ritz, largest)
+    actual = np.linalg.norm(matrix @ vectors - vectors * values, axis=0)
+    actual *= torch.linalg.norm(ritz.coefficients[:, largest], dim=0).numpy()
+    estimated = ritz.residuals[largest].numpy()
+    assert estimated.max() > 1e-3
+    np.testing.assert_allclose(estimated, actual, rtol=1e-5, atol=1e-8)
+
+
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_scale_of_the_coordinates(scale: float, torus_problem: Problem) -> None:
     stiffness, mass, positions = torus_problem
@@ -205,6 +244,22 @@ def test_falls_back_to_arpack_with_a_warning(
     np.testing.assert_allclose(spectrum.eigenvalues, expected.eigenvalues, rtol=1e-10)
     assert_pairs(spectrum, torus_problem)
     assert "falling back to ARPACK: on purpose" in caplog.text
+
+
+def test_a_shift_below_the_spectrum_takes_over(
+    torus_problem: Problem,
+    torus_oracle: tuple[np.ndarray, np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    stiffness, mass, positions = torus_problem
+    monkeypatch.setattr(eigensolver, "_factorize_inside", fail)
+    with caplog.at_level(logging.INFO):
+        spectrum = eigenpairs(stiffness, mass, 80, positions=positions)
+    np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1:81], rtol=1e-10)
+    assert_pairs(spectrum, torus_problem)
+    assert "falling back to a shift below 0: on purpose" in caplog.text
+    assert "ARPACK" not in caplog.text
 
 
 def test_the_fallback_too_is_proved_complete(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:

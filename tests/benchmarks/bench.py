@@ -1,6 +1,6 @@
 """Speed and memory as ratios against named baselines of the same run: `make bench [DATA=folder-of-SHREC07-meshes]`.
 
-Each figure runs in a process of its own, so that its peak memory is its own. Without DATA the meshes are generated. Ours
+Each figure runs in a process of its own, so that its peak memory is its own. Without DATA meshes are generated. Ours
 and the baseline are timed in turn and the best of the repetitions counts, as a shared machine only adds time.
 """
 

@@ -6,7 +6,7 @@ its tangent plane (positive on the inner side). For a piecewise linear ``f`` it 
 routines here compute the unnormalised ``w_v`` on this one scale, by one of three rules:
 
 * dense exact: the closed form for all pairs of face and point, each vertex, edge and face of a mesh visited once;
-* dense far: the moments of a vertex's hat function up to second order, a few matrix products;
+* dense far: the first moments of a vertex's hat function, a few matrix products;
 * listed exact: the closed form, arranged to stay accurate on and near a face, for a list of pairs of face and point.
 
 A dense rule gives all weights of a block of points; those of the vertices near a point are then replaced by the listed
@@ -33,7 +33,7 @@ _ON_SURFACE = 2e-9  # half-diagonals: closer points take the surface value, and 
 _EXACT_RATIO = 1.1  # opening ratio that keeps the dense exact rule away from points near an edge, where it cancels
 _FAR_ERROR = 1e-2  # of the far rule at opening ratio 1; it falls with the third power (largest of 17 models measured)
 _FLOAT32_ACCURACY = 1e-4  # from here on, single precision is enough for the far rule and the product
-_NEAR_SHARE = 0.07  # of hats near a point, above which the dense exact rule is the faster one
+_NEAR_SHARE = 0.12  # of hats near a point, above which the dense exact rule is the faster one
 _NEAR_PAIRS = 2**24  # the most that are listed: 128 MiB
 
 
@@ -93,12 +93,13 @@ def extend(
             f"functions: expected shape (V, K) with V = {len(surface.vertices)} vertices, got {values.shape}; "
             "give one row per vertex"
         )
-    columns = torch.ones(len(values), values.shape[1] + 1, dtype=dtype, device=device)  # the last one sums the weights
-    columns[:, :-1] = torch.as_tensor(values, device=device)
+    if not np.isfinite(values).all():
+        raise ValueError("functions: expected finite values, got NaN or infinity")
+    columns = torch.as_tensor(np.column_stack([values, np.ones(len(values))]), dtype=dtype, device=device)
     ratio = None if accuracy is None else max(_EXACT_RATIO, (_FAR_ERROR / accuracy) ** (1 / 3))
     out = np.empty((len(x), values.shape[1]))
     for rows, weights in _weight_blocks(surface, x, ratio, dtype):
-        product = weights.T @ columns
+        product = weights.T @ columns  # the last column sums the weights
         out[rows] = _normalised(product[:, :-1], product[:, -1:]).cpu().numpy()
     return out
 
@@ -138,7 +139,7 @@ class _Tile:
 
     @staticmethod
     def of(device: torch.device) -> _Tile:
-        return _Tile(1024, 128, 256, 2**13) if device.type == "cpu" else _Tile(2**14, 2**10, 2**14, 2**20)
+        return _Tile(1024, 128, 256, 2**13) if device.type == "cpu" else _Tile(2**12, 2**10, 2**11, 2**17)
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,6 @@ def _prepare(
     centre, scale = (low + high) / 2, np.linalg.norm(high - low) / 2
     if not scale > 0:
         raise ValueError("vertices: expected distinct vertices, got one place for all; check the mesh")
-
     scaled = torch.as_tensor((vertices - centre) / scale, device=device)
     surface = _Surface.of(scaled, torch.as_tensor(faces.astype(np.int64), device=device))
     if len(surface.faces) == 0:
@@ -205,7 +205,7 @@ def _weight_blocks(
         return
     tile = _Tile.of(points.device)
     n_vertices = len(surface.vertices)
-    size = max(1, min(4 * tile.points, len(points), _BLOCK_BYTES // (n_vertices * dtype.itemsize)))
+    size = max(1, min(2 * tile.points, len(points), _BLOCK_BYTES // (n_vertices * dtype.itemsize)))
     hats = _HatMoments.of(surface)
     listed = _ListedRule.of(surface)
     tree = _tree(points)
@@ -228,7 +228,7 @@ def _weight_blocks(
                 out.copy_(total)
         else:
             hats.far_weights(x, weights)
-        listed.replace(x, near[index], mask_memory[: n_vertices * len(x)], weights)
+        listed.replace(x, near[index].long(), mask_memory[: n_vertices * len(x)], weights)
         yield tree.indices[index * size : index * size + len(x)], weights
 
 
@@ -240,10 +240,13 @@ def _normalised(values: torch.Tensor, totals: torch.Tensor) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class _HatMoments:
-    """Far rule. The kernel h/r⁴ of a vertex's hat function, expanded about the hat's centroid to second order.
+    """Far rule. The kernel h/r⁴ of a vertex's hat function, expanded about the hat's centroid.
 
-    With L the flux of x − … through the hat, C its covariance, B = (p−x)ᵀC(p−x) and Q the first moment that
-    is left because normals differ: w = L/r⁴ · (1 − 2 tr C/r² + 12 B/r⁴) − 4 Q/r⁶. L, B, Q and r² are quadratic in x.
+    To first order, and to second as if the hat were flat; on a smooth surface that leaves an error of third order.
+
+    With p the centroid, r = |p − x|, n and v the normal and a vertex of the face that y lies on, λ the hat function:
+    w = L/r⁴ · (1 − 2 tr C/r² + 12 B/r⁴) − 4 Q/r⁶, where L = ∫ λ n·(v − x), C is the covariance of y under λ,
+    B = (p − x)ᵀ C (p − x) and Q = ∫ λ n·(v − x) (y − p)·(p − x), zero in a flat hat. All are quadratic in x.
     """
 
     centres: torch.Tensor  # (V, 3)
@@ -319,7 +322,7 @@ class _HatMoments:
         pairs = pairs[:, np.argsort(block, kind="stable")]
         bounds = np.cumsum(np.bincount(block, minlength=len(blocks)))[:-1]
         return [
-            torch.as_tensor(part - [[0], [index * size]], dtype=torch.int64, device=self.centres.device)
+            torch.as_tensor(part - np.array([[0], [index * size]], np.int32), device=self.centres.device)
             for index, part in enumerate(np.split(pairs, bounds, axis=1))
         ]
 
@@ -495,9 +498,17 @@ class _FaceBlock:
         origins = vertices[local].transpose(0, 1).flatten(0, 1)  # h is 0 at corner 0, λ₁ at corner 1, λ₂ at corner 2
         double_areas = surface.double_areas[chosen]
         gather = _gather_matrix(local, surface.squared_sides[chosen], double_areas, n_vertices)
-        faces, face_edges = local.T.contiguous(), face_edges.T.contiguous()
         return _FaceBlock(
-            vertex_ids, vertices, edges, squared_edges, faces, face_edges, gradients, origins, double_areas[:, None], gather
+            vertex_ids=vertex_ids,
+            vertices=vertices,
+            edges=edges,
+            squared_edges=squared_edges,
+            faces=local.T.contiguous(),
+            face_edges=face_edges.T.contiguous(),
+            gradients=gradients,
+            origins=origins,
+            double_areas=double_areas[:, None],
+            gather=gather,
         )
 
     def _affine(self, points: torch.Tensor, n_rows: int) -> torch.Tensor:
@@ -561,7 +572,7 @@ def _face_blocks(surface: _Surface, size: int) -> list[_FaceBlock]:
 def _gather_matrix(
     faces: torch.Tensor, squared_sides: torch.Tensor, double_areas: torch.Tensor, n_vertices: int
 ) -> torch.Tensor:
-    """Sparse (V, 5F): weights from s/h·λ₁|n|, s/h·λ₂|n|, s/h, h(g₁−g₃), h(g₂−g₃) of each face, for g/4 in place of g."""
+    """Sparse (V, 5F): weights from s/h·λ₁|n|, s/h·λ₂|n|, s/h, h(g₁−g₃), h(g₂−g₃) of each face, with g/4 for g."""
     n_faces = len(faces)
     scale = 4 / (2 * double_areas)
     products = squared_sides - squared_sides.sum(1, keepdim=True) / 2  # of the two other sides

@@ -24,7 +24,9 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -41,12 +43,14 @@ logger = logging.getLogger(__name__)
 BLOCK_SIZE = 16
 # Share of the wanted eigenvalues below the shift: here both ends of the spectrum converge at the same time.
 SHIFT_RANK = 0.55
-# Basis size at which the first pairs are worth looking for; measured: 1.55 vectors a pair and some 11 blocks.
-BASIS_PER_EIGENPAIR, BASIS_BLOCKS = 1.55, 11
+# The shift of the second try, in units of 1/area
+SHIFT_BELOW = -1.0
+# Basis size at which all pairs have converged, as measured: so many vectors a pair, and so many blocks besides
+BASIS_PER_EIGENPAIR, BASIS_PER_EIGENPAIR_BELOW, BASIS_BLOCKS = 1.55, 2.55, 11
 # The basis gives up at this multiple of that size
 BASIS_LIMIT = 3
-# The factorization may be this much worse than the tolerance: lower modes amplify its error the most, some 100 times
-DEFECT = 1e-3
+# How accurate the factorization must be, relative to the tolerance: the lowest modes see its error some 1000 times
+DEFECT = 2e-4
 # A gap this wide, relative to the eigenvalue, is taken at once; a multiplet has none, and the next gap is looked for
 WIDE_GAP, NARROWEST_GAP = 1e-4, 1e-7
 # Below these, relative to what it came from, a number is rounding, a Cholesky factor inaccurate, a matrix sloppy
@@ -98,7 +102,8 @@ def eigenpairs(
         n_eigenpairs: how many, the zero mode not counted.
         positions: (V, 3) vertex positions, any unit. They only guide the elimination order; without them it is slower.
         method: "lanczos" as in the module's docstring, with a dense solver for small meshes; or "eigsh", ARPACK
-            by `scipy.sparse.linalg.eigsh`, to compare with. The former falls back to the latter with a logged warning.
+            by `scipy.sparse.linalg.eigsh` without proof or check, to compare with. Where the former fails, it falls
+            back, with a logged warning, to ARPACK with proof and check.
         tolerance: largest residual, relative to the eigenvalue. An eigenvalue's error is about its square.
         seed: of the random start vectors.
 
@@ -122,21 +127,53 @@ def eigenpairs(
     scale = sparse.diags_array(np.sqrt(area / mass))
     matrix = sparse.csr_array(scale @ stiffness @ scale)
     matrix.sort_indices()
-    try:
-        if len(mass) <= max(DENSE_VERTICES, DENSE_VERTICES_PER_EIGENPAIR * n_eigenpairs):
-            eigenvalues, vectors = eigh(matrix.toarray(), subset_by_index=(1, n_eigenpairs), overwrite_a=True)
-        else:
-            eigenvalues, vectors = _lanczos(matrix, np.sqrt(mass / area), n_eigenpairs, positions, tolerance, seed)
-        _check_residuals(matrix, eigenvalues, vectors, tolerance)
-    except (ConvergenceError, SingularMatrixError, np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
-        logger.warning("falling back to ARPACK: %s", error)
-        eigenvalues, eigenfunctions = _arpack(stiffness, mass, min(n_eigenpairs + N_GUARDS, len(mass) - 2), seed)
-        eigenvalues *= area
-        _prove_complete(matrix, eigenvalues, n_eigenpairs, positions)
-        eigenvalues, vectors = eigenvalues[:n_eigenpairs], eigenfunctions[:, :n_eigenpairs] * np.sqrt(mass)[:, None]
-        _check_residuals(matrix, eigenvalues, vectors, tolerance)
+    eigenvalues, vectors = _solve(matrix, stiffness, mass, n_eigenpairs, positions, tolerance, seed)
     vectors /= np.sqrt(mass)[:, None]
     return Spectrum(eigenvalues / area, vectors, mass)
+
+
+def _solve(
+    matrix: sparse.csr_array,
+    stiffness: sparse.csr_array,
+    mass: np.ndarray,
+    n_eigenpairs: int,
+    positions: np.ndarray | None,
+    tolerance: float,
+    seed: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues (K,) and orthonormal eigenvectors (V, K) of the matrix by the first solver whose result passes."""
+    area = mass.sum()
+
+    def dense() -> tuple[np.ndarray, np.ndarray]:
+        return eigh(matrix.toarray(), subset_by_index=(1, n_eigenpairs), overwrite_a=True)
+
+    def lanczos(inside: bool) -> tuple[np.ndarray, np.ndarray]:
+        zero_mode = np.sqrt(mass / area)
+        return _lanczos(matrix, zero_mode, n_eigenpairs, positions, tolerance, seed, inside)
+
+    def arpack() -> tuple[np.ndarray, np.ndarray]:
+        n_guarded = min(n_eigenpairs + N_GUARDS, len(mass) - 2)
+        eigenvalues, eigenfunctions = _arpack(stiffness, mass, n_guarded, seed)
+        eigenvalues *= area
+        _prove_complete(matrix, eigenvalues, n_eigenpairs, positions)
+        return eigenvalues[:n_eigenpairs], eigenfunctions[:, :n_eigenpairs] * np.sqrt(mass)[:, None]
+
+    small = len(mass) <= max(DENSE_VERTICES, DENSE_VERTICES_PER_EIGENPAIR * n_eigenpairs)
+    solvers: list[Callable[[], tuple[np.ndarray, np.ndarray]]]
+    solvers = [dense, arpack] if small else [partial(lanczos, True), partial(lanczos, False), arpack]
+    for solver in solvers:
+        try:
+            eigenvalues, vectors = solver()
+            _check_residuals(matrix, eigenvalues, vectors, tolerance)
+            return eigenvalues, vectors
+        except (ConvergenceError, SingularMatrixError, np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
+            if solver is solvers[-1]:
+                raise ConvergenceError(f"no solver reached the tolerance, the last one: {error}") from error
+            if solver is solvers[-2]:
+                logger.warning("falling back to ARPACK: %s", error)
+            else:
+                logger.info("falling back to a shift below 0: %s", error)
+    raise AssertionError("unreachable")
 
 
 def _arpack(
@@ -172,23 +209,32 @@ def _lanczos(
     positions: np.ndarray | None,
     tolerance: float,
     seed: int,
+    inside: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues (K,) and orthonormal eigenvectors (V, K) of a matrix with one zero mode, (V,) of length 1."""
+    """Eigenvalues (K,) and orthonormal eigenvectors (V, K) of a matrix with one zero mode, (V,) of length 1.
+
+    With the shift inside the spectrum it is fast. With the shift below, A − σI is definite: its factors are accurate.
+    """
     dissection = dissect(matrix, positions)
-    shift, factors = _factorize_inside(dissection, matrix, zero_mode, n_eigenpairs, tolerance)
-    first_look = math.ceil(BASIS_PER_EIGENPAIR * n_eigenpairs) + BASIS_BLOCKS * BLOCK_SIZE
+    if inside:
+        shift, factors = _factorize_inside(dissection, matrix, zero_mode, n_eigenpairs, tolerance)
+    else:
+        shift, factors = SHIFT_BELOW, factorize(dissection, matrix, SHIFT_BELOW)
+    per_eigenpair = BASIS_PER_EIGENPAIR if inside else BASIS_PER_EIGENPAIR_BELOW
+    first_look = math.ceil(per_eigenpair * n_eigenpairs) + BASIS_BLOCKS * BLOCK_SIZE
+    n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
     krylov = _Krylov(factors, zero_mode, first_look + 4 * BLOCK_SIZE, np.random.default_rng(seed))
     limit = min(BASIS_LIMIT * first_look, len(zero_mode) - 2 * BLOCK_SIZE)
     while krylov.size < first_look:
         krylov.expand()
     while True:
         ritz = krylov.ritz_pairs(shift)
-        found = ritz.leading(n_below=factors.n_negative - 1, tolerance=tolerance)
+        found = ritz.leading(n_below, tolerance)
         gap = _gap_behind(ritz.eigenvalues[found], n_eigenpairs)
         missing = False
         if gap is not None:
             n_found, bound = gap
-            n_present = factorize(dissection, matrix, bound).n_negative - 1  # without the zero mode
+            n_present = factorize(dissection, matrix, bound).n_negative - 1
             if n_present == n_found:
                 return krylov.eigenvectors(ritz, found[:n_eigenpairs])
             if n_present < n_found:
