@@ -33,7 +33,7 @@ _ON_SURFACE = 2e-9  # half-diagonals: closer points take the surface value, and 
 _EXACT_RATIO = 1.1  # opening ratio that keeps the dense exact rule away from points near an edge, where it cancels
 _FAR_ERROR = 1e-2  # of the far rule at opening ratio 1; it falls with the third power (largest of 17 models measured)
 _FLOAT32_ACCURACY = 1e-4  # from here on, single precision is enough for the far rule and the product
-_NEAR_SHARE = 0.12  # of hats near a point, above which the dense exact rule is the faster one
+_NEAR_SHARE = 0.07  # of hats near a point, above which the dense exact rule is the faster one
 _NEAR_PAIRS = 2**24  # the most that are listed: 128 MiB
 
 
