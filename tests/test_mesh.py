@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from conftest import as_mesh
 from igps.geometry.mesh import Mesh, MeshError, load_mesh, simplify
 
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
@@ -155,6 +156,16 @@ def test_simplify_keeps_the_shape_and_the_promise(sphere: Mesh) -> None:
     assert simplify(sphere, 5000) is sphere
 
 
-def test_simplify_does_not_depend_on_scale(sphere: Mesh) -> None:
-    tiny = simplify(Mesh(sphere.vertices * 1e-6, sphere.faces), 500)
-    np.testing.assert_allclose(tiny.vertices * 1e6, simplify(sphere, 500).vertices, atol=1e-5)
+@pytest.mark.parametrize("scale", [2.0**-20, 2.0**20])
+def test_simplify_does_not_depend_on_scale(blob: Mesh, scale: float) -> None:
+    scaled = simplify(Mesh(blob.vertices * scale, blob.faces), 200)
+    np.testing.assert_allclose(scaled.vertices / scale, simplify(blob, 200).vertices, atol=1e-9)
+
+
+def test_simplify_keeps_the_topology() -> None:
+    ring = trimesh.creation.torus(1, 0.1, major_sections=64, minor_sections=16)
+    small = simplify(as_mesh(ring), 60)
+    n_vertices, n_faces = len(small.vertices), len(small.faces)
+    assert n_vertices - n_faces // 2 == 0  # Euler characteristic of a torus, with 3/2 edges a face
+    with pytest.raises(MeshError, match="Raise max_vertices"):
+        simplify(as_mesh(ring), 4)
