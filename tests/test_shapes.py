@@ -11,7 +11,9 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from igps.data.shapes import ArticulatedShapes, GeneratedShape, _Arc, _Box, _Cone, _Prism, _Ring, _Solid
+from igps.data.shapes import ArticulatedShapes, GeneratedShape
+from igps.data.shapes.solids import Arc, Box, Cone, Prism, Ring, Solid
+from igps.figures import contact_sheet
 
 pytest.importorskip("skimage", reason="the extra 'shapes' is not installed")
 
@@ -214,13 +216,13 @@ def test_contact_sheet_shows_every_class(tmp_path: Path) -> None:
     from matplotlib.image import imread
 
     shapes = ArticulatedShapes(n_classes=4, n_per_class=2, n_vertices=1000)
-    shapes.contact_sheet(tmp_path / "sheet.png")
+    contact_sheet(shapes, tmp_path / "sheet.png")
     picture = imread(tmp_path / "sheet.png")[:, :, :3]
     bluish = (picture[:, :, 2] - picture[:, :, 0] > 0.1).sum(axis=0)
     width = bluish.size // 4
     assert all(bluish[i * width : (i + 1) * width].sum() > 1000 for i in range(4))
     with pytest.raises(ValueError, match="n_shown"):
-        shapes.contact_sheet(tmp_path / "sheet.png", n_shown=3)
+        contact_sheet(shapes, tmp_path / "sheet.png", n_shown=3)
 
 
 @pytest.mark.parametrize(("module", "extra"), [("skimage.measure", "shapes"), ("matplotlib.figure", "plot")])
@@ -229,7 +231,7 @@ def test_a_missing_library_is_named_with_its_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ImportError, match=rf"interior-gps\[{extra}\]"):
-        ArticulatedShapes().contact_sheet(tmp_path / "sheet.png")
+        contact_sheet(ArticulatedShapes(), tmp_path / "sheet.png")
 
 
 POINTS = np.random.default_rng(0).uniform(-1.5, 1.5, (400, 3))
@@ -239,17 +241,17 @@ def nearest_sphere(centres: NDArray[np.float64], radii: NDArray[np.float64]) -> 
     return (np.linalg.norm(POINTS[:, None] - centres[None], axis=2) - radii).min(axis=1)
 
 
-def swept(solid: _Solid) -> NDArray[np.float64]:
+def swept(solid: Solid) -> NDArray[np.float64]:
     """The distance to a union of very many balls along the solid's centre line."""
     t = np.linspace(0.0, 1.0, 4001)
     zero = np.zeros_like(t)
     match solid:
-        case _Cone(length, start, end):
+        case Cone(length, start, end):
             return nearest_sphere(np.column_stack([zero, zero, t * length]), start + t * (end - start))
-        case _Arc(bend, angle, start, end):
+        case Arc(bend, angle, start, end):
             line = np.column_stack([zero, bend * (1 - np.cos(t * angle)), bend * np.sin(t * angle)])
             return nearest_sphere(line, start + t * (end - start))
-        case _Ring(radius, tube, side):
+        case Ring(radius, tube, side):
             x, z = radius * np.cos(2 * np.pi * t), radius * np.sin(2 * np.pi * t)
             bows = np.column_stack([x, zero, z + np.sign(z) * side])
             sides = [np.column_stack([zero + s * radius, zero, (2 * t - 1) * side]) for s in (-1, 1)]
@@ -259,17 +261,17 @@ def swept(solid: _Solid) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize(
     "solid",
-    [_Cone(0.9, 0.3, 0.1), _Cone(0.7, 0.1, 0.3), _Arc(0.6, 2.2, 0.15, 0.15), _Ring(0.5, 0.2), _Ring(0.4, 0.1, 0.3)],
+    [Cone(0.9, 0.3, 0.1), Cone(0.7, 0.1, 0.3), Arc(0.6, 2.2, 0.15, 0.15), Ring(0.5, 0.2), Ring(0.4, 0.1, 0.3)],
 )
-def test_distance_to_swept_solids(solid: _Solid) -> None:
+def test_distance_to_swept_solids(solid: Solid) -> None:
     outside = swept(solid) > 0.0
     np.testing.assert_allclose(solid.distance(*POINTS.T)[outside], swept(solid)[outside], atol=1e-3)
 
 
-@pytest.mark.parametrize("solid", [_Box((1.0, 0.6, 1.6), 0.1), _Prism(4, 0.9, 0.5, 0.05)])
-def test_flat_solids_have_their_volume(solid: _Solid) -> None:
+@pytest.mark.parametrize("solid", [Box((1.0, 0.6, 1.6), 0.1), Prism(4, 0.9, 0.5, 0.05)])
+def test_flat_solids_have_their_volume(solid: Solid) -> None:
     """Of a box and of a square prism, by counting points; the rounding takes off little."""
     points = np.random.default_rng(1).uniform(-1.0, 1.0, (400_000, 3))
     volume = 8.0 * np.mean(solid.distance(*points.T) < 0.0)
-    expected = 0.96 if isinstance(solid, _Box) else 2.0 * 0.9**2 * 0.5
+    expected = 0.96 if isinstance(solid, Box) else 2.0 * 0.9**2 * 0.5
     assert 0.94 * expected < volume < 1.01 * expected

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from igps.geometry.mesh import area_vectors, load_mesh, simplify
 
@@ -15,8 +17,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from igps.data.shapes import ArticulatedShapes
+
+Colour = tuple[float, float, float]
+
 # Blue for a hit and orange for a miss stay apart for every kind of colour vision (Okabe and Ito 2008).
 _RELEVANT, _IRRELEVANT, _QUERY = "#0072B2", "#D55E00", "#444444"
+_GREY: Colour = (0.86, 0.88, 0.92)
+_BLUE: Colour = (0.55, 0.72, 0.95)
 # A thumbnail shows no more detail than this, and drawing takes time with every face.
 _THUMBNAIL_VERTICES = 800
 
@@ -56,32 +64,63 @@ def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8) -> Non
     figure.savefig(out, dpi=110)
 
 
+def contact_sheet(shapes: ArticulatedShapes, path: str | Path, n_shown: int = 1) -> None:
+    """Save a picture of the first shapes of every class, all turned the same way.
+
+    Args:
+        shapes: the generated benchmark.
+        path: the PNG file.
+        n_shown: shapes of each class.
+
+    Raises:
+        ValueError: `n_shown` is out of range.
+        ImportError: matplotlib or scikit-image is missing.
+    """
+    if not 1 <= n_shown <= shapes.n_per_class:
+        raise ValueError(f"n_shown: expected 1 to n_per_class={shapes.n_per_class}, got {n_shown}. Ask for fewer.")
+    chosen = [c * shapes.n_per_class + i for c in range(shapes.n_classes) for i in range(n_shown)]
+    columns = min(len(chosen), max(4, math.ceil(math.sqrt(1.6 * len(chosen)))))
+    rows = math.ceil(len(chosen) / columns)
+    figure = _figure(1.7 * columns, 1.85 * rows)
+    view = Rotation.from_euler("zx", (-35, -70), degrees=True).as_matrix()  # from the left, in front and above
+    for place, index in enumerate(chosen, 1):
+        shape = shapes[index]
+        axis = figure.add_subplot(rows, columns, place)
+        _paint(axis, shape.vertices @ shape.rotation @ view.T, shape.faces, _BLUE)
+        axis.set_axis_off()
+        axis.set_title(shape.name if n_shown > 1 else shape.label, fontsize=5, pad=1)
+    figure.savefig(path, dpi=110)
+
+
 def draw_mesh(axis: Axes, path: Path) -> None:
     """Draw a mesh, shaded and seen along its thinnest principal axis."""
-    from matplotlib.collections import PolyCollection
-
     mesh = load_mesh(path, allow_open=True)
     if len(mesh.vertices) > _THUMBNAIL_VERTICES:
         mesh = simplify(mesh, _THUMBNAIL_VERTICES)
-    vertices, faces = _seen_from_the_front(mesh.vertices), mesh.faces
+    _paint(axis, _seen_from_the_front(mesh.vertices), mesh.faces, _GREY)
+
+
+def _paint(axis: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int64], colour: Colour) -> None:
+    """Draw a surface, lit from the upper right, as seen from +z."""
+    from matplotlib.collections import PolyCollection
+
     normals = area_vectors(vertices, faces)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     front = np.nonzero(normals[:, 2] > 0)[0]
     front = front[np.argsort(vertices[faces[front], 2].mean(axis=1))]  # the painter's algorithm: far faces first
     light = normals[front] @ np.array([0.35, 0.45, 0.82])
-    grey = np.clip(0.35 + 0.6 * light, 0, 1)[:, None] * np.array([[0.86, 0.88, 0.92]])
-    axis.add_collection(
-        PolyCollection(list(vertices[faces[front], :2]), facecolors=grey, edgecolors=grey, linewidths=0.3)
-    )
-    reach = np.abs(vertices[:, :2]).max() * 1.08
-    axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])
+    colours = np.outer(np.clip(0.35 + 0.6 * light, 0, 1), colour)
+    polygons = list(vertices[faces[front], :2])
+    axis.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=colours, linewidths=0.3))
+    low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
+    (x, y), reach = (low + high) / 2, 0.54 * (high - low).max()
+    axis.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", xticks=[], yticks=[])
 
 
 def _seen_from_the_front(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-    centred = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    axes = np.linalg.svd(centred - centred.mean(axis=0), full_matrices=False)[2]
+    axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     axes[2] = np.cross(axes[0], axes[1])
-    return centred @ axes[[1, 0, 2]].T * np.array([-1.0, 1.0, 1.0])
+    return vertices @ axes[[1, 0, 2]].T * np.array([-1.0, 1.0, 1.0])
 
 
 def _frame(axis: Axes, title: str, colour: str) -> None:

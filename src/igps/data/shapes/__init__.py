@@ -1,0 +1,15 @@
+"""A generated benchmark of labelled, closed, articulated triangle meshes.
+
+A class is a skeleton: a tree of solids, each with a signed distance function (negative inside), joined to its parent by
+a ball joint with limits. The first classes are named templates, every further one is drawn from a grammar of skeletons.
+A shape is one pose of its class: joint angles, proportions, resolution, surface noise and a rigid motion are drawn, the
+solids are blended by a smooth union and the zero level set is meshed by marching cubes (Lewiner, Lopes, Vieira and
+Tavares 2003), relaxed along the surface and checked.
+
+Each module uses only those before it: solids, skeleton, templates and limbs, creatures and artefacts (the families of
+the grammar), meshing, grammar, files, benchmark.
+"""
+
+from igps.data.shapes.benchmark import ArticulatedShapes, GeneratedShape
+
+__all__ = ["ArticulatedShapes", "GeneratedShape"]

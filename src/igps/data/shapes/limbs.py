@@ -1,0 +1,89 @@
+"""The limbs of the grammar's bodies: their kinds, and what sits at their ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from igps.data.shapes.skeleton import ORIGIN, UP, Part, aim, circle, limb
+from igps.data.shapes.solids import Arc, Array, Blob, Box, Cone, Prism, Ring, Shell, Solid, Vector
+
+
+def ending(kind: str, r: float, group: str, at: Vector = ORIGIN, turn: Array | None = None) -> tuple[Part, ...]:
+    """What sits at the end ``at`` of a limb of radius ``r``, in the frame ``turn`` of the limb (upright if None)."""
+    frame = np.eye(3) if turn is None else turn
+
+    def part(solid: Solid, lift: float, heading: Vector = UP) -> Part:
+        return Part(solid, f"{group}-{kind}", (14, 10, 0), at, frame @ aim(heading), 0.4 * r, lift)
+
+    match kind:
+        case "plain":
+            return ()
+        case "knob":
+            return (part(Blob((2.0 * r, 2.0 * r, 2.1 * r)), 1.5 * r),)
+        case "ring":
+            return (part(Ring(2.6 * r, 0.9 * r), 2.8 * r),)
+        case "paddle":
+            return (part(Box((4.6 * r, 1.7 * r, 5.2 * r), 0.6 * r), 2.4 * r),)
+        case "fork":
+            return tuple(part(Cone(4.2 * r, 0.95 * r, 0.85 * r), 0.0, (s, 0, 1.1)) for s in (-1, 1))
+        case "claw":
+            return tuple(part(Cone(3.6 * r, 0.95 * r, 0.85 * r), 0.0, (c, s, 0.7)) for c, s in circle(3))
+        case "hook":
+            return (part(Arc(2.2 * r, 3.2, 0.95 * r, 0.85 * r), 0.0),)
+        case "hammer":
+            return (part(Box((7.0 * r, 2.6 * r, 2.6 * r), 0.7 * r), 0.8 * r),)
+        case "disc":
+            return (part(Prism(16, 3.2 * r, 1.8 * r, 0.6 * r), 0.4 * r),)
+        case "cup":
+            angles = np.linspace(0.0, 1.7, 7)
+            bowl = tuple((float(3.2 * r * np.sin(a)), float(3.2 * r * (1.0 - np.cos(a)))) for a in angles)
+            return (part(Shell(bowl, 1.5 * r), 0.6 * r),)
+    raise AssertionError(kind)
+
+
+@dataclass(frozen=True)
+class LimbStyle:
+    """What the limbs of one class have in common.
+
+    kind: stub, straight, bent, jointed or tentacle.
+    ending: what sits at the end, see `ending`.
+    length: of the whole limb; a stub has 0.3 of it.
+    start, end: radii.
+    curl: radians; of a bent tube's sweep, or of a jointed limb's knee.
+    swing: limit of the first joint, degrees; later ones bend more.
+    """
+
+    kind: str
+    ending: str
+    length: float
+    start: float
+    end: float
+    curl: float
+    swing: float
+
+    @classmethod
+    def draw(
+        cls, g: np.random.Generator, kind: str, ending: str, length: float, radius: float, swing: float = 14.0
+    ) -> LimbStyle:
+        """Draw the proportions around the given ones."""
+        start = radius * g.uniform(0.95, 1.25)
+        curl = g.uniform(0.8, 1.6) if kind == "bent" else g.choice([-1.0, 1.0]) * g.uniform(0.2, 0.9)
+        return cls(kind, ending, length * g.uniform(0.8, 1.25), start, start * g.uniform(0.62, 0.95), curl, swing)
+
+    def grow(self, group: str = "limb") -> Part:
+        """One limb, to be joined to a body; it curls towards its own y."""
+        if self.kind == "bent":
+            arc = Arc(self.length / self.curl, self.curl, self.start, self.end)
+            tangent = Rotation.from_euler("x", -self.curl).as_matrix()
+            tip = ending(self.ending, self.end, group, arc.tip(), tangent)
+            return Part(arc, group, (self.swing, 0.6 * self.swing, 0), blend=0.5 * self.start, children=tip)
+        count = {"stub": 1, "straight": 1, "jointed": 2, "tentacle": 3}[self.kind]
+        length = self.length * (0.3 if self.kind == "stub" else 1.0) / count
+        radii = np.linspace(self.start, self.end, count + 1).tolist()
+        bends = [(self.swing, 0.6 * self.swing), (1.6 * self.swing, self.swing)]
+        tip = ending(self.ending, self.end, group, (0, 0, length))
+        curl = 0.5 * self.curl if self.kind == "tentacle" else self.curl
+        return limb(group, [length] * count, radii, bends, tip, (0.0, float(np.sin(curl)), float(np.cos(curl))))

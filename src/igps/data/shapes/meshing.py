@@ -1,0 +1,169 @@
+"""From a posed body to a triangle mesh: blending, marching cubes, relaxation, surface noise, and the final check."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from igps.data.shapes.skeleton import Placed
+from igps.data.shapes.solids import Array
+from igps.geometry.mesh import area_vectors
+
+Faces = NDArray[np.int64]
+
+_MIN_ANGLE = 5.0  # degrees; keeps every cotangent below 11.5
+_VERTEX_TOLERANCE = 0.4
+_COARSE_CELLS = 30_000
+_SNAP = 0.1  # grid values closer to zero than this share of the spacing move away from it
+_RELAXATION_STEPS = 10
+
+
+def mesh(body: Sequence[Placed], target: int) -> tuple[Array, Faces, float]:
+    """Vertices (V,3), outward faces (F,3) and the grid spacing, with V within about a tenth of ``target``."""
+    marching_cubes = _marching_cubes()
+    # A vertex is a crossing of the surface with a grid line: 1.5 of them in an area of spacing², on average.
+    spacing = float(np.sqrt(1.5 * _rough_area(body) / target))
+    for _ in range(3):
+        low, grid = _sample(body, spacing)
+        # Snapped, no vertex comes close to a grid point: no two coincide, no face degenerates.
+        near = np.abs(grid) < _SNAP * spacing
+        grid[near] = np.where(grid[near] < 0.0, -_SNAP * spacing, _SNAP * spacing)
+        points, faces, _, _ = marching_cubes(grid, 0.0, gradient_direction="descent")
+        ratio = len(points) / target
+        if abs(ratio - 1.0) < 0.1:
+            break
+        spacing *= float(np.sqrt(ratio))
+    vertices = low + spacing * points.astype(np.float64)
+    faces = faces.astype(np.int64)
+    return _relax(body, vertices, faces, spacing), faces, spacing
+
+
+def roughen(vertices: Array, faces: Faces, amplitude: float, wavelength: float, rng: np.random.Generator) -> Array:
+    """Move vertices (V,3) along their normals by a band-limited random field."""
+    waves = rng.normal(size=(12, 3)) * (2.0 * np.pi / wavelength / np.sqrt(3.0))
+    phases = rng.uniform(0.0, 2.0 * np.pi, 12)
+    noise = np.zeros(len(vertices))
+    for wave, phase in zip(waves, phases, strict=True):
+        noise += np.sin(vertices[:, 0] * wave[0] + vertices[:, 1] * wave[1] + vertices[:, 2] * wave[2] + phase)
+    return vertices + _vertex_normals(vertices, faces) * (amplitude * noise / np.sqrt(6.0))[:, None]
+
+
+def defect(vertices: Array, faces: Faces, genus: int, n_vertices: int) -> str | None:
+    """What keeps a mesh out of the benchmark, in words, or None."""
+    count = len(vertices)
+    if abs(count / n_vertices - 1.0) > _VERTEX_TOLERANCE:
+        return f"{count} vertices"
+    start, end = _edges(faces)
+    forward, backward = start * count + end, end * count + start
+    if len(np.unique(forward)) < len(forward) or not np.array_equal(np.sort(forward), np.sort(backward)):
+        return "not a closed, oriented manifold"
+    graph = sparse.csr_array((np.ones(len(start)), (start, end)), shape=(count, count))
+    components = connected_components(graph, directed=False, return_labels=False)
+    if components != 1:
+        return f"{components} components"
+    found = (2 - (count - len(faces) // 2)) // 2
+    if found != genus:
+        return f"genus {found} in place of {genus}"
+    if np.linalg.det(vertices[faces]).sum() <= 0.0:
+        return "inside out"
+    angle = _smallest_angle(vertices, faces)
+    if angle < _MIN_ANGLE:
+        return f"a triangle with an angle of {angle:.2g} degrees"
+    return None
+
+
+def _marching_cubes() -> Callable[..., tuple[Any, ...]]:
+    try:
+        from skimage.measure import marching_cubes
+    except ImportError as error:
+        raise ImportError('generated shapes need scikit-image: pip install "interior-gps[shapes]"') from error
+    return marching_cubes
+
+
+def _distance(body: Sequence[Placed], points: Array) -> Array:
+    """The blended signed distance (V,) at points (V,3)."""
+    x, y, z = points.T
+    total = body[0].distance(x, y, z)
+    for part in body[1:]:
+        total = _smooth_minimum(total, part.distance(x, y, z), part.blend)
+    return total
+
+
+def _smooth_minimum(a: Array, b: Array, blend: float) -> Array:
+    """The polynomial smooth union of two distances; differs from the minimum where they are closer than ``blend``."""
+    overlap = np.maximum(blend - np.abs(a - b), 0.0)
+    return np.minimum(a, b) - overlap * overlap / (4.0 * blend)
+
+
+def _bounds(body: Sequence[Placed]) -> tuple[Array, Array]:
+    corners = np.array([part.bounds() for part in body])
+    return corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+
+
+def _sample(body: Sequence[Placed], spacing: float) -> tuple[Array, Array]:
+    """The grid's first corner (3,) and the blended distances on it; each solid is evaluated only near itself."""
+    margin = max(part.blend for part in body) + 2.5 * spacing
+    low, high = _bounds(body)
+    low = low - margin
+    shape = np.ceil((high + margin - low) / spacing).astype(int) + 1
+    axes = [low[i] + spacing * np.arange(shape[i]) for i in range(3)]
+    grid = np.full(shape, 1e3)
+    for part in body:
+        first, last = part.bounds()
+        start = np.maximum(np.floor((first - margin - low) / spacing).astype(int), 0)
+        stop = np.minimum(np.ceil((last + margin - low) / spacing).astype(int) + 1, shape)
+        window = tuple(slice(a, b) for a, b in zip(start, stop, strict=True))
+        distance = part.distance(*np.ix_(*(axis[w] for axis, w in zip(axes, window, strict=True))))
+        grid[window] = _smooth_minimum(grid[window], distance, part.blend)
+    return low, grid
+
+
+def _rough_area(body: Sequence[Placed]) -> float:
+    """Surface area from the volume of a band of half-width one coarse cell around the surface."""
+    low, high = _bounds(body)
+    spacing = float((np.prod(high - low) / _COARSE_CELLS) ** (1.0 / 3.0))
+    _, grid = _sample(body, spacing)
+    return float(np.count_nonzero(np.abs(grid) < spacing)) * spacing**2 / 2.0
+
+
+def _relax(body: Sequence[Placed], vertices: Array, faces: Faces, spacing: float) -> Array:
+    """Slide vertices (V,3) towards their neighbours' mean along the surface, and back onto the zero level set."""
+    start, end = _edges(faces)
+    adjacency = sparse.csr_array((np.ones(len(start)), (start, end)), shape=(len(vertices),) * 2)
+    degree = np.bincount(start, minlength=len(vertices))[:, None]
+    for _ in range(_RELAXATION_STEPS):
+        normals = _vertex_normals(vertices, faces)
+        step = (adjacency @ vertices) / degree - vertices
+        step -= normals * (step * normals).sum(axis=1, keepdims=True)
+        vertices = vertices + 0.7 * step
+        vertices -= normals * np.clip(_distance(body, vertices), -0.5 * spacing, 0.5 * spacing)[:, None]
+    return vertices
+
+
+def _vertex_normals(vertices: Array, faces: Faces) -> Array:
+    """Area-weighted unit normals (V,3)."""
+    index = faces.ravel()
+    repeated = np.repeat(area_vectors(vertices, faces), 3, axis=0)
+    normals = np.column_stack([np.bincount(index, repeated[:, i], len(vertices)) for i in range(3)])
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+
+
+def _edges(faces: Faces) -> tuple[Faces, Faces]:
+    """The first and the second vertices of the directed edges (3F,) of faces (F,3)."""
+    return faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
+
+
+def _smallest_angle(vertices: Array, faces: Faces) -> float:
+    """The smallest corner angle in degrees."""
+    corners = vertices[faces]
+    smallest = np.inf
+    for i in range(3):
+        a, b = corners[:, (i + 1) % 3] - corners[:, i], corners[:, (i + 2) % 3] - corners[:, i]
+        angles = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))
+        smallest = min(smallest, float(np.degrees(angles.min())))
+    return smallest

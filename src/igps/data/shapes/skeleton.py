@@ -1,0 +1,152 @@
+"""Skeletons: trees of solids held by ball joints, and how one is bent into a pose.
+
+Directions: z is up, y points backwards. A limb runs along its own +z; a joint's limits are degrees about its own x
+(raise), y (swing) and z (twist).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from igps.data.shapes.solids import Array, Cone, Solid, Vector
+
+ORIGIN: Vector = (0.0, 0.0, 0.0)
+UP: Vector = (0.0, 0.0, 1.0)
+DOWN: Vector = (0.0, 0.0, -1.0)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A solid and the joint that holds it.
+
+    group: parts of one group share their proportions.
+    bend: limits of the joint (raise, swing, twist), degrees.
+    at: the joint's place on the parent.
+    turn: the joint's frame at rest, in the parent's.
+    blend: how far from the solid its union with the others is smooth.
+    lift: how far the solid's own origin lies along z from the joint.
+    """
+
+    solid: Solid
+    group: str = "body"
+    bend: Vector = ORIGIN
+    at: Vector = ORIGIN
+    turn: Array = field(default_factory=lambda: np.eye(3))
+    blend: float = 0.06
+    lift: float = 0.0
+    children: tuple[Part, ...] = ()
+
+    def joined(self, at: Vector, heading: Vector = UP, roll: float = 0.0) -> Part:
+        """This part held at another place, its +z along ``heading``, turned around it by ``roll`` radians."""
+        return replace(self, at=at, turn=aim(heading, roll))
+
+    def walk(self) -> Iterator[Part]:
+        """This part and all below it."""
+        yield self
+        for child in self.children:
+            yield from child.walk()
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """A tree of parts, and the number of handles made by limbs that meet again."""
+
+    root: Part
+    loops: int = 0
+
+    @property
+    def genus(self) -> int:
+        """The number of handles of every shape of this skeleton."""
+        return self.loops + sum(part.solid.genus for part in self.root.walk())
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A solid in the world: ``world = rotation @ local + offset``."""
+
+    solid: Solid
+    rotation: Array
+    offset: Array
+    blend: float
+
+    def distance(self, x: Array, y: Array, z: Array) -> Array:
+        """The solid's signed distance at world coordinates."""
+        # Written out: a library product may sum in another order on another number of threads.
+        r, (a, b, c) = self.rotation, self.offset
+        x, y, z = x - a, y - b, z - c
+        return self.solid.distance(*(r[0, i] * x + r[1, i] * y + r[2, i] * z for i in range(3)))
+
+    def bounds(self) -> tuple[Array, Array]:
+        """The lower and upper corner of a box around the solid, along the world's axes."""
+        low, high = self.solid.box()
+        centre = (self.rotation * (0.5 * (low + high))).sum(axis=1) + self.offset
+        half = (np.abs(self.rotation) * (0.5 * (high - low))).sum(axis=1)
+        return centre - half, centre + half
+
+
+def aim(heading: Vector, roll: float = 0.0) -> Array:
+    """A rotation that takes +z to ``heading``, with x level (x itself where the heading is steep) before the roll."""
+    z = np.array(heading) / np.linalg.norm(heading)
+    x = np.array([1.0, 0.0, 0.0]) - z[0] * z if abs(z[2]) > 0.9 else np.array([-z[1], z[0], 0.0])
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z]) @ Rotation.from_euler("z", roll).as_matrix()
+
+
+def turned(axes: str, *degrees: float) -> Array:
+    """A rotation by Euler angles, as in `scipy.spatial.transform.Rotation.from_euler`."""
+    return np.asarray(Rotation.from_euler(axes, degrees, degrees=True).as_matrix()).reshape(3, 3)
+
+
+def circle(count: int, phase: float = 0.0) -> list[tuple[float, float]]:
+    """Equally spaced points (cos, sin) of the unit circle."""
+    return [(float(np.cos(a)), float(np.sin(a))) for a in phase + 2.0 * np.pi * np.arange(count) / count]
+
+
+def limb(
+    group: str,
+    lengths: Sequence[float],
+    radii: Sequence[float],
+    bends: Sequence[tuple[float, float]],
+    tip: Sequence[Part] = (),
+    knee: Vector = UP,
+) -> Part:
+    """A chain of tapered capsules that carries ``tip``.
+
+    Args:
+        group: the group of all segments.
+        lengths: one per segment.
+        radii: one more: where segments begin, meet and end.
+        bends: (raise, swing) limits of the joints; the last pair holds for all further ones.
+        tip: parts on the last segment.
+        knee: heading of each later segment in the frame of the one before.
+    """
+    children = tuple(tip)
+    for i in reversed(range(len(lengths))):
+        cone = Cone(lengths[i], radii[i], radii[i + 1])
+        part = Part(cone, group, (*bends[min(i, len(bends) - 1)], 0.0), blend=0.5 * radii[i], children=children)
+        children = (part.joined((0.0, 0.0, lengths[i - 1]), knee) if i else part,)
+    return children[0]
+
+
+def pose(skeleton: Skeleton, rng: np.random.Generator, flex: float, rotation: Array) -> list[Placed]:
+    """Draw proportions and joint angles (``flex`` times the limits) and place every solid."""
+    proportions: dict[str, tuple[float, float]] = {}
+    placed: list[Placed] = []
+
+    def place(part: Part, frame: Array, origin: Array) -> None:
+        if part.group not in proportions:
+            thick, length = np.exp(rng.uniform(-1.0, 1.0, 2) * (0.1, 0.13))
+            proportions[part.group] = (float(thick), float(length))
+        angles = flex * np.array(part.bend) * rng.uniform(-1.0, 1.0, 3)
+        frame = frame @ part.turn @ turned("xyz", *angles)
+        solid, factors = part.solid.stretched(*proportions[part.group]), part.solid.factors(*proportions[part.group])
+        placed.append(Placed(solid, frame, origin + frame[:, 2] * (part.lift * factors[2]), part.blend))
+        for child in part.children:
+            place(child, frame, origin + frame @ (factors * np.array(child.at)))
+
+    place(skeleton.root, rotation, np.zeros(3))
+    return placed

@@ -1,0 +1,256 @@
+"""The solids that bodies are made of, each in its own frame and given by a signed distance function.
+
+The functions take coordinates of any shapes that broadcast, so that a grid is evaluated from its three axes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+
+class Solid(ABC):
+    """A solid in its own frame, given by a signed distance function."""
+
+    @property
+    def genus(self) -> int:
+        """The number of handles of the solid's surface."""
+        return 0
+
+    @abstractmethod
+    def distance(self, x: Array, y: Array, z: Array) -> Array:
+        """The signed distance (exact or a good approximation), negative inside."""
+
+    @abstractmethod
+    def box(self) -> tuple[Array, Array]:
+        """The lower and upper corner of a box around the solid."""
+
+    @abstractmethod
+    def stretched(self, thick: float, length: float) -> Solid:
+        """The solid with other proportions."""
+
+    def factors(self, thick: float, length: float) -> Array:
+        """The factors (3,) by which points fixed to the solid move when it is stretched."""
+        return np.array([thick, thick, length])
+
+
+@dataclass(frozen=True)
+class Cone(Solid):
+    """A tapered capsule: spheres of radius ``start`` at the origin to ``end`` at (0, 0, length)."""
+
+    length: float
+    start: float
+    end: float
+
+    def distance(self, x: Array, y: Array, z: Array) -> Array:
+        radial = np.hypot(x, y)
+        slope = (self.start - self.end) / self.length
+        # The nearest sphere of a tapered sweep lies off the perpendicular foot by the taper's tilt.
+        along = np.clip(z - radial * (slope / np.sqrt(1.0 - slope * slope)), 0.0, self.length)
+        return np.hypot(radial, z - along) - (self.start - slope * along)
+
+    def box(self) -> tuple[Array, Array]:
+        wide = max(self.start, self.end)
+        return np.array([-wide, -wide, -self.start]), np.array([wide, wide, self.length + self.end])
+
+    def stretched(self, thick: float, length: float) -> Solid:
+        return Cone(self.length * length, self.start * thick, self.end * thick)
+
+
+@dataclass(frozen=True)
+class Arc(Solid):
+    """A bent tube: from the origin along +z, turning by ``angle`` radians towards +y on a circle of radius ``bend``."""
+
+    bend: float
+    angle: float
+    start: float
+    end: float
+
+    def distance(self, x: Array, y: Array, z: Array) -> Array:
+        turned = np.arctan2(z, self.bend - y) - 0.5 * self.angle
+        turned = np.mod(turned + np.pi, 2.0 * np.pi) - np.pi
+        turned = np.clip(turned, -0.5 * self.angle, 0.5 * self.angle) + 0.5 * self.angle
+        centre_y, centre_z = self.bend * (1.0 - np.cos(turned)), self.bend * np.sin(turned)
+        tube = self.start + (self.end - self.start) / self.angle * turned
+        return np.sqrt(x * x + (y - centre_y) ** 2 + (z - centre_z) ** 2) - tube
+
+    def box(self) -> tuple[Array, Array]:
+        wide = max(self.start, self.end)
+        turned = np.linspace(0.0, self.angle, 33)
+        y, z = self.bend * (1.0 - np.cos(turned)), self.bend * np.sin(turned)
+        slack = wide + 0.01 * self.bend
+        return np.array([-wide, y.min() - slack, z.min() - slack]), np.array([wide, y.max() + slack, z.max() + slack])
+
+    def stretched(self, thick: float, length: float) -> Solid:
+        return Arc(self.bend * length, self.angle, self.start * thick, self.end * thick)
+
+    def factors(self, thick: float, length: float) -> Array:
+        return np.full(3, length)
+
+    def tip(self) -> Vector:
+        """The far end of the centre line."""
+        return (0.0, self.bend * (1.0 - np.cos(self.angle)), self.bend * np.sin(self.angle))
+
+
+@dataclass(frozen=True)
+class Ring(Solid):
+    """A torus in the x-z plane around the y axis, drawn out along z by straight sides of half length ``side``."""
+
+    radius: float
+    tube: float
+    side: float = 0.0
+
+    @property
+    def genus(self) -> int:
+        return 1
+
+    def distance(self, x: Array, y: Array, z: Array) -> Array:
+        return np.hypot(np.hypot(x, np.maximum(np.abs(z) - self.side, 0.0)) - self.radius, y) - self.tube
+
+    def box(self) -> tuple[Array, Array]:
+        wide = self.radius + self.tube
+        upper = np.array([wide, self.tube, wide + self.side])
+        return -upper, upper
+
+    def stretched(self, thick: float, length: float) -> Solid:
+        return Ring(self.radius * length, self.tube * thick, self.side * length)
+
+    def factors(self, thick: float, length: float) -> Array:
+        return np.full(3, length)
+
+
+@dataclass(frozen=True)
+class Blob(Solid):
+    """An ellipsoid around the origin."""
+
+    radii: Vector
+
+    def distance(self, x: Array, y: Array, z: Array) -> Array:
+        a, b, c = self.radii
+        unit = np.sqrt((x / a) ** 2 + (y / b) ** 2 + (z / c) ** 2)
+        gradient = np.sqrt((x / a**2) ** 2 + (y / b**2) ** 2 + (z / c**2) ** 2)
+        # First order in the distance from the surface; the floor keeps the centre finite and inside.
+        return unit * (unit - 1.0) / np.maximum(gradient, 1e-9) - 1e-12
+
+    def box(self) -> tuple[Array, Array]:
+        return -np.array(self.radii), np.array(self.radii)
+
+    def stretched(self, thick: float, length: float) -> Solid:
+        a, b, c = self.radii
+        return Blob((a * thick, b * thick, c * length))
+
+
+@dataclass(frozen=True)
+class Box(Solid):
+    """A box around the origin with edges rounded to radius ``rounding``."""
+
+    size: Vector
+    rounding: float
+
+    def distance(self, x: Array, y: Array, z: Array) -> Array:
+        a, b, c = (np.abs(q) - (0.5 * s - self.rounding) for q, s in zip((x, y, z), self.size, strict=True))
+        outside = np.sqrt(np.maximum(a, 0.0) ** 2 + np.maximum(b, 0.0) ** 2 + np.maximum(c, 0.0) ** 2)
+        return outside + np.minimum(np.maximum(np.maximum(a, b), c), 0.0) - self.rounding
+
+    def box(self) -> tuple[Array, Array]:
+        return -0.5 * np.array(self.size), 0.5 * np.array(self.size)
+
+    def stretched(self, thick: float, length: float) -> Solid:
+        a, b, c = self.size
+        return Box((a * thick, b * thick, c * length), self.rounding * min(thick, length))
+
+
+@dataclass(frozen=True)
+class Prism(Solid):
+    """A regular prism or plate around the z axis: ``sides`` corners at ``radius``, ``height`` high, rounded edges."""
+
+    sides: int
+    radius: float
+    height: float
+    rounding: float
+
+    def distance(self, x: Array, y: Array, z: Array) -> Array:
+        across, past_corner = _to_polygon(self.sides, self.radius - self.rounding / np.cos(np.pi / self.sides), x, y)
+        a = np.where(across > 0.0, np.hypot(across, past_corner), across)
+        b = np.abs(z) - (0.5 * self.height - self.rounding)
+        return np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0)) + np.minimum(np.maximum(a, b), 0.0) - self.rounding
+
+    def box(self) -> tuple[Array, Array]:
+        upper = np.array([self.radius, self.radius, 0.5 * self.height])
+        return -upper, upper
+
+    def stretched(self, thick: float, length: float) -> Solid:
+        return Prism(self.sides, self.radius * thick, self.height * length, self.rounding * min(thick, length))
+
+
+@dataclass(frozen=True)
+class Shell(Solid):
+    """A hollow body of revolution around z: a wall ``wall`` thick along the polyline ``profile`` of (radius, z)."""
+
+    profile: tuple[tuple[float, float], ...]
+    wall: float
+
+    @property
+    def genus(self) -> int:
+        return 0 if self.profile[0][0] == 0.0 else 1  # a profile that starts off the axis is a tube, open at both ends
+
+    def distance(self, x: Array, y: Array, z: Array) -> Array:
+        radial = np.hypot(x, y)
+        squared = np.full(radial.shape, np.inf)
+        for (r0, z0), (r1, z1) in itertools.pairwise(self.profile):
+            dr, dz = r1 - r0, z1 - z0
+            along = np.clip(((radial - r0) * dr + (z - z0) * dz) / (dr * dr + dz * dz), 0.0, 1.0)
+            np.minimum(squared, (radial - r0 - along * dr) ** 2 + (z - z0 - along * dz) ** 2, out=squared)
+        return np.sqrt(squared) - 0.5 * self.wall
+
+    def box(self) -> tuple[Array, Array]:
+        radii, heights = np.array(self.profile).T
+        wide = radii.max() + 0.5 * self.wall
+        low, high = heights.min() - 0.5 * self.wall, heights.max() + 0.5 * self.wall
+        return np.array([-wide, -wide, low]), np.array([wide, wide, high])
+
+    def stretched(self, thick: float, length: float) -> Solid:
+        return Shell(tuple((r * thick, z * length) for r, z in self.profile), self.wall * thick)
+
+
+@dataclass(frozen=True)
+class Frame(Solid):
+    """A tube of radius ``tube`` along a regular polygon around z with corners at ``radius``."""
+
+    sides: int
+    radius: float
+    tube: float
+
+    @property
+    def genus(self) -> int:
+        return 1
+
+    def distance(self, x: Array, y: Array, z: Array) -> Array:
+        across, past_corner = _to_polygon(self.sides, self.radius, x, y)
+        return np.sqrt(across * across + past_corner * past_corner + z * z) - self.tube
+
+    def box(self) -> tuple[Array, Array]:
+        upper = np.array([self.radius + self.tube, self.radius + self.tube, self.tube])
+        return -upper, upper
+
+    def stretched(self, thick: float, length: float) -> Solid:
+        return Frame(self.sides, self.radius * length, self.tube * thick)
+
+    def factors(self, thick: float, length: float) -> Array:
+        return np.full(3, length)
+
+
+def _to_polygon(sides: int, radius: float, x: Array, y: Array) -> tuple[Array, Array]:
+    """How far points lie outside the nearest side's line (negative inside), and along it beyond its corner."""
+    sector = np.pi / sides
+    folded = np.mod(np.arctan2(y, x), 2.0 * sector) - sector
+    radial = np.hypot(x, y)
+    past_corner = np.maximum(radial * np.abs(np.sin(folded)) - radius * np.sin(sector), 0.0)
+    return radial * np.cos(folded) - radius * np.cos(sector), past_corner
