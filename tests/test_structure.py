@@ -34,13 +34,13 @@ def imported_rooms(path: Path) -> set[str]:
 
 @pytest.mark.parametrize("room", sorted(MAY_IMPORT))
 def test_imports_run_one_way(room: str) -> None:
-    files = sorted((PACKAGE / room).glob("*.py"))
+    files = sorted((PACKAGE / room).rglob("*.py"))
     assert files
     for file in files:
         assert imported_rooms(file) <= MAY_IMPORT[room], file
 
 
 def test_front_door_opens() -> None:
-    assert igps.__all__ == sorted(igps.__all__, key=str.casefold)
+    assert len(set(igps.__all__)) == len(igps.__all__)
     for name in igps.__all__:
         assert hasattr(igps, name), name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from igps.geometry.mesh import area_vectors, load_mesh, simplify
+from igps.geometry.mesh import MeshError, area_vectors, load_mesh, simplify
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -95,7 +96,7 @@ def contact_sheet(shapes: ArticulatedShapes, path: str | Path, n_shown: int = 1)
 def draw_mesh(axis: Axes, path: Path) -> None:
     """Draw a mesh, shaded and seen along its thinnest principal axis."""
     mesh = load_mesh(path, allow_open=True)
-    if len(mesh.vertices) > _THUMBNAIL_VERTICES:
+    with contextlib.suppress(MeshError, ImportError):  # drawn in full, it only takes longer
         mesh = simplify(mesh, _THUMBNAIL_VERTICES)
     _paint(axis, _seen_from_the_front(mesh.vertices), mesh.faces, _GREY)
 
@@ -118,9 +119,12 @@ def _paint(axis: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int64], 
 
 
 def _seen_from_the_front(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-    axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
-    axes[2] = np.cross(axes[0], axes[1])
-    return vertices @ axes[[1, 0, 2]].T * np.array([-1.0, 1.0, 1.0])
+    centred = vertices - vertices.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2]
+    # The slender end up, the wider side left, so that poses of one body are drawn alike.
+    axes *= np.where(((centred @ axes.T) ** 3).mean(axis=0) < 0, -1, 1)[:, None]
+    axes[2] = np.cross(axes[1], axes[0])
+    return vertices @ axes[[1, 0, 2]].T
 
 
 def _frame(axis: Axes, title: str, colour: str) -> None:
