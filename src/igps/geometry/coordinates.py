@@ -97,8 +97,9 @@ def extend(
     if not np.isfinite(values).all():
         raise ValueError("functions: expected finite values, got NaN or infinity")
     columns = torch.as_tensor(np.column_stack([values, np.ones(len(values))]), dtype=dtype, device=device)
-    exact = accuracy is None or len(values) < _FEW_VERTICES
-    ratio = None if exact else max(_EXACT_RATIO, (_FAR_ERROR / accuracy) ** (1 / 3))
+    ratio = None
+    if accuracy is not None and len(values) >= _FEW_VERTICES:
+        ratio = max(_EXACT_RATIO, (_FAR_ERROR / accuracy) ** (1 / 3))
     out = np.empty((len(x), values.shape[1]))
     for rows, weights in _weight_blocks(surface, x, ratio, dtype):
         product = weights.T @ columns  # the last column sums the weights
