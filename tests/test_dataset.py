@@ -2,6 +2,10 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -172,6 +176,28 @@ def test_a_missing_file_is_a_failure_like_any_other(root: Path, tmp_path: Path) 
     assert "gone.off" in failure.error
     with pytest.raises(MeshError, match=r"gone\.off"):
         dataset[1]
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc to see whether a process lives")
+def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import os, signal\n"
+        "from igps.data.dataset import _process_pool\n"
+        "if __name__ == '__main__':\n"
+        "    with _process_pool(1) as pool:\n"
+        "        print(pool.submit(os.getpid).result(), flush=True)\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        worker = int(parent.stdout.readline())
+    for _ in range(100):
+        if not Path(f"/proc/{worker}").exists():
+            return
+        time.sleep(0.1)
+    os.kill(worker, signal.SIGKILL)
+    pytest.fail("the worker outlived its parent")
 
 
 def test_two_processes_on_one_cache(root: Path, tmp_path: Path) -> None:
