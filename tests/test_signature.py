@@ -15,7 +15,7 @@ from igps.geometry.laplacian import laplacian
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
 from igps.nn.descriptor import VolumetricDescriptor
-from igps.nn.embedding import barycentroid_potential, commute_time_embedding, interior_distance
+from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding
 
 CONFIG = SignatureConfig(n_eigenpairs=40, resolution=12, min_samples=0, n_surface_samples=300, accuracy=None)
 
@@ -52,7 +52,9 @@ def test_distance_and_potential_equal_the_papers_gram_form(blob: Mesh, signature
     potential = np.sqrt(np.einsum("pi,ij,pj->p", weights, gram, weights))
 
     eigenfunctions = torch.from_numpy(signature.interior.eigenfunctions[::9]).double()
-    embedding = commute_time_embedding(eigenfunctions, torch.from_numpy(signature.eigenvalues))
+    embedding = spectral_embedding(
+        eigenfunctions, torch.from_numpy(signature.eigenvalues), torch.tensor(signature.area)
+    )
     np.testing.assert_allclose(interior_distance(embedding, embedding), distance, atol=1e-6)
     np.testing.assert_allclose(barycentroid_potential(embedding), potential, rtol=1e-5)
 
@@ -67,8 +69,10 @@ def test_barycentroid_of_a_ball_is_its_centre_and_of_a_body_its_least_potential(
 ) -> None:
     ball = compute_signature(sphere, replace(CONFIG, resolution=11))
     np.testing.assert_allclose(ball.barycentroid, 0, atol=1e-9)
-    embedding = commute_time_embedding(
-        torch.from_numpy(signature.interior.eigenfunctions), torch.from_numpy(signature.eigenvalues)
+    embedding = spectral_embedding(
+        torch.from_numpy(signature.interior.eigenfunctions),
+        torch.from_numpy(signature.eigenvalues),
+        torch.tensor(signature.area),
     )
     least = int(barycentroid_potential(embedding).argmin())
     np.testing.assert_array_equal(signature.barycentroid, signature.interior.points[least])

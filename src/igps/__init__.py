@@ -8,35 +8,41 @@ N shapes, Q queries, G gallery, D embedding width.
 """
 
 from igps.data.cache import SignatureCache
+from igps.data.datamodule import SignatureDataModule
 from igps.data.dataset import LabelledSignature, SignatureBatch, SignatureDataset, collate
 from igps.data.shapes import ArticulatedShapes
 from igps.geometry.mesh import Mesh, MeshError, load_mesh, simplify
 from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
 from igps.nn.descriptor import VolumetricDescriptor
-from igps.nn.embedding import SpectralEmbedding, barycentroid_potential, commute_time_embedding, interior_distance
+from igps.nn.embedding import SpectralEmbedding, barycentroid_potential, interior_distance, spectral_embedding
 from igps.nn.extraction import describe
+from igps.nn.head import CorrectedDistance, MetricHead
 from igps.nn.histogram import PairHistogram, pair_histogram
+from igps.nn.learner import RetrievalLearner
 from igps.retrieval import RetrievalScores, chi_square, retrieval_scores, search
 
 __all__ = [
     "ArticulatedShapes",
+    "CorrectedDistance",
     "LabelledSignature",
     "Mesh",
     "MeshError",
+    "MetricHead",
     "PairHistogram",
+    "RetrievalLearner",
     "RetrievalScores",
     "Samples",
     "Signature",
     "SignatureBatch",
     "SignatureCache",
     "SignatureConfig",
+    "SignatureDataModule",
     "SignatureDataset",
     "SpectralEmbedding",
     "VolumetricDescriptor",
     "barycentroid_potential",
     "chi_square",
     "collate",
-    "commute_time_embedding",
     "compute_signature",
     "describe",
     "interior_distance",
@@ -45,4 +51,5 @@ __all__ = [
     "retrieval_scores",
     "search",
     "simplify",
+    "spectral_embedding",
 ]

@@ -12,7 +12,7 @@ from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from igps.data.dataset import LabelledSignature, SignatureDataset, collate
+from igps.data.dataset import LabelledSignature, SignatureBatch, SignatureDataset, collate
 from igps.geometry.signature import SignatureConfig
 
 Protocol = Literal["seen", "unseen"]
@@ -162,6 +162,10 @@ class SignatureDataModule(LightningDataModule):
         )
         return DataLoader(part, batch_size=n_batch, sampler=sampler, collate_fn=collate)
 
+    def training_in_order(self) -> DataLoader[LabelledSignature]:
+        """The training part, each shape once: for what is measured on it, such as a distance's median."""
+        return self._in_order(self.split.train)
+
     def val_dataloader(self) -> DataLoader[LabelledSignature] | list[DataLoader[LabelledSignature]]:
         """The validation part in order; nothing if it is empty."""
         return self._in_order(self.split.validation) if self.split.validation else []
@@ -169,6 +173,12 @@ class SignatureDataModule(LightningDataModule):
     def test_dataloader(self) -> DataLoader[LabelledSignature]:
         """The test part in order."""
         return self._in_order(self.split.test)
+
+    def transfer_batch_to_device(
+        self, batch: SignatureBatch, device: torch.device, dataloader_index: int
+    ) -> SignatureBatch:
+        """Lightning moves tensors and their containers, not batches of ours."""
+        return batch.to(device)
 
     def _in_order(self, indices: Sequence[int]) -> DataLoader[LabelledSignature]:
         return DataLoader(self.dataset.subset(indices), batch_size=16, collate_fn=collate)

@@ -17,8 +17,9 @@ class VolumetricDescriptor(nn.Module):
     """Signatures to histograms: embedding, potential, and joint histograms over all pairs of samples.
 
     Args:
-        embedding: eigenfunctions (..., P, K) and eigenvalues (..., K) to coordinates (..., P, D).
-        histogram: (N, P, D) coordinates, (N, P) potential and (N, P) mask to (N, cells..., B).
+        embedding: eigenfunctions (..., P, K), eigenvalues (..., K) and areas (...) to coordinates (..., P, D).
+        histogram: (N, P, D) coordinates, (N, P) potential and (N, P) mask to (N, cells..., B); it is also given the
+            samples' attributes, each (N, P), and points, (N, P, 3) in units of √area.
         samples: "interior" is the volumetric descriptor; "surface" its counterpart on the surface, the histograms of
             the Global Point Signature (Rustamov 2007).
     """
@@ -42,7 +43,14 @@ class VolumetricDescriptor(nn.Module):
         return cls(SpectralEmbedding(), PairHistogram(n_classes=4, n_bins=64), samples)
 
     def forward(self, batch: SignatureBatch) -> Tensor:
-        """(N, C(C+1)/2, B) histograms, each shape's of sum 1."""
+        """(N, C(C+1)/2, B) histograms, with Euclidean bins (N, C(C+1)/2, B, E), each shape's of sum 1."""
         samples = batch.interior if self.samples == "interior" else batch.surface
-        coordinates = self.embedding(samples.eigenfunctions, batch.eigenvalues)
-        return self.histogram(coordinates, barycentroid_potential(coordinates), samples.mask)
+        coordinates = self.embedding(samples.eigenfunctions, batch.eigenvalues, batch.area)
+        length = batch.area.sqrt().to(samples.points.dtype)[:, None, None]
+        return self.histogram(
+            coordinates,
+            barycentroid_potential(coordinates),
+            samples.mask,
+            attributes=samples.attributes,
+            points=samples.points / length,
+        )

@@ -2,24 +2,74 @@
 
 from __future__ import annotations
 
+import math
+from typing import Literal, get_args
+
 import torch
 from torch import Tensor, nn
 
+EmbeddingKind = Literal["commute_time", "diffusion", "biharmonic"]
 
-def commute_time_embedding(eigenfunctions: Tensor, eigenvalues: Tensor) -> Tensor:
-    """The Global Point Signature φₖ/√λₖ (Rustamov 2007); of interior samples, the interior one (Rustamov 2010).
+# λ·area from below the smallest of elongated bodies to beyond the 250th of any (4π·250, Weyl's law).
+_FILTER_RANGE = (2.0, 5000.0)
 
-    Euclidean distance between two rows is the square root of the commute time between the points, up to a constant;
-    it does not change with the scale of the mesh.
+
+def spectral_weights(
+    eigenvalues: Tensor, area: Tensor, kind: EmbeddingKind = "commute_time", time: float | None = None
+) -> Tensor:
+    """Factors √area·g(λ·area) that turn eigenfunctions into an embedding that does not change with scale.
+
+    g(x) is x^(−1/2) for the commute time (Rustamov 2007), e^(−x·time) for diffusion (Coifman, Lafon 2006) and 1/x for
+    the biharmonic distance (Lipman, Rustamov, Funkhouser 2010).
+
+    Args:
+        eigenvalues: (..., K) positive, 1/length²; infinite where padded, with weight 0.
+        area: (...) of the surface, length².
+        kind: which g.
+        time: diffusion time over area, dimensionless; for "diffusion" alone.
+
+    Returns:
+        (..., K), length.
+
+    Raises:
+        ValueError: unknown kind, or a time that is missing, not positive, or given to another kind.
+    """
+    _check_kind(kind, time)
+    if kind == "commute_time":
+        return eigenvalues.rsqrt()
+    area = area.to(eigenvalues.dtype).unsqueeze(-1)
+    if kind == "biharmonic":
+        return 1 / (eigenvalues * area.sqrt())
+    assert time is not None
+    return area.sqrt() * (-time * eigenvalues * area).exp()
+
+
+def spectral_embedding(
+    eigenfunctions: Tensor,
+    eigenvalues: Tensor,
+    area: Tensor,
+    *,
+    kind: EmbeddingKind = "commute_time",
+    time: float | None = None,
+    n_eigenpairs: int | None = None,
+) -> Tensor:
+    """Eigenfunctions times their `spectral_weights`.
 
     Args:
         eigenfunctions: (..., P, K), 1/length.
-        eigenvalues: (..., K) positive, 1/length²; infinite where padded.
+        eigenvalues: (..., K) positive ascending, 1/length²; infinite where padded.
+        area: (...) of the surface, length².
+        kind, time: see `spectral_weights`.
+        n_eigenpairs: keep so many of the first; None, or more than there are, keeps all.
 
     Returns:
-        (..., P, K) in the eigenfunctions' type, dimensionless.
+        (..., P, min(K, n_eigenpairs)) in the eigenfunctions' type, float32 at least, dimensionless.
+
+    Raises:
+        ValueError: see `spectral_weights`.
     """
-    return eigenfunctions * eigenvalues.rsqrt().to(eigenfunctions.dtype).unsqueeze(-2)
+    weights = spectral_weights(eigenvalues[..., :n_eigenpairs], area, kind, time)
+    return _weigh(eigenfunctions[..., :n_eigenpairs], weights)
 
 
 def interior_distance(p: Tensor, q: Tensor) -> Tensor:
@@ -48,8 +98,70 @@ def barycentroid_potential(embedding: Tensor) -> Tensor:
 
 
 class SpectralEmbedding(nn.Module):
-    """`commute_time_embedding` as a module."""
+    """`spectral_embedding` as a module, its weights fixed or learned.
 
-    def forward(self, eigenfunctions: Tensor, eigenvalues: Tensor) -> Tensor:
-        """Embed (..., P, K) eigenfunctions with (..., K) eigenvalues."""
-        return commute_time_embedding(eigenfunctions, eigenvalues)
+    A learned filter multiplies the weights of the kind by exp(s(log(λ·area))), s piecewise linear between knots and
+    constant beyond them: it is non-negative, starts at the kind itself, and serves every shape whatever its K.
+
+    Args:
+        kind, time, n_eigenpairs: see `spectral_embedding`.
+        n_knots: parameters of the learned filter; 0 for a fixed one.
+
+    Raises:
+        ValueError: see `spectral_weights`, a single knot, or no eigenpair.
+    """
+
+    def __init__(
+        self,
+        kind: EmbeddingKind = "commute_time",
+        *,
+        time: float | None = None,
+        n_eigenpairs: int | None = None,
+        n_knots: int = 0,
+    ) -> None:
+        super().__init__()
+        _check_kind(kind, time)
+        if n_eigenpairs is not None and n_eigenpairs < 1:
+            raise ValueError(f"n_eigenpairs: expected None or at least 1, got {n_eigenpairs}.")
+        if n_knots < 0 or n_knots == 1:
+            raise ValueError(f"n_knots: expected 0 for a fixed filter or at least 2, got {n_knots}.")
+        self.kind: EmbeddingKind = kind
+        self.time = time
+        self.n_eigenpairs = n_eigenpairs
+        self.log_gain = nn.Parameter(torch.zeros(n_knots)) if n_knots else None
+
+    def weights(self, eigenvalues: Tensor, area: Tensor) -> Tensor:
+        """(..., K) factors of the eigenfunctions, length; with an area of 1 the filter g at the eigenvalues."""
+        weights = spectral_weights(eigenvalues, area, self.kind, self.time)
+        if self.log_gain is None:
+            return weights
+        least, most = (math.log(x) for x in _FILTER_RANGE)
+        last = len(self.log_gain) - 1
+        x = (eigenvalues * area.to(eigenvalues.dtype).unsqueeze(-1)).log()
+        position = ((x - least) * (last / (most - least))).clamp(0, last)
+        lower = position.long().clamp(max=last - 1)
+        gain = self.log_gain.to(weights.dtype)
+        return weights * torch.lerp(gain[lower], gain[lower + 1], position - lower).exp()
+
+    def forward(self, eigenfunctions: Tensor, eigenvalues: Tensor, area: Tensor) -> Tensor:
+        """Embed (..., P, K) eigenfunctions with (..., K) eigenvalues and (...) areas."""
+        weights = self.weights(eigenvalues[..., : self.n_eigenpairs], area)
+        return _weigh(eigenfunctions[..., : self.n_eigenpairs], weights)
+
+    def extra_repr(self) -> str:
+        n_knots = 0 if self.log_gain is None else len(self.log_gain)
+        return f"kind={self.kind!r}, time={self.time}, n_eigenpairs={self.n_eigenpairs}, n_knots={n_knots}"
+
+
+def _weigh(eigenfunctions: Tensor, weights: Tensor) -> Tensor:
+    dtype = torch.promote_types(eigenfunctions.dtype, torch.float32)
+    return eigenfunctions * weights.to(dtype).unsqueeze(-2)
+
+
+def _check_kind(kind: str, time: float | None) -> None:
+    if kind not in get_args(EmbeddingKind):
+        raise ValueError(f"kind: expected one of {', '.join(get_args(EmbeddingKind))}, got {kind!r}.")
+    if kind == "diffusion" and (time is None or not 0 < time < math.inf):
+        raise ValueError(f"time: expected a positive diffusion time over area for kind='diffusion', got {time}.")
+    if kind != "diffusion" and time is not None:
+        raise ValueError(f"time: expected None for kind={kind!r}, which has no time, got {time}.")

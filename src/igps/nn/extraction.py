@@ -46,5 +46,9 @@ def describe(
 def _parallel(function: Callable[[range], Tensor], batches: list[range]) -> Iterator[Tensor]:
     # One single-threaded shape per core. Splitting each small product over all cores instead makes every one of them
     # wait for the slowest core, which on a machine with other work to do costs many times the product itself.
-    with ThreadPoolExecutor(n_cores(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        yield from pool.map(function, batches)
+    n_threads = torch.get_num_threads()
+    try:
+        with ThreadPoolExecutor(n_cores(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            yield from pool.map(function, batches)
+    finally:
+        torch.set_num_threads(n_threads)  # or every thread started later would inherit the workers' one

@@ -1,0 +1,126 @@
+"""Training a descriptor and a metric end to end, as a LightningModule."""
+
+from __future__ import annotations
+
+import torch
+from pytorch_lightning import LightningModule
+from pytorch_lightning.utilities.types import OptimizerLRScheduler
+from torch import Tensor, nn
+
+from igps.data.dataset import SignatureBatch
+from igps.nn.head import CorrectedDistance
+from igps.retrieval import RetrievalScoresMetric
+
+
+class RetrievalLearner(LightningModule):
+    """Learns whatever has parameters in the descriptor and the distance, by a loss on the head's embeddings.
+
+    Validation and test log the retrieval scores of the whole distance, each shape against all others of its part. With
+    a distance that has no head there is nothing to train, and `Trainer.test` gives the plain descriptor's scores.
+
+    Args:
+        descriptor: `SignatureBatch` to histograms (N, ...).
+        distance: between histograms; its head is trained.
+        loss: embeddings (N, D) and labels (N,) to a scalar; supervised contrastive (Khosla et al. 2020) if None, which
+            needs `pytorch-metric-learning`.
+        learning_rate: of the head; cosine decay over the epochs.
+        bin_rate: learning rate of the descriptor's parameters.
+        weight_decay: of the head alone.
+    """
+
+    def __init__(
+        self,
+        descriptor: nn.Module,
+        distance: CorrectedDistance,
+        loss: nn.Module | None = None,
+        learning_rate: float = 1e-3,
+        bin_rate: float = 1e-2,
+        weight_decay: float = 1e-2,
+    ) -> None:
+        super().__init__()
+        self.descriptor = descriptor
+        self.distance = distance
+        self.loss = loss if loss is not None else _supervised_contrastive()
+        self.learning_rate = learning_rate
+        self.bin_rate = bin_rate
+        self.weight_decay = weight_decay
+        # A method, not the module: the metric's state must not repeat its parameters in the checkpoint.
+        self.scores = RetrievalScoresMetric(self.distances)
+
+    def forward(self, batch: SignatureBatch) -> Tensor:
+        """Histograms of a batch."""
+        return self.descriptor(batch)
+
+    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        """(Q, G) distances between histograms (Q, ...) and (G, ...)."""
+        return self.distance(queries, gallery)
+
+    def setup(self, stage: str) -> None:
+        """Refuse to train without a head, before the optimiser is made."""
+        if stage == "fit" and self.distance.head is None:
+            raise ValueError("distance: expected a head to train, got none. Use Trainer.test for a plain descriptor.")
+
+    def on_fit_start(self) -> None:
+        """Centre the head's inputs on the training shapes."""
+        self.distance.head.calibrate(self._training_histograms())  # type: ignore[union-attr, operator]
+
+    def on_fit_end(self) -> None:
+        """Put the plain and the learned distance on one scale, by the training shapes."""
+        self.distance.calibrate(self._training_histograms())
+
+    def on_validation_epoch_start(self) -> None:
+        """The scale changes with the head."""
+        self.distance.calibrate(self._training_histograms())
+
+    def training_step(self, batch: SignatureBatch, batch_index: int) -> Tensor:
+        """Loss of one P×K batch."""
+        loss = self.loss(self.distance.head(self(batch)), batch.labels)  # type: ignore[misc]
+        self.log("train_loss", loss, batch_size=len(batch), prog_bar=True)
+        return loss
+
+    def validation_step(self, batch: SignatureBatch, batch_index: int) -> None:
+        """Collect the histograms of a batch."""
+        self.scores.update(self(batch), batch.labels)
+
+    def test_step(self, batch: SignatureBatch, batch_index: int) -> None:
+        """Collect the histograms of a batch."""
+        self.scores.update(self(batch), batch.labels)
+
+    def on_validation_epoch_end(self) -> None:
+        """Scores over the validation part."""
+        self._log_scores("val")
+
+    def on_test_epoch_end(self) -> None:
+        """Scores over the test part."""
+        self._log_scores("test")
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        """AdamW: decay for the head, none for bins and filters, which have a meaning where they start."""
+        groups = [
+            {"params": list(self.distance.parameters()), "lr": self.learning_rate, "weight_decay": self.weight_decay},
+            {"params": list(self.descriptor.parameters()), "lr": self.bin_rate, "weight_decay": 0.0},
+        ]
+        optimizer = torch.optim.AdamW([group for group in groups if group["params"]])
+        epochs = max(self.trainer.max_epochs or 1, 1)
+        return {"optimizer": optimizer, "lr_scheduler": torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs)}
+
+    def _log_scores(self, part: str) -> None:
+        self.log_dict({f"{part}_{name}": value for name, value in self.scores.compute().items()})
+        self.scores.reset()
+
+    @torch.no_grad()
+    def _training_histograms(self) -> Tensor:
+        loader = self.trainer.datamodule.training_in_order()  # type: ignore[attr-defined]
+        training = self.training
+        self.eval()
+        parts = [self(batch.to(self.device)) for batch in loader]
+        self.train(training)
+        return torch.cat(parts)
+
+
+def _supervised_contrastive() -> nn.Module:
+    try:
+        from pytorch_metric_learning.losses import SupConLoss
+    except ImportError as error:
+        raise ImportError('training needs pytorch-metric-learning: pip install "interior-gps[metric]".') from error
+    return SupConLoss(temperature=0.1)

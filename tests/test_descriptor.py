@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from igps.data.dataset import SampleBatch, SignatureBatch
+from igps.nn.descriptor import VolumetricDescriptor
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histogram import PairHistogram, pair_histogram
+
+N_POINTS = (40, 25)
+
+
+def samples(n_eigenpairs: tuple[int, int], generator: torch.Generator) -> SampleBatch:
+    longest = max(N_POINTS)
+    mask = torch.arange(longest) < torch.tensor(N_POINTS)[:, None]
+    functions = torch.randn(2, longest, max(n_eigenpairs), generator=generator) * mask[:, :, None]
+    for i, n in enumerate(n_eigenpairs):
+        functions[i, :, n:] = 0
+    points = torch.rand(2, longest, 3, generator=generator) * mask[:, :, None]
+    return SampleBatch(points, functions, mask, {"depth": torch.rand(2, longest, generator=generator) * mask})
+
+
+@pytest.fixture(scope="module")
+def batch() -> SignatureBatch:
+    """Two shapes of different numbers of samples and eigenpairs."""
+    generator = torch.Generator().manual_seed(11)
+    n_eigenpairs = (12, 7)
+    eigenvalues = torch.rand(2, 12, generator=generator, dtype=torch.float64).cumsum(dim=1) * 10 + 5
+    eigenvalues[1, 7:] = torch.inf
+    return SignatureBatch(
+        eigenvalues=eigenvalues,
+        interior=samples(n_eigenpairs, generator),
+        surface=samples(n_eigenpairs, generator),
+        area=torch.tensor([2.0, 3.0], dtype=torch.float64),
+        volume=torch.tensor([0.2, 0.3], dtype=torch.float64),
+        labels=torch.tensor([0, 1]),
+        ids=("a", "b"),
+    )
+
+
+def learned() -> VolumetricDescriptor:
+    histogram = PairHistogram(
+        n_classes=3, n_bins=8, learnable=True, attributes={"depth": [0.2, 0.5, 0.9]}, n_euclidean_bins=4
+    )
+    return VolumetricDescriptor(SpectralEmbedding(n_knots=8), histogram)
+
+
+def single(batch: SignatureBatch, i: int) -> SignatureBatch:
+    """One shape without its padding."""
+
+    def alone(samples: SampleBatch) -> SampleBatch:
+        n_points, n_eigenpairs = N_POINTS[i], int(torch.isfinite(batch.eigenvalues[i]).sum())
+        return SampleBatch(
+            samples.points[i : i + 1, :n_points],
+            samples.eigenfunctions[i : i + 1, :n_points, :n_eigenpairs],
+            samples.mask[i : i + 1, :n_points],
+            {name: values[i : i + 1, :n_points] for name, values in samples.attributes.items()},
+        )
+
+    return replace(
+        batch,
+        eigenvalues=batch.eigenvalues[i : i + 1, torch.isfinite(batch.eigenvalues[i])],
+        interior=alone(batch.interior),
+        surface=alone(batch.surface),
+        area=batch.area[i : i + 1],
+    )
+
+
+def scaled(batch: SignatureBatch, scale: float) -> SignatureBatch:
+    def grown(samples: SampleBatch) -> SampleBatch:
+        return replace(samples, points=samples.points * scale, eigenfunctions=samples.eigenfunctions / scale)
+
+    return replace(
+        batch,
+        eigenvalues=batch.eigenvalues / scale**2,
+        interior=grown(batch.interior),
+        surface=grown(batch.surface),
+        area=batch.area * scale**2,
+        volume=batch.volume * scale**3,
+    )
+
+
+@pytest.mark.parametrize("kind", ["interior", "surface"])
+def test_paper_is_the_hard_histogram_of_the_commute_time(batch: SignatureBatch, kind: str) -> None:
+    descriptor = VolumetricDescriptor.paper(kind)  # type: ignore[arg-type]
+    assert list(descriptor.parameters()) == []
+    result = descriptor(batch)
+    for i, n in enumerate(N_POINTS):
+        functions = getattr(batch, kind).eigenfunctions[i, :n].double()
+        embedding = torch.nan_to_num(functions / batch.eigenvalues[i].sqrt())
+        expected = pair_histogram(embedding, embedding.norm(dim=1), n_classes=4, n_bins=64)
+        np.testing.assert_allclose(result[i], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("make", [VolumetricDescriptor.paper, learned])
+def test_padding_never_shows(batch: SignatureBatch, make) -> None:
+    descriptor = make()
+    with torch.no_grad():
+        together = descriptor(batch)
+        for i in range(2):
+            torch.testing.assert_close(descriptor(single(batch, i))[0], together[i], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("make", [VolumetricDescriptor.paper, learned])
+def test_does_not_change_with_scale(batch: SignatureBatch, make) -> None:
+    descriptor = make()
+    with torch.no_grad():
+        torch.testing.assert_close(descriptor(scaled(batch, 8.0)), descriptor(batch), rtol=0, atol=1e-6)
+
+
+def test_euclidean_distance_is_one_more_dimension(batch: SignatureBatch) -> None:
+    """Summed over the interior distance, the histogram of Euclidean distances over √area; and the other way round."""
+    descriptor = VolumetricDescriptor(histogram=PairHistogram(n_classes=4, n_bins=32, n_euclidean_bins=16))
+    result = descriptor(batch)
+    assert result.shape == (2, 10, 32, 16)
+    plain = VolumetricDescriptor(histogram=PairHistogram(n_classes=4, n_bins=32))(batch)
+    np.testing.assert_allclose(result.sum(dim=3), plain, atol=1e-6)
+    for i, n in enumerate(N_POINTS):
+        points = batch.interior.points[i, :n] / batch.area[i].sqrt().float()
+        expected = pair_histogram(points, torch.zeros(n), n_classes=1, n_bins=16, distance_range=1.0)
+        np.testing.assert_allclose(result[i].sum(dim=(0, 1)), expected[0], atol=1e-6)
+
+
+def test_everything_learns(batch: SignatureBatch) -> None:
+    descriptor = learned()
+    result = descriptor(batch)
+    assert result.shape == (2, 45, 8, 4)
+    np.testing.assert_allclose(result.detach().sum(dim=(1, 2, 3)), 1, atol=1e-6)
+    (result[0] - result[1]).square().sum().backward()
+    parameters = dict(descriptor.named_parameters())
+    assert set(parameters) == {
+        "embedding.log_gain",
+        "histogram.distance_centres.log_gap",
+        "histogram.potential_centres.log_gap",
+        "histogram.attribute_centres.depth.log_gap",
+        "histogram.euclidean_centres.log_gap",
+    }
+    for name, parameter in parameters.items():
+        assert parameter.grad is not None, name
+        assert torch.isfinite(parameter.grad).all(), name
+        assert (parameter.grad != 0).any(), name
+
+
+def gradients(module: torch.nn.Module, batch: SignatureBatch, parameters: list[Tensor]) -> tuple[Tensor, ...]:
+    result = module(batch)
+    return result.detach(), *torch.autograd.grad(result.square().sum(), parameters)
+
+
+def test_compiled_equals_eager(batch: SignatureBatch) -> None:
+    descriptor = learned()
+    parameters = list(descriptor.parameters())
+    torch.compiler.reset()
+    compiled = torch.compile(descriptor, backend="aot_eager")
+    torch.testing.assert_close(
+        gradients(compiled, batch, parameters), gradients(descriptor, batch, parameters), rtol=1e-4, atol=1e-7
+    )
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_cuda_equals_cpu(batch: SignatureBatch) -> None:
+    descriptor = learned()
+    expected = gradients(descriptor, batch, list(descriptor.parameters()))
+    descriptor.cuda()
+    result = gradients(descriptor, batch.to("cuda"), list(descriptor.parameters()))
+    torch.testing.assert_close([value.cpu() for value in result], list(expected), rtol=1e-3, atol=1e-6)
+
+
+def test_unknown_samples_are_refused() -> None:
+    with pytest.raises(ValueError, match="samples: expected 'interior' or 'surface'"):
+        VolumetricDescriptor(samples="volume")  # type: ignore[arg-type]

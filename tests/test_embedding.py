@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from igps.nn.embedding import SpectralEmbedding, spectral_embedding, spectral_weights
+
+KINDS = [("commute_time", None), ("diffusion", 0.01), ("biharmonic", None)]
+AREA = 2.7
+
+
+def commute_time_embedding(eigenfunctions: torch.Tensor, eigenvalues: torch.Tensor) -> torch.Tensor:
+    """The Global Point Signature as it is defined: φₖ/√λₖ."""
+    return eigenfunctions * eigenvalues.rsqrt().to(eigenfunctions.dtype).unsqueeze(-2)
+
+
+@pytest.fixture(scope="module")
+def spectrum() -> tuple[Tensor, Tensor]:
+    """Eigenfunctions (20, 12) and eigenvalues (12,) of no body in particular."""
+    generator = torch.Generator().manual_seed(5)
+    eigenvalues = torch.rand(12, generator=generator, dtype=torch.float64).cumsum(0) * 20 + 1
+    return torch.randn(20, 12, generator=generator, dtype=torch.float64), eigenvalues
+
+
+def embed(kind: str, time: float | None, functions: Tensor, values: Tensor, area: float = AREA) -> Tensor:
+    return spectral_embedding(functions, values, torch.tensor(area, dtype=torch.float64), kind=kind, time=time)  # type: ignore[arg-type]
+
+
+def learned(kind: str, time: float | None) -> SpectralEmbedding:
+    module = SpectralEmbedding(kind, time=time, n_knots=9)  # type: ignore[arg-type]
+    assert module.log_gain is not None
+    with torch.no_grad():
+        module.log_gain.copy_(torch.randn(9, generator=torch.Generator().manual_seed(1)))
+    return module
+
+
+@pytest.mark.parametrize(
+    ("kind", "time", "weight"),
+    [
+        ("commute_time", None, lambda value: 1 / math.sqrt(value)),
+        ("diffusion", 0.01, lambda value: math.sqrt(AREA) * math.exp(-value * AREA * 0.01)),
+        ("biharmonic", None, lambda value: 1 / (value * math.sqrt(AREA))),
+    ],
+)
+def test_weights_are_the_definition(spectrum: tuple[Tensor, Tensor], kind: str, time: float | None, weight) -> None:
+    functions, values = spectrum
+    expected = functions.numpy() * [weight(float(value)) for value in values]
+    np.testing.assert_allclose(embed(kind, time, functions, values), expected, rtol=1e-12)
+    module = SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
+    np.testing.assert_allclose(module(functions, values, torch.tensor(AREA, dtype=torch.float64)), expected, rtol=1e-12)
+
+
+def test_default_is_the_commute_time(spectrum: tuple[Tensor, Tensor]) -> None:
+    area = torch.tensor(AREA)
+    assert torch.equal(SpectralEmbedding()(*spectrum, area), commute_time_embedding(*spectrum))
+
+
+@pytest.mark.parametrize(("kind", "time"), KINDS)
+@pytest.mark.parametrize("is_learned", [False, True])
+def test_does_not_change_with_scale(spectrum: tuple[Tensor, Tensor], kind: str, time: float, is_learned: bool) -> None:
+    functions, values = spectrum
+    module = learned(kind, time) if is_learned else SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
+    scale = 7.0
+    scaled = module(functions / scale, values / scale**2, torch.tensor(AREA * scale**2, dtype=torch.float64))
+    expected = module(functions, values, torch.tensor(AREA, dtype=torch.float64))
+    torch.testing.assert_close(scaled, expected, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize(("kind", "time"), KINDS)
+@pytest.mark.parametrize("is_learned", [False, True])
+def test_padding_has_no_weight(spectrum: tuple[Tensor, Tensor], kind: str, time: float, is_learned: bool) -> None:
+    functions, values = spectrum
+    module = learned(kind, time) if is_learned else SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
+    padded_values = torch.full((2, 12), math.inf, dtype=torch.float64)
+    padded_values[0], padded_values[1, :5] = values, values[:5]
+    padded_functions = functions.repeat(2, 1, 1)
+    padded_functions[1, :, 5:] = 0
+    area = torch.tensor([AREA, 3.1], dtype=torch.float64)
+    result = module(padded_functions, padded_values, area)
+    assert (module.weights(padded_values, area)[1, 5:] == 0).all()
+    assert (result[1, :, 5:] == 0).all()
+    assert torch.equal(result[0], module(functions, values, area[0]))
+    assert torch.equal(result[1, :, :5], module(functions[:, :5], values[:5], area[1]))
+    if is_learned:
+        result.square().sum().backward()
+        assert torch.isfinite(module.log_gain.grad).all()
+        assert (module.log_gain.grad != 0).any()
+
+
+def test_keeps_the_first_eigenpairs(spectrum: tuple[Tensor, Tensor]) -> None:
+    functions, values = spectrum
+    area = torch.tensor(AREA)
+    for module in (SpectralEmbedding(n_eigenpairs=4), SpectralEmbedding(n_eigenpairs=4, n_knots=3)):
+        assert torch.equal(module(functions, values, area), commute_time_embedding(functions[:, :4], values[:4]))
+    assert torch.equal(spectral_embedding(functions, values, area, n_eigenpairs=4), module(functions, values, area))
+    assert SpectralEmbedding(n_eigenpairs=99)(functions, values, area).shape == (20, 12)
+
+
+@pytest.mark.parametrize(("kind", "time"), KINDS)
+def test_learned_filter_starts_at_its_kind(spectrum: tuple[Tensor, Tensor], kind: str, time: float | None) -> None:
+    area = torch.tensor(AREA)
+    start = SpectralEmbedding(kind, time=time, n_knots=16)  # type: ignore[arg-type]
+    plain = SpectralEmbedding(kind, time=time)  # type: ignore[arg-type]
+    assert torch.equal(start(*spectrum, area), plain(*spectrum, area))
+
+
+def test_learned_filter_interpolates_its_knots_in_log() -> None:
+    module = learned("commute_time", None)
+    assert module.log_gain is not None
+    gain = module.log_gain.detach().double().numpy()
+    x = np.geomspace(0.5, 20_000, 333)
+    expected = x**-0.5 * np.exp(np.interp(np.log(x), np.linspace(math.log(2), math.log(5000), 9), gain))
+    weights = module.weights(torch.from_numpy(x), torch.tensor(1.0)).detach()
+    np.testing.assert_allclose(weights, expected, rtol=1e-6)
+    assert (weights >= 0).all()
+
+
+def test_gradient_of_the_filter(spectrum: tuple[Tensor, Tensor]) -> None:
+    functions, values = spectrum
+    module = SpectralEmbedding(n_knots=6).double()
+    gain = torch.randn(6, generator=torch.Generator().manual_seed(2), dtype=torch.float64, requires_grad=True)
+
+    def embedding(gain: Tensor) -> Tensor:
+        area = torch.tensor(AREA, dtype=torch.float64)
+        return torch.func.functional_call(module, {"log_gain": gain}, (functions, values, area))
+
+    assert embedding(gain).sum().requires_grad
+    assert torch.autograd.gradcheck(embedding, (gain,))
+
+
+def test_learned_filter_survives_its_state(spectrum: tuple[Tensor, Tensor]) -> None:
+    module, fresh = learned("biharmonic", None), SpectralEmbedding("biharmonic", n_knots=9)
+    fresh.load_state_dict(module.state_dict())
+    area = torch.tensor(AREA)
+    assert torch.equal(fresh(*spectrum, area), module(*spectrum, area))
+    assert not torch.equal(fresh(*spectrum, area), SpectralEmbedding("biharmonic")(*spectrum, area))
+
+
+def test_result_has_single_precision_at_least(spectrum: tuple[Tensor, Tensor]) -> None:
+    functions, values = spectrum
+    for dtype in (torch.float32, torch.bfloat16):
+        result = embed("diffusion", 0.01, functions.to(dtype), values)
+        assert result.dtype == torch.float32
+        expected = embed("diffusion", 0.01, functions.to(dtype).double(), values)
+        np.testing.assert_allclose(result, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        ("heat", {}, "kind: expected one of commute_time"),
+        ("diffusion", {}, "time: expected a positive"),
+        ("diffusion", {"time": -1.0}, "time: expected a positive"),
+        ("biharmonic", {"time": 1.0}, "time: expected None"),
+        ("commute_time", {"n_knots": 1}, "n_knots"),
+        ("commute_time", {"n_eigenpairs": 0}, "n_eigenpairs"),
+    ],
+)
+def test_bad_filter_is_refused(kind: str, options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SpectralEmbedding(kind, **options)  # type: ignore[arg-type]
+    if set(options) <= {"time"}:
+        with pytest.raises(ValueError, match=message):
+            spectral_weights(torch.ones(3), torch.ones(()), kind, **options)  # type: ignore[arg-type]
