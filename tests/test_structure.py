@@ -15,7 +15,6 @@ MAY_IMPORT = {
     "data": {"geometry", "data"},
     "nn": {"geometry", "data", "nn", "retrieval"},
     "retrieval": {"retrieval"},
-    "baselines": {"geometry", "data", "nn", "retrieval", "baselines"},
 }
 
 
