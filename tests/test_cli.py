@@ -150,6 +150,7 @@ def test_query_lists_the_nearest(
     ("arguments", "message"),
     [
         (["retrieve", "nowhere"], "no such folder"),
+        (["retrieve", "ROOT/egg"], "no classes found"),
         (["query", "nowhere.off", "--gallery", "ROOT"], "no such file|cannot be read"),
         (["query", "ROOT/egg/1.off", "--gallery", "ROOT", "--top", "0"], "top"),
         (["retrieve", "ROOT", "--paper"], "none of 6 meshes could be used.*too few for 250 eigenpairs"),

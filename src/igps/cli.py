@@ -55,12 +55,13 @@ def retrieve(
         descriptor: interior is the volumetric descriptor of Rustamov 2010, gps its surface counterpart.
         out: folder for scores.json, ranking.csv, distances.npz, and failures.csv if a mesh could not be used.
     """
-    dataset, failures = _signatures(find_meshes(root), **reading)
-    if dataset.files.labels is None:
+    files = find_meshes(root)
+    if files.labels is None:
         raise ValueError(f"{root}: no classes found. Expected one folder per class, or a labels.csv (file,label).")
+    dataset, failures = _signatures(files, **reading)
     histograms = describe(dataset, _descriptor(descriptor), progress=True)
     distances = chi_square(histograms, histograms)
-    scores = retrieval_scores(distances, dataset.files.labels)
+    scores = retrieval_scores(distances, dataset.files.labels or ())
     print(format_scores(scores))
     if failures:
         print(f"{len(failures)} of {len(failures) + len(dataset)} meshes could not be used.")
