@@ -76,7 +76,7 @@ def test_computed_once_then_read(dataset: SignatureDataset, counted: list[str]) 
 @pytest.mark.parametrize(
     "change",
     [{"n_eigenpairs": 21}, {"resolution": 11}, {"min_samples": 300}, {"n_surface_samples": 51}, {"backend": "robust"},
-     {"max_vertices": 100}, {"accuracy": None}, {"seed": 1}],
+     {"max_vertices": 100}, {"accuracy": None}, {"attributes": ("depth",)}, {"seed": 1}],
 )  # fmt: skip
 def test_key_covers_every_parameter(root: Path, tmp_path: Path, counted: list[str], change: dict[str, object]) -> None:
     SignatureDataset(root, CONFIG, tmp_path / "cache")[0]
@@ -86,7 +86,7 @@ def test_key_covers_every_parameter(root: Path, tmp_path: Path, counted: list[st
 
 def test_parametrisation_above_is_complete() -> None:
     changed = {"n_eigenpairs", "resolution", "min_samples", "n_surface_samples", "backend", "max_vertices", "accuracy",
-               "seed"}  # fmt: skip
+               "attributes", "seed"}  # fmt: skip
     assert set(CONFIG.as_dict()) == changed | {"algorithm_version"}
 
 

@@ -107,6 +107,7 @@ def _decode(file: Any, metadata: Mapping[str, str]) -> Signature:
     config: dict[str, Any] = json.loads(metadata["config"])
     if config.pop("algorithm_version") != SignatureConfig.ALGORITHM_VERSION:
         raise ValueError("made by another version of the algorithm")
+    config["attributes"] = tuple(config["attributes"])
     rooms = {}
     for room in _ROOMS:
         prefix = f"{room}.attributes."

@@ -154,7 +154,7 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     try:
         import igl
     except ImportError as error:
-        raise ImportError('simplify needs libigl: pip install "interior-gps[simplify]".') from error
+        raise ImportError('simplify needs libigl: pip install "interior-gps[igl]".') from error
     # In unit scale, because quadrics are sums of squares. A collapse on a closed surface takes a vertex and two faces.
     centre, scale = mesh.vertices.mean(axis=0), float(np.ptp(mesh.vertices, axis=0).max())
     points = np.asfortranarray((mesh.vertices - centre) / scale)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.geometry.attributes import AttributeName, check_attributes, interior_attributes
 from igps.geometry.coordinates import extend
 from igps.geometry.eigensolver import Spectrum, eigenpairs
 from igps.geometry.laplacian import Backend, laplacian
@@ -33,6 +34,8 @@ class SignatureConfig:
         max_vertices: simplify larger meshes first; None keeps them.
         accuracy: relative error that 99 % of the interior distances may have, which speeds up the mean value
             coordinates; None evaluates them exactly.
+        attributes: named scalars of the interior samples: "depth" and "electrostatic_potential", see
+            `interior_attributes`.
         seed: of the surface samples and of the eigensolver's start.
     """
 
@@ -46,6 +49,7 @@ class SignatureConfig:
     backend: Backend = "cotangent"
     max_vertices: int | None = None
     accuracy: float | None = 1e-3
+    attributes: tuple[AttributeName, ...] = ()
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -61,6 +65,7 @@ class SignatureConfig:
             )
         if self.accuracy is not None and not 0 < self.accuracy < 1:
             raise ValueError(f"accuracy: expected None or a number between 0 and 1, got {self.accuracy}.")
+        check_attributes(self.attributes)
 
     @classmethod
     def paper(cls) -> SignatureConfig:
@@ -147,7 +152,7 @@ def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Sign
     spectrum = eigenpairs(
         stiffness, mass, config.n_eigenpairs, positions=mesh.vertices, tolerance=_RESIDUAL, seed=config.seed
     )
-    interior = _interior(mesh, spectrum, points, config.accuracy)
+    interior = _interior(mesh, spectrum, points, config)
     surface = _surface(mesh, spectrum, config.n_surface_samples, config.seed)
     for where, samples in (("interior", interior), ("surface", surface)):
         if not np.isfinite(samples.eigenfunctions).all():
@@ -167,9 +172,9 @@ def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Sign
     )
 
 
-def _interior(mesh: Mesh, spectrum: Spectrum, points: NDArray[np.float64], accuracy: float | None) -> Samples:
-    values = extend(mesh.vertices, mesh.faces, spectrum.eigenfunctions, points, accuracy=accuracy)
-    return Samples(points, np.asarray(values, dtype=np.float32))
+def _interior(mesh: Mesh, spectrum: Spectrum, points: NDArray[np.float64], config: SignatureConfig) -> Samples:
+    values = extend(mesh.vertices, mesh.faces, spectrum.eigenfunctions, points, accuracy=config.accuracy)
+    return Samples(points, np.asarray(values, dtype=np.float32), interior_attributes(mesh, points, config.attributes))
 
 
 def _surface(mesh: Mesh, spectrum: Spectrum, n_samples: int, seed: int) -> Samples:

@@ -1,0 +1,90 @@
+"""Scalars of points in the volume that a histogram may be split by, beside the potential."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.geometry.mesh import Mesh, area_vectors
+
+AttributeName = Literal["depth", "electrostatic_potential"]
+
+# Numbers of a block of points × vertices: 32 MiB.
+_BLOCK = 2**22
+
+
+def interior_attributes(
+    mesh: Mesh, points: NDArray[np.float64], names: Sequence[AttributeName]
+) -> Mapping[str, NDArray[np.float32]]:
+    """Named scalars of points, each (P,), dimensionless and the same for a scaled or moved body.
+
+    Raises:
+        ValueError: unknown name.
+        ImportError: "depth" without libigl.
+    """
+    check_attributes(names)
+    functions = {"depth": depth, "electrostatic_potential": electrostatic_potential}
+    return {name: functions[name](mesh, points).astype(np.float32) for name in names}
+
+
+def check_attributes(names: Sequence[str]) -> None:
+    """Raise a ValueError that says which names there are, unless all of `names` are known and none comes twice."""
+    known = get_args(AttributeName)
+    if not set(names) <= set(known) or len(set(names)) < len(names):
+        raise ValueError(f"attributes: expected different ones of {', '.join(known)}, got {', '.join(names)}.")
+
+
+def depth(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance of points to the surface over √area: 0 on the surface, 0.28 in the centre of a ball, its maximum.
+
+    Args:
+        mesh: V vertices, F faces.
+        points: (P, 3), length.
+
+    Returns:
+        (P,) dimensionless.
+
+    Raises:
+        ImportError: libigl is not installed.
+    """
+    try:
+        import igl
+    except ImportError as error:
+        raise ImportError('depth needs libigl: pip install "interior-gps[igl]".') from error
+    squared, *_ = igl.point_mesh_squared_distance(
+        np.ascontiguousarray(points), np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
+    )
+    return np.sqrt(np.asarray(squared) / mesh.area)
+
+
+def electrostatic_potential(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Electrostatic potential of a uniform unit charge on the surface, (1/√area) ∫ dS/|x − s|: √4π in a ball.
+
+    It is high where much surface is near: deep in thick parts and among folded ones, low in thin limbs and at their
+    tips. Rustamov 2010, section 4, names electrostatic potentials as a further dimension; where a body has charges of
+    its own (a protein), pass that potential as an attribute instead.
+
+    Args:
+        mesh: V vertices, F faces.
+        points: (P, 3), length.
+
+    Returns:
+        (P,) dimensionless.
+    """
+    area = np.repeat(np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1) / 3, 3)
+    # One quadrature point a vertex. The potential at a disc's centre is that of its charge at half its radius.
+    patch = np.bincount(mesh.faces.ravel(), weights=area, minlength=len(mesh.vertices))
+    least = patch / (4 * np.pi)
+    centre = mesh.vertices.mean(axis=0)  # keeps digits in the squared distances
+    vertices = mesh.vertices - centre
+    norms = np.square(vertices).sum(axis=1)
+    size = max(1, _BLOCK // len(vertices))
+    potential = np.empty(len(points))
+    for i in range(0, len(points), size):
+        block = points[i : i + size] - centre
+        squared = np.square(block).sum(axis=1)[:, None] + norms - 2 * block @ vertices.T
+        potential[i : i + size] = (1 / np.sqrt(np.maximum(squared, least))) @ patch
+    return potential / np.sqrt(mesh.area)
