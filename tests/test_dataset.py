@@ -67,6 +67,17 @@ def test_items_are_labelled_and_named(dataset: SignatureDataset) -> None:
     assert item.signature.config == CONFIG
 
 
+def test_functions_of_position_become_attributes(root: Path, tmp_path: Path) -> None:
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"height": lambda points: points[:, 2]})
+    for part in (dataset, dataset.subset([0, 3])):
+        samples = part[1].signature.interior
+        np.testing.assert_allclose(samples.attributes["height"], samples.points[:, 2], rtol=1e-6)
+    assert SignatureDataset(root, CONFIG, tmp_path / "cache")[0].signature.interior.attributes == {}
+    broken = SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"height": lambda points: points})
+    with pytest.raises(ValueError, match=r"attributes: expected 'height' to give \d+ finite numbers.*ball/1.off"):
+        broken[0]
+
+
 def test_computed_once_then_read(dataset: SignatureDataset, counted: list[str]) -> None:
     first, second = dataset[0].signature, dataset[0].signature
     assert len(counted) == 1

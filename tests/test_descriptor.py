@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from igps.data.dataset import SampleBatch, SignatureBatch
-from igps.nn.descriptor import VolumetricDescriptor
+from igps.nn.descriptor import CombinedDescriptor, VolumetricDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histogram import PairHistogram, pair_histogram
+from igps.retrieval import chi_square
 
 N_POINTS = (40, 25)
 
@@ -173,3 +174,36 @@ def test_cuda_equals_cpu(batch: SignatureBatch) -> None:
 def test_unknown_samples_are_refused() -> None:
     with pytest.raises(ValueError, match="samples: expected 'interior' or 'surface'"):
         VolumetricDescriptor(samples="volume")  # type: ignore[arg-type]
+
+
+def test_combined_chi_square_is_the_mean(batch: SignatureBatch) -> None:
+    parts = [
+        VolumetricDescriptor(SpectralEmbedding(n_eigenpairs=k), PairHistogram(n_classes, 16))
+        for k, n_classes in ((3, 2), (5, 3))
+    ]
+    combined = CombinedDescriptor(parts)(batch)
+    torch.testing.assert_close(combined.sum(dim=1), torch.ones(2))
+    separate = [chi_square(histograms, histograms) for histograms in (part(batch) for part in parts)]
+    torch.testing.assert_close(chi_square(combined, combined), torch.stack(separate).mean(dim=0))
+
+
+def test_subset_of_samples_is_the_same_in_any_batch(batch: SignatureBatch) -> None:
+    descriptor = VolumetricDescriptor(histogram=PairHistogram(2, 8), n_samples=5)
+    together = descriptor(batch)
+    for i in range(2):
+        torch.testing.assert_close(descriptor(single(batch, i))[0], together[i])
+    assert not torch.allclose(together, VolumetricDescriptor(histogram=PairHistogram(2, 8))(batch))
+
+
+def test_training_draws_another_subset_each_time(batch: SignatureBatch) -> None:
+    descriptor = VolumetricDescriptor(histogram=PairHistogram(2, 8), n_training_samples=5)
+    torch.manual_seed(0)
+    assert not torch.equal(descriptor(batch), descriptor(batch))
+    descriptor.eval()
+    torch.testing.assert_close(descriptor(batch), VolumetricDescriptor(histogram=PairHistogram(2, 8))(batch))
+
+
+@pytest.mark.parametrize("argument", ["n_samples", "n_training_samples"])
+def test_a_single_sample_forms_no_pair(argument: str) -> None:
+    with pytest.raises(ValueError, match=f"{argument}: expected None or at least 2"):
+        VolumetricDescriptor(**{argument: 1})  # type: ignore[arg-type]

@@ -9,7 +9,7 @@ import logging
 import multiprocessing
 import os
 import threading
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 from torch.utils.data import Dataset
@@ -28,6 +29,8 @@ from igps.geometry.mesh import Component, MeshError, load_mesh
 from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
 
 logger = logging.getLogger(__name__)
+
+PointFunction = Callable[[NDArray[np.float64]], NDArray[np.floating]]
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -70,6 +73,32 @@ class SampleBatch:
         """The same batch on another device."""
         attributes = {name: values.to(device) for name, values in self.attributes.items()}
         return SampleBatch(self.points.to(device), self.eigenfunctions.to(device), self.mask.to(device), attributes)
+
+    def subset(self, n_samples: int, seed: int | None = None) -> SampleBatch:
+        """A random subset of at most `n_samples` samples of each shape.
+
+        Args:
+            n_samples: how many; a shape with fewer keeps all of them.
+            seed: makes the subset of a shape depend on its number of samples alone, not on its batch; torch's global
+                generator draws if None.
+        """
+        n_kept = min(n_samples, self.mask.shape[1])
+        index = torch.zeros(len(self.mask), n_kept, dtype=torch.long)
+        kept = torch.zeros(len(self.mask), n_kept, dtype=torch.bool)
+        for i, real in enumerate(self.mask.cpu()):
+            present = real.nonzero().flatten()
+            generator = None if seed is None else torch.Generator().manual_seed(seed)
+            chosen = present[torch.randperm(len(present), generator=generator)[:n_samples]]
+            index[i, : len(chosen)] = chosen
+            kept[i, : len(chosen)] = True
+        index, kept = index.to(self.mask.device), kept.to(self.mask.device)
+
+        def take(values: Tensor) -> Tensor:
+            over_rest = (..., *[None] * (values.ndim - 2))
+            return values.gather(1, index[over_rest].expand(-1, -1, *values.shape[2:])) * kept[over_rest]
+
+        attributes = {name: take(values) for name, values in self.attributes.items()}
+        return SampleBatch(take(self.points), take(self.eigenfunctions), kept, attributes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +194,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         cache_dir: where Signatures are kept; the user's cache directory if None. The key of a file covers the mesh
             file's content, how it is read, every parameter, and the algorithm's version.
         labels: classes of the given paths, by name.
+        attributes: further named scalars of the interior samples, each a function of their points, (P, 3) in the mesh
+            file's coordinates, to (P,). They are evaluated at each reading, not cached.
         repair, component, allow_open: how meshes are read, see `load_mesh`.
 
     Raises:
@@ -178,6 +209,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         cache_dir: str | Path | None = None,
         *,
         labels: Sequence[str] | None = None,
+        attributes: Mapping[str, PointFunction] | None = None,
         repair: bool = False,
         component: Component | None = None,
         allow_open: bool = False,
@@ -193,6 +225,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         self._recipe = _Recipe(
             config or SignatureConfig(), Path(cache_dir or default_cache_dir()), repair, component, allow_open
         )
+        self._attributes = dict(attributes or {})
         self.classes: tuple[str, ...] = tuple(sorted(set(self.files.labels or ())))
 
     @property
@@ -213,7 +246,10 @@ class SignatureDataset(Dataset[LabelledSignature]):
     def __getitem__(self, index: int) -> LabelledSignature:
         path, name = self.files.paths[index], self.files.names[index]
         label = -1 if self.files.labels is None else self.classes.index(self.files.labels[index])
-        return LabelledSignature(replace(self._recipe.signature(path), name=name), label, name)
+        signature = replace(self._recipe.signature(path), name=name)
+        if self._attributes:
+            signature = replace(signature, interior=_with_attributes(signature.interior, self._attributes, name))
+        return LabelledSignature(signature, label, name)
 
     def subset(self, indices: Sequence[int]) -> SignatureDataset:
         """The dataset of some of the meshes; `classes` keeps all names, so that labels keep their numbers."""
@@ -224,6 +260,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
             None if self.files.labels is None else tuple(self.files.labels[i] for i in indices),
         )
         chosen._recipe = self._recipe
+        chosen._attributes = self._attributes
         chosen.classes = self.classes
         return chosen
 
@@ -270,6 +307,19 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """The dataset without the meshes that failed."""
         failed = {failure.id for failure in failures}
         return self.subset([i for i, name in enumerate(self.files.names) if name not in failed])
+
+
+def _with_attributes(samples: Samples, functions: Mapping[str, PointFunction], name: str) -> Samples:
+    found = dict(samples.attributes)
+    for attribute, function in functions.items():
+        values = np.asarray(function(samples.points), dtype=np.float32)
+        if values.shape != (len(samples),) or not np.isfinite(values).all():
+            raise ValueError(
+                f"attributes: expected {attribute!r} to give {len(samples)} finite numbers for the points of {name}, "
+                f"got an array of shape {values.shape} with {int((~np.isfinite(values)).sum())} not finite."
+            )
+        found[attribute] = values
+    return replace(samples, attributes=found)
 
 
 @dataclass(frozen=True)

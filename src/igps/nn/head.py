@@ -1,4 +1,4 @@
-"""What is learned on top of histograms: an embedding, weights of the χ² cells, a correction to the plain distance."""
+"""What gradients learn on top of histograms: an embedding, weights of the χ² cells, a correction of the distance."""
 
 from __future__ import annotations
 
@@ -7,6 +7,20 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from igps.retrieval import chi_square, cosine
+
+
+def square_roots(histograms: Tensor, n_cells: int) -> Tensor:
+    """(N, ...) histograms to the (N, n_cells) square roots of their cells, unit vectors with a finite gradient.
+
+    Raises:
+        ValueError: another number of cells.
+    """
+    cells = histograms.flatten(1)
+    if cells.shape[1] != n_cells:
+        raise ValueError(f"histograms: expected {n_cells} cells, got {cells.shape[1]}.")
+    # The root's gradient is infinite at an empty cell, where it is of no use.
+    filled = cells > 0
+    return torch.where(filled, torch.where(filled, cells, 1.0).sqrt(), 0.0)
 
 
 class MetricHead(nn.Module):
@@ -42,7 +56,7 @@ class MetricHead(nn.Module):
     @torch.no_grad()
     def calibrate(self, histograms: Tensor) -> None:
         """Centre and scale the inputs by the histograms (N, ...) of the training shapes, N at least 2."""
-        roots = self._roots(histograms)
+        roots = square_roots(histograms, len(self.mean))
         if len(roots) < 2:
             raise ValueError(f"histograms: expected at least two training shapes, got {len(roots)}.")
         self.mean.copy_(roots.mean(dim=0))
@@ -51,15 +65,8 @@ class MetricHead(nn.Module):
 
     def forward(self, histograms: Tensor) -> Tensor:
         """(N, ...) histograms to (N, D) of length 1."""
-        return functional.normalize(self.layers((self._roots(histograms) - self.mean) / self.scale), dim=1)
-
-    def _roots(self, histograms: Tensor) -> Tensor:
-        cells = histograms.flatten(1)
-        if cells.shape[1] != len(self.mean):
-            raise ValueError(f"histograms: expected {len(self.mean)} cells, got {cells.shape[1]}.")
-        # The root's gradient is infinite at an empty cell, where it is of no use.
-        filled = cells > 0
-        return torch.where(filled, torch.where(filled, cells, 1.0).sqrt(), 0.0)
+        roots = square_roots(histograms, len(self.mean))
+        return functional.normalize(self.layers((roots - self.mean) / self.scale), dim=1)
 
 
 class LearnedChiSquare(nn.Module):

@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from sklearn.kernel_ridge import KernelRidge
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from igps.nn.fitted import KernelHead, WhitenedHead
+from igps.retrieval import cosine, retrieval_scores
+
+N_CELLS = 60
+
+
+@pytest.fixture
+def collection() -> tuple[Tensor, Tensor]:
+    """Histograms of 8 classes of 6 shapes; all classes vary along the same two directions, and much."""
+    generator = torch.Generator().manual_seed(0)
+    kinds = torch.rand(8, 1, N_CELLS, generator=generator)
+    nuisance = torch.randn(8, 6, 2, generator=generator) @ torch.randn(2, N_CELLS, generator=generator)
+    noise = 0.05 * torch.randn(8, 6, N_CELLS, generator=generator)
+    histograms = (kinds + 0.5 * nuisance + noise).exp().flatten(0, 1)
+    return histograms / histograms.sum(dim=1, keepdim=True), torch.arange(8).repeat_interleave(6)
+
+
+def ft(embedding: Tensor, labels: Tensor) -> float:
+    return retrieval_scores(cosine(embedding, embedding), labels).mean()["ft"]
+
+
+def test_whitening_is_the_inverse_root_of_the_covariance(collection: tuple[Tensor, Tensor]) -> None:
+    histograms, labels = collection
+    roots = histograms.double().sqrt().numpy()
+    residuals = np.concatenate([roots[labels == c] - roots[labels == c].mean(axis=0) for c in range(8)])
+    within = residuals.T @ residuals
+    within /= within.trace() / 40  # the mean of the 40 eigenvalues that the residuals of 48 shapes of 8 classes allow
+    values, vectors = np.linalg.eigh(within + 0.5 * np.eye(N_CELLS))
+    expected = (roots - roots.mean(axis=0)) @ vectors / np.sqrt(values) @ vectors.T
+    head = WhitenedHead(N_CELLS, n_directions=40, shrinkage=0.5).fit(histograms, labels)
+    np.testing.assert_allclose(head(histograms), normalize(torch.from_numpy(expected)), atol=2e-5)
+
+
+def test_few_directions_are_the_largest(collection: tuple[Tensor, Tensor]) -> None:
+    histograms, labels = collection
+    few = WhitenedHead(N_CELLS, n_directions=3).fit(histograms, labels)
+    many = WhitenedHead(N_CELLS, n_directions=40).fit(histograms, labels)
+    torch.testing.assert_close(few.gains, many.gains[:3])
+    torch.testing.assert_close((few.directions @ many.directions[:3].T).abs(), torch.eye(3), atol=1e-4, rtol=0)
+
+
+def test_as_made_it_is_the_root_at_unit_length(collection: tuple[Tensor, Tensor]) -> None:
+    torch.testing.assert_close(WhitenedHead(N_CELLS)(collection[0]), collection[0].sqrt())
+
+
+def test_whitening_serves_classes_it_was_not_fitted_to(collection: tuple[Tensor, Tensor]) -> None:
+    histograms, labels = collection
+    trained = labels < 4
+    head = WhitenedHead(N_CELLS, shrinkage=0.1).fit(histograms[trained], labels[trained])
+    unseen = histograms[~trained]
+    assert ft(head(unseen), labels[~trained]) > ft(unseen.sqrt(), labels[~trained]) + 0.2
+
+
+def test_order_of_the_training_shapes_does_not_matter(collection: tuple[Tensor, Tensor]) -> None:
+    histograms, labels = collection
+    order = torch.randperm(len(labels), generator=torch.Generator().manual_seed(1))
+    one = KernelHead(N_CELLS, 48, 8).fit(histograms, labels)
+    other = KernelHead(N_CELLS, 48, 8).fit(histograms[order], labels[order])
+    torch.testing.assert_close(one(histograms), other(histograms), atol=1e-4, rtol=0)
+
+
+def test_kernel_head_is_kernel_ridge_regression(collection: tuple[Tensor, Tensor]) -> None:
+    histograms, labels = collection
+    train, test = slice(0, 48, 2), slice(1, 48, 2)
+    head = KernelHead(N_CELLS, 24, 8, ridge=0.1).fit(histograms[train], labels[train])
+    whitened = WhitenedHead(N_CELLS).fit(histograms[train], labels[train])(histograms).double().numpy()
+    distances = 1 - whitened @ whitened[train].T
+    kernel = np.exp(-distances / np.median(distances[train][np.triu_indices(24, 1)]))
+    targets = np.eye(8)[labels[train]]
+    oracle = KernelRidge(alpha=0.1, kernel="precomputed").fit(kernel[train], targets)
+    expected = oracle.predict(kernel[test])
+    np.testing.assert_allclose(head.scores(histograms[test]), expected, atol=2e-3)
+    np.testing.assert_array_equal(head.predict(histograms[test]), expected.argmax(axis=1))
+
+
+def test_identical_shapes_have_no_direction() -> None:
+    histograms = torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.0, 0.25, 0.75], [0.0, 0.25, 0.75]])
+    head = WhitenedHead(3).fit(histograms, torch.tensor([0, 0, 1, 1]))
+    centred = histograms.sqrt() - histograms.sqrt().mean(dim=0)
+    torch.testing.assert_close(head(histograms), normalize(centred))
+
+
+def test_classes_keep_their_names(collection: tuple[Tensor, Tensor]) -> None:
+    histograms, labels = collection
+    head = KernelHead(N_CELLS, 48, 8).fit(histograms, 10 * labels + 3)
+    assert (head.predict(histograms) == 10 * labels + 3).all()
+
+
+def test_state_round_trips(collection: tuple[Tensor, Tensor]) -> None:
+    histograms, labels = collection
+    head = KernelHead(N_CELLS, 48, 8).fit(histograms, labels)
+    copy = KernelHead(N_CELLS, 48, 8)
+    copy.load_state_dict(head.state_dict())
+    torch.testing.assert_close(copy(histograms), head(histograms))
+
+
+def test_errors_name_the_argument(collection: tuple[Tensor, Tensor]) -> None:
+    histograms, labels = collection
+    with pytest.raises(ValueError, match="expected 60 cells, got 59"):
+        WhitenedHead(N_CELLS).fit(histograms[:, 1:], labels)
+    with pytest.raises(ValueError, match="labels: expected one for each of 48"):
+        WhitenedHead(N_CELLS).fit(histograms, labels[1:])
+    with pytest.raises(ValueError, match="labels: expected a class of at least two"):
+        WhitenedHead(N_CELLS).fit(histograms[:4], torch.arange(4))
+    with pytest.raises(ValueError, match="expected 40 shapes of 8 classes, got 48 of 8"):
+        KernelHead(N_CELLS, 40, 8).fit(histograms, labels)
+    with pytest.raises(ValueError, match="shrinkage"):
+        WhitenedHead(N_CELLS, shrinkage=0)
+    with pytest.raises(ValueError, match="ridge"):
+        KernelHead(N_CELLS, 40, 8, ridge=0)
+    with pytest.raises(ValueError, match="n_classes"):
+        KernelHead(N_CELLS, 4, 8)
