@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -77,6 +77,26 @@ class VolumetricDescriptor(nn.Module):
         )
 
 
+DescriptorName = Literal["interior", "gps", "multiscale", "rich"]
+
+
+def named_descriptor(name: DescriptorName) -> nn.Module:
+    """A descriptor by the name that the command line and the training scripts give it.
+
+    "interior" and "gps" are `VolumetricDescriptor.paper` on interior and surface samples, "multiscale" and "rich" those
+    of `CombinedDescriptor`.
+    """
+    made: dict[str, Callable[[], nn.Module]] = {
+        "interior": VolumetricDescriptor.paper,
+        "gps": lambda: VolumetricDescriptor.paper("surface"),
+        "multiscale": CombinedDescriptor.multiscale,
+        "rich": CombinedDescriptor.rich,
+    }
+    if name not in made:
+        raise ValueError(f"name: expected one of {', '.join(made)}, got {name!r}.")
+    return made[name]()
+
+
 class CombinedDescriptor(nn.Module):
     """Several descriptors side by side as one histogram, in which each has the same share.
 
@@ -93,7 +113,7 @@ class CombinedDescriptor(nn.Module):
         self.parts = nn.ModuleList(parts)
 
     @classmethod
-    def interior(cls) -> CombinedDescriptor:
+    def multiscale(cls) -> CombinedDescriptor:
         """Interior distances alone, of the first 250, 50 and 16 eigenpairs: fine, middle and coarse."""
         return cls(
             [

@@ -124,18 +124,19 @@ class CorrectedDistance(nn.Module):
         pairs = tuple(torch.triu_indices(len(histograms), len(histograms), 1))
         embedding = self.head(histograms)
         for unit, distances in (
-            (self.plain_unit, self._plain(histograms, histograms)),
+            (self.plain_unit, self.plain_distance(histograms, histograms)),
             (self.learned_unit, cosine(embedding, embedding)),
         ):
             unit.copy_(distances[pairs].median().clamp_min(torch.finfo(distances.dtype).tiny))
 
     def forward(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, ...) and (G, ...) histograms to (Q, G) distances."""
-        plain = self._plain(queries, gallery)
+        plain = self.plain_distance(queries, gallery)
         if self.head is None:
             return plain
         learned = cosine(self.head(queries), self.head(gallery))
         return (1 - self.share) * plain / self.plain_unit + self.share * learned / self.learned_unit
 
-    def _plain(self, queries: Tensor, gallery: Tensor) -> Tensor:
+    def plain_distance(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        """(Q, ...) and (G, ...) histograms to (Q, G) distances without the head."""
         return chi_square(queries, gallery) if self.plain is None else self.plain(queries, gallery)

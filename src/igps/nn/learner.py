@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import torch
+import yaml
+from jsonargparse import ArgumentParser
 from pytorch_lightning import LightningModule
 from pytorch_lightning.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 
+from igps.data.datamodule import SignatureDataModule
 from igps.data.dataset import SignatureBatch
 from igps.nn.head import CorrectedDistance
 from igps.retrieval import RetrievalScoresMetric
@@ -72,6 +78,11 @@ class RetrievalLearner(LightningModule):
         """The scale changes with the head."""
         self.distance.calibrate(self._training_histograms())
 
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """The same for a checkpoint of an epoch that is not validated, or its distance would be on an older scale."""
+        self.distance.calibrate(self._training_histograms())
+        checkpoint["state_dict"].update(self.state_dict())
+
     def training_step(self, batch: SignatureBatch, batch_index: int) -> Tensor:
         """Loss of one P×K batch."""
         loss = self.loss(self.distance.head(self(batch)), batch.labels)  # type: ignore[misc]
@@ -116,6 +127,29 @@ class RetrievalLearner(LightningModule):
         parts = [self(batch.to(self.device)) for batch in loader]
         self.train(training)
         return torch.cat(parts)
+
+
+def load_learner(checkpoint: str | Path) -> tuple[RetrievalLearner, SignatureDataModule]:
+    """A trained learner in evaluation mode and its data, from a checkpoint of training/train.py.
+
+    The configuration is read from config.yaml, two folders above the checkpoint, and the parameters without executing
+    any code of the file. Paths in the configuration are taken as they were given to the training.
+
+    Raises:
+        FileNotFoundError: no such checkpoint, or no configuration.
+    """
+    checkpoint = Path(checkpoint)
+    configuration = checkpoint.parent.parent / "config.yaml"
+    for path in (checkpoint, configuration):
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file. Name a checkpoint in the folder that train.py wrote.")
+    parser = ArgumentParser()
+    parser.add_class_arguments(RetrievalLearner, "model")
+    parser.add_class_arguments(SignatureDataModule, "data")
+    stored = yaml.safe_load(configuration.read_text())
+    made = parser.instantiate(parser.parse_object({name: stored[name] for name in ("model", "data")}))
+    made.model.load_state_dict(torch.load(checkpoint, map_location="cpu", weights_only=True)["state_dict"])
+    return made.model.eval(), made.data
 
 
 def _supervised_contrastive() -> nn.Module:

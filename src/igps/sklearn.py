@@ -1,0 +1,105 @@
+"""The descriptors as a scikit-learn transformer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from igps.data.dataset import SignatureDataset, collate
+from igps.geometry.mesh import Mesh
+from igps.geometry.signature import SignatureConfig, compute_signature
+from igps.nn.descriptor import DescriptorName, named_descriptor
+from igps.nn.extraction import describe
+
+try:
+    from sklearn.base import BaseEstimator, TransformerMixin
+except ImportError as error:
+    raise ImportError('igps.sklearn needs scikit-learn: pip install "interior-gps[sklearn]".') from error
+
+
+class VolumetricFeatures(TransformerMixin, BaseEstimator):
+    """Mesh files, or meshes, in; histograms out, one row a mesh; nothing is fitted.
+
+    The square roots of the cells are given by default: their Euclidean distance is Hellinger's between histograms, what
+    linear classifiers and Gaussian kernels on them can work with. For a χ² kernel ask for the cells themselves.
+
+    Args:
+        descriptor: "interior", "gps", "multiscale" or "rich", see `named_descriptor`.
+        square_root: give square roots of the cells.
+        config: of the signatures; if None, the default with the attributes that "rich" asks for.
+        cache_dir: of the signatures of mesh files; the user's cache directory if None. Meshes are not cached.
+        n_workers: processes that compute the signatures of mesh files; all cores if None.
+    """
+
+    def __init__(
+        self,
+        descriptor: DescriptorName = "rich",
+        *,
+        square_root: bool = True,
+        config: SignatureConfig | None = None,
+        cache_dir: str | Path | None = None,
+        n_workers: int | None = None,
+    ) -> None:
+        self.descriptor = descriptor
+        self.square_root = square_root
+        self.config = config
+        self.cache_dir = cache_dir
+        self.n_workers = n_workers
+
+    def fit(self, X: Sequence[str | Path | Mesh], y: Any = None) -> Self:
+        """Check the parameters and the kind of input; there is nothing to learn."""
+        named_descriptor(self.descriptor)
+        _checked(X)
+        return self
+
+    def transform(self, X: Sequence[str | Path | Mesh]) -> NDArray[np.float32]:
+        """(N, cells) features of N mesh files or N meshes.
+
+        Raises:
+            MeshError: a mesh that cannot be used; see `load_mesh`.
+            TypeError: other input.
+        """
+        shapes = _checked(X)
+        config = self.config
+        if config is None:
+            config = SignatureConfig(
+                attributes=("depth", "electrostatic_potential") if self.descriptor == "rich" else ()
+            )
+        descriptor = named_descriptor(self.descriptor)
+        if isinstance(shapes[0], Mesh):
+            with torch.inference_mode():
+                parts = [descriptor(collate([compute_signature(mesh, config)])) for mesh in shapes]
+            features = torch.cat(parts)
+        else:
+            dataset = SignatureDataset(shapes, config, self.cache_dir)
+            dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
+            features = describe(dataset, descriptor)
+        cells = features.flatten(1)
+        return (cells.sqrt() if self.square_root else cells).numpy()
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return True
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.two_d_array = False
+        tags.input_tags.string = True
+        tags.no_validation = True
+        tags.requires_fit = False
+        return tags
+
+
+def _checked(shapes: Sequence[str | Path | Mesh]) -> list[Any]:
+    found = list(np.asarray(shapes, dtype=object).ravel()) if isinstance(shapes, np.ndarray) else list(shapes)
+    kinds = {
+        Mesh if isinstance(shape, Mesh) else Path if isinstance(shape, str | Path) else type(shape) for shape in found
+    }
+    if kinds not in ({Mesh}, {Path}):
+        names = sorted(kind.__name__ for kind in kinds) or ["nothing"]
+        raise TypeError(f"X: expected paths of mesh files, or meshes, got {', '.join(names)}.")
+    return found
