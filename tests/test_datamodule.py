@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -103,6 +104,27 @@ def test_loaders_give_the_parts_and_balanced_batches(root: Path, tmp_path: Path)
     ):
         ids = [name for batch in loader for name in batch.ids]  # type: ignore[union-attr]
         assert ids == [names[i] for i in part]
+
+
+@pytest.mark.parametrize("n_samples", [20, None])
+def test_training_shapes_are_kept_in_memory_thinned(root: Path, tmp_path: Path, n_samples: int | None) -> None:
+    module = SignatureDataModule(
+        root, n_train=3, n_validation=1, classes_per_batch=3, shapes_per_class=2, config=CONFIG,
+        cache_dir=tmp_path / "cache", n_workers=1, n_samples_in_memory=n_samples,
+    )  # fmt: skip
+    module.prepare_data()
+    whole = {item.id: item.signature.interior for item in (module.dataset[i] for i in module.split.train)}
+    (batch,) = module.train_dataloader()
+    shutil.rmtree(tmp_path / "cache")
+    for i, name in enumerate(batch.ids):
+        kept = batch.interior.eigenfunctions[i, batch.interior.mask[i]]
+        assert len(kept) == (n_samples or len(whole[name]))
+        among = (kept[:, None] == torch.from_numpy(whole[name].eigenfunctions)).all(dim=2)
+        assert among.any(dim=1).all()
+    if n_samples is not None:
+        assert len(list(module.train_dataloader())) == 1  # without the cache
+        shutil.rmtree(root)
+        assert len(list(module.train_dataloader())) == 1
 
 
 def test_a_bad_mesh_stops_training(root: Path, tmp_path: Path) -> None:

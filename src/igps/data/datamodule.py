@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader
 
 from igps.data.dataset import LabelledSignature, SignatureBatch, SignatureDataset, collate
-from igps.geometry.signature import SignatureConfig
+from igps.geometry.signature import Samples, SignatureConfig
 
 Protocol = Literal["seen", "unseen"]
 
@@ -109,6 +110,8 @@ class SignatureDataModule(LightningDataModule):
         n_test: classes to test ("unseen" only); all others if None.
         split_seed: of the split.
         classes_per_batch, shapes_per_class: P and K of a training batch.
+        n_samples_in_memory: interior and surface samples of each training shape, a fixed random subset, that are kept
+            in memory from step to step; None reads whole signatures from the cache at each step.
         config: of the signatures.
         cache_dir: of the signatures; the user's cache directory if None.
         n_workers: processes that compute missing signatures; all cores if None.
@@ -124,6 +127,7 @@ class SignatureDataModule(LightningDataModule):
         split_seed: int = 0,
         classes_per_batch: int = 10,
         shapes_per_class: int = 4,
+        n_samples_in_memory: int | None = 1000,
         config: SignatureConfig | None = None,
         cache_dir: Path | None = None,
         n_workers: int | None = None,
@@ -138,6 +142,8 @@ class SignatureDataModule(LightningDataModule):
             raise ValueError(f"{root}: no classes found. Expected one folder per class, or a labels.csv (file,label).")
         self.classes_per_batch = classes_per_batch
         self.shapes_per_class = shapes_per_class
+        self.n_samples_in_memory = n_samples_in_memory
+        self._in_memory: list[LabelledSignature] = []
         self.n_workers = n_workers
         labels = self.dataset.labels
         if protocol == "seen":
@@ -160,7 +166,12 @@ class SignatureDataModule(LightningDataModule):
         sampler = MPerClassSampler(
             part.labels, self.shapes_per_class, batch_size=n_batch, length_before_new_iter=max(len(part), n_batch)
         )
-        return DataLoader(part, batch_size=n_batch, sampler=sampler, collate_fn=collate)
+        if self.n_samples_in_memory is None:
+            return DataLoader(part, batch_size=n_batch, sampler=sampler, collate_fn=collate)
+        if not self._in_memory:
+            self._in_memory = [_thinned(part[i], self.n_samples_in_memory) for i in range(len(part))]
+        # A list is a map-style dataset to a DataLoader.
+        return DataLoader(self._in_memory, batch_size=n_batch, sampler=sampler, collate_fn=collate)  # type: ignore[arg-type]
 
     def training_in_order(self) -> DataLoader[LabelledSignature]:
         """The training part, each shape once: for what is measured on it, such as a distance's median."""
@@ -182,3 +193,16 @@ class SignatureDataModule(LightningDataModule):
 
     def _in_order(self, indices: Sequence[int]) -> DataLoader[LabelledSignature]:
         return DataLoader(self.dataset.subset(indices), batch_size=16, collate_fn=collate)
+
+
+def _thinned(item: LabelledSignature, n_samples: int) -> LabelledSignature:
+    generator = np.random.default_rng(0)
+
+    def subset(samples: Samples) -> Samples:
+        chosen = np.sort(generator.permutation(len(samples))[:n_samples])
+        attributes = {name: values[chosen] for name, values in samples.attributes.items()}
+        return Samples(samples.points[chosen], samples.eigenfunctions[chosen], attributes)
+
+    signature = item.signature
+    thinned = replace(signature, interior=subset(signature.interior), surface=subset(signature.surface))
+    return replace(item, signature=thinned)
