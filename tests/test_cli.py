@@ -12,6 +12,7 @@ import pytest
 import torch
 import trimesh
 
+from igps import cli
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.geometry.signature import SignatureConfig
@@ -172,7 +173,7 @@ def test_errors_are_one_line(
     assert re.search(message, error[0])
 
 
-@pytest.mark.parametrize("command", ["retrieve", "extract", "query", "demo"])
+@pytest.mark.parametrize("command", ["retrieve", "extract", "query", "demo", "compare"])
 def test_help_explains_every_option(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
@@ -183,3 +184,26 @@ def test_help_explains_every_option(
     if command != "demo":
         for word in ("--cache", "--strict", "--repair", "--signature.min_samples", "refined until"):
             assert word in text, word
+
+
+def test_commands_may_be_grouped(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def pose(mesh: Path, classes: list[int] | None = None, exact: bool = False, size: float = 2.0) -> None:
+        """Draw a pose.
+
+        Args:
+            mesh: what to draw.
+            classes: which to show.
+            exact: without a tolerance
+            size: in inches.
+        """
+        print(mesh, classes, exact, size)
+
+    monkeypatch.setattr(cli, "COMMANDS", {"figure": {"pose": pose, "demo": cli.demo}, "query": cli.query})
+    igps(monkeypatch, "figure", "pose", "a.off", "--classes", "1", "2", "--exact")
+    igps(monkeypatch, "figure", "pose", "a.off", "--size", "3")
+    assert capsys.readouterr().out.splitlines() == ["a.off [1, 2] True 2.0", "a.off None False 3.0"]
+    for arguments, words in ((["figure"], ("pose", "demo")), (["figure", "pose"], ("what to draw", "which to show"))):
+        with pytest.raises(SystemExit, match="0"):
+            igps(monkeypatch, *arguments, "--help")
+        text = capsys.readouterr().out
+        assert all(word in text for word in words)

@@ -194,9 +194,9 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(
         "import os, signal\n"
-        "from igps.data.dataset import _process_pool\n"
+        "from igps.data.dataset import process_pool\n"
         "if __name__ == '__main__':\n"
-        "    with _process_pool(1) as pool:\n"
+        "    with process_pool(1) as pool:\n"
         "        print(pool.submit(os.getpid).result(), flush=True)\n"
         "        os.kill(os.getpid(), signal.SIGKILL)\n"
     )

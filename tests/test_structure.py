@@ -1,4 +1,4 @@
-"""The imports run one way: geometry → data → nn → the command line; retrieval stands apart."""
+"""The imports run one way: geometry → data → nn → baselines → the command line; retrieval stands apart."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ MAY_IMPORT = {
     "data": {"geometry", "data"},
     "nn": {"geometry", "data", "nn", "retrieval"},
     "retrieval": {"retrieval"},
+    "baselines": {"geometry", "data", "nn", "retrieval", "baselines"},
 }
 
 
@@ -22,7 +23,7 @@ def imported_rooms(path: Path) -> set[str]:
     rooms = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module:
-            names = [node.module]
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
         elif isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         else:
@@ -37,6 +38,13 @@ def test_imports_run_one_way(room: str) -> None:
     assert files
     for file in files:
         assert imported_rooms(file) <= MAY_IMPORT[room], file
+
+
+def test_only_the_command_line_imports_baselines() -> None:
+    importing = {
+        file.relative_to(PACKAGE).parts[0] for file in PACKAGE.rglob("*.py") if "baselines" in imported_rooms(file)
+    }
+    assert importing == {"baselines", "cli"}
 
 
 def test_front_door_opens() -> None:

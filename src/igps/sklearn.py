@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from igps.data.dataset import SignatureDataset, collate
 from igps.geometry.mesh import Mesh
 from igps.geometry.signature import SignatureConfig, compute_signature
-from igps.nn.descriptor import DescriptorName, named_descriptor
 from igps.nn.extraction import describe
+from igps.nn.presets import DescriptorName, preset
+from igps.retrieval import chi_square
 
 try:
     from sklearn.base import BaseEstimator, TransformerMixin
@@ -23,15 +24,15 @@ except ImportError as error:
 
 
 class VolumetricFeatures(TransformerMixin, BaseEstimator):
-    """Mesh files, or meshes, in; histograms out, one row a mesh; nothing is fitted.
+    """Mesh files, or meshes, in; histograms or embeddings out, one row a mesh; nothing is fitted.
 
-    The square roots of the cells are given by default: their Euclidean distance is Hellinger's between histograms, what
-    linear classifiers and Gaussian kernels on them can work with. For a χ² kernel ask for the cells themselves.
+    The square roots of a histogram's cells are given by default: their Euclidean distance is Hellinger's between
+    histograms, what linear classifiers and Gaussian kernels can work with. For a χ² kernel ask for the cells.
 
     Args:
-        descriptor: "interior", "gps", "multiscale" or "rich", see `named_descriptor`.
-        square_root: give square roots of the cells.
-        config: of the signatures; if None, the default with the attributes that "rich" asks for.
+        descriptor: "interior", "gps", "multiscale", "rich" or "pretrained", see `preset`.
+        square_root: give square roots of the cells; embeddings ("pretrained") are given as they are.
+        config: of the signatures; if None, the default with the attributes that the descriptor asks for.
         cache_dir: of the signatures of mesh files; the user's cache directory if None. Meshes are not cached.
         n_workers: processes that compute the signatures of mesh files; all cores if None.
     """
@@ -53,7 +54,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
 
     def fit(self, X: Sequence[str | Path | Mesh], y: Any = None) -> Self:
         """Check the parameters and the kind of input; there is nothing to learn."""
-        named_descriptor(self.descriptor)
+        preset(self.descriptor)
         _checked(X)
         return self
 
@@ -65,12 +66,9 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
             TypeError: other input.
         """
         shapes = _checked(X)
-        config = self.config
-        if config is None:
-            config = SignatureConfig(
-                attributes=("depth", "electrostatic_potential") if self.descriptor == "rich" else ()
-            )
-        descriptor = named_descriptor(self.descriptor)
+        chosen = preset(self.descriptor)
+        config = self.config or SignatureConfig(attributes=chosen.attributes)
+        descriptor = chosen.make()
         if isinstance(shapes[0], Mesh):
             with torch.inference_mode():
                 parts = [descriptor(collate([compute_signature(mesh, config)])) for mesh in shapes]
@@ -80,7 +78,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
             dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
             features = describe(dataset, descriptor)
         cells = features.flatten(1)
-        return (cells.sqrt() if self.square_root else cells).numpy()
+        return (cells.sqrt() if self.square_root and chosen.distance is chi_square else cells).numpy()
 
     def __sklearn_is_fitted__(self) -> bool:
         return True

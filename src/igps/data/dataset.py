@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.sources import MeshFiles, find_meshes, mesh_files
-from igps.geometry.mesh import Component, MeshError, load_mesh
+from igps.geometry.mesh import Component, Mesh, MeshError, load_mesh
 from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
 
 logger = logging.getLogger(__name__)
@@ -251,6 +251,14 @@ class SignatureDataset(Dataset[LabelledSignature]):
             signature = replace(signature, interior=_with_attributes(signature.interior, self._attributes, name))
         return LabelledSignature(signature, label, name)
 
+    def mesh(self, index: int) -> Mesh:
+        """The mesh itself, read and checked as for its Signature.
+
+        Raises:
+            MeshError: it cannot be used.
+        """
+        return self._recipe.mesh(self.files.paths[index])
+
     def subset(self, indices: Sequence[int]) -> SignatureDataset:
         """The dataset of some of the meshes; `classes` keeps all names, so that labels keep their numbers."""
         chosen = object.__new__(SignatureDataset)
@@ -291,7 +299,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
                 tqdm(total=len(self), initial=len(self) - len(missing), desc="signatures", disable=not progress)
             )
             if executor is None and n_workers > 1:
-                executor = stack.enter_context(_process_pool(n_workers))
+                executor = stack.enter_context(process_pool(n_workers))
             results = _map(executor, self._recipe, {i: self.files.paths[i] for i in missing})
             for i, error in stack.enter_context(contextlib.closing(results)):
                 bar.update()
@@ -332,12 +340,14 @@ class _Recipe:
     component: Component | None
     allow_open: bool
 
+    def mesh(self, path: Path) -> Mesh:
+        return load_mesh(path, repair=self.repair, component=self.component, allow_open=self.allow_open)
+
     def signature(self, path: Path) -> Signature:
         cache, key = SignatureCache(self.cache_dir), self._key(path)
         signature = cache.get(key)
         if signature is None:
-            mesh = load_mesh(path, repair=self.repair, component=self.component, allow_open=self.allow_open)
-            signature = compute_signature(mesh, self.config)
+            signature = compute_signature(self.mesh(path), self.config)
             cache.put(key, signature)
         return signature
 
@@ -387,7 +397,8 @@ def _map(
 
 
 @contextlib.contextmanager
-def _process_pool(n_workers: int) -> Iterator[Executor]:
+def process_pool(n_workers: int) -> Iterator[Executor]:
+    """A pool of spawned processes with one BLAS thread each, which end with this process."""
     # One BLAS thread a worker, or n workers on n cores run n² threads. The libraries read the variables when they are
     # first imported, which in a spawned process is before any initialiser runs.
     before: dict[str, Any] = {name: os.environ.get(name) for name in _THREAD_VARIABLES}

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
 import torch
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from igps.data.dataset import SignatureBatch
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential
+from igps.nn.fitted import WhitenedHead
 from igps.nn.histogram import PairHistogram
 
 SampleKind = Literal["interior", "surface"]
+
+PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
+"""The parameters of `VolumetricDescriptor.pretrained`, written by training/pretrain.py."""
 
 # Class centres of further scalars; those of the depth have their boundaries at 0.015, 0.03 and 0.06 of √area.
 _DEPTH = (0.0075, 0.0225, 0.0375, 0.0825)
@@ -59,6 +65,19 @@ class VolumetricDescriptor(nn.Module):
         """Rustamov 2010: commute time, 4 potential classes, 64 distance bins; nothing to learn."""
         return cls(SpectralEmbedding(), PairHistogram(n_classes=4, n_bins=64), samples)
 
+    @classmethod
+    def pretrained(cls) -> EmbeddedDescriptor:
+        """`CombinedDescriptor.rich` under a `WhitenedHead` that was fitted to generated articulated shapes.
+
+        It needs no label of the shapes that it compares. Distances are `cosine` distances. The model card is in the
+        README; training/pretrain.py makes the file.
+        """
+        stored = {name: tensor.float() for name, tensor in load_file(PRETRAINED).items()}
+        n_directions, n_cells = stored["directions"].shape
+        head = WhitenedHead(n_cells, n_directions)
+        head.load_state_dict(stored)
+        return EmbeddedDescriptor(CombinedDescriptor.rich(), head).eval()
+
     def forward(self, batch: SignatureBatch) -> Tensor:
         """(N, C(C+1)/2, B) histograms, with Euclidean bins (N, C(C+1)/2, B, E), each shape's of sum 1."""
         samples = batch.interior if self.samples == "interior" else batch.surface
@@ -75,26 +94,6 @@ class VolumetricDescriptor(nn.Module):
             attributes=samples.attributes,
             points=samples.points / length,
         )
-
-
-DescriptorName = Literal["interior", "gps", "multiscale", "rich"]
-
-
-def named_descriptor(name: DescriptorName) -> nn.Module:
-    """A descriptor by the name that the command line and the training scripts give it.
-
-    "interior" and "gps" are `VolumetricDescriptor.paper` on interior and surface samples, "multiscale" and "rich" those
-    of `CombinedDescriptor`.
-    """
-    made: dict[str, Callable[[], nn.Module]] = {
-        "interior": VolumetricDescriptor.paper,
-        "gps": lambda: VolumetricDescriptor.paper("surface"),
-        "multiscale": CombinedDescriptor.multiscale,
-        "rich": CombinedDescriptor.rich,
-    }
-    if name not in made:
-        raise ValueError(f"name: expected one of {', '.join(made)}, got {name!r}.")
-    return made[name]()
 
 
 class CombinedDescriptor(nn.Module):
@@ -143,6 +142,24 @@ class CombinedDescriptor(nn.Module):
     def forward(self, batch: SignatureBatch) -> Tensor:
         """(N, cells) histograms, each shape's of sum 1."""
         return torch.cat([part(batch).flatten(1) for part in self.parts], dim=1) / len(self.parts)
+
+
+class EmbeddedDescriptor(nn.Module):
+    """A descriptor and the head that embeds its histograms.
+
+    Args:
+        descriptor: `SignatureBatch` to histograms (N, ...).
+        head: histograms to (N, D) of length 1.
+    """
+
+    def __init__(self, descriptor: nn.Module, head: nn.Module) -> None:
+        super().__init__()
+        self.descriptor = descriptor
+        self.head = head
+
+    def forward(self, batch: SignatureBatch) -> Tensor:
+        """(N, D) embeddings of length 1."""
+        return self.head(self.descriptor(batch))
 
 
 def _layout(n_eigenpairs: int, histogram: PairHistogram) -> VolumetricDescriptor:

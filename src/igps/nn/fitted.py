@@ -122,13 +122,18 @@ class KernelHead(nn.Module):
         self.register_buffer("classes", torch.arange(n_classes))
 
     @torch.no_grad()
-    def fit(self, histograms: Tensor, labels: Tensor) -> Self:
+    def fit(self, histograms: Tensor, labels: Tensor, *, whiten: bool = True) -> Self:
         """Fit whitening and regression to the histograms (N, ...) and classes (N,) of the training shapes.
+
+        Args:
+            histograms, labels: of the training shapes.
+            whiten: False leaves `whitened` as it is: where labels are few, one fitted to other shapes serves better.
 
         Raises:
             ValueError: numbers of shapes or classes other than the head was made for.
         """
-        self.whitened.fit(histograms, labels)
+        if whiten:
+            self.whitened.fit(histograms, labels)
         classes, members = labels.to(self.classes.device).unique(return_inverse=True)
         if (len(histograms), len(classes)) != self.coefficients.shape:
             raise ValueError(

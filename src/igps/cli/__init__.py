@@ -1,0 +1,87 @@
+"""The command line: `igps retrieve`, `extract`, `query`, `demo` and `compare`, one function each."""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any, get_args, get_origin, get_type_hints
+
+from docstring_parser import parse
+from jsonargparse import ArgumentParser, Namespace
+
+from igps.cli.compare import compare
+from igps.cli.demo import demo
+from igps.cli.reading import FLAGS
+from igps.cli.retrieval import extract, query, retrieve
+
+Command = Callable[..., None]
+Commands = Mapping[str, "Command | Commands"]
+
+COMMANDS: Commands = {"retrieve": retrieve, "extract": extract, "query": query, "demo": demo, "compare": compare}
+"""What follows `igps`: a function, or the commands of a group by name."""
+
+
+def main() -> None:
+    """Entry point of the `igps` command."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    parser = ArgumentParser(prog="igps", description="Volumetric shape retrieval by interior Global Point Signatures.")
+    _add_commands(parser, COMMANDS)
+    command, options = _chosen(parser.instantiate(parser.parse_args()), COMMANDS)
+    try:
+        command(**options)
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
+        # Expected of bad input, and said in full by the message; a traceback would bury it.
+        print(f"igps: {error}", file=sys.stderr)
+        sys.exit(1)
+
+
+def _chosen(arguments: Namespace, commands: Commands) -> tuple[Command, dict[str, Any]]:
+    name: str = arguments.subcommand
+    command, options = commands[name], arguments[name]
+    return (command, options.as_dict()) if callable(command) else _chosen(options, command)
+
+
+def _add_commands(parser: ArgumentParser, commands: Commands) -> None:
+    added = parser.add_subcommands(required=True)
+    for name, command in commands.items():
+        if callable(command):
+            summary, _, rest = (inspect.getdoc(command) or "").partition("\n")
+            one = ArgumentParser(description=summary + "\n" + rest.partition("Args:")[0])
+            _add_options(one, command)
+            added.add_subcommand(name, one, help=summary)
+        else:
+            group = ArgumentParser(description=f"One of {', '.join(command)}.")
+            added.add_subcommand(name, group, help=", ".join(command))
+            _add_commands(group, command)  # a group takes commands only once it has its own place
+
+
+def _add_options(parser: ArgumentParser, command: Command) -> None:
+    """Options from the signature and docstring of a command, written as a shell user expects them.
+
+    A first parameter without default is positional, a list takes several words, and a truth value is a switch.
+    """
+    kinds = get_type_hints(command)
+    meanings = {parameter.arg_name: parameter.description for parameter in parse(command.__doc__ or "").params}
+    parameters = inspect.signature(command).parameters
+    switches = {name: meanings.get(name) for name in parameters if kinds[name] is bool}
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+        switches = {**FLAGS, **switches}
+    by_hand: set[str | int] = set(switches)
+    for place, (name, parameter) in enumerate(parameters.items()):
+        positional = place == 0 and parameter.default is parameter.empty
+        item = _list_item(kinds[name])
+        if positional or item is not None:
+            option = name if positional else f"--{name}"
+            parser.add_argument(option, nargs=item and "+", type=item or kinds[name], help=meanings[name])
+            by_hand.add(name)
+    parser.add_function_arguments(command, skip=by_hand)
+    for name, meaning in switches.items():
+        parser.add_argument(f"--{name}", action="store_true", help=meaning)
+
+
+def _list_item(kind: Any) -> Any:
+    """What a list, or an optional list, is of; None for everything else."""
+    lists = [one for one in (kind, *get_args(kind)) if get_origin(one) is list]
+    return get_args(lists[0])[0] if lists else None

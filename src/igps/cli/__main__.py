@@ -1,0 +1,6 @@
+"""`python -m igps.cli` is `igps`."""
+
+from igps.cli import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""The scripts of training/, run as a user runs them, on generated shapes."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from igps.data.shapes import ArticulatedShapes
+
+PROJECT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("training")
+    ArticulatedShapes(n_classes=4, n_per_class=6, n_vertices=700).write(root / "meshes")
+    return root
+
+
+def run(script: str, *arguments: object) -> str:
+    command = [sys.executable, str(PROJECT / "training" / script), *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT / "src")}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_splits_and_classification(root: Path) -> None:
+    table = run(
+        "evaluate.py", "splits", root / "meshes", "--descriptor", "rich", "--n_train", 3, "--n_splits", 2,
+        "--cache", root / "cache",
+    )  # fmt: skip
+    assert re.search(r"none +\d+\.\d ± .*\nwhitened +\d+\.\d ± .*\nkernel +\d+\.\d ± ", table), table
+    unseen = run(
+        "evaluate.py", "splits", root / "meshes", "--descriptor", "interior", "--protocol", "unseen", "--n_train", 2,
+        "--n_splits", 2, "--cache", root / "cache",
+    )  # fmt: skip
+    assert re.search(r"unseen, n_train=2, 2 splits.*\n.*\nnone .*\nwhitened ", unseen), unseen
+    accuracy = run("classify.py", root / "meshes", "--n_train", 3, "--n_splits", 2, "--cache", root / "cache")
+    assert float(accuracy.split()[1]) > 50, accuracy  # by chance 25
+
+
+def test_checkpoint_to_table_figure_and_classifier(root: Path) -> None:
+    out = root / "out"
+    run(
+        "train.py", "fit", "--config", PROJECT / "configs/default.yaml", "--config", PROJECT / "configs/smoke.yaml",
+        "--data.root", root / "meshes", "--data.cache_dir", root / "cache_plain", "--data.n_train", 4,
+        "--data.n_validation", 2, "--data.shapes_per_class", 2, "--trainer.default_root_dir", out,
+    )  # fmt: skip
+    (checkpoint,) = out.rglob("*.ckpt")
+    table = run("evaluate.py", "checkpoint", checkpoint, "--out", out / "evaluation")
+    scores = {line.split()[0]: [float(x) for x in line.split()[1:]] for line in table.splitlines()[1:3]}
+    assert set(scores) == {"plain", "learned"}
+    assert all(0 < value <= 100 for row in scores.values() for value in row)
+    assert (out / "evaluation/layout.png").stat().st_size > 10_000
+    accuracy = run("classify.py", root / "meshes", "--checkpoint", checkpoint)
+    assert float(accuracy.split()[1]) > 40, accuracy

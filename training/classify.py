@@ -1,0 +1,73 @@
+"""Classification accuracy over several seeded splits, on fixed or on trained histograms.
+
+    python training/classify.py DATA --descriptor rich
+    python training/classify.py DATA --checkpoint build/training/lightning_logs/version_0/checkpoints/X.ckpt
+
+With a checkpoint the features are the histograms of its learned bins and filter, on the checkpoint's own split.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from statistics import mean, stdev
+
+import torch
+from jsonargparse import auto_cli
+from torch import Tensor
+
+from igps.data.datamodule import Split, split_seen
+from igps.data.dataset import SignatureDataset
+from igps.geometry.signature import SignatureConfig
+from igps.nn.extraction import describe
+from igps.nn.fitted import KernelHead
+from igps.nn.learner import load_learner
+from igps.nn.presets import DescriptorName, preset
+
+
+def classify(
+    root: Path,
+    descriptor: DescriptorName = "rich",
+    checkpoint: Path | None = None,
+    n_train: int = 10,
+    n_splits: int = 5,
+    first_seed: int = 100,
+    cache: Path | None = None,
+) -> None:
+    """Share of test shapes whose class is found by a `KernelHead`, mean ± standard deviation over splits.
+
+    Args:
+        root: labelled collection.
+        descriptor: the features.
+        checkpoint: of train.py with protocol seen; its learned histograms are the features.
+        n_train: shapes of each class to train on.
+        n_splits: how many splits, with the seeds from `first_seed` on.
+        first_seed: see n_splits.
+        cache: folder of cached signatures; the user's cache directory if not given.
+    """
+    if checkpoint is None:
+        dataset = SignatureDataset(root, SignatureConfig(attributes=preset(descriptor).attributes), cache)
+        dataset.precompute(strict=True)
+        histograms = describe(dataset, preset(descriptor).make(), progress=True)
+        seeds = range(first_seed, first_seed + n_splits)
+        found = [split_seen(dataset.labels, n_train, seed=seed) for seed in seeds]
+        labels = dataset.labels
+    else:
+        learner, data = load_learner(checkpoint)
+        data.prepare_data()
+        histograms, labels = describe(data.dataset, learner.descriptor, progress=True), data.dataset.labels
+        # The validation part chose nothing here.
+        found = [Split(data.split.train + data.split.validation, (), data.split.test)]
+    accuracy = [100 * _accuracy(histograms.flatten(1), labels, split) for split in found]
+    spread = stdev(accuracy) if len(accuracy) > 1 else 0.0
+    print(f"accuracy {mean(accuracy):.1f} ± {spread:.1f} percent over {len(accuracy)} splits")
+
+
+def _accuracy(histograms: Tensor, labels: Tensor, split: Split) -> float:
+    train, test = torch.tensor(split.train), torch.tensor(split.test)
+    head = KernelHead(histograms.shape[1], len(train), len(labels[train].unique()))
+    predicted = head.fit(histograms[train], labels[train]).predict(histograms[test])
+    return float((predicted == labels[test]).float().mean())
+
+
+if __name__ == "__main__":
+    auto_cli(classify)

@@ -1,0 +1,109 @@
+"""Retrieval scores over several seeded splits, and of a trained checkpoint.
+
+    python training/evaluate.py splits DATA --descriptor rich --protocol unseen
+    python training/evaluate.py checkpoint build/training/lightning_logs/version_0/checkpoints/X.ckpt
+
+Nothing is chosen here: the heads are fitted to the training part with fixed parameters, the test part is scored once.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from statistics import mean, stdev
+from typing import Literal
+
+import torch
+from jsonargparse import auto_cli
+from torch import Tensor, nn
+
+from igps.data.datamodule import Protocol, Split, split_seen, split_unseen
+from igps.data.dataset import SignatureDataset
+from igps.figures.learned import learned_layout
+from igps.geometry.signature import SignatureConfig
+from igps.nn.extraction import describe
+from igps.nn.fitted import KernelHead, WhitenedHead
+from igps.nn.head import CorrectedDistance
+from igps.nn.learner import load_learner
+from igps.nn.presets import DescriptorName, preset
+from igps.retrieval import retrieval_scores
+
+Head = Literal["none", "whitened", "kernel"]
+COLUMNS = {"ft": "FT", "nn": "NN", "dcg": "DCG", "st": "ST", "adr": "ADR", "map": "mAP"}
+
+
+def splits(
+    root: Path,
+    descriptor: DescriptorName = "interior",
+    protocol: Protocol = "seen",
+    n_train: int = 10,
+    n_test: int | None = None,
+    n_splits: int = 5,
+    first_seed: int = 100,
+    cache: Path | None = None,
+) -> None:
+    """Scores of the plain chi-square distance and of the fitted heads: mean ± standard deviation over splits.
+
+    Args:
+        root: labelled collection.
+        descriptor: what is compared.
+        protocol: seen splits every class, unseen splits the classes.
+        n_train: shapes of each class (seen) or classes (unseen) to fit to.
+        n_test: classes to test (unseen); all others if not given.
+        n_splits: how many splits, with the seeds from `first_seed` on.
+        first_seed: see n_splits.
+        cache: folder of cached signatures; the user's cache directory if not given.
+    """
+    dataset = SignatureDataset(root, SignatureConfig(attributes=preset(descriptor).attributes), cache)
+    dataset.precompute(strict=True)
+    histograms, labels = describe(dataset, preset(descriptor).make(), progress=True).flatten(1), dataset.labels
+    print(f"{descriptor}, {protocol}, n_train={n_train}, {n_splits} splits from seed {first_seed}, percent")
+    print(f"{'head':<10}" + "".join(f"{title:>14}" for title in COLUMNS.values()))
+    for head in ("none", "whitened", "kernel"):
+        results = []
+        for seed in range(first_seed, first_seed + n_splits):
+            if protocol == "seen":
+                split = split_seen(labels, n_train, seed=seed)
+            else:
+                split = split_unseen(labels, n_train, n_test=n_test, seed=seed)
+            results.append(score(histograms, labels, split, head))
+        values = [[100 * one[name] for one in results] for name in COLUMNS]
+        print(f"{head:<10}" + "".join(f"{mean(v):>8.1f} ± {stdev(v) if n_splits > 1 else 0:>3.1f}" for v in values))
+
+
+def score(histograms: Tensor, labels: Tensor, split: Split, head: Head) -> dict[str, float]:
+    """Scores of the test part, each shape against the others."""
+    train, test = torch.tensor(split.train), torch.tensor(split.test)
+    fitted: nn.Module | None = None
+    if head == "whitened":
+        fitted = WhitenedHead(histograms.shape[1]).fit(histograms[train], labels[train])
+    elif head == "kernel":
+        n_classes = len(labels[train].unique())
+        fitted = KernelHead(histograms.shape[1], len(train), n_classes).fit(histograms[train], labels[train])
+    distance = CorrectedDistance(fitted, share=1.0)
+    return retrieval_scores(distance(histograms[test], histograms[test]), labels[test]).mean()
+
+
+def checkpoint(path: Path, out: Path = Path("build/evaluation")) -> None:
+    """Scores of a checkpoint on the test part of its own split, beside the plain distance; and what it has learned.
+
+    Args:
+        path: the checkpoint; its configuration is read from config.yaml two folders up, where train.py puts it.
+        out: folder for layout.png, the learned bins and filter against their start.
+    """
+    learner, data = load_learner(path)
+    data.prepare_data()
+    part = data.dataset.subset(data.split.test)
+    histograms = describe(part, learner.descriptor, progress=True)
+    plain = retrieval_scores(learner.distance.plain_distance(histograms, histograms), part.labels).mean()
+    with torch.inference_mode():
+        learned = retrieval_scores(learner.distances(histograms, histograms), part.labels).mean()
+    print(f"{'':<10}" + "".join(f"{title:>8}" for title in COLUMNS.values()))
+    for name, scores in (("plain", plain), ("learned", learned)):
+        print(f"{name:<10}" + "".join(f"{100 * scores[column]:>8.1f}" for column in COLUMNS))
+    out.mkdir(parents=True, exist_ok=True)
+    learned_layout(learner.descriptor, out / "layout.png")
+    print(f"learned bins and filter: {out / 'layout.png'}")
+
+
+if __name__ == "__main__":
+    auto_cli([splits, checkpoint])
