@@ -69,7 +69,7 @@ def test_other_input_is_refused(features: VolumetricFeatures) -> None:
         features.transform([1, 2])
     with pytest.raises(TypeError, match="got nothing"):
         features.fit([])
-    with pytest.raises(ValueError, match="name: expected one of interior"):
+    with pytest.raises(ValueError, match="descriptor: expected one of interior"):
         VolumetricFeatures("unknown").fit(["a.off"])  # type: ignore[arg-type]
 
 

@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from igps.data.dataset import SignatureDataset
+from igps.data.shapes import ArticulatedShapes
+from igps.geometry.signature import SignatureConfig
+from igps.nn.descriptor import PRETRAINED, CombinedDescriptor, VolumetricDescriptor
+from igps.nn.extraction import describe
+from igps.nn.presets import DescriptorName, preset
+from igps.retrieval import chi_square, cosine, retrieval_scores
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataset:
+    """Shapes of a seed that the pretrained metric was not fitted to."""
+    root = tmp_path_factory.mktemp("shapes")
+    ArticulatedShapes(n_classes=6, n_per_class=5, seed=7, n_vertices=1500).write(root)
+    config = SignatureConfig(n_eigenpairs=50, n_surface_samples=50, attributes=("depth", "electrostatic_potential"))
+    return SignatureDataset(root, config, root / "cache")
+
+
+@pytest.mark.parametrize("name", get_args(DescriptorName))
+def test_presets_describe_and_compare(name: DescriptorName, dataset: SignatureDataset) -> None:
+    chosen = preset(name)
+    described = describe(dataset.subset([0, 1, 5]), chosen.make())
+    distances = chosen.distance(described, described)
+    np.testing.assert_allclose(distances.diagonal(), 0, atol=1e-5)
+    assert distances[0, 1] < distances[0, 2]
+
+
+def test_pretrained_is_the_fitted_whitening_of_the_rich_histograms(dataset: SignatureDataset) -> None:
+    part = dataset.subset(range(3))
+    roots = describe(part, CombinedDescriptor.rich()).double().sqrt()
+    stored = {name: tensor.double() for name, tensor in load_file(PRETRAINED).items()}
+    centred = roots - stored["mean"]
+    directions = stored["directions"]
+    expected = centred - centred @ directions.T @ torch.diag(1 - stored["gains"]) @ directions
+    expected = expected / expected.norm(dim=1, keepdim=True)
+    np.testing.assert_allclose(describe(part, VolumetricDescriptor.pretrained()), expected, atol=1e-5)
+
+
+def test_pretrained_gains_on_shapes_it_has_not_seen(dataset: SignatureDataset) -> None:
+    histograms = describe(dataset, CombinedDescriptor.rich())
+    embedded = describe(dataset, VolumetricDescriptor.pretrained())
+    plain = retrieval_scores(chi_square(histograms, histograms), dataset.labels).mean()
+    learned = retrieval_scores(cosine(embedded, embedded), dataset.labels).mean()
+    assert learned["ft"] > plain["ft"]
+
+
+def test_shipped_file_is_small() -> None:
+    assert Path(PRETRAINED).stat().st_size < 2e6
+
+
+def test_unknown_name_is_refused() -> None:
+    with pytest.raises(ValueError, match="descriptor: expected one of interior, gps, multiscale, rich, pretrained"):
+        preset("best")  # type: ignore[arg-type]
