@@ -40,7 +40,7 @@ class SignatureConfig:
     """
 
     # Raise it whenever the same mesh and parameters would give another Signature: it is part of every cache key.
-    ALGORITHM_VERSION: ClassVar[int] = 1
+    ALGORITHM_VERSION: ClassVar[int] = 2
 
     n_eigenpairs: int = 250
     resolution: int = 32
