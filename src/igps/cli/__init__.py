@@ -1,4 +1,4 @@
-"""The command line: `igps retrieve`, `extract`, `query`, `demo` and `compare`, one function each."""
+"""The command line: `igps retrieve`, `extract`, `query`, `demo`, `compare`, `figure` and `robustness`, by functions."""
 
 from __future__ import annotations
 
@@ -13,13 +13,23 @@ from jsonargparse import ArgumentParser, Namespace
 
 from igps.cli.compare import compare
 from igps.cli.demo import demo
+from igps.cli.figure import pose, potential, topology
 from igps.cli.reading import FLAGS
 from igps.cli.retrieval import extract, query, retrieve
+from igps.cli.robustness import robustness
 
 Command = Callable[..., None]
 Commands = Mapping[str, "Command | Commands"]
 
-COMMANDS: Commands = {"retrieve": retrieve, "extract": extract, "query": query, "demo": demo, "compare": compare}
+COMMANDS: Commands = {
+    "retrieve": retrieve,
+    "extract": extract,
+    "query": query,
+    "demo": demo,
+    "compare": compare,
+    "figure": {"pose": pose, "topology": topology, "potential": potential},
+    "robustness": robustness,
+}
 """What follows `igps`: a function, or the commands of a group by name."""
 
 
