@@ -155,6 +155,40 @@ def test_facing_vertices_are_the_best_of_all_pairs(mesh: Mesh, largest_gap: floa
     assert value[a, b] == pytest.approx(value[allowed].max())
 
 
+def test_search_lists_every_facing_pair_once_and_best_first() -> None:
+    mesh = horseshoe(0.2, n_sections=30, n_around=8)
+    largest_gap = 0.3 * diagonal(mesh)
+    unit = vertex_normals(mesh)
+    way = mesh.vertices[None, :] - mesh.vertices[:, None]
+    gap = np.linalg.norm(way, axis=2) + np.eye(len(way))
+    facing = np.einsum("ik,ijk->ij", unit, way / gap[..., None]) > 0.5
+    allowed = np.triu(facing & facing.T & (gap <= largest_gap))
+    assert np.triu(facing & (gap <= largest_gap)).sum() > 2 * allowed.sum()  # many look at what does not look at them
+    along = paths(mesh)
+    far = np.median(along[allowed])
+    for least_path, value in ((None, along), (far, along / gap)):
+        found = list(disturbances._GapSearch(mesh).pairs(largest_gap, least_path))
+        wanted = allowed & (along >= (least_path or 0))
+        assert len(found) == len(set(found)) == wanted.sum()
+        assert all(wanted[min(pair), max(pair)] for pair in found)
+        values = np.array([value[pair] for pair in found])
+        assert (np.diff(values) <= 1e-12).all()
+
+
+def test_narrow_gaps_come_before_wide_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = horseshoe()
+    asked = []
+
+    def none(self: object, largest_gap: float, least_path: float | None = None) -> list[tuple[int, int]]:
+        asked.append((largest_gap / diagonal(mesh), least_path and least_path / diagonal(mesh)))
+        return []
+
+    monkeypatch.setattr(disturbances._GapSearch, "pairs", none)
+    with pytest.raises(MeshError, match="no two places face each other"):
+        facing_vertices(mesh)
+    assert asked == [(1 / 64, 1 / 4), (1 / 32, 1 / 4), (1 / 16, 1 / 4), (1 / 16, None)]
+
+
 def test_gap_must_be_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = horseshoe()
     search = disturbances._GapSearch(mesh)
@@ -257,9 +291,15 @@ def test_clip_takes_a_cap_off_a_ball(sphere: Mesh) -> None:
 
 def test_clip_keeps_the_largest_piece() -> None:
     pytest.importorskip("manifold3d")
-    mesh = horseshoe(0.4)
-    cut = clip(mesh, 0.7)  # a Mesh of two pieces would have been refused
-    assert 0 < cut.volume < 0.5 * mesh.volume
+    ring = horseshoe(0.4)
+    x, y, _ = ring.vertices.T
+    # Its bend far away from its ends, of which one is thicker.
+    stretched = ring.vertices * np.stack([np.where(x < 0, 2.5, 1), 1 + 0 * y, np.where(y > 0, 1.5, 1)], axis=1)
+    mesh = Mesh(stretched, ring.faces)
+    cut = clip(mesh, 0.8)
+    assert cut.vertices[:, 1].min() > 0  # both ends remain; the thinner one is on the other side
+    assert cut.vertices[:, 0].max() == pytest.approx(stretched[:, 0].max(), abs=0.05)
+    assert 0 < cut.volume < 0.3 * mesh.volume
     with pytest.raises(ValueError, match="share"):
         clip(mesh, 0)
 
