@@ -127,6 +127,11 @@ def test_training_shapes_are_kept_in_memory_thinned(root: Path, tmp_path: Path, 
         assert len(list(module.train_dataloader())) == 1
 
 
+def test_a_single_sample_in_memory_is_refused(root: Path) -> None:
+    with pytest.raises(ValueError, match="n_samples_in_memory: expected None or at least 2, got -3"):
+        SignatureDataModule(root, n_samples_in_memory=-3)
+
+
 def test_a_bad_mesh_stops_training(root: Path, tmp_path: Path) -> None:
     (root / "class1" / "9.off").write_text("nothing")
     module = SignatureDataModule(root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path, n_workers=1)

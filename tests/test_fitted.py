@@ -119,3 +119,15 @@ def test_errors_name_the_argument(collection: tuple[Tensor, Tensor]) -> None:
         KernelHead(N_CELLS, 40, 8, ridge=0)
     with pytest.raises(ValueError, match="n_classes"):
         KernelHead(N_CELLS, 4, 8)
+
+
+def test_kernel_head_can_keep_another_whitening(collection: tuple[Tensor, Tensor]) -> None:
+    histograms, labels = collection
+    head = KernelHead(N_CELLS, 24, 4)
+    head.whitened.fit(histograms[labels >= 4], labels[labels >= 4])
+    before = {name: value.clone() for name, value in head.whitened.state_dict().items()}
+    few = labels < 4
+    head.fit(histograms[few], labels[few], whiten=False)
+    for name, value in head.whitened.state_dict().items():
+        torch.testing.assert_close(value, before[name], rtol=0, atol=0)
+    assert (head.predict(histograms[few]) == labels[few]).float().mean() > 0.9

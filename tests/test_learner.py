@@ -8,6 +8,7 @@ import pytest
 import torch
 import yaml
 from pytorch_lightning import Trainer, seed_everything
+from pytorch_lightning.callbacks import ModelCheckpoint
 
 from igps.data.datamodule import SignatureDataModule
 from igps.data.shapes import ArticulatedShapes
@@ -66,6 +67,24 @@ def test_training_moves_bins_filter_and_head_and_is_reproducible(shapes: Path, t
     for name, value in states[0].items():
         torch.testing.assert_close(states[1][name], value, atol=0, rtol=0)
     assert not any(name.startswith("scores") for name in states[0])
+
+
+def test_a_checkpoint_has_the_scale_of_its_own_epoch(shapes: Path, tmp_path: Path) -> None:
+    module, model = data(shapes), learner()
+    run = trainer(1, tmp_path)
+    run.limit_val_batches = 0
+    # Saved at the end of an epoch that is not validated, and before the end of the fit.
+    run.callbacks.append(ModelCheckpoint(tmp_path, filename="last", every_n_epochs=1, save_on_train_epoch_end=True))  # type: ignore[attr-defined]
+    run.fit(model, module)
+    state = torch.load(tmp_path / "last.ckpt", weights_only=True)["state_dict"]
+    fresh = learner()
+    fresh.load_state_dict(state)
+    fresh.eval()
+    histograms = describe(module.dataset.subset(module.split.train), fresh.descriptor)
+    fresh.distance.calibrate(histograms)
+    for name in ("plain_unit", "learned_unit"):
+        torch.testing.assert_close(state[f"distance.{name}"], getattr(fresh.distance, name))
+        assert state[f"distance.{name}"] != 1
 
 
 def test_without_head_the_test_scores_are_the_plain_ones(shapes: Path, tmp_path: Path) -> None:

@@ -61,3 +61,11 @@ def test_shipped_file_is_small() -> None:
 def test_unknown_name_is_refused() -> None:
     with pytest.raises(ValueError, match="descriptor: expected one of interior, gps, multiscale, rich, pretrained"):
         preset("best")  # type: ignore[arg-type]
+
+
+def test_what_a_descriptor_needs_is_added_or_asked_for() -> None:
+    config = SignatureConfig(n_eigenpairs=50, attributes=("electrostatic_potential",))
+    assert preset("rich").completed(config).attributes == ("electrostatic_potential", "depth")
+    assert preset("interior").completed(config) == config
+    with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 50, got 49"):
+        preset("pretrained").completed(SignatureConfig(n_eigenpairs=49))

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from safetensors.torch import load_file
 
 from igps.data.shapes import ArticulatedShapes
 
@@ -60,3 +61,19 @@ def test_checkpoint_to_table_figure_and_classifier(root: Path) -> None:
     assert (out / "evaluation/layout.png").stat().st_size > 10_000
     accuracy = run("classify.py", root / "meshes", "--checkpoint", checkpoint)
     assert float(accuracy.split()[1]) > 40, accuracy
+
+
+def test_pretraining_saves_a_metric_and_measures_it(root: Path, tmp_path: Path) -> None:
+    out = run(
+        "pretrain.py", "--root", tmp_path / "generated", "--n_classes", 7, "--n_per_class", 3, "--n_held_out", 3,
+        "--n_eigenpairs", 50, "--n_directions", 4, "--cache", root / "cache", "--out", tmp_path / "metric.safetensors",
+        "--data", root / "meshes", "--figure", tmp_path / "curve.png",
+    )  # fmt: skip
+    assert {name: tuple(value.shape) for name, value in load_file(tmp_path / "metric.safetensors").items()} == {
+        "mean": (25920,), "directions": (4, 25920), "gains": (4,)
+    }  # fmt: skip
+    assert (tmp_path / "curve.png").stat().st_size > 5_000
+    assert "3 held-out generated classes" in out
+    assert "   4 generated classes: FT" in out
+    assert "1 labels a class" in out
+    assert "5 labels a class" not in out  # a single shape of each class would be left to score

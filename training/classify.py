@@ -45,7 +45,7 @@ def classify(
         cache: folder of cached signatures; the user's cache directory if not given.
     """
     if checkpoint is None:
-        dataset = SignatureDataset(root, SignatureConfig(attributes=preset("rich").attributes), cache)
+        dataset = SignatureDataset(root, preset("rich").completed(SignatureConfig()), cache)
         dataset.precompute(strict=True)
         histograms = describe(dataset, preset(descriptor).make(), progress=True)
         seeds = range(first_seed, first_seed + n_splits)

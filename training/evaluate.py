@@ -53,7 +53,7 @@ def splits(
         first_seed: see n_splits.
         cache: folder of cached signatures; the user's cache directory if not given.
     """
-    dataset = SignatureDataset(root, SignatureConfig(attributes=preset("rich").attributes), cache)
+    dataset = SignatureDataset(root, preset("rich").completed(SignatureConfig()), cache)
     dataset.precompute(strict=True)
     histograms, labels = describe(dataset, preset(descriptor).make(), progress=True).flatten(1), dataset.labels
     print(f"{descriptor}, {protocol}, n_train={n_train}, {n_splits} splits from seed {first_seed}, percent")

@@ -60,8 +60,7 @@ def pretrain(
         figure: picture of FT on `data` against the number of generated classes.
     """
     ArticulatedShapes(n_classes, n_per_class, seed).write(root, progress=True)
-    attributes = preset("rich").attributes
-    generated = SignatureDataset(root, SignatureConfig(n_eigenpairs=n_eigenpairs, attributes=attributes), cache)
+    generated = SignatureDataset(root, preset("rich").completed(SignatureConfig(n_eigenpairs=n_eigenpairs)), cache)
     generated.precompute(strict=True)
     shapes, labels = describe(generated, preset("rich").make(), progress=True), generated.labels
 
@@ -76,7 +75,7 @@ def pretrain(
     report(f"{n_held_out} held-out generated classes", shapes[held_out], labels[held_out], head)
     if data is None:
         return
-    real = SignatureDataset(data, SignatureConfig(attributes=attributes), cache)
+    real = SignatureDataset(data, preset("rich").completed(SignatureConfig()), cache)
     real.precompute(strict=True)
     histograms, classes = describe(real, preset("rich").make(), progress=True), real.labels
     report(str(data), histograms, classes, head)
@@ -86,7 +85,8 @@ def pretrain(
     for n, values in curve.items():
         print(f"{n:>4} generated classes: FT {' '.join(f'{100 * value:.1f}' for value in values)} (three draws)")
     transfer_curve(curve, plain, figure)
-    for n in (1, 3, 5):
+    # Two of each class are left to find each other.
+    for n in (n for n in (1, 3, 5) if n + 2 <= int(classes.bincount().min())):
         few_labels(n, histograms, classes, head)
 
 

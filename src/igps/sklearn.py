@@ -32,7 +32,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
     Args:
         descriptor: "interior", "gps", "multiscale", "rich" or "pretrained", see `preset`.
         square_root: give square roots of the cells; embeddings ("pretrained") are given as they are.
-        config: of the signatures; if None, the default with the attributes that the descriptor asks for.
+        config: of the signatures; the default if None. The attributes that the descriptor asks for are added.
         cache_dir: of the signatures of mesh files; the user's cache directory if None. Meshes are not cached.
         n_workers: processes that compute the signatures of mesh files; all cores if None.
     """
@@ -67,7 +67,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         """
         shapes = _checked(X)
         chosen = preset(self.descriptor)
-        config = self.config or SignatureConfig(attributes=chosen.attributes)
+        config = chosen.completed(self.config or SignatureConfig())
         descriptor = chosen.make()
         if isinstance(shapes[0], Mesh):
             with torch.inference_mode():

@@ -1,5 +1,7 @@
 """The systems that the paper compares with or builds on, each in one file, and their comparison."""
 
+from collections.abc import Sequence
+
 from igps.baselines.canonical_form import CanonicalForm
 from igps.baselines.comparison import Result, compare
 from igps.baselines.d2 import D2
@@ -16,8 +18,12 @@ from igps.baselines.volume_shape_dna import VolumeShapeDNA
 __all__ = ["Body", "Result", "System", "compare", "systems"]
 
 
-def systems() -> dict[str, System]:
-    """All systems by name, with the parameters of their sources."""
+def systems(names: Sequence[str] | None = None) -> dict[str, System]:
+    """Systems by name, with the parameters of their sources; all of them if no names are given.
+
+    Raises:
+        ValueError: an unknown name.
+    """
     every: tuple[System, ...] = (
         Interior(),
         GPS(),
@@ -30,4 +36,7 @@ def systems() -> dict[str, System]:
         GeodesicSpectral(),
         SpectralGromovWasserstein(),
     )
-    return {system.name: system for system in every}
+    known = {system.name: system for system in every}
+    if unknown := [name for name in names or () if name not in known]:
+        raise ValueError(f"descriptors: no system is called {unknown[0]}. There are {', '.join(known)}.")
+    return {name: known[name] for name in names or known}

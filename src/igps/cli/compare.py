@@ -37,11 +37,7 @@ def compare(
         workers: processes that compute; all cores if not given.
         strict: stop at the first mesh that cannot be used instead of skipping it
     """
-    known = baselines.systems()
-    unknown = [name for name in descriptors or () if name not in known]
-    if unknown:
-        raise ValueError(f"descriptors: no system is called {unknown[0]}. There are {', '.join(known)}.")
-    chosen = {name: known[name] for name in descriptors or known}
+    chosen = baselines.systems(descriptors)
     dataset, failures = signatures(labelled_meshes(root), workers=workers, strict=strict, **reading)
     results: list[Result] = []
     for result in baselines.compare(dataset, chosen, n_workers=workers, strict=strict):

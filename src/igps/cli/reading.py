@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import MeshFiles, find_meshes
-from igps.geometry.attributes import AttributeName
 from igps.geometry.mesh import Component
 from igps.geometry.signature import SignatureConfig
+from igps.nn.presets import Preset
 
 FLAGS = {
     "paper": "use the parameters of Rustamov 2010: as the defaults, but the grid is never refined",
@@ -32,8 +32,6 @@ def signatures(
     allow_open: bool = False,
     strict: bool = False,
     workers: int | None = None,
-    *,
-    attributes: tuple[AttributeName, ...] = (),
 ) -> tuple[SignatureDataset, list[Failure]]:
     """The meshes whose signatures are in the cache, after computing what was missing; and those that failed.
 
@@ -46,21 +44,42 @@ def signatures(
         component: largest keeps only the largest connected component of each mesh.
         workers: processes that compute signatures; all cores if not given.
         paper, repair, allow_open, strict: see `FLAGS`.
-        attributes: that the descriptor needs; added to those of `signature`.
 
     Raises:
         ValueError: no mesh could be used, or `paper` beside other parameters of the signatures.
     """
-    if paper:
-        if signature != SignatureConfig():
-            raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
-        signature = SignatureConfig.paper()
-    signature = replace(signature, attributes=tuple(dict.fromkeys((*signature.attributes, *attributes))))
-    dataset = SignatureDataset(source, signature, cache, repair=repair, component=component, allow_open=allow_open)
+    config = _config(signature, paper)
+    dataset = SignatureDataset(source, config, cache, repair=repair, component=component, allow_open=allow_open)
     failures = dataset.precompute(n_workers=workers, strict=strict)
     if len(failures) == len(dataset):
         raise ValueError(f"none of {len(dataset)} meshes could be used; the first: {failures[0].error}")
     return dataset.usable(failures), failures
+
+
+def preset_signatures(
+    chosen: Preset,
+    source: Path | Sequence[Path] | MeshFiles,
+    signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
+    paper: bool = False,
+    **reading: Any,
+) -> tuple[SignatureDataset, list[Failure]]:
+    """`signatures` that carry what a descriptor needs of them.
+
+    Args:
+        chosen: the descriptor.
+        source: a folder, files, or what was found in a folder.
+        signature: parameters of the signatures.
+        paper: see `FLAGS`.
+    """
+    return signatures(source, signature=chosen.completed(_config(signature, paper)), **reading)
+
+
+def _config(signature: SignatureConfig, paper: bool) -> SignatureConfig:
+    if not paper:
+        return signature
+    if signature != SignatureConfig():
+        raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
+    return SignatureConfig.paper()
 
 
 def labelled_meshes(root: Path) -> MeshFiles:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from igps.cli.reading import labelled_meshes, signatures, write_failures
+from igps.cli.reading import labelled_meshes, preset_signatures, write_failures
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import find_meshes
 from igps.nn.extraction import describe
@@ -41,7 +41,7 @@ def retrieve(
         out: folder for scores.json, ranking.csv, distances.npz, and failures.csv if a mesh could not be used.
     """
     chosen = preset(descriptor)
-    dataset, failures = signatures(labelled_meshes(root), attributes=chosen.attributes, **reading)
+    dataset, failures = preset_signatures(chosen, labelled_meshes(root), **reading)
     descriptors = describe(dataset, chosen.make(), progress=True)
     distances = chosen.distance(descriptors, descriptors)
     scores = retrieval_scores(distances, dataset.files.labels or ())
@@ -72,7 +72,7 @@ def extract(
     """
     chosen = preset(descriptor)
     source = meshes[0] if len(meshes) == 1 else meshes
-    dataset, failures = signatures(source, attributes=chosen.attributes, **reading)
+    dataset, failures = preset_signatures(chosen, source, **reading)
     features = describe(dataset, chosen.make(), progress=True).numpy()
     arrays: dict[str, Any] = {"features": features, "names": np.array(dataset.files.names)}
     if dataset.files.labels is not None:
@@ -102,8 +102,8 @@ def query(
     if top < 1:
         raise ValueError(f"top: expected at least 1, got {top}.")
     chosen = preset(descriptor)
-    needle, _ = signatures([mesh], attributes=chosen.attributes, **reading)
-    dataset, _ = signatures(find_meshes(gallery), attributes=chosen.attributes, **reading)
+    needle, _ = preset_signatures(chosen, [mesh], **reading)
+    dataset, _ = preset_signatures(chosen, find_meshes(gallery), **reading)
     module = chosen.make()
     wanted, descriptors = describe(needle, module), describe(dataset, module, progress=True)
     found = search(wanted, descriptors, top=min(top, len(dataset)), distance=chosen.distance)

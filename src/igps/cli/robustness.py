@@ -65,11 +65,7 @@ def robustness(
         out: folder for robustness.json.
         workers: processes that compute; all cores if not given.
     """
-    known = baselines.systems()
-    unknown = [name for name in descriptors or () if name not in known]
-    if unknown:
-        raise ValueError(f"descriptors: no system is called {unknown[0]}. There are {', '.join(known)}.")
-    systems = {name: known[name] for name in descriptors or known}
+    systems = baselines.systems(descriptors)
     dataset, failures = signatures(meshes, workers=workers, **reading)
     if gallery is None and len(dataset) < 2:
         raise ValueError("meshes: expected at least two, each its own class, or a gallery. Give one of them.")

@@ -137,6 +137,8 @@ class SignatureDataModule(LightningDataModule):
             raise ValueError(f"protocol: expected 'seen' or 'unseen', got {protocol!r}.")
         if protocol == "seen" and n_test is not None:
             raise ValueError("n_test: expected None with protocol 'seen', which tests all shapes not trained on.")
+        if n_samples_in_memory is not None and n_samples_in_memory < 2:
+            raise ValueError(f"n_samples_in_memory: expected None or at least 2, got {n_samples_in_memory}.")
         self.dataset = SignatureDataset(root, config, cache_dir)
         if self.dataset.files.labels is None:
             raise ValueError(f"{root}: no classes found. Expected one folder per class, or a labels.csv (file,label).")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from igps.figures import _figure
 from igps.nn.descriptor import VolumetricDescriptor
 from igps.nn.embedding import SpectralEmbedding, spectral_weights
 from igps.nn.histogram import OrderedCentres, PairHistogram
@@ -23,32 +24,26 @@ def learned_layout(descriptor: VolumetricDescriptor, path: str | Path) -> None:
         ValueError: a descriptor of other parts.
         ImportError: matplotlib is not installed.
     """
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError('figures need matplotlib: pip install "interior-gps[plot]".') from error
     if not isinstance(descriptor.embedding, SpectralEmbedding) or not isinstance(descriptor.histogram, PairHistogram):
         raise ValueError("descriptor: expected one made of a SpectralEmbedding and a PairHistogram.")
     axes_of = _centres(descriptor.histogram)
-    with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(4 * (len(axes_of) + 1), 3.2), layout="constrained")
-        panels = figure.subplots(1, len(axes_of) + 1)
-        x = torch.logspace(0.5, 3.6, 200, dtype=torch.float64)
-        area = torch.ones((), dtype=torch.float64)
-        learned = descriptor.embedding.weights(x, area).detach()
-        start = spectral_weights(x, area, descriptor.embedding.kind, descriptor.embedding.time)
-        panels[0].loglog(x, start, color="#888888", linestyle="--", label="start")
-        panels[0].loglog(x, learned, color="#0072B2", label="learned")
-        panels[0].set(xlabel="eigenvalue × area", ylabel="weight of the eigenfunction g", title="spectral filter")
-        panels[0].legend(frameon=False)
-        for panel, (title, centres) in zip(panels[1:], axes_of.items(), strict=True):
-            values = centres().detach()
-            panel.plot(centres.start, centres.start, color="#888888", linestyle="--", label="start")
-            panel.plot(centres.start, values, color="#D55E00", marker=".", markersize=3, label="learned")
-            panel.set(xlabel="centre at the start", ylabel="centre", title=title)
-            panel.legend(frameon=False)
-        figure.savefig(path, dpi=150)
+    figure = _figure(4 * (len(axes_of) + 1), 3.2)
+    panels = figure.subplots(1, len(axes_of) + 1)
+    x = torch.logspace(0.5, 3.6, 200, dtype=torch.float64)
+    area = torch.ones((), dtype=torch.float64)
+    learned = descriptor.embedding.weights(x, area).detach()
+    start = spectral_weights(x, area, descriptor.embedding.kind, descriptor.embedding.time)
+    panels[0].loglog(x, start, color="#888888", linestyle="--", label="start")
+    panels[0].loglog(x, learned, color="#0072B2", label="learned")
+    panels[0].set(xlabel="eigenvalue × area", ylabel="weight of the eigenfunction g", title="spectral filter")
+    panels[0].legend(frameon=False)
+    for panel, (title, centres) in zip(panels[1:], axes_of.items(), strict=True):
+        values = centres().detach()
+        panel.plot(centres.start, centres.start, color="#888888", linestyle="--", label="start")
+        panel.plot(centres.start, values, color="#D55E00", marker=".", markersize=3, label="learned")
+        panel.set(xlabel="centre at the start", ylabel="centre", title=title)
+        panel.legend(frameon=False)
+    figure.savefig(path, dpi=150)
 
 
 def _centres(histogram: PairHistogram) -> dict[str, OrderedCentres]:
@@ -75,11 +70,7 @@ def transfer_curve(curve: Mapping[int, Sequence[float]], plain: float, path: str
     Raises:
         ImportError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError('figures need matplotlib: pip install "interior-gps[plot]".') from error
-    figure = Figure(figsize=(4.5, 3.2), layout="constrained")
+    figure = _figure(4.5, 3.2)
     axes = figure.subplots()
     counts = sorted(curve)
     means = [100 * sum(curve[n]) / len(curve[n]) for n in counts]

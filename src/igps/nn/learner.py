@@ -72,15 +72,15 @@ class RetrievalLearner(LightningModule):
 
     def on_fit_end(self) -> None:
         """Put the plain and the learned distance on one scale, by the training shapes."""
-        self.distance.calibrate(self._training_histograms())
+        self._calibrate()
 
     def on_validation_epoch_start(self) -> None:
         """The scale changes with the head."""
-        self.distance.calibrate(self._training_histograms())
+        self._calibrate()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The same for a checkpoint of an epoch that is not validated, or its distance would be on an older scale."""
-        self.distance.calibrate(self._training_histograms())
+        self._calibrate()
         checkpoint["state_dict"].update(self.state_dict())
 
     def training_step(self, batch: SignatureBatch, batch_index: int) -> Tensor:
@@ -118,6 +118,13 @@ class RetrievalLearner(LightningModule):
     def _log_scores(self, part: str) -> None:
         self.log_dict({f"{part}_{name}": value for name, value in self.scores.compute().items()})
         self.scores.reset()
+
+    def _calibrate(self) -> None:
+        training = self.training
+        # A checkpoint is saved in training mode, where the head drops cells.
+        self.eval()
+        self.distance.calibrate(self._training_histograms())
+        self.train(training)
 
     @torch.no_grad()
     def _training_histograms(self) -> Tensor:
