@@ -296,7 +296,7 @@ def test_command_lists_failures_by_system_and_of_signatures(
     logging.disable(logging.WARNING)
     bad = root / "egg" / "bad.off"
     bad.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
-    monkeypatch.setattr(baselines, "systems", lambda: {"picky": Height("egg/1.off"), "broken": Broken()})
+    monkeypatch.setattr(baselines, "systems", lambda names: {"picky": Height("egg/1.off"), "broken": Broken()})
     arguments = ["compare", root, "--out", tmp_path, "--cache", root.parent / "cache", *SMALL]
     try:
         igps(monkeypatch, *arguments)
@@ -315,7 +315,7 @@ def test_command_lists_failures_by_system_and_of_signatures(
             igps(monkeypatch, *arguments, "--strict")
         assert "igps: picky: " in capsys.readouterr().err
 
-        monkeypatch.setattr(baselines, "systems", lambda: {"tall": Height()})
+        monkeypatch.setattr(baselines, "systems", lambda names: {"tall": Height()})
         igps(monkeypatch, *arguments)
         assert not (tmp_path / "failures.csv").exists()
     finally:
