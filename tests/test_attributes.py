@@ -5,7 +5,13 @@ import pytest
 import scipy.integrate
 import trimesh
 
-from igps.geometry.attributes import depth, electrostatic_potential, interior_attributes
+from igps.geometry.attributes import (
+    depth,
+    electrostatic_potential,
+    interior_attributes,
+    surface_attributes,
+    surface_direction,
+)
 from igps.geometry.mesh import Mesh
 
 
@@ -25,6 +31,22 @@ def points() -> np.ndarray:
 def test_depth_in_a_box_is_to_the_nearest_wall(box: Mesh, points: np.ndarray) -> None:
     expected = (np.array([0.5, 1.0, 1.5]) - np.abs(points)).min(axis=1) / np.sqrt(22)
     np.testing.assert_allclose(depth(box, points), expected, atol=1e-12)
+
+
+def test_direction_in_a_box_is_the_normal_of_the_nearest_wall(box: Mesh, points: np.ndarray) -> None:
+    gap = np.array([0.5, 1.0, 1.5]) - np.abs(points)
+    expected = np.sign(points) * (gap == gap.min(axis=1, keepdims=True))
+    np.testing.assert_allclose(surface_direction(box, points), expected, atol=1e-12)
+
+
+def test_direction_on_the_surface_is_the_outward_normal(sphere: Mesh) -> None:
+    faces = np.arange(0, len(sphere.faces), 7)
+    centres = sphere.vertices[sphere.faces[faces]].mean(axis=1)
+    normals = surface_attributes(sphere, faces, ("depth", "surface_direction"))
+    assert list(normals) == ["surface_direction"]  # the depth of the surface is 0 everywhere
+    expected = centres / np.linalg.norm(centres, axis=1, keepdims=True)
+    np.testing.assert_allclose(normals["surface_direction"], expected, atol=0.02)
+    assert surface_attributes(sphere, faces, ("depth",)) == {}
 
 
 def test_potential_in_a_charged_ball_is_constant(sphere: Mesh) -> None:
@@ -55,11 +77,11 @@ def test_potential_stays_finite_on_a_vertex(sphere: Mesh) -> None:
 
 
 def test_attributes_do_not_change_with_scale_or_place(box: Mesh, points: np.ndarray) -> None:
-    names = ("depth", "electrostatic_potential")
+    names = ("depth", "electrostatic_potential", "surface_direction")
     moved = Mesh(box.vertices * 7 + [100.0, 0, 5], box.faces)
     here, there = (interior_attributes(m, p, names) for m, p in ((box, points), (moved, points * 7 + [100.0, 0, 5])))
     for name in names:
-        np.testing.assert_allclose(here[name], there[name], rtol=1e-5)
+        np.testing.assert_allclose(here[name], there[name], rtol=1e-5, atol=1e-6)
         assert here[name].dtype == np.float32
 
 

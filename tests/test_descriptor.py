@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from igps.data.dataset import SampleBatch, SignatureBatch
-from igps.nn.descriptor import CombinedDescriptor, VolumetricDescriptor
+from igps.nn.descriptor import CombinedDescriptor, OrientedDescriptor, VolumetricDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histogram import PairHistogram, pair_histogram
+from igps.nn.oriented import OrientedPairHistogram
 from igps.retrieval import chi_square
 
 N_POINTS = (40, 25)
@@ -23,7 +25,11 @@ def samples(n_eigenpairs: tuple[int, int], generator: torch.Generator) -> Sample
     for i, n in enumerate(n_eigenpairs):
         functions[i, :, n:] = 0
     points = torch.rand(2, longest, 3, generator=generator) * mask[:, :, None]
-    return SampleBatch(points, functions, mask, {"depth": torch.rand(2, longest, generator=generator) * mask})
+    attributes = {
+        "depth": torch.rand(2, longest, generator=generator) * mask,
+        "surface_direction": normalize(torch.randn(2, longest, 3, generator=generator), dim=2) * mask[:, :, None],
+    }
+    return SampleBatch(points, functions, mask, attributes)
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +55,23 @@ def learned() -> VolumetricDescriptor:
         n_classes=3, n_bins=8, learnable=True, attributes={"depth": [0.2, 0.5, 0.9]}, n_euclidean_bins=4
     )
     return VolumetricDescriptor(SpectralEmbedding(n_knots=8), histogram)
+
+
+def oriented(space: str = "position", distance: str = "interior", n_knots: int = 0) -> OrientedDescriptor:
+    embedding, histogram = SpectralEmbedding(n_knots=n_knots), OrientedPairHistogram(4, 3, learnable=n_knots > 0)
+    return OrientedDescriptor(embedding, histogram, space=space, distance=distance)  # type: ignore[arg-type]
+
+
+def combined() -> CombinedDescriptor:
+    """Every kind of part."""
+    two_scales = VolumetricDescriptor(
+        SpectralEmbedding(n_eigenpairs=5),
+        PairHistogram(2, 6, n_euclidean_bins=4),
+        second_embedding=SpectralEmbedding(n_eigenpairs=2),
+    )
+    surface = OrientedDescriptor(samples="surface", distance="euclidean")
+    nested = CombinedDescriptor([learned(), VolumetricDescriptor.paper()])
+    return CombinedDescriptor([nested, two_scales, oriented(), oriented("embedding"), surface])
 
 
 def single(batch: SignatureBatch, i: int) -> SignatureBatch:
@@ -98,7 +121,7 @@ def test_paper_is_the_hard_histogram_of_the_commute_time(batch: SignatureBatch, 
         np.testing.assert_allclose(result[i], expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("make", [VolumetricDescriptor.paper, learned])
+@pytest.mark.parametrize("make", [VolumetricDescriptor.paper, learned, combined])
 def test_padding_never_shows(batch: SignatureBatch, make) -> None:
     descriptor = make()
     with torch.no_grad():
@@ -107,7 +130,7 @@ def test_padding_never_shows(batch: SignatureBatch, make) -> None:
             torch.testing.assert_close(descriptor(single(batch, i))[0], together[i], rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("make", [VolumetricDescriptor.paper, learned])
+@pytest.mark.parametrize("make", [VolumetricDescriptor.paper, learned, combined])
 def test_does_not_change_with_scale(batch: SignatureBatch, make) -> None:
     descriptor = make()
     with torch.no_grad():
@@ -169,6 +192,86 @@ def test_cuda_equals_cpu(batch: SignatureBatch) -> None:
     descriptor.cuda()
     result = gradients(descriptor, batch.to("cuda"), list(descriptor.parameters()))
     torch.testing.assert_close([value.cpu() for value in result], list(expected), rtol=1e-3, atol=1e-6)
+
+
+def test_cells_are_counted_by_part(batch: SignatureBatch) -> None:
+    descriptor = combined()
+    assert descriptor(batch).shape == (2, sum(descriptor.part_cells))
+    assert descriptor.part_cells == (45 * 8 * 4 + 10 * 64, 3 * 6 * 4, 4 * 27, 4 * 27, 6 * 125)
+
+
+def test_second_embedding_takes_the_place_of_the_points(batch: SignatureBatch) -> None:
+    """Summed over one distance, the histogram of the other."""
+    scales = [SpectralEmbedding(n_eigenpairs=k) for k in (6, 2)]
+    histogram = PairHistogram(1, 12, n_euclidean_bins=9, euclidean_range=2.0)
+    joint = VolumetricDescriptor(scales[0], histogram, second_embedding=scales[1])(batch)
+    fine = VolumetricDescriptor(scales[0], PairHistogram(1, 12))(batch)
+    coarse = VolumetricDescriptor(scales[1], PairHistogram(1, 9, distance_range=2.0))(batch)
+    torch.testing.assert_close(joint.sum(dim=3), fine, atol=1e-6, rtol=0)
+    torch.testing.assert_close(joint.sum(dim=2), coarse, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("space", "distance"), [("position", "interior"), ("position", "euclidean"), ("embedding", "interior")]
+)
+def test_oriented_distances_are_those_of_the_plain_histogram(batch: SignatureBatch, space: str, distance: str) -> None:
+    result = oriented(space, distance)(batch)
+    assert result.shape == (2, 4, 3, 3, 3)
+    samples, length = batch.interior, batch.area.sqrt().float()
+    for i, n in enumerate(N_POINTS):
+        places = samples.points[i, :n] / length[i]
+        if distance == "interior":
+            places = torch.nan_to_num(samples.eigenfunctions[i, :n] / batch.eigenvalues[i].sqrt()).float()
+        expected = pair_histogram(places, torch.zeros(n), n_classes=1, n_bins=4, distance_range=3.0)
+        np.testing.assert_allclose(result[i].sum(dim=(1, 2, 3)), expected[0], atol=1e-6)
+
+
+def test_directions_in_the_embedding_are_to_the_nearest_surface_samples(batch: SignatureBatch) -> None:
+    scale = SpectralEmbedding(n_eigenpairs=4)
+    result = OrientedDescriptor(scale, space="embedding")(batch)
+    for i, n in enumerate(N_POINTS):
+        inside, surface = (
+            (samples.eigenfunctions[i, :n, :4] / batch.eigenvalues[i, :4].sqrt()).float()
+            for samples in (batch.interior, batch.surface)
+        )
+        nearest = (inside[:, None] - surface).norm(dim=2).argsort(dim=1)[:, :8]
+        directions = normalize(surface[nearest].mean(dim=1) - inside, dim=1)
+        mask = torch.ones(1, n, dtype=torch.bool)
+        expected = OrientedPairHistogram()(inside[None], inside[None], directions[None], mask)[0]
+        torch.testing.assert_close(result[i], expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("space", ["position", "embedding"])
+def test_oriented_descriptor_learns_bins_and_filter(batch: SignatureBatch, space: str) -> None:
+    descriptor = oriented(space, n_knots=6)
+    result = descriptor(batch)
+    (result[0] - result[1]).square().sum().backward()
+    parameters = dict(descriptor.named_parameters())
+    assert len(parameters) == 4
+    for name, parameter in parameters.items():
+        assert parameter.grad is not None, name
+        assert torch.isfinite(parameter.grad).all(), name
+        assert (parameter.grad != 0).any(), name
+
+
+def test_oriented_descriptor_says_what_it_needs(batch: SignatureBatch) -> None:
+    bare = replace(batch, interior=replace(batch.interior, attributes={}))
+    with pytest.raises(ValueError, match="expected 'surface_direction' among those of the interior samples"):
+        oriented()(bare)
+    with pytest.raises(ValueError, match="space: expected 'position' or 'embedding'"):
+        OrientedDescriptor(space="volume")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="samples: expected 'interior' with space='embedding'"):
+        OrientedDescriptor(samples="surface", space="embedding")
+    with pytest.raises(ValueError, match="distance: expected 'interior' or 'euclidean'"):
+        OrientedDescriptor(distance="geodesic")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="distance: expected 'interior' with space='embedding'"):
+        OrientedDescriptor(space="embedding", distance="euclidean")
+
+
+def test_directions_are_no_classes(batch: SignatureBatch) -> None:
+    histogram = PairHistogram(2, 8, attributes={"surface_direction": [0.0, 1.0]})
+    with pytest.raises(ValueError, match="surface_direction"):
+        VolumetricDescriptor(histogram=histogram)(batch)
 
 
 def test_unknown_samples_are_refused() -> None:

@@ -70,7 +70,7 @@ def test_pretraining_saves_a_metric_and_measures_it(root: Path, tmp_path: Path) 
         "--data", root / "meshes", "--figure", tmp_path / "curve.png",
     )  # fmt: skip
     assert {name: tuple(value.shape) for name, value in load_file(tmp_path / "metric.safetensors").items()} == {
-        "mean": (25920,), "directions": (4, 25920), "gains": (4,)
+        "mean": (27420,), "directions": (4, 27420), "gains": (3, 4)
     }  # fmt: skip
     assert (tmp_path / "curve.png").stat().st_size > 5_000
     assert "3 held-out generated classes" in out

@@ -8,6 +8,7 @@ With a checkpoint the features are the histograms of its learned bins and filter
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, stdev
 
@@ -21,12 +22,12 @@ from igps.geometry.signature import SignatureConfig
 from igps.nn.extraction import describe
 from igps.nn.fitted import KernelHead
 from igps.nn.learner import load_learner
-from igps.nn.presets import DescriptorName, preset
+from igps.nn.presets import HistogramName, preset
 
 
 def classify(
     root: Path,
-    descriptor: DescriptorName = "rich",
+    descriptor: HistogramName = "rich",
     checkpoint: Path | None = None,
     n_train: int = 10,
     n_splits: int = 5,
@@ -47,24 +48,26 @@ def classify(
     if checkpoint is None:
         dataset = SignatureDataset(root, preset("rich").completed(SignatureConfig()), cache)
         dataset.precompute(strict=True)
-        histograms = describe(dataset, preset(descriptor).make(), progress=True)
+        module = preset(descriptor).make()
+        histograms = describe(dataset, module, progress=True)
         seeds = range(first_seed, first_seed + n_splits)
         found = [split_seen(dataset.labels, n_train, seed=seed) for seed in seeds]
         labels = dataset.labels
     else:
         learner, data = load_learner(checkpoint)
         data.prepare_data()
-        histograms, labels = describe(data.dataset, learner.descriptor, progress=True), data.dataset.labels
+        module = learner.descriptor
+        histograms, labels = describe(data.dataset, module, progress=True), data.dataset.labels
         # The validation part chose nothing here.
         found = [Split(data.split.train + data.split.validation, (), data.split.test)]
-    accuracy = [100 * _accuracy(histograms.flatten(1), labels, split) for split in found]
+    accuracy = [100 * _accuracy(histograms.flatten(1), labels, split, module.part_cells) for split in found]
     spread = stdev(accuracy) if len(accuracy) > 1 else 0.0
     print(f"accuracy {mean(accuracy):.1f} ± {spread:.1f} percent over {len(accuracy)} splits")
 
 
-def _accuracy(histograms: Tensor, labels: Tensor, split: Split) -> float:
+def _accuracy(histograms: Tensor, labels: Tensor, split: Split, part_cells: Sequence[int]) -> float:
     train, test = torch.tensor(split.train), torch.tensor(split.test)
-    head = KernelHead(histograms.shape[1], len(train), len(labels[train].unique()))
+    head = KernelHead(part_cells, len(train), len(labels[train].unique()))
     predicted = head.fit(histograms[train], labels[train]).predict(histograms[test])
     return float((predicted == labels[test]).float().mean())
 

@@ -8,6 +8,7 @@ Nothing is chosen here: the heads are fitted to the training part with fixed par
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Literal
@@ -24,7 +25,7 @@ from igps.nn.extraction import describe
 from igps.nn.fitted import KernelHead, WhitenedHead
 from igps.nn.head import CorrectedDistance
 from igps.nn.learner import load_learner
-from igps.nn.presets import DescriptorName, preset
+from igps.nn.presets import HistogramName, preset
 from igps.retrieval import retrieval_scores
 
 Head = Literal["none", "whitened", "kernel"]
@@ -33,7 +34,7 @@ COLUMNS = {"ft": "FT", "nn": "NN", "dcg": "DCG", "st": "ST", "adr": "ADR", "map"
 
 def splits(
     root: Path,
-    descriptor: DescriptorName = "interior",
+    descriptor: HistogramName = "interior",
     protocol: Protocol = "seen",
     n_train: int = 10,
     n_test: int | None = None,
@@ -55,7 +56,8 @@ def splits(
     """
     dataset = SignatureDataset(root, preset("rich").completed(SignatureConfig()), cache)
     dataset.precompute(strict=True)
-    histograms, labels = describe(dataset, preset(descriptor).make(), progress=True).flatten(1), dataset.labels
+    module = preset(descriptor).make()
+    histograms, labels = describe(dataset, module, progress=True).flatten(1), dataset.labels
     print(f"{descriptor}, {protocol}, n_train={n_train}, {n_splits} splits from seed {first_seed}, percent")
     print(f"{'head':<10}" + "".join(f"{title:>14}" for title in COLUMNS.values()))
     for head in ("none", "whitened", "kernel"):
@@ -65,20 +67,20 @@ def splits(
                 split = split_seen(labels, n_train, seed=seed)
             else:
                 split = split_unseen(labels, n_train, n_test=n_test, seed=seed)
-            results.append(score(histograms, labels, split, head))
+            results.append(score(histograms, labels, split, head, module.part_cells))
         values = [[100 * one[name] for one in results] for name in COLUMNS]
         print(f"{head:<10}" + "".join(f"{mean(v):>8.1f} ± {stdev(v) if n_splits > 1 else 0:>3.1f}" for v in values))
 
 
-def score(histograms: Tensor, labels: Tensor, split: Split, head: Head) -> dict[str, float]:
+def score(histograms: Tensor, labels: Tensor, split: Split, head: Head, part_cells: Sequence[int]) -> dict[str, float]:
     """Scores of the test part, each shape against the others."""
     train, test = torch.tensor(split.train), torch.tensor(split.test)
     fitted: nn.Module | None = None
     if head == "whitened":
-        fitted = WhitenedHead(histograms.shape[1]).fit(histograms[train], labels[train])
+        fitted = WhitenedHead(part_cells).fit(histograms[train], labels[train])
     elif head == "kernel":
         n_classes = len(labels[train].unique())
-        fitted = KernelHead(histograms.shape[1], len(train), n_classes).fit(histograms[train], labels[train])
+        fitted = KernelHead(part_cells, len(train), n_classes).fit(histograms[train], labels[train])
     distance = CorrectedDistance(fitted, share=1.0)
     return retrieval_scores(distance(histograms[test], histograms[test]), labels[test]).mean()
 

@@ -22,7 +22,7 @@ from igps.data.dataset import SignatureDataset
 from igps.data.shapes import ArticulatedShapes
 from igps.figures.learned import transfer_curve
 from igps.geometry.signature import SignatureConfig
-from igps.nn.descriptor import PRETRAINED
+from igps.nn.descriptor import PRETRAINED, CombinedDescriptor
 from igps.nn.extraction import describe
 from igps.nn.fitted import KernelHead, WhitenedHead
 from igps.nn.head import square_roots
@@ -62,11 +62,12 @@ def pretrain(
     ArticulatedShapes(n_classes, n_per_class, seed).write(root, progress=True)
     generated = SignatureDataset(root, preset("rich").completed(SignatureConfig(n_eigenpairs=n_eigenpairs)), cache)
     generated.precompute(strict=True)
-    shapes, labels = describe(generated, preset("rich").make(), progress=True), generated.labels
+    descriptor = CombinedDescriptor.rich()
+    shapes, labels = describe(generated, descriptor, progress=True), generated.labels
 
     def fit(n: int, seed: int) -> WhitenedHead:
         chosen = torch.tensor(split_unseen(labels, n, n_test=n_held_out, seed=seed).train)
-        return WhitenedHead(shapes.shape[1], n_directions, shrinkage).fit(shapes[chosen], labels[chosen])
+        return WhitenedHead(descriptor.part_cells, n_directions, shrinkage).fit(shapes[chosen], labels[chosen])
 
     head = fit(n_classes - n_held_out, seed)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -77,7 +78,7 @@ def pretrain(
         return
     real = SignatureDataset(data, preset("rich").completed(SignatureConfig()), cache)
     real.precompute(strict=True)
-    histograms, classes = describe(real, preset("rich").make(), progress=True), real.labels
+    histograms, classes = describe(real, descriptor, progress=True), real.labels
     report(str(data), histograms, classes, head)
     counts = [n for n in (10, 30, 100) if n < n_classes - n_held_out] + [n_classes - n_held_out]
     curve = {n: [scores(fit(n, s)(histograms), classes)["ft"] for s in range(3)] for n in counts}
@@ -110,7 +111,7 @@ def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: WhitenedH
         split = split_seen(labels, n, seed=seed)
         train, test = torch.tensor(split.train), torch.tensor(split.test)
         fitted = {
-            name: KernelHead(histograms.shape[1], len(train), len(labels.unique()), len(pretrained.directions))
+            name: KernelHead(pretrained.part_cells, len(train), len(labels.unique()), len(pretrained.directions))
             for name in ("from pretrained", "from scratch")
         }
         fitted["from pretrained"].whitened.load_state_dict(pretrained.state_dict())

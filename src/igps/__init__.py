@@ -13,13 +13,14 @@ from igps.data.dataset import LabelledSignature, SignatureBatch, SignatureDatase
 from igps.data.shapes import ArticulatedShapes
 from igps.geometry.mesh import Mesh, MeshError, load_mesh, simplify
 from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
-from igps.nn.descriptor import CombinedDescriptor, VolumetricDescriptor
+from igps.nn.descriptor import CombinedDescriptor, OrientedDescriptor, VolumetricDescriptor
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential, interior_distance, spectral_embedding
 from igps.nn.extraction import describe
 from igps.nn.fitted import KernelHead, WhitenedHead
 from igps.nn.head import CorrectedDistance, MetricHead
 from igps.nn.histogram import PairHistogram, pair_histogram
 from igps.nn.learner import RetrievalLearner
+from igps.nn.oriented import OrientedPairHistogram
 from igps.retrieval import RetrievalScores, chi_square, retrieval_scores, search
 
 __all__ = [
@@ -31,6 +32,8 @@ __all__ = [
     "Mesh",
     "MeshError",
     "MetricHead",
+    "OrientedDescriptor",
+    "OrientedPairHistogram",
     "PairHistogram",
     "RetrievalLearner",
     "RetrievalScores",

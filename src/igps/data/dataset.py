@@ -61,7 +61,7 @@ class SampleBatch:
         points: (N, P, 3) float32, length, measured from the centre of each shape's own samples.
         eigenfunctions: (N, P, K) float32, 1/length; zero where padded.
         mask: (N, P) true where a sample is real.
-        attributes: named scalars, each (N, P) float32.
+        attributes: named scalars, each (N, P) float32, and directions, each (N, P, 3) float32.
     """
 
     points: Tensor
@@ -169,7 +169,9 @@ def _pad_samples(samples: Sequence[Samples]) -> SampleBatch:
     points = torch.zeros(n_shapes, longest, 3)
     mask = torch.zeros(n_shapes, longest, dtype=torch.bool)
     names = set(samples[0].attributes)
-    attributes = {name: torch.zeros(n_shapes, longest) for name in sorted(names)}
+    attributes = {
+        name: torch.zeros(n_shapes, longest, *samples[0].attributes[name].shape[1:]) for name in sorted(names)
+    }
     for i, s in enumerate(samples):
         if set(s.attributes) != names:
             raise ValueError(

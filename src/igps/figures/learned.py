@@ -8,9 +8,10 @@ from pathlib import Path
 import torch
 
 from igps.figures import _figure
+from igps.nn.bins import OrderedCentres
 from igps.nn.descriptor import VolumetricDescriptor
 from igps.nn.embedding import SpectralEmbedding, spectral_weights
-from igps.nn.histogram import OrderedCentres, PairHistogram
+from igps.nn.histogram import PairHistogram
 
 
 def learned_layout(descriptor: VolumetricDescriptor, path: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""Scalars of points in the volume that a histogram may be split by, beside the potential."""
+"""Scalars and directions of samples that a histogram may be split by, beside the potential."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from igps.geometry.mesh import Mesh, area_vectors
 
-AttributeName = Literal["depth", "electrostatic_potential"]
+AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
 
 # Numbers of a block of points × vertices: 32 MiB.
 _BLOCK = 2**22
@@ -19,15 +19,36 @@ _BLOCK = 2**22
 def interior_attributes(
     mesh: Mesh, points: NDArray[np.float64], names: Sequence[AttributeName]
 ) -> Mapping[str, NDArray[np.float32]]:
-    """Named scalars of points, each (P,), dimensionless and the same for a scaled or moved body.
+    """Named attributes of points inside, (P,) or (P, 3), dimensionless and the same for a scaled or moved body.
 
     Raises:
         ValueError: unknown name.
-        ImportError: "depth" without libigl.
+        ImportError: "depth" or "surface_direction" without libigl.
     """
     check_attributes(names)
-    functions = {"depth": depth, "electrostatic_potential": electrostatic_potential}
+    functions = {
+        "depth": depth,
+        "electrostatic_potential": electrostatic_potential,
+        "surface_direction": surface_direction,
+    }
     return {name: functions[name](mesh, points).astype(np.float32) for name in names}
+
+
+def surface_attributes(
+    mesh: Mesh, faces: NDArray[np.int64], names: Sequence[AttributeName]
+) -> Mapping[str, NDArray[np.float32]]:
+    """Those of the named attributes that points of the surface have: "surface_direction", the outward normal.
+
+    Args:
+        mesh: F faces, oriented outwards.
+        faces: (P,) the face of each point.
+        names: see `interior_attributes`.
+    """
+    check_attributes(names)
+    if "surface_direction" not in names:
+        return {}
+    normals = area_vectors(mesh.vertices, mesh.faces)[faces]
+    return {"surface_direction": _unit(normals).astype(np.float32)}
 
 
 def check_attributes(names: Sequence[str]) -> None:
@@ -50,14 +71,42 @@ def depth(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
     Raises:
         ImportError: libigl is not installed.
     """
+    return np.linalg.norm(_to_surface(mesh, points), axis=1) / np.sqrt(mesh.area)
+
+
+def surface_direction(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit vectors from points to the nearest point of the surface; near it, the outward normal.
+
+    Where several points of the surface are nearest, as on the axis of a tube, it is one of their directions.
+
+    Args:
+        mesh: V vertices, F faces.
+        points: (P, 3) inside, length.
+
+    Returns:
+        (P, 3); zero for a point on the surface.
+
+    Raises:
+        ImportError: libigl is not installed.
+    """
+    return _unit(_to_surface(mesh, points))
+
+
+def _to_surface(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
     try:
         import igl
     except ImportError as error:
-        raise ImportError('depth needs libigl: pip install "interior-gps[igl]".') from error
-    squared, *_ = igl.point_mesh_squared_distance(
+        raise ImportError(
+            'depth, surface_direction: these attributes need libigl: pip install "interior-gps[igl]".'
+        ) from error
+    *_, nearest = igl.point_mesh_squared_distance(
         np.ascontiguousarray(points), np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
     )
-    return np.sqrt(np.asarray(squared) / mesh.area)
+    return np.asarray(nearest) - points
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 def electrostatic_potential(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:

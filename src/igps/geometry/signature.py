@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.geometry.attributes import AttributeName, check_attributes, interior_attributes
+from igps.geometry.attributes import AttributeName, check_attributes, interior_attributes, surface_attributes
 from igps.geometry.coordinates import extend
 from igps.geometry.eigensolver import Spectrum, eigenpairs
 from igps.geometry.laplacian import Backend, laplacian
@@ -34,8 +34,8 @@ class SignatureConfig:
         max_vertices: simplify larger meshes first; None keeps them.
         accuracy: relative error that 99 % of the interior distances may have, which speeds up the mean value
             coordinates; None evaluates them exactly.
-        attributes: named scalars of the interior samples: "depth" and "electrostatic_potential", see
-            `interior_attributes`.
+        attributes: of the samples: "depth" and "electrostatic_potential" of the interior ones, "surface_direction" of
+            all, see `interior_attributes` and `surface_attributes`.
         seed: of the surface samples and of the eigensolver's start.
     """
 
@@ -84,7 +84,7 @@ class Samples:
     Args:
         points: (P, 3) float64, length.
         eigenfunctions: (P, K) float32, 1/length, not scaled by any power of the eigenvalues.
-        attributes: named scalars of the points, each (P,) float32.
+        attributes: named scalars of the points, each (P,) float32, and directions, each (P, 3) float32.
     """
 
     points: NDArray[np.float64]
@@ -153,7 +153,7 @@ def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Sign
         stiffness, mass, config.n_eigenpairs, positions=mesh.vertices, tolerance=_RESIDUAL, seed=config.seed
     )
     interior = _interior(mesh, spectrum, points, config)
-    surface = _surface(mesh, spectrum, config.n_surface_samples, config.seed)
+    surface = _surface(mesh, spectrum, config)
     for where, samples in (("interior", interior), ("surface", surface)):
         if not np.isfinite(samples.eigenfunctions).all():
             raise MeshError(
@@ -177,8 +177,9 @@ def _interior(mesh: Mesh, spectrum: Spectrum, points: NDArray[np.float64], confi
     return Samples(points, np.asarray(values, dtype=np.float32), interior_attributes(mesh, points, config.attributes))
 
 
-def _surface(mesh: Mesh, spectrum: Spectrum, n_samples: int, seed: int) -> Samples:
-    generator = np.random.default_rng(seed)
+def _surface(mesh: Mesh, spectrum: Spectrum, config: SignatureConfig) -> Samples:
+    n_samples = config.n_surface_samples
+    generator = np.random.default_rng(config.seed)
     area = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1)
     face = generator.choice(len(area), size=n_samples, p=area / area.sum())
     # Uniform in a triangle (Osada et al. 2002, equation 1).
@@ -188,4 +189,4 @@ def _surface(mesh: Mesh, spectrum: Spectrum, n_samples: int, seed: int) -> Sampl
     corner = mesh.faces[face]
     points = np.einsum("pi,pij->pj", weights, mesh.vertices[corner])
     values = np.einsum("pi,pik->pk", weights, spectrum.eigenfunctions[corner])
-    return Samples(points, values.astype(np.float32))
+    return Samples(points, values.astype(np.float32), surface_attributes(mesh, face, config.attributes))

@@ -10,12 +10,15 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from igps.data.dataset import SignatureBatch
+from igps.data.dataset import SampleBatch, SignatureBatch
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential
 from igps.nn.fitted import WhitenedHead
 from igps.nn.histogram import PairHistogram
+from igps.nn.oriented import OrientedPairHistogram, nearest_directions
 
 SampleKind = Literal["interior", "surface"]
+Space = Literal["position", "embedding"]
+Distance = Literal["interior", "euclidean"]
 
 PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
 """The parameters of `VolumetricDescriptor.pretrained`, written by training/pretrain.py."""
@@ -25,15 +28,46 @@ _DEPTH = (0.0075, 0.0225, 0.0375, 0.0825)
 _ELECTROSTATIC_POTENTIAL = (2.4, 2.8, 3.2, 3.6)
 
 
-class VolumetricDescriptor(nn.Module):
+class _SampledDescriptor(nn.Module):
+    """What descriptors of a shape's samples share: which samples they take."""
+
+    def __init__(self, samples: SampleKind, n_samples: int | None, n_training_samples: int | None) -> None:
+        super().__init__()
+        if samples not in ("interior", "surface"):
+            raise ValueError(f"samples: expected 'interior' or 'surface', got {samples!r}.")
+        for name, value in (("n_samples", n_samples), ("n_training_samples", n_training_samples)):
+            if value is not None and value < 2:
+                raise ValueError(f"{name}: expected None or at least 2, to form a pair, got {value}.")
+        self.samples: SampleKind = samples
+        self.n_samples = n_samples
+        self.n_training_samples = n_training_samples
+
+    @property
+    def part_cells(self) -> tuple[int, ...]:
+        """Cells of a histogram, over all its dimensions; of one part, as there are several in `CombinedDescriptor`."""
+        return (int(self.histogram.n_cells),)  # type: ignore[arg-type, union-attr]
+
+    def _embedded(self, samples: SampleBatch, batch: SignatureBatch) -> Tensor:
+        return self.embedding(samples.eigenfunctions, batch.eigenvalues, batch.area)  # type: ignore[operator]
+
+    def _chosen(self, batch: SignatureBatch) -> SampleBatch:
+        samples = batch.interior if self.samples == "interior" else batch.surface
+        if self.training and self.n_training_samples is not None:
+            return samples.subset(self.n_training_samples)
+        return samples if self.n_samples is None else samples.subset(self.n_samples, seed=0)
+
+
+class VolumetricDescriptor(_SampledDescriptor):
     """Signatures to histograms: embedding, potential, and joint histograms over all pairs of samples.
 
     Args:
         embedding: eigenfunctions (..., P, K), eigenvalues (..., K) and areas (...) to coordinates (..., P, D).
         histogram: (N, P, D) coordinates, (N, P) potential and (N, P) mask to (N, cells..., B); it is also given the
-            samples' attributes, each (N, P), and points, (N, P, 3) in units of √area.
+            samples' attributes, each (N, P) or (N, P, 3), and points, (N, P, 3) in units of √area.
         samples: "interior" is the volumetric descriptor; "surface" its counterpart on the surface, the histograms of
             the Global Point Signature (Rustamov 2007).
+        second_embedding: its coordinates take the place of the points, and so its distances that of the Euclidean
+            ones: a joint histogram of interior distances on two scales.
         n_samples: of a shape with more samples, a subset of so many that is always the same; None uses all.
         n_training_samples: in training mode, a random subset of so many samples, another one each time: it is faster,
             and a head cannot learn the samples by heart. None uses the same as in evaluation.
@@ -45,20 +79,14 @@ class VolumetricDescriptor(nn.Module):
         histogram: nn.Module | None = None,
         samples: SampleKind = "interior",
         *,
+        second_embedding: nn.Module | None = None,
         n_samples: int | None = None,
         n_training_samples: int | None = None,
     ) -> None:
-        super().__init__()
-        if samples not in ("interior", "surface"):
-            raise ValueError(f"samples: expected 'interior' or 'surface', got {samples!r}.")
-        for name, value in (("n_samples", n_samples), ("n_training_samples", n_training_samples)):
-            if value is not None and value < 2:
-                raise ValueError(f"{name}: expected None or at least 2, to form a pair, got {value}.")
+        super().__init__(samples, n_samples, n_training_samples)
         self.embedding = embedding or SpectralEmbedding()
+        self.second_embedding = second_embedding
         self.histogram = histogram or PairHistogram()
-        self.samples: SampleKind = samples
-        self.n_samples = n_samples
-        self.n_training_samples = n_training_samples
 
     @classmethod
     def paper(cls, samples: SampleKind = "interior") -> VolumetricDescriptor:
@@ -73,33 +101,99 @@ class VolumetricDescriptor(nn.Module):
         README; training/pretrain.py makes the file.
         """
         stored = {name: tensor.float() for name, tensor in load_file(PRETRAINED).items()}
-        n_directions, n_cells = stored["directions"].shape
-        head = WhitenedHead(n_cells, n_directions)
+        descriptor = CombinedDescriptor.rich()
+        head = WhitenedHead(descriptor.part_cells, len(stored["directions"]))
         head.load_state_dict(stored)
-        return EmbeddedDescriptor(CombinedDescriptor.rich(), head).eval()
+        return EmbeddedDescriptor(descriptor, head).eval()
 
     def forward(self, batch: SignatureBatch) -> Tensor:
         """(N, C(C+1)/2, B) histograms, with Euclidean bins (N, C(C+1)/2, B, E), each shape's of sum 1."""
-        samples = batch.interior if self.samples == "interior" else batch.surface
-        if self.training and self.n_training_samples is not None:
-            samples = samples.subset(self.n_training_samples)
-        elif self.n_samples is not None:
-            samples = samples.subset(self.n_samples, seed=0)
-        coordinates = self.embedding(samples.eigenfunctions, batch.eigenvalues, batch.area)
-        length = batch.area.sqrt().to(samples.points.dtype)[:, None, None]
+        samples = self._chosen(batch)
+        coordinates = self._embedded(samples, batch)
+        points = (
+            _in_units(samples, batch)
+            if self.second_embedding is None
+            else self.second_embedding(samples.eigenfunctions, batch.eigenvalues, batch.area)
+        )
         return self.histogram(
             coordinates,
             barycentroid_potential(coordinates),
             samples.mask,
             attributes=samples.attributes,
-            points=samples.points / length,
+            points=points,
         )
+
+
+class OrientedDescriptor(_SampledDescriptor):
+    """Signatures to histograms of distance and `point_pair_features`: how samples and the surface lie together.
+
+    The direction of a sample is that to the surface next to it. It sees corners, hollows and symmetry, which distances
+    alone tell little of.
+
+    Args:
+        embedding: see `VolumetricDescriptor`.
+        histogram: coordinates, points, directions and mask of N shapes to (N, cells...).
+        samples: "interior" or "surface".
+        space: "position" takes lines and directions in space, and needs the attribute "surface_direction"; "embedding"
+            takes them between the embedded samples, the direction being to the embedded surface samples nearest to it:
+            it consists of interior distances alone and hardly changes with pose. Only interior samples have it.
+        distance: which is counted, "interior" or "euclidean", the latter over √area. On the surface the euclidean one
+            makes the histograms of Wahl et al. 2003.
+        n_samples, n_training_samples: see `VolumetricDescriptor`.
+    """
+
+    def __init__(
+        self,
+        embedding: nn.Module | None = None,
+        histogram: nn.Module | None = None,
+        samples: SampleKind = "interior",
+        *,
+        space: Space = "position",
+        distance: Distance = "interior",
+        n_samples: int | None = 700,
+        n_training_samples: int | None = None,
+    ) -> None:
+        super().__init__(samples, n_samples, n_training_samples)
+        if space not in ("position", "embedding"):
+            raise ValueError(f"space: expected 'position' or 'embedding', got {space!r}.")
+        if space == "embedding" and samples != "interior":
+            raise ValueError("samples: expected 'interior' with space='embedding': the surface is its own nearest.")
+        if distance not in ("interior", "euclidean"):
+            raise ValueError(f"distance: expected 'interior' or 'euclidean', got {distance!r}.")
+        if space == "embedding" and distance == "euclidean":
+            raise ValueError("distance: expected 'interior' with space='embedding', got 'euclidean'.")
+        # What has parameters that nothing depends on cannot be trained.
+        self.embedding = None if distance == "euclidean" else embedding or SpectralEmbedding()
+        self.histogram = histogram or OrientedPairHistogram(distance_range=1.0 if distance == "euclidean" else 3.0)
+        self.space: Space = space
+
+    def forward(self, batch: SignatureBatch) -> Tensor:
+        """(N, B, A, A, A) histograms, each shape's of sum 1.
+
+        Raises:
+            ValueError: the samples have no "surface_direction".
+        """
+        samples = self._chosen(batch)
+        points = _in_units(samples, batch)
+        coordinates = points if self.embedding is None else self._embedded(samples, batch)
+        if self.space == "position":
+            if "surface_direction" not in samples.attributes:
+                raise ValueError(
+                    f"attributes: expected 'surface_direction' among those of the {self.samples} samples, got "
+                    f"{sorted(samples.attributes)}. Name it in SignatureConfig(attributes=...)."
+                )
+            return self.histogram(coordinates, points, samples.attributes["surface_direction"], samples.mask)
+        surface = self._embedded(batch.surface, batch)
+        directions = torch.stack(
+            [nearest_directions(coordinates[i], surface[i, real]) for i, real in enumerate(batch.surface.mask)]
+        )
+        return self.histogram(coordinates, coordinates, directions, samples.mask)
 
 
 class CombinedDescriptor(nn.Module):
     """Several descriptors side by side as one histogram, in which each has the same share.
 
-    The χ² distance of combined histograms is the mean of the χ² distances of the parts.
+    The χ² distance of combined histograms is the mean of the χ² distances of the parts. A part may be combined itself.
 
     Args:
         parts: each `SignatureBatch` to (N, cells...) of sum 1.
@@ -113,31 +207,62 @@ class CombinedDescriptor(nn.Module):
 
     @classmethod
     def multiscale(cls) -> CombinedDescriptor:
-        """Interior distances alone, of the first 250, 50 and 16 eigenpairs: fine, middle and coarse."""
+        """Interior distances alone, in three parts.
+
+        The histograms of the first 250, 50 and 16 eigenpairs (fine, middle and coarse); the joint histogram of the
+        distances of 50 and of 4; and how the samples lie to the surface in the embedding of 8.
+        """
         return cls(
             [
-                _layout(250, PairHistogram(8, 64)),
-                _layout(50, PairHistogram(8, 64)),
-                _layout(16, PairHistogram(8, 64, distance_range=3.0)),
+                cls(
+                    [
+                        _layout(250, PairHistogram(8, 64)),
+                        _layout(50, PairHistogram(8, 64)),
+                        _layout(16, PairHistogram(8, 64, distance_range=3.0)),
+                    ]
+                ),
+                VolumetricDescriptor(
+                    SpectralEmbedding(n_eigenpairs=50),
+                    PairHistogram(1, 24, distance_range=3.0, n_euclidean_bins=24, euclidean_range=2.5),
+                    second_embedding=SpectralEmbedding(n_eigenpairs=4),
+                    n_samples=700,
+                ),
+                OrientedDescriptor(SpectralEmbedding(n_eigenpairs=8), space="embedding"),
             ]
         )
 
     @classmethod
     def rich(cls) -> CombinedDescriptor:
-        """Interior distances joined with Euclidean distances, depth and electrostatic potential of the samples.
+        """Interior distances joined with all else there is, in three parts.
 
-        It needs signatures with `SignatureConfig(attributes=("depth", "electrostatic_potential"))`; 50 eigenpairs do.
+        The histograms with Euclidean distances, depth and electrostatic potential of the samples; how interior samples
+        lie to each other and to the surface, by interior distance; and the same of surface samples, by Euclidean
+        distance. It needs signatures with
+        `SignatureConfig(attributes=("depth", "electrostatic_potential", "surface_direction"))`; 50 eigenpairs do.
         """
         return cls(
             [
-                _layout(50, PairHistogram(8, 64)),
-                _layout(16, PairHistogram(8, 64, distance_range=3.0)),
-                _layout(50, PairHistogram(4, 32, n_euclidean_bins=16)),
-                _layout(50, PairHistogram(3, 12, attributes={"depth": _DEPTH}, n_euclidean_bins=8)),
-                _layout(50, PairHistogram(4, 32, attributes={"depth": _DEPTH})),
-                _layout(50, PairHistogram(4, 32, attributes={"electrostatic_potential": _ELECTROSTATIC_POTENTIAL})),
+                cls(
+                    [
+                        _layout(50, PairHistogram(8, 64)),
+                        _layout(16, PairHistogram(8, 64, distance_range=3.0)),
+                        _layout(50, PairHistogram(4, 32, n_euclidean_bins=16)),
+                        _layout(50, PairHistogram(3, 12, attributes={"depth": _DEPTH}, n_euclidean_bins=8)),
+                        _layout(50, PairHistogram(4, 32, attributes={"depth": _DEPTH})),
+                        _layout(
+                            50, PairHistogram(4, 32, attributes={"electrostatic_potential": _ELECTROSTATIC_POTENTIAL})
+                        ),
+                    ]
+                ),
+                OrientedDescriptor(SpectralEmbedding(n_eigenpairs=50)),
+                OrientedDescriptor(samples="surface", distance="euclidean"),
             ]
         )
+
+    @property
+    def part_cells(self) -> tuple[int, ...]:
+        """Cells of each part."""
+        return tuple(sum(part.part_cells) for part in self.parts)  # type: ignore[arg-type]
 
     def forward(self, batch: SignatureBatch) -> Tensor:
         """(N, cells) histograms, each shape's of sum 1."""
@@ -160,6 +285,11 @@ class EmbeddedDescriptor(nn.Module):
     def forward(self, batch: SignatureBatch) -> Tensor:
         """(N, D) embeddings of length 1."""
         return self.head(self.descriptor(batch))
+
+
+def _in_units(samples: SampleBatch, batch: SignatureBatch) -> Tensor:
+    """(N, P, 3) points in units of √area."""
+    return samples.points / batch.area.sqrt().to(samples.points.dtype)[:, None, None]
 
 
 def _layout(n_eigenpairs: int, histogram: PairHistogram) -> VolumetricDescriptor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Self
 
 import torch
@@ -20,9 +21,12 @@ class WhitenedHead(nn.Module):
     class, so that this metric, unlike a free one, serves classes that were not trained on. As made, it leaves
     histograms as they are but for the root and the length.
 
+    The parts of a `CombinedDescriptor` may be treated one by one: each is whitened and brought to one length, so that
+    the cosine distance is the mean of those of the parts.
+
     Args:
-        n_cells: cells of a histogram, over all its dimensions; D is as large.
-        n_directions: eigenvectors of W that are kept, the largest.
+        n_cells: cells of a histogram, over all its dimensions, or of each of its parts; D is as large as all of them.
+        n_directions: eigenvectors of W that are kept of each part, the largest.
         shrinkage: s; a large one leaves only the centring.
     """
 
@@ -30,17 +34,18 @@ class WhitenedHead(nn.Module):
     directions: Tensor
     gains: Tensor
 
-    def __init__(self, n_cells: int, n_directions: int = 32, shrinkage: float = 1.0) -> None:
+    def __init__(self, n_cells: int | Sequence[int], n_directions: int = 32, shrinkage: float = 1.0) -> None:
         super().__init__()
-        for name, value in (("n_cells", n_cells), ("n_directions", n_directions)):
+        self.part_cells = (n_cells,) if isinstance(n_cells, int) else tuple(n_cells)
+        for name, value in (("n_cells", min(self.part_cells, default=0)), ("n_directions", n_directions)):
             if value < 1:
                 raise ValueError(f"{name}: expected at least 1, got {value}.")
         if shrinkage <= 0:
             raise ValueError(f"shrinkage: expected a positive number, got {shrinkage}.")
         self.shrinkage = shrinkage
-        self.register_buffer("mean", torch.zeros(n_cells))
-        self.register_buffer("directions", torch.zeros(n_directions, n_cells))
-        self.register_buffer("gains", torch.ones(n_directions))
+        self.register_buffer("mean", torch.zeros(sum(self.part_cells)))
+        self.register_buffer("directions", torch.zeros(n_directions, len(self.mean)))
+        self.register_buffer("gains", torch.ones(len(self.part_cells), n_directions))
 
     @torch.no_grad()
     def fit(self, histograms: Tensor, labels: Tensor) -> Self:
@@ -53,38 +58,48 @@ class WhitenedHead(nn.Module):
         labels = _checked(roots, labels)
         _, members = labels.unique(return_inverse=True)
         n_members = torch.bincount(members)
-        means = roots.new_zeros(len(n_members), roots.shape[1]).index_add_(0, members, roots) / n_members[:, None]
-        residuals = (roots - means[members]).double()
-        rank = len(roots) - len(n_members)
-        if rank == 0:
+        if len(roots) == len(n_members):
             raise ValueError("labels: expected a class of at least two shapes, got as many classes as shapes.")
+        means = roots.new_zeros(len(n_members), roots.shape[1]).index_add_(0, members, roots) / n_members[:, None]
+        self.mean.copy_(roots.mean(dim=0))
+        self.directions.zero_()
+        self.gains.fill_(1)
+        residuals = self.parts((roots - means[members]).double())
+        for part, directions, gains in zip(residuals, self.parts(self.directions), self.gains, strict=True):
+            self._fit_part(part, len(roots) - len(n_members), directions, gains)
+        return self
+
+    def _fit_part(self, residuals: Tensor, rank: int, directions: Tensor, gains: Tensor) -> None:
         # The eigenvectors of the covariance from the smaller Gram matrix: there are fewer shapes than cells.
         spread, vectors = torch.linalg.eigh(residuals @ residuals.T)
         spread, vectors = spread.flip(0).clamp_min(0), vectors.flip(1)
         # What is left of the others is rounding: it has no direction.
-        n_kept = min(len(self.directions), rank, int((spread > 1e-10 * spread[0]).sum()))
+        n_kept = min(len(directions), rank, int((spread > 1e-10 * spread[0]).sum()))
         relative = spread[:n_kept] * rank / spread.sum()
         lengths = spread[:n_kept].sqrt()
-        self.mean.copy_(roots.mean(dim=0))
-        self.directions.zero_()
-        self.gains.fill_(1)
-        self.directions[:n_kept] = (vectors[:, :n_kept].T @ residuals) / lengths[:, None]
-        self.gains[:n_kept] = (self.shrinkage / (self.shrinkage + relative)).sqrt()
-        return self
+        directions[:n_kept] = (vectors[:, :n_kept].T @ residuals) / lengths[:, None]
+        gains[:n_kept] = (self.shrinkage / (self.shrinkage + relative)).sqrt()
 
     def forward(self, histograms: Tensor) -> Tensor:
         """(N, ...) histograms to (N, D) of length 1."""
-        centred = square_roots(histograms, len(self.mean)) - self.mean
-        damped = centred - ((centred @ self.directions.T) * (1 - self.gains)) @ self.directions
-        return functional.normalize(damped, dim=1)
+        centred = self.parts(square_roots(histograms, len(self.mean)) - self.mean)
+        whitened = [
+            part - ((part @ directions.T) * (1 - gains)) @ directions
+            for part, directions, gains in zip(centred, self.parts(self.directions), self.gains, strict=True)
+        ]
+        return torch.cat([functional.normalize(part, dim=1) for part in whitened], dim=1) / len(whitened) ** 0.5
+
+    def parts(self, cells: Tensor) -> tuple[Tensor, ...]:
+        """Views of (N, D) values, one of each part."""
+        return cells.split(self.part_cells, dim=1)
 
 
 class KernelHead(nn.Module):
     """Histograms to what they have of each training class, by kernel ridge regression on a `WhitenedHead`.
 
-    The kernel is exp(−d/m), d the cosine distance of the whitened histograms, m its median between training shapes; it
-    is regressed onto the indicators of the classes. The best there is here for classes that were trained on; for other
-    classes use the `WhitenedHead`.
+    The kernel is exp(−d/m), d the cosine distance of the whitened histograms, m its median between training shapes, and
+    the mean of such kernels if there are several parts. It is regressed onto the indicators of the classes. The best
+    there is here for classes that were trained on; for other classes use the `WhitenedHead`.
 
     Args:
         n_cells, n_directions, shrinkage: see `WhitenedHead`.
@@ -94,13 +109,13 @@ class KernelHead(nn.Module):
     """
 
     anchors: Tensor
-    median: Tensor
+    medians: Tensor
     coefficients: Tensor
     classes: Tensor
 
     def __init__(
         self,
-        n_cells: int,
+        n_cells: int | Sequence[int],
         n_shapes: int,
         n_classes: int,
         n_directions: int = 32,
@@ -116,8 +131,8 @@ class KernelHead(nn.Module):
             )
         self.whitened = WhitenedHead(n_cells, n_directions, shrinkage)
         self.ridge = ridge
-        self.register_buffer("anchors", torch.zeros(n_shapes, n_cells))
-        self.register_buffer("median", torch.ones(()))
+        self.register_buffer("anchors", torch.zeros(n_shapes, len(self.whitened.mean)))
+        self.register_buffer("medians", torch.ones(len(self.whitened.part_cells)))
         self.register_buffer("coefficients", torch.zeros(n_shapes, n_classes))
         self.register_buffer("classes", torch.arange(n_classes))
 
@@ -142,9 +157,9 @@ class KernelHead(nn.Module):
             )
         self.classes.copy_(classes)
         self.anchors.copy_(self.whitened(histograms))
-        distances = 1 - self.anchors @ self.anchors.T
-        pairs = torch.triu_indices(len(distances), len(distances), 1, device=distances.device)
-        self.median.copy_(distances[pairs[0], pairs[1]].median().clamp_min(torch.finfo(distances.dtype).tiny))
+        i, j = torch.triu_indices(len(self.anchors), len(self.anchors), 1, device=self.anchors.device)
+        distances = self._distances(self.anchors)[:, i, j]
+        self.medians.copy_(distances.median(dim=1).values.clamp_min(torch.finfo(distances.dtype).tiny))
         kernel = self._kernel(self.anchors).double()
         kernel.diagonal().add_(self.ridge)
         targets = functional.one_hot(members, len(classes)).double()
@@ -164,7 +179,13 @@ class KernelHead(nn.Module):
         return functional.normalize(self.scores(histograms) - 1 / len(self.classes), dim=1)
 
     def _kernel(self, whitened: Tensor) -> Tensor:
-        return ((whitened @ self.anchors.T - 1) / self.median).exp()
+        return (-self._distances(whitened) / self.medians[:, None, None]).exp().mean(dim=0)
+
+    def _distances(self, whitened: Tensor) -> Tensor:
+        """(parts, N, n_shapes) cosine distances to the training shapes."""
+        parts = zip(self.whitened.parts(whitened), self.whitened.parts(self.anchors), strict=True)
+        # The parts of a vector of length 1 have that length together.
+        return torch.stack([1 - len(self.medians) * part @ anchors.T for part, anchors in parts])
 
 
 def _checked(roots: Tensor, labels: Tensor) -> Tensor:

@@ -11,7 +11,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import one_hot, pad, softplus
+from torch.nn.functional import one_hot, pad
+
+from igps.nn.bins import OrderedCentres, middles
 
 Result = TypeVar("Result")
 
@@ -21,8 +23,6 @@ _BLOCK = 512
 _BLOCK_COUNTS = 2**16
 # Entries for each centre in the table from a distance to its interval.
 _TABLE_PER_CENTRE = 64
-# The part of its start that a learned gap between centres always keeps, so that no interval closes.
-_LEAST_GAP = 1e-3
 # Moments of a shape that are kept from forward to backward; more are counted a second time.
 _MOST_KEPT = 2**22
 
@@ -447,40 +447,6 @@ def _take(table: Tensor, index: Tensor) -> Tensor:
     return table.index_select(0, index.flatten()).view_as(index)
 
 
-class OrderedCentres(nn.Module):
-    """Ascending centres of bins or classes, fixed or learned.
-
-    Learned centres are the running sum of positive gaps, each its start times softplus(θ)/log 2 with θ = 0 at first,
-    so that they ascend whatever the parameters become. Centres that start positive stay positive.
-
-    Args:
-        start: (B,) ascending.
-        learnable: whether they are parameters.
-
-    Raises:
-        ValueError: values that are not finite or do not ascend.
-    """
-
-    start: Tensor
-
-    def __init__(self, start: Tensor | Sequence[float], learnable: bool = False) -> None:
-        super().__init__()
-        values = torch.as_tensor(start, dtype=torch.float32)
-        if values.ndim != 1 or not len(values) or not torch.isfinite(values).all() or (values.diff() <= 0).any():
-            raise ValueError(f"start: expected finite values in ascending order, got {values.tolist()}.")
-        self.register_buffer("start", values)
-        self.log_gap = nn.Parameter(torch.zeros(len(values))) if learnable else None
-
-    def forward(self) -> Tensor:
-        """(B,) centres."""
-        if self.log_gap is None:
-            return self.start
-        first = self.start[:1]
-        origin = torch.where(first > 0, 0, first - self.start.diff()[:1]) if len(self.start) > 1 else first.clamp(max=0)
-        gaps = torch.cat([origin, self.start]).diff()
-        return origin + (gaps * (_LEAST_GAP + (1 - _LEAST_GAP) / math.log(2) * softplus(self.log_gap))).cumsum(0)
-
-
 class PairHistogram(nn.Module):
     """Pair histograms of a padded batch of shapes, with hard, soft or learned classes and bins.
 
@@ -521,16 +487,23 @@ class PairHistogram(nn.Module):
         self.distance_range = distance_range
         self.potential_range = potential_range
         self.soft = soft or learnable
-        self.distance_centres = OrderedCentres(_middles(n_bins, distance_range, "bins"), learnable)
-        self.potential_centres = OrderedCentres(_middles(n_classes, potential_range, "classes"), learnable)
+        self.distance_centres = OrderedCentres(middles(n_bins, distance_range, "bins"), learnable)
+        self.potential_centres = OrderedCentres(middles(n_classes, potential_range, "classes"), learnable)
         self.attribute_centres = nn.ModuleDict(
             {name: OrderedCentres(start, learnable) for name, start in (attributes or {}).items()}
         )
         self.euclidean_centres = (
-            OrderedCentres(_middles(n_euclidean_bins, euclidean_range, "euclidean_bins"), learnable)
+            OrderedCentres(middles(n_euclidean_bins, euclidean_range, "euclidean_bins"), learnable)
             if n_euclidean_bins
             else None
         )
+
+    @property
+    def n_cells(self) -> int:
+        """Cells of a histogram, over all its dimensions."""
+        n_classes = self.n_classes * math.prod(len(centres.start) for centres in self.attribute_centres.values())  # type: ignore[arg-type, misc]
+        n_euclidean_bins = 1 if self.euclidean_centres is None else len(self.euclidean_centres.start)
+        return len(class_pairs(n_classes)) * self.n_bins * n_euclidean_bins
 
     @torch.compiler.disable
     def forward(
@@ -560,6 +533,8 @@ class PairHistogram(nn.Module):
         attributes = attributes or {}
         if missing := [name for name in self.attribute_centres if name not in attributes]:
             raise ValueError(f"attributes: expected {missing} among them, got {sorted(attributes)}.")
+        if vectors := [name for name in self.attribute_centres if attributes[name].ndim != 2]:
+            raise ValueError(f"attributes: expected scalars to split by, but {vectors} are directions.")
         if self.euclidean_centres is not None and points is None:
             raise ValueError("points: expected positions for the Euclidean bins, got None.")
         return torch.stack(
@@ -606,12 +581,6 @@ class PairHistogram(nn.Module):
             f"n_classes={self.n_classes}, n_bins={self.n_bins}, distance_range={self.distance_range}, "
             f"potential_range={self.potential_range}, soft={self.soft}"
         )
-
-
-def _middles(n: int, largest: float, name: str) -> Tensor:
-    if n < 1 or not 0 < largest < math.inf:
-        raise ValueError(f"expected at least one of {name} and a positive range, got n_{name}={n} and {largest}.")
-    return (torch.arange(n) + 0.5) * (largest / n)
 
 
 def _nearest(values: Tensor, centres: Tensor) -> Tensor:

@@ -13,7 +13,8 @@ from igps.geometry.signature import SignatureConfig
 from igps.nn.descriptor import CombinedDescriptor, VolumetricDescriptor
 from igps.retrieval import chi_square, cosine
 
-DescriptorName = Literal["interior", "gps", "multiscale", "rich", "pretrained"]
+HistogramName = Literal["interior", "gps", "multiscale", "rich"]
+DescriptorName = Literal[HistogramName, "pretrained"]
 
 
 @dataclass(frozen=True)

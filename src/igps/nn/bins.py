@@ -1,0 +1,64 @@
+"""Centres of bins and classes, and where values lie among them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+# The part of its start that a learned gap between centres always keeps, so that no interval closes.
+_LEAST_GAP = 1e-3
+
+
+def middles(n: int, largest: float, name: str) -> Tensor:
+    """(n,) middles of n equal intervals of [0, largest].
+
+    Raises:
+        ValueError: no interval, or no positive range; `name` is that of the argument without its "n_".
+    """
+    if n < 1 or not 0 < largest < math.inf:
+        raise ValueError(f"expected at least one of {name} and a positive range, got n_{name}={n} and {largest}.")
+    return (torch.arange(n) + 0.5) * (largest / n)
+
+
+def position(values: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+    """The last centre but one below each value, and how far the value is on the way to the next centre, 0 to 1."""
+    lower = (torch.bucketize(values.detach(), centres.detach(), right=True) - 1).clamp(0, len(centres) - 2)
+    return lower, ((values - centres[lower]) / centres.diff()[lower]).clamp(0, 1)
+
+
+class OrderedCentres(nn.Module):
+    """Ascending centres of bins or classes, fixed or learned.
+
+    Learned centres are the running sum of positive gaps, each its start times softplus(θ)/log 2 with θ = 0 at first,
+    so that they ascend whatever the parameters become. Centres that start positive stay positive.
+
+    Args:
+        start: (B,) ascending.
+        learnable: whether they are parameters.
+
+    Raises:
+        ValueError: values that are not finite or do not ascend.
+    """
+
+    start: Tensor
+
+    def __init__(self, start: Tensor | Sequence[float], learnable: bool = False) -> None:
+        super().__init__()
+        values = torch.as_tensor(start, dtype=torch.float32)
+        if values.ndim != 1 or not len(values) or not torch.isfinite(values).all() or (values.diff() <= 0).any():
+            raise ValueError(f"start: expected finite values in ascending order, got {values.tolist()}.")
+        self.register_buffer("start", values)
+        self.log_gap = nn.Parameter(torch.zeros(len(values))) if learnable else None
+
+    def forward(self) -> Tensor:
+        """(B,) centres."""
+        if self.log_gap is None:
+            return self.start
+        first = self.start[:1]
+        origin = torch.where(first > 0, 0, first - self.start.diff()[:1]) if len(self.start) > 1 else first.clamp(max=0)
+        gaps = torch.cat([origin, self.start]).diff()
+        return origin + (gaps * (_LEAST_GAP + (1 - _LEAST_GAP) / math.log(2) * softplus(self.log_gap))).cumsum(0)
