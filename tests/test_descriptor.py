@@ -226,18 +226,20 @@ def test_oriented_distances_are_those_of_the_plain_histogram(batch: SignatureBat
         np.testing.assert_allclose(result[i].sum(dim=(1, 2, 3)), expected[0], atol=1e-6)
 
 
-def test_directions_in_the_embedding_are_to_the_nearest_surface_samples(batch: SignatureBatch) -> None:
+@pytest.mark.parametrize("kind", ["interior", "surface"])
+def test_directions_in_the_embedding_lead_outwards(batch: SignatureBatch, kind: str) -> None:
     scale = SpectralEmbedding(n_eigenpairs=4)
-    result = OrientedDescriptor(scale, space="embedding")(batch)
+    result = OrientedDescriptor(scale, samples=kind, space="embedding")(batch)  # type: ignore[arg-type]
     for i, n in enumerate(N_POINTS):
         inside, surface = (
             (samples.eigenfunctions[i, :n, :4] / batch.eigenvalues[i, :4].sqrt()).float()
             for samples in (batch.interior, batch.surface)
         )
-        nearest = (inside[:, None] - surface).norm(dim=2).argsort(dim=1)[:, :8]
-        directions = normalize(surface[nearest].mean(dim=1) - inside, dim=1)
+        own, other, sign = (inside, surface, 1) if kind == "interior" else (surface, inside, -1)
+        nearest = (own[:, None] - other).norm(dim=2).argsort(dim=1)[:, :8]
+        directions = sign * normalize(other[nearest].mean(dim=1) - own, dim=1)
         mask = torch.ones(1, n, dtype=torch.bool)
-        expected = OrientedPairHistogram()(inside[None], inside[None], directions[None], mask)[0]
+        expected = OrientedPairHistogram()(own[None], own[None], directions[None], mask)[0]
         torch.testing.assert_close(result[i], expected, atol=1e-5, rtol=0)
 
 
@@ -260,8 +262,6 @@ def test_oriented_descriptor_says_what_it_needs(batch: SignatureBatch) -> None:
         oriented()(bare)
     with pytest.raises(ValueError, match="space: expected 'position' or 'embedding'"):
         OrientedDescriptor(space="volume")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="samples: expected 'interior' with space='embedding'"):
-        OrientedDescriptor(samples="surface", space="embedding")
     with pytest.raises(ValueError, match="distance: expected 'interior' or 'euclidean'"):
         OrientedDescriptor(distance="geodesic")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="distance: expected 'interior' with space='embedding'"):

@@ -16,6 +16,7 @@ from igps.geometry.signature import SignatureConfig
 from igps.nn.descriptor import VolumetricDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.extraction import describe
+from igps.nn.fitted import WhitenedHead
 from igps.nn.head import CorrectedDistance, MetricHead
 from igps.nn.histogram import PairHistogram
 from igps.nn.learner import RetrievalLearner
@@ -85,6 +86,19 @@ def test_a_checkpoint_has_the_scale_of_its_own_epoch(shapes: Path, tmp_path: Pat
     for name in ("plain_unit", "learned_unit"):
         torch.testing.assert_close(state[f"distance.{name}"], getattr(fresh.distance, name))
         assert state[f"distance.{name}"] != 1
+
+
+def test_a_head_in_closed_form_follows_the_bins(shapes: Path, tmp_path: Path) -> None:
+    seed_everything(3, verbose=False)
+    descriptor = VolumetricDescriptor(SpectralEmbedding(n_knots=5), PairHistogram(2, 16, learnable=True))
+    model = RetrievalLearner(descriptor, CorrectedDistance(WhitenedHead(3 * 16, 4), share=1.0))
+    module = data(shapes)
+    trainer(2, tmp_path).fit(model, module)
+    assert all((parameter != 0).any() for parameter in model.parameters())
+    part = module.dataset.subset(module.split.train)
+    expected = WhitenedHead(3 * 16, 4).fit(describe(part, model.eval().descriptor), part.labels)
+    for name, value in expected.state_dict().items():
+        torch.testing.assert_close(model.distance.head.state_dict()[name].abs(), value.abs(), atol=1e-4, rtol=0)
 
 
 def test_without_head_the_test_scores_are_the_plain_ones(shapes: Path, tmp_path: Path) -> None:

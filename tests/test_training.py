@@ -55,24 +55,38 @@ def test_checkpoint_to_table_figure_and_classifier(root: Path) -> None:
     )  # fmt: skip
     (checkpoint,) = out.rglob("*.ckpt")
     table = run("evaluate.py", "checkpoint", checkpoint, "--out", out / "evaluation")
-    scores = {line.split()[0]: [float(x) for x in line.split()[1:]] for line in table.splitlines()[1:3]}
-    assert set(scores) == {"plain", "learned"}
+    scores = {line.split()[0]: [float(x) for x in line.split()[1:]] for line in table.splitlines()[1:5]}
+    assert set(scores) == {"plain", "learned", "whitened", "kernel"}
     assert all(0 < value <= 100 for row in scores.values() for value in row)
     assert (out / "evaluation/layout.png").stat().st_size > 10_000
     accuracy = run("classify.py", root / "meshes", "--checkpoint", checkpoint)
     assert float(accuracy.split()[1]) > 40, accuracy
 
 
+def test_ablation_prints_every_head_of_every_layout(root: Path) -> None:
+    table = run(
+        "ablate.py", root / "meshes", "--n_train", 3, "--n_splits", 1, "--n_epochs", 1, "--n_training_samples", 50,
+        "--cache", root / "cache",
+    )  # fmt: skip
+    rows = re.findall(r"^(interior|euclidean|oriented) +(nothing|bins|spectrum|bins \+ spectrum)  +(.*)$", table, re.M)
+    assert len({row[:2] for row in rows}) == 12, table
+    assert all(len(re.findall(r"\d+\.\d ± ", row[2])) == 3 for row in rows), table
+
+
 def test_pretraining_saves_a_metric_and_measures_it(root: Path, tmp_path: Path) -> None:
     out = run(
         "pretrain.py", "--root", tmp_path / "generated", "--n_classes", 7, "--n_per_class", 3, "--n_held_out", 3,
         "--n_eigenpairs", 50, "--n_directions", 4, "--cache", root / "cache", "--out", tmp_path / "metric.safetensors",
-        "--data", root / "meshes", "--figure", tmp_path / "curve.png",
+        "--data", root / "meshes", "--figures", tmp_path / "figures", "--n_epochs", 1, "--n_training_samples", 50,
     )  # fmt: skip
-    assert {name: tuple(value.shape) for name, value in load_file(tmp_path / "metric.safetensors").items()} == {
-        "mean": (27420,), "directions": (4, 27420), "gains": (3, 4)
-    }  # fmt: skip
-    assert (tmp_path / "curve.png").stat().st_size > 5_000
+    stored = load_file(tmp_path / "metric.safetensors")
+    head = {name: tuple(value.shape) for name, value in stored.items() if name.startswith("head.")}
+    assert head == {"head.mean": (27420,), "head.directions": (4, 27420), "head.gains": (3, 4)}
+    learned = [value for name, value in stored.items() if name.endswith(("log_gain", "log_gap"))]
+    assert learned
+    assert all((value != 0).any() for value in learned)
+    for name in ("pretrain.png", "pretrain_layout.png"):
+        assert (tmp_path / "figures" / name).stat().st_size > 5_000
     assert "3 held-out generated classes" in out
     assert "   4 generated classes: FT" in out
     assert "1 labels a class" in out

@@ -86,7 +86,10 @@ def score(histograms: Tensor, labels: Tensor, split: Split, head: Head, part_cel
 
 
 def checkpoint(path: Path, out: Path = Path("build/evaluation")) -> None:
-    """Scores of a checkpoint on the test part of its own split, beside the plain distance; and what it has learned.
+    """Scores of a checkpoint on the test part of its own split; and what it has learned.
+
+    "plain" is the distance of its histograms without the head, "learned" the whole; "whitened" and "kernel" are heads
+    fitted to the same histograms of its training and validation parts.
 
     Args:
         path: the checkpoint; its configuration is read from config.yaml two folders up, where train.py puts it.
@@ -94,13 +97,18 @@ def checkpoint(path: Path, out: Path = Path("build/evaluation")) -> None:
     """
     learner, data = load_learner(path)
     data.prepare_data()
-    part = data.dataset.subset(data.split.test)
-    histograms = describe(part, learner.descriptor, progress=True)
-    plain = retrieval_scores(learner.distance.plain_distance(histograms, histograms), part.labels).mean()
+    histograms, labels = describe(data.dataset, learner.descriptor, progress=True), data.dataset.labels
+    test = torch.tensor(data.split.test)
+    part = histograms[test]
+    found = {"plain": retrieval_scores(learner.distance.plain_distance(part, part), labels[test]).mean()}
     with torch.inference_mode():
-        learned = retrieval_scores(learner.distances(histograms, histograms), part.labels).mean()
+        found["learned"] = retrieval_scores(learner.distances(part, part), labels[test]).mean()
+    # The validation part has chosen nothing that these heads depend on.
+    split = Split(data.split.train + data.split.validation, (), data.split.test)
+    for head in ("whitened", "kernel"):
+        found[head] = score(histograms.flatten(1), labels, split, head, learner.descriptor.part_cells)
     print(f"{'':<10}" + "".join(f"{title:>8}" for title in COLUMNS.values()))
-    for name, scores in (("plain", plain), ("learned", learned)):
+    for name, scores in found.items():
         print(f"{name:<10}" + "".join(f"{100 * scores[column]:>8.1f}" for column in COLUMNS))
     out.mkdir(parents=True, exist_ok=True)
     learned_layout(learner.descriptor, out / "layout.png")

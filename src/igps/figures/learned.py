@@ -4,50 +4,73 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import nn
 
 from igps.figures import _figure
 from igps.nn.bins import OrderedCentres
-from igps.nn.descriptor import VolumetricDescriptor
+from igps.nn.descriptor import OrientedDescriptor, VolumetricDescriptor
 from igps.nn.embedding import SpectralEmbedding, spectral_weights
 from igps.nn.histogram import PairHistogram
+from igps.nn.oriented import OrientedPairHistogram
 
 
-def learned_layout(descriptor: VolumetricDescriptor, path: str | Path) -> None:
+def learned_layout(descriptor: nn.Module, path: str | Path) -> None:
     """Save a picture of the bin and class centres and of the spectral filter g(λ·area), learned and as they started.
 
     Args:
-        descriptor: with a `SpectralEmbedding` and a `PairHistogram`.
+        descriptor: a `VolumetricDescriptor` or an `OrientedDescriptor`, or a `CombinedDescriptor` of such, which are
+            drawn one a row.
         path: of the picture, such as layout.png.
 
     Raises:
         ValueError: a descriptor of other parts.
         ImportError: matplotlib is not installed.
     """
-    if not isinstance(descriptor.embedding, SpectralEmbedding) or not isinstance(descriptor.histogram, PairHistogram):
-        raise ValueError("descriptor: expected one made of a SpectralEmbedding and a PairHistogram.")
-    axes_of = _centres(descriptor.histogram)
-    figure = _figure(4 * (len(axes_of) + 1), 3.2)
-    panels = figure.subplots(1, len(axes_of) + 1)
-    x = torch.logspace(0.5, 3.6, 200, dtype=torch.float64)
-    area = torch.ones((), dtype=torch.float64)
-    learned = descriptor.embedding.weights(x, area).detach()
-    start = spectral_weights(x, area, descriptor.embedding.kind, descriptor.embedding.time)
-    panels[0].loglog(x, start, color="#888888", linestyle="--", label="start")
-    panels[0].loglog(x, learned, color="#0072B2", label="learned")
-    panels[0].set(xlabel="eigenvalue × area", ylabel="weight of the eigenfunction g", title="spectral filter")
-    panels[0].legend(frameon=False)
-    for panel, (title, centres) in zip(panels[1:], axes_of.items(), strict=True):
-        values = centres().detach()
-        panel.plot(centres.start, centres.start, color="#888888", linestyle="--", label="start")
-        panel.plot(centres.start, values, color="#D55E00", marker=".", markersize=3, label="learned")
-        panel.set(xlabel="centre at the start", ylabel="centre", title=title)
-        panel.legend(frameon=False)
+    parts = [part for part in descriptor.modules() if isinstance(part, VolumetricDescriptor | OrientedDescriptor)]
+    rows = [(part.embedding, _centres(part.histogram)) for part in parts]
+    known = all(isinstance(embedding, SpectralEmbedding | None) and centres for embedding, centres in rows)
+    if not rows or not known:
+        raise ValueError("descriptor: expected one made of the embeddings and histograms of this library.")
+    n_columns = 1 + max(len(centres) for _, centres in rows)
+    figure = _figure(4 * n_columns, 3.2 * len(rows))
+    grid = figure.subplots(len(rows), n_columns, squeeze=False)
+    for panels, (embedding, centres) in zip(grid, rows, strict=True):
+        if isinstance(embedding, SpectralEmbedding):
+            _filter(panels[0], embedding)
+        else:
+            panels[0].set_axis_off()
+        for panel, (title, bins) in zip(panels[1:], centres.items(), strict=False):
+            panel.plot(bins.start, bins.start, color="#888888", linestyle="--", label="start")
+            panel.plot(bins.start, bins().detach(), color="#D55E00", marker=".", markersize=3, label="learned")
+            panel.set(xlabel="centre at the start", ylabel="centre", title=title)
+            panel.legend(frameon=False)
+        for panel in panels[1 + len(centres) :]:
+            panel.set_axis_off()
     figure.savefig(path, dpi=150)
 
 
-def _centres(histogram: PairHistogram) -> dict[str, OrderedCentres]:
+def _filter(panel: Any, embedding: SpectralEmbedding) -> None:
+    x = torch.logspace(0.5, 3.6, 200, dtype=torch.float64)
+    area = torch.ones((), dtype=torch.float64)
+    start = spectral_weights(x, area, embedding.kind, embedding.time)
+    panel.loglog(x, start, color="#888888", linestyle="--", label="start")
+    panel.loglog(x, embedding.weights(x, area).detach(), color="#0072B2", label="learned")
+    panel.set(xlabel="eigenvalue × area", ylabel="weight of the eigenfunction g", title="spectral filter")
+    panel.legend(frameon=False)
+
+
+def _centres(histogram: nn.Module) -> dict[str, OrderedCentres]:
+    if isinstance(histogram, OrientedPairHistogram):
+        return {
+            "bins of distance": histogram.distance_centres,
+            "bins of the cosine to the line": histogram.towards_centres,
+            "bins of the cosine between directions": histogram.between_centres,
+        }
+    if not isinstance(histogram, PairHistogram):
+        return {}
     found = {
         "bins of interior distance": histogram.distance_centres,
         "classes of barycentroid potential": histogram.potential_centres,
@@ -56,7 +79,7 @@ def _centres(histogram: PairHistogram) -> dict[str, OrderedCentres]:
         assert isinstance(centres, OrderedCentres)
         found[f"classes of {name}"] = centres
     if histogram.euclidean_centres is not None:
-        found["bins of Euclidean distance / √area"] = histogram.euclidean_centres
+        found["bins of the second distance"] = histogram.euclidean_centres
     return found
 
 

@@ -51,7 +51,8 @@ class OrderedCentres(nn.Module):
         values = torch.as_tensor(start, dtype=torch.float32)
         if values.ndim != 1 or not len(values) or not torch.isfinite(values).all() or (values.diff() <= 0).any():
             raise ValueError(f"start: expected finite values in ascending order, got {values.tolist()}.")
-        self.register_buffer("start", values)
+        # A copy: safetensors refuses tensors that share memory.
+        self.register_buffer("start", values.clone())
         self.log_gap = nn.Parameter(torch.zeros(len(values))) if learnable else None
 
     def forward(self) -> Tensor:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from igps.data.dataset import SampleBatch, SignatureBatch
@@ -26,6 +26,12 @@ PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
 # Class centres of further scalars; those of the depth have their boundaries at 0.015, 0.03 and 0.06 of √area.
 _DEPTH = (0.0075, 0.0225, 0.0375, 0.0825)
 _ELECTROSTATIC_POTENTIAL = (2.4, 2.8, 3.2, 3.6)
+
+# Of the bodies with the most samples so many tell the histograms well enough, and the time grows with their square.
+_N_SAMPLES = 1500
+_N_ORIENTED_SAMPLES = 1000
+# Of the spectral filters of learnable layouts.
+_N_KNOTS = 12
 
 
 class _SampledDescriptor(nn.Module):
@@ -95,16 +101,12 @@ class VolumetricDescriptor(_SampledDescriptor):
 
     @classmethod
     def pretrained(cls) -> EmbeddedDescriptor:
-        """`CombinedDescriptor.rich` under a `WhitenedHead` that was fitted to generated articulated shapes.
+        """`CombinedDescriptor.rich` under a `WhitenedHead`, both trained on generated articulated shapes.
 
         It needs no label of the shapes that it compares. Distances are `cosine` distances. The model card is in the
         README; training/pretrain.py makes the file.
         """
-        stored = {name: tensor.float() for name, tensor in load_file(PRETRAINED).items()}
-        descriptor = CombinedDescriptor.rich()
-        head = WhitenedHead(descriptor.part_cells, len(stored["directions"]))
-        head.load_state_dict(stored)
-        return EmbeddedDescriptor(descriptor, head).eval()
+        return load_embedded(PRETRAINED)
 
     def forward(self, batch: SignatureBatch) -> Tensor:
         """(N, C(C+1)/2, B) histograms, with Euclidean bins (N, C(C+1)/2, B, E), each shape's of sum 1."""
@@ -135,8 +137,9 @@ class OrientedDescriptor(_SampledDescriptor):
         histogram: coordinates, points, directions and mask of N shapes to (N, cells...).
         samples: "interior" or "surface".
         space: "position" takes lines and directions in space, and needs the attribute "surface_direction"; "embedding"
-            takes them between the embedded samples, the direction being to the embedded surface samples nearest to it:
-            it consists of interior distances alone and hardly changes with pose. Only interior samples have it.
+            takes them between the embedded samples, the direction of an interior sample being to the embedded surface
+            samples nearest to it, that of a surface sample away from the interior ones: it consists of interior
+            distances alone and hardly changes with pose.
         distance: which is counted, "interior" or "euclidean", the latter over √area. On the surface the euclidean one
             makes the histograms of Wahl et al. 2003.
         n_samples, n_training_samples: see `VolumetricDescriptor`.
@@ -150,14 +153,12 @@ class OrientedDescriptor(_SampledDescriptor):
         *,
         space: Space = "position",
         distance: Distance = "interior",
-        n_samples: int | None = 700,
+        n_samples: int | None = _N_ORIENTED_SAMPLES,
         n_training_samples: int | None = None,
     ) -> None:
         super().__init__(samples, n_samples, n_training_samples)
         if space not in ("position", "embedding"):
             raise ValueError(f"space: expected 'position' or 'embedding', got {space!r}.")
-        if space == "embedding" and samples != "interior":
-            raise ValueError("samples: expected 'interior' with space='embedding': the surface is its own nearest.")
         if distance not in ("interior", "euclidean"):
             raise ValueError(f"distance: expected 'interior' or 'euclidean', got {distance!r}.")
         if space == "embedding" and distance == "euclidean":
@@ -183,9 +184,10 @@ class OrientedDescriptor(_SampledDescriptor):
                     f"{sorted(samples.attributes)}. Name it in SignatureConfig(attributes=...)."
                 )
             return self.histogram(coordinates, points, samples.attributes["surface_direction"], samples.mask)
-        surface = self._embedded(batch.surface, batch)
+        other, outward = (batch.surface, 1) if self.samples == "interior" else (batch.interior, -1)
+        targets = self._embedded(other, batch)
         directions = torch.stack(
-            [nearest_directions(coordinates[i], surface[i, real]) for i, real in enumerate(batch.surface.mask)]
+            [outward * nearest_directions(coordinates[i], targets[i, real]) for i, real in enumerate(other.mask)]
         )
         return self.histogram(coordinates, coordinates, directions, samples.mask)
 
@@ -207,10 +209,11 @@ class CombinedDescriptor(nn.Module):
 
     @classmethod
     def multiscale(cls) -> CombinedDescriptor:
-        """Interior distances alone, in three parts.
+        """Interior distances alone, in four parts.
 
         The histograms of the first 250, 50 and 16 eigenpairs (fine, middle and coarse); the joint histogram of the
-        distances of 50 and of 4; and how the samples lie to the surface in the embedding of 8.
+        distances of 50 and of 4; how the interior samples lie to the surface in the embedding of 16, and how the
+        surface samples lie to the interior ones in that of 8.
         """
         return cls(
             [
@@ -225,37 +228,55 @@ class CombinedDescriptor(nn.Module):
                     SpectralEmbedding(n_eigenpairs=50),
                     PairHistogram(1, 24, distance_range=3.0, n_euclidean_bins=24, euclidean_range=2.5),
                     second_embedding=SpectralEmbedding(n_eigenpairs=4),
-                    n_samples=700,
+                    n_samples=_N_SAMPLES,
                 ),
-                OrientedDescriptor(SpectralEmbedding(n_eigenpairs=8), space="embedding"),
+                OrientedDescriptor(SpectralEmbedding(n_eigenpairs=16), space="embedding"),
+                OrientedDescriptor(SpectralEmbedding(n_eigenpairs=8), samples="surface", space="embedding"),
             ]
         )
 
     @classmethod
-    def rich(cls) -> CombinedDescriptor:
+    def rich(cls, *, learnable: bool = False, n_samples: int | None = None) -> CombinedDescriptor:
         """Interior distances joined with all else there is, in three parts.
 
         The histograms with Euclidean distances, depth and electrostatic potential of the samples; how interior samples
         lie to each other and to the surface, by interior distance; and the same of surface samples, by Euclidean
         distance. It needs signatures with
         `SignatureConfig(attributes=("depth", "electrostatic_potential", "surface_direction"))`; 50 eigenpairs do.
+
+        Args:
+            learnable: whether the centres of bins and classes and the spectral filters are parameters; the classes are
+                soft ones then.
+            n_samples: of each part; by default as many as its histograms need.
         """
+        layouts = (
+            (50, PairHistogram(8, 64, learnable=learnable)),
+            (16, PairHistogram(8, 64, distance_range=3.0, learnable=learnable)),
+            (50, PairHistogram(4, 32, n_euclidean_bins=16, learnable=learnable)),
+            (50, PairHistogram(3, 12, attributes={"depth": _DEPTH}, n_euclidean_bins=8, learnable=learnable)),
+            (50, PairHistogram(4, 32, attributes={"depth": _DEPTH}, learnable=learnable)),
+            (
+                50,
+                PairHistogram(
+                    4, 32, attributes={"electrostatic_potential": _ELECTROSTATIC_POTENTIAL}, learnable=learnable
+                ),
+            ),
+        )
+        n_knots = _N_KNOTS if learnable else 0
         return cls(
             [
-                cls(
-                    [
-                        _layout(50, PairHistogram(8, 64)),
-                        _layout(16, PairHistogram(8, 64, distance_range=3.0)),
-                        _layout(50, PairHistogram(4, 32, n_euclidean_bins=16)),
-                        _layout(50, PairHistogram(3, 12, attributes={"depth": _DEPTH}, n_euclidean_bins=8)),
-                        _layout(50, PairHistogram(4, 32, attributes={"depth": _DEPTH})),
-                        _layout(
-                            50, PairHistogram(4, 32, attributes={"electrostatic_potential": _ELECTROSTATIC_POTENTIAL})
-                        ),
-                    ]
+                cls([_layout(n, histogram, n_knots, n_samples or _N_SAMPLES) for n, histogram in layouts]),
+                OrientedDescriptor(
+                    SpectralEmbedding(n_eigenpairs=50, n_knots=n_knots),
+                    OrientedPairHistogram(learnable=learnable),
+                    n_samples=n_samples or _N_ORIENTED_SAMPLES,
                 ),
-                OrientedDescriptor(SpectralEmbedding(n_eigenpairs=50)),
-                OrientedDescriptor(samples="surface", distance="euclidean"),
+                OrientedDescriptor(
+                    histogram=OrientedPairHistogram(distance_range=1.0, learnable=learnable),
+                    samples="surface",
+                    distance="euclidean",
+                    n_samples=n_samples or _N_ORIENTED_SAMPLES,
+                ),
             ]
         )
 
@@ -287,11 +308,34 @@ class EmbeddedDescriptor(nn.Module):
         return self.head(self.descriptor(batch))
 
 
+def save_embedded(module: EmbeddedDescriptor, path: Path) -> None:
+    """Write a `CombinedDescriptor.rich` under a `WhitenedHead` to a safetensors file, the head in half precision."""
+    state = {
+        name: (tensor.half() if name.startswith("head.") else tensor).contiguous()
+        for name, tensor in module.state_dict().items()
+    }
+    save_file(state, path)
+
+
+def load_embedded(path: Path) -> EmbeddedDescriptor:
+    """What `save_embedded` wrote, in evaluation mode."""
+    stored = {name: tensor.float() for name, tensor in load_file(path).items()}
+    # Fixed layouts have no parameters, their filters none to store.
+    descriptor = CombinedDescriptor.rich(learnable=any(name.endswith("log_gain") for name in stored))
+    head = WhitenedHead(descriptor.part_cells, len(stored["head.directions"]))
+    module = EmbeddedDescriptor(descriptor, head)
+    module.load_state_dict(stored)
+    return module.eval()
+
+
 def _in_units(samples: SampleBatch, batch: SignatureBatch) -> Tensor:
     """(N, P, 3) points in units of √area."""
     return samples.points / batch.area.sqrt().to(samples.points.dtype)[:, None, None]
 
 
-def _layout(n_eigenpairs: int, histogram: PairHistogram) -> VolumetricDescriptor:
-    # Of the bodies with the most samples 1,500 tell the histograms well enough, and the time grows with their square.
-    return VolumetricDescriptor(SpectralEmbedding(n_eigenpairs=n_eigenpairs), histogram, n_samples=1500)
+def _layout(
+    n_eigenpairs: int, histogram: PairHistogram, n_knots: int = 0, n_samples: int = _N_SAMPLES
+) -> VolumetricDescriptor:
+    return VolumetricDescriptor(
+        SpectralEmbedding(n_eigenpairs=n_eigenpairs, n_knots=n_knots), histogram, n_samples=n_samples
+    )

@@ -34,7 +34,7 @@ class WhitenedHead(nn.Module):
     directions: Tensor
     gains: Tensor
 
-    def __init__(self, n_cells: int | Sequence[int], n_directions: int = 32, shrinkage: float = 1.0) -> None:
+    def __init__(self, n_cells: int | Sequence[int], n_directions: int = 64, shrinkage: float = 0.3) -> None:
         super().__init__()
         self.part_cells = (n_cells,) if isinstance(n_cells, int) else tuple(n_cells)
         for name, value in (("n_cells", min(self.part_cells, default=0)), ("n_directions", n_directions)):
@@ -118,8 +118,8 @@ class KernelHead(nn.Module):
         n_cells: int | Sequence[int],
         n_shapes: int,
         n_classes: int,
-        n_directions: int = 32,
-        shrinkage: float = 1.0,
+        n_directions: int = 64,
+        shrinkage: float = 0.3,
         ridge: float = 0.03,
     ) -> None:
         super().__init__()

@@ -21,6 +21,9 @@ from igps.retrieval import RetrievalScoresMetric
 class RetrievalLearner(LightningModule):
     """Learns whatever has parameters in the descriptor and the distance, by a loss on the head's embeddings.
 
+    A head that is fitted in closed form, such as a `WhitenedHead`, is fitted to the training shapes before training and
+    again before each validation and checkpoint; what is trained then are bins and filters, through it.
+
     Validation and test log the retrieval scores of the whole distance, each shape against all others of its part. With
     a distance that has no head there is nothing to train, and `Trainer.test` gives the plain descriptor's scores.
 
@@ -67,8 +70,10 @@ class RetrievalLearner(LightningModule):
             raise ValueError("distance: expected a head to train, got none. Use Trainer.test for a plain descriptor.")
 
     def on_fit_start(self) -> None:
-        """Centre the head's inputs on the training shapes."""
-        self.distance.head.calibrate(self._training_histograms())  # type: ignore[union-attr, operator]
+        """Fit the head to the training shapes, or centre its inputs on them."""
+        histograms, labels = self._training_histograms()
+        if not self._fit_head(histograms, labels):
+            self.distance.head.calibrate(histograms)  # type: ignore[union-attr, operator]
 
     def on_fit_end(self) -> None:
         """Put the plain and the learned distance on one scale, by the training shapes."""
@@ -123,17 +128,27 @@ class RetrievalLearner(LightningModule):
         training = self.training
         # A checkpoint is saved in training mode, where the head drops cells.
         self.eval()
-        self.distance.calibrate(self._training_histograms())
+        histograms, labels = self._training_histograms()
+        self._fit_head(histograms, labels)
+        self.distance.calibrate(histograms)
         self.train(training)
 
+    def _fit_head(self, histograms: Tensor, labels: Tensor) -> bool:
+        """Whether the head is one that is fitted in closed form."""
+        fit: Any = getattr(self.distance.head, "fit", None)
+        if fit is not None:
+            fit(histograms, labels)
+        return fit is not None
+
     @torch.no_grad()
-    def _training_histograms(self) -> Tensor:
+    def _training_histograms(self) -> tuple[Tensor, Tensor]:
         loader = self.trainer.datamodule.training_in_order()  # type: ignore[attr-defined]
         training = self.training
         self.eval()
-        parts = [self(batch.to(self.device)) for batch in loader]
+        parts = [(self(batch.to(self.device)), batch.labels) for batch in loader]
         self.train(training)
-        return torch.cat(parts)
+        histograms, labels = zip(*parts, strict=True)
+        return torch.cat(histograms), torch.cat(labels)
 
 
 def load_learner(checkpoint: str | Path) -> tuple[RetrievalLearner, SignatureDataModule]:

@@ -104,18 +104,22 @@ class OrientedPairHistogram(nn.Module):
                 (second, towards),
                 (between, self.between_centres()),
             ]
+            # The cell of the lower centres, and how the weight of a pair is shared among it and the cells next to it.
             cell = torch.zeros_like(i)
-            corners = [(cell, torch.ones_like(distance))]
+            corners = [(0, torch.ones_like(distance))]
             for values, centres in axes:
-                lower, upper_share = position(values, centres)
+                lower, share = position(values, centres)
+                cell = cell * len(centres) + lower
                 corners = [
-                    (cell * len(centres) + lower + step, weight * (upper_share if step else 1 - upper_share))
-                    for cell, weight in corners
+                    (len(centres) * offset + step, weight * share if step else weight - weight * share)
+                    for offset, weight in corners
                     for step in (0, 1)
                 ]
             counts = torch.zeros(self.n_cells, dtype=torch.float64, device=points.device)
-            for cell, weight in corners:
-                counts = counts.index_add(0, cell, weight.double())
+            for offset, weight in corners:
+                added = torch.zeros_like(counts).index_add(0, cell, weight.double())
+                # The last centre but one is the lower one at most, so that nothing is rolled over the end.
+                counts = counts + added.roll(offset)
             shape = (self.n_bins, *[self.n_angle_bins] * 3)
             return (counts / len(distance)).to(distance.dtype).view(shape)
 

@@ -1,0 +1,105 @@
+"""What each learned part gives: bins, spectral filter, dimensions and head, over several seeded splits.
+
+    python training/ablate.py DATA
+
+Bins and filter are trained on the training part through a `WhitenedHead`; then heads are fitted to its histograms, and
+the test part is scored once.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from statistics import mean, stdev
+
+from jsonargparse import auto_cli
+from pytorch_lightning import Trainer, seed_everything
+from torch import nn
+
+from evaluate import score
+from igps.data.datamodule import SignatureDataModule
+from igps.geometry.signature import SignatureConfig
+from igps.nn.descriptor import CombinedDescriptor, OrientedDescriptor, VolumetricDescriptor
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.extraction import describe
+from igps.nn.fitted import WhitenedHead
+from igps.nn.head import CorrectedDistance
+from igps.nn.histogram import PairHistogram
+from igps.nn.learner import RetrievalLearner
+from igps.nn.oriented import OrientedPairHistogram
+from igps.nn.presets import preset
+
+HEADS = ("none", "whitened", "kernel")
+
+
+def ablate(
+    root: Path,
+    n_train: int = 10,
+    n_splits: int = 5,
+    first_seed: int = 100,
+    n_epochs: int = 20,
+    n_training_samples: int = 400,
+    cache: Path | None = None,
+) -> None:
+    """FT of each head on each descriptor, trained or not: mean ± standard deviation over splits.
+
+    Args:
+        root: labelled collection; every class is split.
+        n_train: shapes of each class to train on.
+        n_splits: how many splits, with the seeds from `first_seed` on.
+        first_seed: see n_splits.
+        n_epochs: of training bins and filters.
+        n_training_samples: of each shape in training, drawn anew at each step.
+        cache: folder of cached signatures; the user's cache directory if not given.
+    """
+    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
+    config = preset("rich").completed(SignatureConfig())
+    print(f"{'dimensions':<14}{'learned':<16}" + "".join(f"{head:>14}" for head in HEADS))
+    for dimensions in ("interior", "euclidean", "oriented"):
+        for bins, spectrum in ((False, False), (True, False), (False, True), (True, True)):
+            found: dict[str, list[float]] = {head: [] for head in HEADS}
+            for seed in range(first_seed, first_seed + n_splits):
+                seed_everything(seed, verbose=False)
+                data = SignatureDataModule(root, "seen", n_train, 0, split_seed=seed, config=config, cache_dir=cache)
+                data.prepare_data()
+                descriptor = layout(dimensions, bins, spectrum, n_training_samples)
+                if bins or spectrum:
+                    train(descriptor, data, n_epochs)
+                histograms = describe(data.dataset, descriptor.eval()).flatten(1)
+                for head in HEADS:
+                    scores = score(histograms, data.dataset.labels, data.split, head, descriptor.part_cells)
+                    found[head].append(100 * scores["ft"])
+            learned = " + ".join(name for name, on in (("bins", bins), ("spectrum", spectrum)) if on) or "nothing"
+            cells = "".join(f"{mean(v):>8.1f} ± {stdev(v) if n_splits > 1 else 0:>3.1f}" for v in found.values())
+            print(f"{dimensions:<14}{learned:<16}{cells}", flush=True)
+
+
+def layout(dimensions: str, bins: bool, spectrum: bool, n_training_samples: int) -> CombinedDescriptor:
+    """Interior distance and potential alone; with Euclidean distance; and with how samples lie to the surface too."""
+
+    def embedding() -> SpectralEmbedding:
+        return SpectralEmbedding(n_eigenpairs=50, n_knots=12 if spectrum else 0)
+
+    n_samples = {"n_samples": 1000, "n_training_samples": n_training_samples}
+    if dimensions == "interior":
+        histogram = PairHistogram(4, 64, soft=True, learnable=bins)
+    else:
+        histogram = PairHistogram(4, 32, soft=True, learnable=bins, n_euclidean_bins=16)
+    parts: list[nn.Module] = [VolumetricDescriptor(embedding(), histogram, **n_samples)]
+    if dimensions == "oriented":
+        parts.append(OrientedDescriptor(embedding(), OrientedPairHistogram(learnable=bins), **n_samples))
+    return CombinedDescriptor(parts)
+
+
+def train(descriptor: CombinedDescriptor, data: SignatureDataModule, n_epochs: int) -> None:
+    """Train bins and filters on the training part, in place."""
+    learner = RetrievalLearner(descriptor, CorrectedDistance(WhitenedHead(descriptor.part_cells), share=1.0))
+    trainer = Trainer(
+        max_epochs=n_epochs, logger=False, enable_checkpointing=False, enable_progress_bar=False,
+        enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(learner, data)
+
+
+if __name__ == "__main__":
+    auto_cli(ablate)

@@ -1,0 +1,72 @@
+"""How a metric that was fitted to generated shapes does on others: what pretrain.py prints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from statistics import mean
+
+import torch
+from torch import Tensor
+
+from igps.data.datamodule import split_seen
+from igps.figures.learned import transfer_curve
+from igps.nn.fitted import KernelHead, WhitenedHead
+from igps.nn.head import square_roots
+from igps.retrieval import chi_square, cosine, retrieval_scores
+
+COLUMNS = ("nn", "ft", "st", "dcg")
+
+
+def report(title: str, histograms: Tensor, labels: Tensor, head: WhitenedHead) -> None:
+    """Print the scores of the plain distance and of the head."""
+    print(f"{title}\n{'':<12}" + "".join(f"{name.upper():>7}" for name in COLUMNS))
+    plain = retrieval_scores(chi_square(histograms, histograms), labels).mean()
+    for name, found in (("plain", plain), ("pretrained", scores(head(histograms), labels))):
+        print(f"{name:<12}" + "".join(f"{100 * found[column]:>7.1f}" for column in COLUMNS))
+
+
+def curve(
+    fit: Callable[[int, int], WhitenedHead],
+    counts: Sequence[int],
+    histograms: Tensor,
+    labels: Tensor,
+    figure: Path,
+) -> None:
+    """Print and draw FT by the number of generated classes that a metric is fitted to, three draws of each.
+
+    Args:
+        fit: number of classes and seed of their draw to the metric.
+        counts: numbers of classes.
+        histograms, labels: of the shapes to measure on.
+        figure: path of the picture.
+    """
+    found = {n: [scores(fit(n, seed)(histograms), labels)["ft"] for seed in range(3)] for n in counts}
+    for n, values in found.items():
+        print(f"{n:>4} generated classes: FT {' '.join(f'{100 * value:.1f}' for value in values)} (three draws)")
+    transfer_curve(found, retrieval_scores(chi_square(histograms, histograms), labels).mean()["ft"], figure)
+
+
+def scores(embedding: Tensor, labels: Tensor) -> dict[str, float]:
+    """Leave-one-out scores of the cosine distance."""
+    return retrieval_scores(cosine(embedding, embedding), labels).mean()
+
+
+def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: WhitenedHead) -> None:
+    """Print FT of heads fitted to n shapes of each class, from the pretrained metric and from scratch."""
+    found: dict[str, list[float]] = {"pretrained, no labels": [], "from pretrained": [], "from scratch": []}
+    for seed in range(100, 105):
+        split = split_seen(labels, n, seed=seed)
+        train, test = torch.tensor(split.train), torch.tensor(split.test)
+        fitted = {
+            name: KernelHead(pretrained.part_cells, len(train), len(labels.unique()), len(pretrained.directions))
+            for name in ("from pretrained", "from scratch")
+        }
+        fitted["from pretrained"].whitened.load_state_dict(pretrained.state_dict())
+        # A single shape of a class tells nothing of the variation within it; what is left is to centre.
+        fitted["from scratch"].whitened.mean.copy_(square_roots(histograms[train], histograms.shape[1]).mean(dim=0))
+        fitted["from pretrained"].fit(histograms[train], labels[train], whiten=False)
+        fitted["from scratch"].fit(histograms[train], labels[train], whiten=n > 1)
+        for name, head in {"pretrained, no labels": pretrained, **fitted}.items():
+            found[name].append(100 * scores(head(histograms[test]), labels[test])["ft"])
+    print(f"{n} labels a class: " + ", ".join(f"{name} FT {mean(values):.1f}" for name, values in found.items()))
