@@ -11,8 +11,16 @@ from safetensors.torch import load_file
 from igps.data.dataset import SignatureDataset
 from igps.data.shapes import ArticulatedShapes
 from igps.geometry.signature import SignatureConfig
-from igps.nn.descriptor import PRETRAINED, CombinedDescriptor, VolumetricDescriptor
+from igps.nn.descriptor import (
+    PRETRAINED,
+    CombinedDescriptor,
+    EmbeddedDescriptor,
+    VolumetricDescriptor,
+    load_embedded,
+    save_embedded,
+)
 from igps.nn.extraction import describe
+from igps.nn.fitted import WhitenedHead
 from igps.nn.presets import DescriptorName, preset
 from igps.retrieval import chi_square, cosine, retrieval_scores
 
@@ -61,6 +69,24 @@ def test_pretrained_gains_on_shapes_it_has_not_seen(dataset: SignatureDataset) -
     plain = retrieval_scores(chi_square(histograms, histograms), dataset.labels).mean()
     learned = retrieval_scores(cosine(embedded, embedded), dataset.labels).mean()
     assert learned["ft"] > plain["ft"]
+
+
+def test_a_trained_metric_is_stored_with_its_bins_and_filters(dataset: SignatureDataset, tmp_path: Path) -> None:
+    descriptor = CombinedDescriptor.rich(learnable=True, n_samples=100)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in descriptor.parameters():
+            parameter.copy_(0.3 * torch.randn(parameter.shape, generator=generator))
+    histograms = describe(dataset, descriptor)
+    head = WhitenedHead(descriptor.part_cells, 5).fit(histograms, dataset.labels)
+    save_embedded(EmbeddedDescriptor(descriptor, head), tmp_path / "metric.safetensors")
+    loaded = load_embedded(tmp_path / "metric.safetensors")
+    assert not loaded.training
+    for part in loaded.descriptor.modules():
+        if hasattr(part, "n_samples"):
+            part.n_samples = 100
+    torch.testing.assert_close(describe(dataset, loaded), head(histograms), atol=2e-3, rtol=0)
+    assert not torch.allclose(describe(dataset, loaded.descriptor), describe(dataset, CombinedDescriptor.rich()))
 
 
 def test_shipped_file_is_small() -> None:

@@ -30,6 +30,17 @@ from igps.nn.oriented import OrientedPairHistogram
 from igps.nn.presets import preset
 
 HEADS = ("none", "whitened", "kernel")
+# Dimensions, and whether bins and spectral filter are learned.
+ROWS = (
+    ("interior", False, False),
+    ("interior", True, False),
+    ("interior", False, True),
+    ("interior", True, True),
+    ("euclidean", False, False),
+    ("euclidean", True, True),
+    ("oriented", False, False),
+    ("oriented", True, True),
+)
 
 
 def ablate(
@@ -37,8 +48,8 @@ def ablate(
     n_train: int = 10,
     n_splits: int = 5,
     first_seed: int = 100,
-    n_epochs: int = 20,
-    n_training_samples: int = 400,
+    n_epochs: int = 10,
+    n_training_samples: int = 300,
     cache: Path | None = None,
 ) -> None:
     """FT of each head on each descriptor, trained or not: mean ± standard deviation over splits.
@@ -55,23 +66,22 @@ def ablate(
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
     config = preset("rich").completed(SignatureConfig())
     print(f"{'dimensions':<14}{'learned':<16}" + "".join(f"{head:>14}" for head in HEADS))
-    for dimensions in ("interior", "euclidean", "oriented"):
-        for bins, spectrum in ((False, False), (True, False), (False, True), (True, True)):
-            found: dict[str, list[float]] = {head: [] for head in HEADS}
-            for seed in range(first_seed, first_seed + n_splits):
-                seed_everything(seed, verbose=False)
-                data = SignatureDataModule(root, "seen", n_train, 0, split_seed=seed, config=config, cache_dir=cache)
-                data.prepare_data()
-                descriptor = layout(dimensions, bins, spectrum, n_training_samples)
-                if bins or spectrum:
-                    train(descriptor, data, n_epochs)
-                histograms = describe(data.dataset, descriptor.eval()).flatten(1)
-                for head in HEADS:
-                    scores = score(histograms, data.dataset.labels, data.split, head, descriptor.part_cells)
-                    found[head].append(100 * scores["ft"])
-            learned = " + ".join(name for name, on in (("bins", bins), ("spectrum", spectrum)) if on) or "nothing"
-            cells = "".join(f"{mean(v):>8.1f} ± {stdev(v) if n_splits > 1 else 0:>3.1f}" for v in found.values())
-            print(f"{dimensions:<14}{learned:<16}{cells}", flush=True)
+    for dimensions, bins, spectrum in ROWS:
+        found: dict[str, list[float]] = {head: [] for head in HEADS}
+        for seed in range(first_seed, first_seed + n_splits):
+            seed_everything(seed, verbose=False)
+            data = SignatureDataModule(root, "seen", n_train, 0, split_seed=seed, config=config, cache_dir=cache)
+            data.prepare_data()
+            descriptor = layout(dimensions, bins, spectrum, n_training_samples)
+            if bins or spectrum:
+                train(descriptor, data, n_epochs)
+            histograms = describe(data.dataset, descriptor.eval()).flatten(1)
+            for head in HEADS:
+                scores = score(histograms, data.dataset.labels, data.split, head, descriptor.part_cells)
+                found[head].append(100 * scores["ft"])
+        learned = " + ".join(name for name, on in (("bins", bins), ("spectrum", spectrum)) if on) or "nothing"
+        cells = "".join(f"{mean(v):>8.1f} ± {stdev(v) if n_splits > 1 else 0:>3.1f}" for v in found.values())
+        print(f"{dimensions:<14}{learned:<16}{cells}", flush=True)
 
 
 def layout(dimensions: str, bins: bool, spectrum: bool, n_training_samples: int) -> CombinedDescriptor:

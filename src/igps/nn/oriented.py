@@ -9,6 +9,9 @@ from torch.utils.checkpoint import checkpoint
 
 from igps.nn.bins import OrderedCentres, middles, position
 
+# Pairs, of both orders, that are held at once.
+_BLOCK = 2**18
+
 
 def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Cosines that tell how each pair of oriented points lies (Wahl et al. 2003; Drost et al. 2010).
@@ -24,14 +27,25 @@ def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Ten
         Three tensors (P(P−1)/2,), pairs in the order of `torch.triu_indices`; of points that coincide the first two
         are 0.
     """
-    i, j = torch.triu_indices(len(points), len(points), 1, device=points.device)
-    length = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")[i, j]
-    reach = directions @ points.T
-    own = reach.diagonal()
-    length = length.clamp_min(torch.finfo(length.dtype).tiny)
-    towards_j = ((reach[i, j] - own[i]) / length).clamp(-1, 1)
-    towards_i = ((reach[j, i] - own[j]) / length).clamp(-1, 1)
-    return torch.maximum(towards_j, towards_i), torch.minimum(towards_j, towards_i), (directions @ directions.T)[i, j]
+    return _features(points, directions, *_pairs(points, slice(None)))
+
+
+def _pairs(points: Tensor, rows: slice) -> tuple[slice, Tensor]:
+    """The pairs (i, j > i) of some rows i: the rows, and a mask of (rows, P)."""
+    first, last, _ = rows.indices(len(points))
+    return slice(first, last), torch.ones(last - first, len(points), dtype=torch.bool, device=points.device).triu(
+        1 + first
+    )
+
+
+def _features(points: Tensor, directions: Tensor, rows: slice, pairs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    length = torch.cdist(points[rows], points, compute_mode="donot_use_mm_for_euclid_dist")[pairs]
+    inverse = torch.where(length > 0, 1 / torch.where(length > 0, length, 1), 0)
+    own = (directions * points).sum(dim=1)
+    towards_j = ((directions[rows] @ points.T - own[rows, None])[pairs] * inverse).clamp(-1, 1)
+    towards_i = ((points[rows] @ directions.T - own)[pairs] * inverse).clamp(-1, 1)
+    between = (directions[rows] @ directions.T)[pairs]
+    return torch.maximum(towards_j, towards_i), torch.minimum(towards_j, towards_i), between
 
 
 class OrientedPairHistogram(nn.Module):
@@ -86,42 +100,53 @@ class OrientedPairHistogram(nn.Module):
         for i, real in enumerate(mask):
             inputs = [values[i, real] for values in (coordinates, points, directions)]
             _check(*inputs)
-            # The numbers of all pairs are many times those of the points: one shape's at a time.
-            histograms.append(checkpoint(self._histogram, *inputs, use_reentrant=False))
+            histograms.append(self._histogram(*inputs))
         return torch.stack(histograms)
 
     def _histogram(self, coordinates: Tensor, points: Tensor, directions: Tensor) -> Tensor:
         dtype = torch.promote_types(coordinates.dtype, torch.float32)
-        coordinates, points, directions = (values.to(dtype) for values in (coordinates, points, directions))
+        inputs = tuple(values.to(dtype) for values in (coordinates, points, directions))
+        n_points = len(points)
+        n_rows = max(1, _BLOCK // n_points)
+        counts = torch.zeros(self.n_cells, dtype=torch.float64, device=points.device)
         with torch.autocast(points.device.type, enabled=False):
-            i, j = torch.triu_indices(len(points), len(points), 1, device=points.device)
-            distance = torch.cdist(coordinates, coordinates)[i, j]
-            first, second, between = point_pair_features(points, directions)
-            towards = self.towards_centres()
-            axes = [
-                (distance, self.distance_centres()),
-                (first, towards),
-                (second, towards),
-                (between, self.between_centres()),
+            for first in range(0, n_points - 1, n_rows):
+                # What the gradient needs of the pairs is many times what it needs of the points: computed again.
+                counts = counts + checkpoint(
+                    self._counts, *inputs, slice(first, min(first + n_rows, n_points)), use_reentrant=False
+                )
+        shape = (self.n_bins, *[self.n_angle_bins] * 3)
+        return (counts / (n_points * (n_points - 1) / 2)).to(dtype).view(shape)
+
+    def _counts(self, coordinates: Tensor, points: Tensor, directions: Tensor, rows: slice) -> Tensor:
+        """(cells,) counts of the pairs of some rows."""
+        rows, pairs = _pairs(points, rows)
+        distance = torch.cdist(coordinates[rows], coordinates)[pairs]
+        first, second, between = _features(points, directions, rows, pairs)
+        towards = self.towards_centres()
+        axes = [
+            (distance, self.distance_centres()),
+            (first, towards),
+            (second, towards),
+            (between, self.between_centres()),
+        ]
+        # The cell of the lower centres, and how the weight of a pair is shared among it and the cells next to it.
+        cell = torch.zeros_like(distance, dtype=torch.long)
+        corners = [(0, torch.ones_like(distance))]
+        for values, centres in axes:
+            lower, share = position(values, centres)
+            cell = cell * len(centres) + lower
+            corners = [
+                (len(centres) * offset + step, weight * share if step else weight - weight * share)
+                for offset, weight in corners
+                for step in (0, 1)
             ]
-            # The cell of the lower centres, and how the weight of a pair is shared among it and the cells next to it.
-            cell = torch.zeros_like(i)
-            corners = [(0, torch.ones_like(distance))]
-            for values, centres in axes:
-                lower, share = position(values, centres)
-                cell = cell * len(centres) + lower
-                corners = [
-                    (len(centres) * offset + step, weight * share if step else weight - weight * share)
-                    for offset, weight in corners
-                    for step in (0, 1)
-                ]
-            counts = torch.zeros(self.n_cells, dtype=torch.float64, device=points.device)
-            for offset, weight in corners:
-                added = torch.zeros_like(counts).index_add(0, cell, weight.double())
-                # The last centre but one is the lower one at most, so that nothing is rolled over the end.
-                counts = counts + added.roll(offset)
-            shape = (self.n_bins, *[self.n_angle_bins] * 3)
-            return (counts / len(distance)).to(distance.dtype).view(shape)
+        counts = torch.zeros(self.n_cells, dtype=torch.float64, device=points.device)
+        for offset, weight in corners:
+            added = torch.zeros_like(counts).index_add(0, cell, weight.double())
+            # The lower centre is the last but one at most, so that nothing is rolled over the end.
+            counts = counts + added.roll(offset)
+        return counts
 
     def extra_repr(self) -> str:
         return f"n_bins={self.n_bins}, n_angle_bins={self.n_angle_bins}"
