@@ -54,7 +54,7 @@ def test_meshes_give_what_their_files_give(paths: list[Path], features: Volumetr
 
 def test_rich_features_bring_their_attributes(paths: list[Path], tmp_path: Path) -> None:
     rich = VolumetricFeatures("rich", cache_dir=tmp_path, n_workers=1).transform(paths[:1])
-    assert rich.shape == (1, 25920)
+    assert rich.shape == (1, 27420)
     np.testing.assert_allclose((rich**2).sum(), 1, rtol=1e-4)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from statistics import mean
+from statistics import mean, stdev
 
 import torch
 from torch import Tensor
@@ -69,4 +69,5 @@ def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: WhitenedH
         fitted["from scratch"].fit(histograms[train], labels[train], whiten=n > 1)
         for name, head in {"pretrained, no labels": pretrained, **fitted}.items():
             found[name].append(100 * scores(head(histograms[test]), labels[test])["ft"])
-    print(f"{n} labels a class: " + ", ".join(f"{name} FT {mean(values):.1f}" for name, values in found.items()))
+    rows = ", ".join(f"{name} FT {mean(values):.1f} ± {stdev(values):.1f}" for name, values in found.items())
+    print(f"{n} labels a class: {rows}")

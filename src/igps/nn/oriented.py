@@ -9,8 +9,8 @@ from torch.utils.checkpoint import checkpoint
 
 from igps.nn.bins import OrderedCentres, middles, position
 
-# Pairs, of both orders, that are held at once.
-_BLOCK = 2**18
+# Pairs that are held at once: each of their many numbers fills a part of a core's second-level cache.
+_BLOCK = 2**16
 
 
 def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -27,25 +27,22 @@ def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Ten
         Three tensors (P(P−1)/2,), pairs in the order of `torch.triu_indices`; of points that coincide the first two
         are 0.
     """
-    return _features(points, directions, *_pairs(points, slice(None)))
+    i, j = torch.triu_indices(len(points), len(points), 1, device=points.device)
+    first, second, between = (feature[i, j] for feature in _features(points, directions, 0, len(points)))
+    return first, second, between
 
 
-def _pairs(points: Tensor, rows: slice) -> tuple[slice, Tensor]:
-    """The pairs (i, j > i) of some rows i: the rows, and a mask of (rows, P)."""
-    first, last, _ = rows.indices(len(points))
-    return slice(first, last), torch.ones(last - first, len(points), dtype=torch.bool, device=points.device).triu(
-        1 + first
-    )
-
-
-def _features(points: Tensor, directions: Tensor, rows: slice, pairs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    length = torch.cdist(points[rows], points, compute_mode="donot_use_mm_for_euclid_dist")[pairs]
+def _features(points: Tensor, directions: Tensor, first: int, last: int) -> tuple[Tensor, Tensor, Tensor]:
+    """(last − first, P − first) features of the pairs of points from `first` to `last` with those from `first` on."""
+    rows, row_directions = points[first:last], directions[first:last]
+    columns, column_directions = points[first:], directions[first:]
+    length = torch.cdist(rows, columns, compute_mode="donot_use_mm_for_euclid_dist")
     inverse = torch.where(length > 0, 1 / torch.where(length > 0, length, 1), 0)
-    own = (directions * points).sum(dim=1)
-    towards_j = ((directions[rows] @ points.T - own[rows, None])[pairs] * inverse).clamp(-1, 1)
-    towards_i = ((points[rows] @ directions.T - own)[pairs] * inverse).clamp(-1, 1)
-    between = (directions[rows] @ directions.T)[pairs]
-    return torch.maximum(towards_j, towards_i), torch.minimum(towards_j, towards_i), between
+    own_row, own_column = (row_directions * rows).sum(dim=1), (column_directions * columns).sum(dim=1)
+    towards_column = (torch.addmm(-own_row[:, None], row_directions, columns.T) * inverse).clamp(-1, 1)
+    towards_row = (torch.addmm(-own_column, rows, column_directions.T) * inverse).clamp(-1, 1)
+    between = row_directions @ column_directions.T
+    return torch.maximum(towards_column, towards_row), torch.minimum(towards_column, towards_row), between
 
 
 class OrientedPairHistogram(nn.Module):
@@ -108,45 +105,45 @@ class OrientedPairHistogram(nn.Module):
         inputs = tuple(values.to(dtype) for values in (coordinates, points, directions))
         n_points = len(points)
         n_rows = max(1, _BLOCK // n_points)
-        counts = torch.zeros(self.n_cells, dtype=torch.float64, device=points.device)
+        sums = torch.zeros(16, self.n_cells, dtype=torch.float64, device=points.device)
         with torch.autocast(points.device.type, enabled=False):
             for first in range(0, n_points - 1, n_rows):
                 # What the gradient needs of the pairs is many times what it needs of the points: computed again.
-                counts = counts + checkpoint(
-                    self._counts, *inputs, slice(first, min(first + n_rows, n_points)), use_reentrant=False
-                )
-        shape = (self.n_bins, *[self.n_angle_bins] * 3)
-        return (counts / (n_points * (n_points - 1) / 2)).to(dtype).view(shape)
+                sums = sums + checkpoint(self._sums, *inputs, first, first + n_rows, use_reentrant=False)
+        counts = sums.view(2, 2, 2, 2, self.n_bins, *[self.n_angle_bins] * 3)
+        for _ in range(4):
+            count, share = counts.unbind(0)
+            # Of the next cell along the axis; the last one gives none, so that nothing is rolled over the end.
+            counts = count - share + share.roll(1, dims=3)
+        return (counts / (n_points * (n_points - 1) / 2)).to(dtype)
 
-    def _counts(self, coordinates: Tensor, points: Tensor, directions: Tensor, rows: slice) -> Tensor:
-        """(cells,) counts of the pairs of some rows."""
-        rows, pairs = _pairs(points, rows)
-        distance = torch.cdist(coordinates[rows], coordinates)[pairs]
-        first, second, between = _features(points, directions, rows, pairs)
+    def _sums(self, coordinates: Tensor, points: Tensor, directions: Tensor, first: int, last: int) -> Tensor:
+        """(16, cells) sums over the pairs of points from `first` to `last` with those after them.
+
+        Of all products of the shares that the next cells along the four axes have of a pair: what is linear in each of
+        the shares follows from these.
+        """
+        distance = torch.cdist(coordinates[first:last], coordinates[first:])
+        higher, lower, between = _features(points, directions, first, last)
         towards = self.towards_centres()
-        axes = [
+        axes = (
             (distance, self.distance_centres()),
-            (first, towards),
-            (second, towards),
+            (higher, towards),
+            (lower, towards),
             (between, self.between_centres()),
-        ]
-        # The cell of the lower centres, and how the weight of a pair is shared among it and the cells next to it.
+        )
         cell = torch.zeros_like(distance, dtype=torch.long)
-        corners = [(0, torch.ones_like(distance))]
+        # Pairs of a point with itself or with one before it weigh nothing.
+        products = [torch.ones_like(distance).triu(1)]
         for values, centres in axes:
-            lower, share = position(values, centres)
-            cell = cell * len(centres) + lower
-            corners = [
-                (len(centres) * offset + step, weight * share if step else weight - weight * share)
-                for offset, weight in corners
-                for step in (0, 1)
-            ]
-        counts = torch.zeros(self.n_cells, dtype=torch.float64, device=points.device)
-        for offset, weight in corners:
-            added = torch.zeros_like(counts).index_add(0, cell, weight.double())
-            # The lower centre is the last but one at most, so that nothing is rolled over the end.
-            counts = counts + added.roll(offset)
-        return counts
+            along = position(values, centres)
+            before = along.detach().long().clamp_(max=len(centres) - 2)
+            share = along - before
+            cell = cell.mul_(len(centres)).add_(before)
+            products = [part for product in products for part in (product, product * share)]
+        cell = cell.flatten()
+        none = torch.zeros(self.n_cells, dtype=torch.float64, device=cell.device)
+        return torch.stack([none.index_add(0, cell, part.double().flatten()) for part in products])
 
     def extra_repr(self) -> str:
         return f"n_bins={self.n_bins}, n_angle_bins={self.n_angle_bins}"
