@@ -9,6 +9,7 @@ import torch
 import yaml
 from pytorch_lightning import Trainer, seed_everything
 from pytorch_lightning.callbacks import ModelCheckpoint
+from pytorch_metric_learning.losses import TripletMarginLoss
 
 from igps.data.datamodule import SignatureDataModule
 from igps.data.shapes import ArticulatedShapes
@@ -86,6 +87,28 @@ def test_a_checkpoint_has_the_scale_of_its_own_epoch(shapes: Path, tmp_path: Pat
     for name in ("plain_unit", "learned_unit"):
         torch.testing.assert_close(state[f"distance.{name}"], getattr(fresh.distance, name))
         assert state[f"distance.{name}"] != 1
+
+
+def test_the_loss_uses_what_the_miner_chose(shapes: Path, tmp_path: Path) -> None:
+    seen = []
+
+    class First(torch.nn.Module):
+        """One triplet."""
+
+        def forward(self, embeddings: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            anchor, positive = (labels == labels[0]).nonzero().flatten()[:2]
+            return tuple(i.reshape(1) for i in (anchor, positive, (labels != labels[0]).nonzero().flatten()[0]))
+
+    class Loss(TripletMarginLoss):
+        def forward(self, embeddings: torch.Tensor, labels: torch.Tensor, chosen: tuple) -> torch.Tensor:  # type: ignore[override]
+            seen.append([len(indices) for indices in chosen])
+            return super().forward(embeddings, labels, chosen)
+
+    plain = learner()
+    model = RetrievalLearner(plain.descriptor, plain.distance, Loss(), miner=First())
+    trainer(1, tmp_path).fit(model, data(shapes))
+    assert seen
+    assert all(lengths == [1, 1, 1] for lengths in seen)
 
 
 def test_a_head_in_closed_form_follows_the_bins(shapes: Path, tmp_path: Path) -> None:

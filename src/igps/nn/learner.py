@@ -32,6 +32,8 @@ class RetrievalLearner(LightningModule):
         distance: between histograms; its head is trained.
         loss: embeddings (N, D) and labels (N,) to a scalar; supervised contrastive (Khosla et al. 2020) if None, which
             needs `pytorch-metric-learning`.
+        miner: embeddings and labels to the pairs or triplets that a loss of `pytorch-metric-learning` is to use; all of
+            a batch if None.
         learning_rate: of the head; cosine decay over the epochs.
         bin_rate: learning rate of the descriptor's parameters.
         weight_decay: of the head alone.
@@ -45,11 +47,13 @@ class RetrievalLearner(LightningModule):
         learning_rate: float = 1e-3,
         bin_rate: float = 1e-2,
         weight_decay: float = 1e-2,
+        miner: nn.Module | None = None,
     ) -> None:
         super().__init__()
         self.descriptor = descriptor
         self.distance = distance
         self.loss = loss if loss is not None else _supervised_contrastive()
+        self.miner = miner
         self.learning_rate = learning_rate
         self.bin_rate = bin_rate
         self.weight_decay = weight_decay
@@ -90,7 +94,9 @@ class RetrievalLearner(LightningModule):
 
     def training_step(self, batch: SignatureBatch, batch_index: int) -> Tensor:
         """Loss of one P×K batch."""
-        loss = self.loss(self.distance.head(self(batch)), batch.labels)  # type: ignore[misc]
+        embeddings = self.distance.head(self(batch))  # type: ignore[misc]
+        chosen = () if self.miner is None else (self.miner(embeddings, batch.labels),)
+        loss = self.loss(embeddings, batch.labels, *chosen)
         self.log("train_loss", loss, batch_size=len(batch), prog_bar=True)
         return loss
 
