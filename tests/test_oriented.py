@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -83,6 +85,17 @@ def test_turning_moving_and_reordering_change_nothing() -> None:
     torch.testing.assert_close(moved, expected, atol=1e-9, rtol=0)
     turned_in = histogram(module, coordinates, points, -directions)
     assert (turned_in - expected).abs().sum() > 0.1
+
+
+def test_no_cell_is_negative_by_rounding() -> None:
+    """χ² refuses a histogram with a cell of −1e−18; a pair close below several centres leaves next to nothing there."""
+    module = OrientedPairHistogram()
+    for below in torch.logspace(-6, -3, 40).tolist():
+        points = torch.tensor([[0.0, 0.0, 0.0], [0.75 - below, 0.0, 0.0]])
+        for angle in torch.linspace(0.1, 3.0, 20).tolist():
+            turned = angle + math.acos(0.4 - below)
+            directions = torch.tensor([[math.cos(a), math.sin(a), 0.0] for a in (angle, turned)])
+            assert (histogram(module, points, points, directions) >= 0).all()
 
 
 def test_padding_is_not_counted() -> None:

@@ -112,16 +112,15 @@ class OrientedPairHistogram(nn.Module):
                 sums = sums + checkpoint(self._sums, *inputs, first, first + n_rows, use_reentrant=False)
         counts = sums.view(2, 2, 2, 2, self.n_bins, *[self.n_angle_bins] * 3)
         for _ in range(4):
-            count, share = counts.unbind(0)
-            # Of the next cell along the axis; the last one gives none, so that nothing is rolled over the end.
-            counts = count - share + share.roll(1, dims=3)
+            own, beyond = counts.unbind(0)
+            # Beyond the last cell there is nothing to give, so that nothing is rolled over the end.
+            counts = own + beyond.roll(1, dims=3)
         return (counts / (n_points * (n_points - 1) / 2)).to(dtype)
 
     def _sums(self, coordinates: Tensor, points: Tensor, directions: Tensor, first: int, last: int) -> Tensor:
-        """(16, cells) sums over the pairs of points from `first` to `last` with those after them.
+        """(16, cells) weights of the pairs of points from `first` to `last` with those after them.
 
-        Of all products of the shares that the next cells along the four axes have of a pair: what is linear in each of
-        the shares follows from these.
+        By the cell of the lower centres, and by which of the cells next to it, along the four axes, the weight is of.
         """
         distance = torch.cdist(coordinates[first:last], coordinates[first:])
         higher, lower, between = _features(points, directions, first, last)
@@ -134,16 +133,18 @@ class OrientedPairHistogram(nn.Module):
         )
         cell = torch.zeros_like(distance, dtype=torch.long)
         # Pairs of a point with itself or with one before it weigh nothing.
-        products = [torch.ones_like(distance).triu(1)]
+        weights = [torch.ones_like(distance).triu(1)]
         for values, centres in axes:
             along = position(values, centres)
             before = along.detach().long().clamp_(max=len(centres) - 2)
             share = along - before
             cell = cell.mul_(len(centres)).add_(before)
-            products = [part for product in products for part in (product, product * share)]
+            halves = ((weight, weight * share) for weight in weights)
+            # Not weight·(1 − share), nor a difference of sums, which rounding could make negative.
+            weights = [part for whole, beyond in halves for part in (whole - beyond, beyond)]
         cell = cell.flatten()
         none = torch.zeros(self.n_cells, dtype=torch.float64, device=cell.device)
-        return torch.stack([none.index_add(0, cell, part.double().flatten()) for part in products])
+        return torch.stack([none.index_add(0, cell, part.double().flatten()) for part in weights])
 
     def extra_repr(self) -> str:
         return f"n_bins={self.n_bins}, n_angle_bins={self.n_angle_bins}"
