@@ -58,7 +58,8 @@ def learned() -> VolumetricDescriptor:
 
 
 def oriented(space: str = "position", distance: str = "interior", n_knots: int = 0) -> OrientedDescriptor:
-    embedding, histogram = SpectralEmbedding(n_knots=n_knots), OrientedPairHistogram(4, 3, learnable=n_knots > 0)
+    embedding = SpectralEmbedding(n_knots=n_knots) if distance == "interior" else None
+    histogram = OrientedPairHistogram(4, 3, learnable=n_knots > 0)
     return OrientedDescriptor(embedding, histogram, space=space, distance=distance)  # type: ignore[arg-type]
 
 
@@ -264,6 +265,8 @@ def test_oriented_descriptor_says_what_it_needs(batch: SignatureBatch) -> None:
         OrientedDescriptor(space="volume")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="distance: expected 'interior' or 'euclidean'"):
         OrientedDescriptor(distance="geodesic")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="embedding: expected None with distance='euclidean'"):
+        OrientedDescriptor(SpectralEmbedding(), distance="euclidean")
     with pytest.raises(ValueError, match="distance: expected 'interior' with space='embedding'"):
         OrientedDescriptor(space="embedding", distance="euclidean")
 

@@ -133,7 +133,7 @@ class OrientedDescriptor(_SampledDescriptor):
     alone tell little of.
 
     Args:
-        embedding: see `VolumetricDescriptor`.
+        embedding: see `VolumetricDescriptor`; none with distance="euclidean", which has no use for it.
         histogram: coordinates, points, directions and mask of N shapes to (N, cells...).
         samples: "interior" or "surface".
         space: "position" takes lines and directions in space, and needs the attribute "surface_direction"; "embedding"
@@ -141,7 +141,7 @@ class OrientedDescriptor(_SampledDescriptor):
             samples nearest to it, that of a surface sample away from the interior ones: it consists of interior
             distances alone and hardly changes with pose.
         distance: which is counted, "interior" or "euclidean", the latter over √area. On the surface the euclidean one
-            makes the histograms of Wahl et al. 2003.
+            makes histograms after Wahl et al. 2003.
         n_samples, n_training_samples: see `VolumetricDescriptor`.
     """
 
@@ -163,7 +163,8 @@ class OrientedDescriptor(_SampledDescriptor):
             raise ValueError(f"distance: expected 'interior' or 'euclidean', got {distance!r}.")
         if space == "embedding" and distance == "euclidean":
             raise ValueError("distance: expected 'interior' with space='embedding', got 'euclidean'.")
-        # What has parameters that nothing depends on cannot be trained.
+        if embedding is not None and distance == "euclidean":
+            raise ValueError("embedding: expected None with distance='euclidean', which has no use for it.")
         self.embedding = None if distance == "euclidean" else embedding or SpectralEmbedding()
         self.histogram = histogram or OrientedPairHistogram(distance_range=1.0 if distance == "euclidean" else 3.0)
         self.space: Space = space
