@@ -35,7 +35,7 @@ def pretrain(
     n_per_class: int = 8,
     n_held_out: int = 60,
     n_eigenpairs: int = 64,
-    n_epochs: int = 5,
+    n_epochs: int = 3,
     n_training_samples: int = 300,
     bin_rate: float = 0.01,
     n_directions: int = 32,
@@ -71,10 +71,9 @@ def pretrain(
     generated.precompute(strict=True)
     descriptor = CombinedDescriptor.rich(learnable=n_epochs > 0)
     if n_epochs:
-        thinned = CombinedDescriptor.rich(learnable=True, n_samples=n_training_samples)
-        for part in thinned.modules():
-            if hasattr(part, "n_training_samples"):
-                part.n_training_samples = n_training_samples
+        thinned = CombinedDescriptor.rich(
+            learnable=True, n_samples=n_training_samples, n_training_samples=n_training_samples
+        )
         distance = CorrectedDistance(WhitenedHead(thinned.part_cells, n_directions, shrinkage), share=1.0)
         shapes = SignatureDataModule(
             root, "unseen", n_classes - n_held_out, 0, split_seed=seed, classes_per_batch=16, config=config,

@@ -237,7 +237,9 @@ class CombinedDescriptor(nn.Module):
         )
 
     @classmethod
-    def rich(cls, *, learnable: bool = False, n_samples: int | None = None) -> CombinedDescriptor:
+    def rich(
+        cls, *, learnable: bool = False, n_samples: int | None = None, n_training_samples: int | None = None
+    ) -> CombinedDescriptor:
         """Interior distances joined with all else there is, in three parts.
 
         The histograms with Euclidean distances, depth and electrostatic potential of the samples; how interior samples
@@ -249,6 +251,7 @@ class CombinedDescriptor(nn.Module):
             learnable: whether the centres of bins and classes and the spectral filters are parameters; the classes are
                 soft ones then.
             n_samples: of each part; by default as many as its histograms need.
+            n_training_samples: of each part, see `VolumetricDescriptor`.
         """
         layouts = (
             (50, PairHistogram(8, 64, learnable=learnable)),
@@ -266,17 +269,24 @@ class CombinedDescriptor(nn.Module):
         n_knots = _N_KNOTS if learnable else 0
         return cls(
             [
-                cls([_layout(n, histogram, n_knots, n_samples or _N_SAMPLES) for n, histogram in layouts]),
+                cls(
+                    [
+                        _layout(n, histogram, n_knots, n_samples or _N_SAMPLES, n_training_samples)
+                        for n, histogram in layouts
+                    ]
+                ),
                 OrientedDescriptor(
                     SpectralEmbedding(n_eigenpairs=50, n_knots=n_knots),
                     OrientedPairHistogram(learnable=learnable),
                     n_samples=n_samples or _N_ORIENTED_SAMPLES,
+                    n_training_samples=n_training_samples,
                 ),
                 OrientedDescriptor(
                     histogram=OrientedPairHistogram(distance_range=1.0, learnable=learnable),
                     samples="surface",
                     distance="euclidean",
                     n_samples=n_samples or _N_ORIENTED_SAMPLES,
+                    n_training_samples=n_training_samples,
                 ),
             ]
         )
@@ -335,8 +345,15 @@ def _in_units(samples: SampleBatch, batch: SignatureBatch) -> Tensor:
 
 
 def _layout(
-    n_eigenpairs: int, histogram: PairHistogram, n_knots: int = 0, n_samples: int = _N_SAMPLES
+    n_eigenpairs: int,
+    histogram: PairHistogram,
+    n_knots: int = 0,
+    n_samples: int = _N_SAMPLES,
+    n_training_samples: int | None = None,
 ) -> VolumetricDescriptor:
     return VolumetricDescriptor(
-        SpectralEmbedding(n_eigenpairs=n_eigenpairs, n_knots=n_knots), histogram, n_samples=n_samples
+        SpectralEmbedding(n_eigenpairs=n_eigenpairs, n_knots=n_knots),
+        histogram,
+        n_samples=n_samples,
+        n_training_samples=n_training_samples,
     )
