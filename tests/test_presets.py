@@ -82,6 +82,8 @@ def test_a_trained_metric_is_stored_with_its_bins_and_filters(dataset: Signature
     save_embedded(EmbeddedDescriptor(descriptor, head), tmp_path / "metric.safetensors")
     loaded = load_embedded(tmp_path / "metric.safetensors")
     assert not loaded.training
+    for name, value in descriptor.state_dict().items():
+        torch.testing.assert_close(loaded.descriptor.state_dict()[name], value, atol=0, rtol=0)
     for part in loaded.descriptor.modules():
         if hasattr(part, "n_samples"):
             part.n_samples = 100
