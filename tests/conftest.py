@@ -21,6 +21,25 @@ def as_mesh(surface: trimesh.Trimesh, name: str = "mesh") -> Mesh:
     return Mesh(np.asarray(surface.vertices), np.asarray(surface.faces), name=name)
 
 
+def horseshoe(half_gap: float = 0.05, tube: float = 0.3, n_sections: int = 48, n_around: int = 14) -> Mesh:
+    """A ring that is open by twice `half_gap` radians, with flat ends, without any symmetry."""
+    jitter = np.random.default_rng(0).uniform(0.9, 1.1, (n_sections, n_around))
+    u = np.linspace(half_gap, 2 * np.pi - half_gap, n_sections)[:, None]
+    v = np.arange(n_around)[None, :] * (2 * np.pi / n_around)
+    radius = 1 + tube * jitter * np.cos(v)
+    ring = np.stack([radius * np.cos(u), radius * np.sin(u), tube * jitter * np.sin(v)], axis=2).reshape(-1, 3)
+    ends = np.stack([np.cos(u[[0, -1], 0]), np.sin(u[[0, -1], 0]), np.zeros(2)], axis=1)
+    i, j = np.mgrid[: n_sections - 1, :n_around]
+    a, b = i * n_around + j, i * n_around + (j + 1) % n_around
+    sides = [np.stack([a, a + n_around, b], axis=-1), np.stack([b, a + n_around, b + n_around], axis=-1)]
+    here = np.arange(n_around)
+    there, last, n = (here + 1) % n_around, (n_sections - 1) * n_around, n_sections * n_around
+    caps = [np.stack([here, there, np.full(n_around, n)], axis=1)]
+    caps.append(np.stack([last + there, last + here, np.full(n_around, n + 1)], axis=1))
+    faces = np.concatenate([part.reshape(-1, 3) for part in (*sides, *caps)])
+    return Mesh(np.concatenate([ring, ends]), faces, name="horseshoe")
+
+
 @pytest.fixture(scope="session")
 def sphere() -> Mesh:
     """The unit sphere with 2,562 vertices."""

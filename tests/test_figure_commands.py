@@ -17,6 +17,7 @@ from matplotlib.image import imread
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
+from conftest import horseshoe
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.figures import paper
@@ -26,7 +27,6 @@ from igps.geometry.laplacian import laplacian
 from igps.geometry.mesh import Mesh, load_mesh
 from igps.geometry.signature import SignatureConfig
 from igps.geometry.voxels import interior_samples
-from test_disturbances import horseshoe
 
 SMALL = ["--signature.n_eigenpairs", "20", "--signature.resolution", "10", "--signature.min_samples", "0"]
 SMALL += ["--signature.n_surface_samples", "60", "--workers", "1"]

@@ -12,7 +12,6 @@ from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_metric_learning.losses import TripletMarginLoss
 
 from igps.data.datamodule import SignatureDataModule
-from igps.data.shapes import ArticulatedShapes
 from igps.geometry.signature import SignatureConfig
 from igps.nn.descriptor import VolumetricDescriptor
 from igps.nn.embedding import SpectralEmbedding
@@ -22,6 +21,7 @@ from igps.nn.head import CorrectedDistance, MetricHead
 from igps.nn.histogram import PairHistogram
 from igps.nn.learner import RetrievalLearner
 from igps.retrieval import chi_square, retrieval_scores
+from igps.shapes import ArticulatedShapes
 
 PROJECT = Path(__file__).parents[1]
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=12, min_samples=0, n_surface_samples=20)

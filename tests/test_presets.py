@@ -9,7 +9,6 @@ import torch
 from safetensors.torch import load_file
 
 from igps.data.dataset import SignatureDataset
-from igps.data.shapes import ArticulatedShapes
 from igps.geometry.signature import SignatureConfig
 from igps.nn.descriptor import (
     PRETRAINED,
@@ -23,6 +22,7 @@ from igps.nn.extraction import describe
 from igps.nn.fitted import WhitenedHead
 from igps.nn.presets import DescriptorName, preset
 from igps.retrieval import chi_square, cosine, retrieval_scores
+from igps.shapes import ArticulatedShapes
 
 
 @pytest.fixture(scope="module")

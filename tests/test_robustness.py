@@ -17,12 +17,12 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
+from conftest import horseshoe
 from igps import baselines
 from igps.baselines import Body
 from igps.cli import main
 from igps.geometry.disturbances import DISTURBANCES
 from igps.geometry.mesh import load_mesh
-from test_disturbances import horseshoe
 
 SMALL = ["--signature.n_eigenpairs", "20", "--signature.resolution", "10", "--signature.min_samples", "0"]
 SMALL += ["--signature.n_surface_samples", "60", "--workers", "1"]

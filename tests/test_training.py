@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file
 
-from igps.data.shapes import ArticulatedShapes
+from igps.shapes import ArticulatedShapes
 
 PROJECT = Path(__file__).parents[1]
 

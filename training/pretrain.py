@@ -17,7 +17,6 @@ from pytorch_lightning import Trainer, seed_everything
 
 from igps.data.datamodule import SignatureDataModule, split_unseen
 from igps.data.dataset import SignatureDataset
-from igps.data.shapes import ArticulatedShapes
 from igps.figures.learned import learned_layout
 from igps.geometry.signature import SignatureConfig
 from igps.nn.descriptor import PRETRAINED, CombinedDescriptor, EmbeddedDescriptor, save_embedded
@@ -26,6 +25,7 @@ from igps.nn.fitted import WhitenedHead
 from igps.nn.head import CorrectedDistance
 from igps.nn.learner import RetrievalLearner
 from igps.nn.presets import preset
+from igps.shapes import ArticulatedShapes
 from transfer import curve, few_labels, report
 
 

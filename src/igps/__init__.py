@@ -10,7 +10,6 @@ N shapes, Q queries, G gallery, D embedding width.
 from igps.data.cache import SignatureCache
 from igps.data.datamodule import SignatureDataModule
 from igps.data.dataset import LabelledSignature, SignatureBatch, SignatureDataset, collate
-from igps.data.shapes import ArticulatedShapes
 from igps.geometry.mesh import Mesh, MeshError, load_mesh, simplify
 from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
 from igps.nn.descriptor import CombinedDescriptor, OrientedDescriptor, VolumetricDescriptor
@@ -22,6 +21,7 @@ from igps.nn.histogram import PairHistogram, pair_histogram
 from igps.nn.learner import RetrievalLearner
 from igps.nn.oriented import OrientedPairHistogram
 from igps.retrieval import RetrievalScores, chi_square, retrieval_scores, search
+from igps.shapes import ArticulatedShapes
 
 __all__ = [
     "ArticulatedShapes",

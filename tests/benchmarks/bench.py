@@ -24,10 +24,10 @@ from scipy import sparse
 
 import igps
 from igps.geometry.coordinates import extend, winding_number
-from igps.geometry.eigensolver import eigenpairs
 from igps.geometry.laplacian import laplacian
 from igps.geometry.mesh import Mesh, load_mesh
 from igps.geometry.voxels import grid_axes, inside_grid, interior_samples
+from igps.linalg import eigenpairs
 
 K = 250
 

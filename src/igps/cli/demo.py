@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from igps.cli.retrieval import retrieve
-from igps.data.shapes import ArticulatedShapes
+from igps.shapes import ArticulatedShapes
 
 
 def demo(out: Path = Path("build/demo"), workers: int | None = None) -> None:

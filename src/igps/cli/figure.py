@@ -15,10 +15,10 @@ from igps.cli.reading import labelled_meshes, signatures
 from igps.data.sources import MeshFiles
 from igps.geometry import disturbances
 from igps.geometry.coordinates import extend
-from igps.geometry.eigensolver import Spectrum, eigenpairs
 from igps.geometry.laplacian import laplacian
 from igps.geometry.mesh import Mesh, load_mesh
 from igps.geometry.voxels import grid_axes, inside_grid, interior_samples
+from igps.linalg import Spectrum, eigenpairs
 from igps.nn.descriptor import VolumetricDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.extraction import describe

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from igps.data.shapes import ArticulatedShapes
+    from igps.shapes import ArticulatedShapes
 
 Colour = tuple[float, float, float]
 

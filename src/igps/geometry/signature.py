@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from igps.geometry.attributes import AttributeName, check_attributes, interior_attributes, surface_attributes
 from igps.geometry.coordinates import extend
-from igps.geometry.eigensolver import Spectrum, eigenpairs
 from igps.geometry.laplacian import Backend, laplacian
 from igps.geometry.mesh import Mesh, MeshError, area_vectors, simplify
 from igps.geometry.voxels import interior_samples
+from igps.linalg import Spectrum, eigenpairs
 
 # Largest relative residual of an eigenpair. It is mostly far smaller; on meshes with very thin triangles rounding does
 # not allow much less, and the histograms cannot tell.

@@ -10,10 +10,10 @@ import trimesh
 from conftest import as_mesh
 from igps.data.dataset import collate
 from igps.geometry.coordinates import mean_value_coordinates
-from igps.geometry.eigensolver import eigenpairs
 from igps.geometry.laplacian import laplacian
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
+from igps.linalg import eigenpairs
 from igps.nn.descriptor import VolumetricDescriptor
 from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding
 

@@ -11,9 +11,9 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from igps.data.shapes import ArticulatedShapes, GeneratedShape
-from igps.data.shapes.solids import Arc, Box, Cone, Prism, Ring, Solid
 from igps.figures import contact_sheet
+from igps.shapes import ArticulatedShapes, GeneratedShape
+from igps.shapes.solids import Arc, Box, Cone, Prism, Ring, Solid
 
 pytest.importorskip("skimage", reason="the extra 'shapes' is not installed")
 

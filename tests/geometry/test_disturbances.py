@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
 
+from conftest import SHARED, horseshoe
 from igps.geometry import disturbances
 from igps.geometry.disturbances import (
     DISTURBANCES,
@@ -29,27 +29,6 @@ from igps.geometry.disturbances import (
     weld_gap,
 )
 from igps.geometry.mesh import Mesh, MeshError, load_mesh
-
-SHARED = Path(__file__).parents[2] / "shared"
-
-
-def horseshoe(half_gap: float = 0.05, tube: float = 0.3, n_sections: int = 48, n_around: int = 14) -> Mesh:
-    """A ring that is open by twice `half_gap` radians, with flat ends, without any symmetry."""
-    jitter = np.random.default_rng(0).uniform(0.9, 1.1, (n_sections, n_around))
-    u = np.linspace(half_gap, 2 * np.pi - half_gap, n_sections)[:, None]
-    v = np.arange(n_around)[None, :] * (2 * np.pi / n_around)
-    radius = 1 + tube * jitter * np.cos(v)
-    ring = np.stack([radius * np.cos(u), radius * np.sin(u), tube * jitter * np.sin(v)], axis=2).reshape(-1, 3)
-    ends = np.stack([np.cos(u[[0, -1], 0]), np.sin(u[[0, -1], 0]), np.zeros(2)], axis=1)
-    i, j = np.mgrid[: n_sections - 1, :n_around]
-    a, b = i * n_around + j, i * n_around + (j + 1) % n_around
-    sides = [np.stack([a, a + n_around, b], axis=-1), np.stack([b, a + n_around, b + n_around], axis=-1)]
-    here = np.arange(n_around)
-    there, last, n = (here + 1) % n_around, (n_sections - 1) * n_around, n_sections * n_around
-    caps = [np.stack([here, there, np.full(n_around, n)], axis=1)]
-    caps.append(np.stack([last + there, last + here, np.full(n_around, n + 1)], axis=1))
-    faces = np.concatenate([part.reshape(-1, 3) for part in (*sides, *caps)])
-    return Mesh(np.concatenate([ring, ends]), faces, name="horseshoe")
 
 
 def grooved_ball() -> Mesh:

@@ -10,6 +10,6 @@ Each module uses only those before it: solids, skeleton, templates and limbs, cr
 the grammar), meshing, grammar, files, benchmark.
 """
 
-from igps.data.shapes.benchmark import ArticulatedShapes, GeneratedShape
+from igps.shapes.benchmark import ArticulatedShapes, GeneratedShape
 
 __all__ = ["ArticulatedShapes", "GeneratedShape"]

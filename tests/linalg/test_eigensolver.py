@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from typing import Any, Literal
 
+import igl
+import lapy
 import numpy as np
 import pytest
 import torch
@@ -11,9 +15,9 @@ import trimesh
 from scipy import sparse
 from scipy.linalg import eigh
 
-from igps.geometry import eigensolver
-from igps.geometry.eigensolver import ConvergenceError, Spectrum, eigenpairs
-from igps.geometry.factorization import dissect, factorize
+from igps.linalg import ConvergenceError, Spectrum, eigenpairs, eigensolver, krylov, lanczos
+from igps.linalg.factorization import factorize
+from igps.linalg.symbolic import dissect
 
 Problem = tuple[sparse.csr_array, np.ndarray, np.ndarray]
 
@@ -130,22 +134,20 @@ def test_krylov_basis_keeps_its_promises(torus_problem: Problem) -> None:
     stiffness, mass, positions = torus_problem
     matrix = sparse.csr_array(stiffness * mass.sum() / np.sqrt(mass)[:, None] / np.sqrt(mass))
     factors = factorize(dissect(matrix, positions), matrix, 300.0)
-    krylov = eigensolver._Krylov(factors, np.sqrt(mass / mass.sum()), 40, np.random.default_rng(0))
+    space = krylov.Krylov(factors, np.sqrt(mass / mass.sum()), 40, np.random.default_rng(0))
     for widen in (False, False, True, False, False):
-        krylov.expand()
+        space.expand()
         if widen:
-            krylov.widen()
-    basis = krylov._basis[: krylov._stop]
+            space.widen()
+    basis = space._basis[: space._stop]
     torch.testing.assert_close(basis @ basis.T, torch.eye(len(basis), dtype=torch.float64), atol=1e-12, rtol=0)
-    inside = basis[1 : krylov.size + 1]
-    assert len(inside) == 3 * eigensolver.BLOCK_SIZE + 2 * 2 * eigensolver.BLOCK_SIZE
+    inside = basis[1 : space.size + 1]
+    assert len(inside) == 3 * krylov.BLOCK_SIZE + 2 * 2 * krylov.BLOCK_SIZE
     projected = inside @ factors.solve(inside.T.contiguous())
-    torch.testing.assert_close(
-        krylov._projected[1 : krylov.size + 1, 1 : krylov.size + 1], projected, atol=1e-12, rtol=0
-    )
-    ritz = krylov.ritz_pairs(300.0)
+    torch.testing.assert_close(space._projected[1 : space.size + 1, 1 : space.size + 1], projected, atol=1e-12, rtol=0)
+    ritz = space.ritz_pairs(300.0)
     largest = torch.argsort((ritz.eigenvalues - 300).abs())[:40]
-    values, vectors = krylov.eigenvectors(ritz, largest)
+    values, vectors = space.eigenvectors(ritz, largest)
     actual = np.linalg.norm(matrix @ vectors - vectors * values, axis=0)
     actual *= torch.linalg.norm(ritz.coefficients[:, largest], dim=0).numpy()
     estimated = ritz.residuals[largest].numpy()
@@ -213,15 +215,15 @@ def test_a_missed_pair_is_noticed_by_inertia(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Hide the tenth pair twice: the solver must not return before it is back."""
-    leading = eigensolver._RitzPairs.leading
+    leading = krylov.RitzPairs.leading
     calls = []
 
-    def forgetful(self: eigensolver._RitzPairs, n_below: int, tolerance: float) -> object:
+    def forgetful(self: krylov.RitzPairs, n_below: int, tolerance: float) -> object:
         found = leading(self, n_below, tolerance)
         calls.append(len(found))
         return found[np.arange(len(found)) != 9] if len(calls) <= 2 else found
 
-    monkeypatch.setattr(eigensolver._RitzPairs, "leading", forgetful)
+    monkeypatch.setattr(krylov.RitzPairs, "leading", forgetful)
     stiffness, mass, positions = torus_problem
     with caplog.at_level(logging.DEBUG):
         spectrum = eigenpairs(stiffness, mass, 80, positions=positions)
@@ -239,7 +241,7 @@ def test_falls_back_to_arpack_with_a_warning(
 ) -> None:
     stiffness, mass, positions = torus_problem
     expected = eigenpairs(stiffness, mass, 30, positions=positions)
-    monkeypatch.setattr(eigensolver, "_lanczos", fail)
+    monkeypatch.setattr(eigensolver, "lanczos", fail)
     spectrum = eigenpairs(stiffness, mass, 30, positions=positions)
     np.testing.assert_allclose(spectrum.eigenvalues, expected.eigenvalues, rtol=1e-10)
     assert_pairs(spectrum, torus_problem)
@@ -253,7 +255,7 @@ def test_a_shift_below_the_spectrum_takes_over(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     stiffness, mass, positions = torus_problem
-    monkeypatch.setattr(eigensolver, "_factorize_inside", fail)
+    monkeypatch.setattr(lanczos, "_factorize_inside", fail)
     with caplog.at_level(logging.INFO):
         spectrum = eigenpairs(stiffness, mass, 80, positions=positions)
     np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1:81], rtol=1e-10)
@@ -269,7 +271,7 @@ def test_the_fallback_too_is_proved_complete(torus_problem: Problem, monkeypatch
         values, functions = arpack(*arguments)  # type: ignore[arg-type]
         return np.delete(values, 4), np.delete(functions, 4, axis=1)
 
-    monkeypatch.setattr(eigensolver, "_lanczos", fail)
+    monkeypatch.setattr(eigensolver, "lanczos", fail)
     monkeypatch.setattr(eigensolver, "_arpack", lossy)
     with pytest.raises(ConvergenceError, match="found 30 of 31"):
         eigenpairs(*torus_problem[:2], 30)
@@ -278,11 +280,46 @@ def test_the_fallback_too_is_proved_complete(torus_problem: Problem, monkeypatch
 def test_wrong_pairs_are_not_returned(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     stiffness, mass, _ = torus_problem
     values, vectors = np.arange(1.0, 11), np.linalg.qr(np.random.default_rng(0).normal(size=(len(mass), 10)))[0]
-    monkeypatch.setattr(eigensolver, "_lanczos", lambda *arguments: (values, vectors))
+    monkeypatch.setattr(eigensolver, "lanczos", lambda *arguments: (values, vectors))
     monkeypatch.setattr(eigensolver, "_arpack", lambda *arguments: (values, vectors))
     monkeypatch.setattr(eigensolver, "_prove_complete", lambda *arguments: None)
     with pytest.raises(ConvergenceError, match="10 of eigenpairs 1 to 10 have a relative residual above"):
         eigenpairs(stiffness, mass, 10)
+
+
+@pytest.mark.parametrize("method", ["lanczos", "eigsh"])
+@pytest.mark.parametrize("n_eigenpairs", [60, 300])  # Lanczos, and the dense solver
+def test_the_residual_is_that_of_the_worst_pair(
+    n_eigenpairs: int, method: Literal["lanczos", "eigsh"], torus_problem: Problem
+) -> None:
+    stiffness, mass, positions = torus_problem
+    spectrum = eigenpairs(stiffness, mass, n_eigenpairs, positions=positions, method=method, tolerance=1e-4)
+    values, functions = spectrum.eigenvalues, spectrum.eigenfunctions
+    defect = stiffness @ functions - mass[:, None] * functions * values
+    expected = np.linalg.norm(defect / np.sqrt(mass)[:, None], axis=0) / values
+    assert spectrum.residual == pytest.approx(expected.max(), rel=1e-2, abs=1e-12)
+    assert 0 < spectrum.residual < 1e-4
+
+
+@pytest.mark.parametrize("pack", [sparse.diags_array, sparse.diags, lambda mass: sparse.csc_matrix(np.diag(mass))])
+def test_mass_may_be_a_diagonal_matrix(pack: Callable[[np.ndarray], Any], torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    of_vector = eigenpairs(stiffness, mass, 20, positions=positions)
+    of_matrix = eigenpairs(stiffness, pack(mass), 20, positions=positions)
+    np.testing.assert_array_equal(of_matrix.eigenfunctions, of_vector.eigenfunctions)
+    np.testing.assert_array_equal(of_matrix.mass, mass)
+
+
+def test_takes_the_matrices_of_other_libraries() -> None:
+    """LaPy's and libigl's, as they give them; LaPy solves with them as the oracle."""
+    mesh = torus(32, 16)
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    solver = lapy.Solver(lapy.TriaMesh(vertices, faces), lump=True, use_cholmod=False)
+    values = solver.eigs(25)[0][1:]
+    of_lapy = eigenpairs(solver.stiffness, solver.mass, 24)
+    np.testing.assert_allclose(of_lapy.eigenvalues, values, rtol=1e-5)  # LaPy computes in single precision
+    of_igl = eigenpairs(-igl.cotmatrix(vertices, faces), igl.massmatrix(vertices, faces, 0), 24)
+    np.testing.assert_allclose(of_igl.eigenvalues, values, rtol=1e-5)
 
 
 def test_arguments_are_left_alone(torus_problem: Problem) -> None:
@@ -324,7 +361,7 @@ def test_what_is_refused(torus_problem: Problem) -> None:
     lopsided[0, lopsided.indices[1]] += 0.1
     with pytest.raises(ValueError, match="n_eigenpairs must be at least 1"):
         eigenpairs(stiffness, mass, 0)
-    with pytest.raises(ValueError, match="subdivide the mesh or ask for fewer"):
+    with pytest.raises(ValueError, match="ask for fewer eigenpairs"):
         eigenpairs(stiffness, mass, n_vertices - 1)
     with pytest.raises(ValueError, match="stiffness has entries that are not finite"):
         eigenpairs(broken, mass, 5)
@@ -343,3 +380,9 @@ def test_what_is_refused(torus_problem: Problem) -> None:
         eigenpairs(stiffness, mass, 5, positions=positions[1:])
     with pytest.raises(ValueError, match="method"):
         eigenpairs(stiffness, mass, 5, method="lobpcg")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="pass -stiffness"):
+        eigenpairs(-stiffness, mass, 5)
+    with pytest.raises(ValueError, match="not diagonal: lump it"):
+        eigenpairs(stiffness, abs(stiffness), 5)
+    with pytest.raises(ValueError, match="not diagonal"):
+        eigenpairs(stiffness, sparse.diags_array(mass).tocsr()[:, :-1], 5)

@@ -13,11 +13,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from igps.data.shapes.files import is_whole_off, off_text, write_whole
-from igps.data.shapes.grammar import Stream, class_name, class_skeleton
-from igps.data.shapes.meshing import Faces, defect, mesh, roughen
-from igps.data.shapes.skeleton import Skeleton, pose
-from igps.data.shapes.solids import Array
+from igps.shapes.files import is_whole_off, off_text, write_whole
+from igps.shapes.grammar import Stream, class_name, class_skeleton
+from igps.shapes.meshing import Faces, defect, mesh, roughen
+from igps.shapes.skeleton import Skeleton, pose
+from igps.shapes.solids import Array
 
 _VERSION = 1  # raised whenever the same arguments would give other meshes
 _MAX_ATTEMPTS = 20

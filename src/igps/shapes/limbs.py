@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from igps.data.shapes.skeleton import ORIGIN, UP, Part, aim, circle, limb
-from igps.data.shapes.solids import Arc, Array, Blob, Box, Cone, Prism, Ring, Shell, Solid, Vector
+from igps.shapes.skeleton import ORIGIN, UP, Part, aim, circle, limb
+from igps.shapes.solids import Arc, Array, Blob, Box, Cone, Prism, Ring, Shell, Solid, Vector
 
 
 def ending(kind: str, r: float, group: str, at: Vector = ORIGIN, turn: Array | None = None) -> tuple[Part, ...]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import uuid
 from pathlib import Path
 
-from igps.data.shapes.meshing import Faces
-from igps.data.shapes.solids import Array
+from igps.shapes.meshing import Faces
+from igps.shapes.solids import Array
 
 
 def off_text(vertices: Array, faces: Faces) -> str:

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from igps.data.shapes.limbs import LimbStyle, ending
-from igps.data.shapes.skeleton import DOWN, ORIGIN, Part, Skeleton, aim, circle, limb, turned
-from igps.data.shapes.solids import Blob, Box, Cone, Frame, Prism, Ring, Shell, Solid
+from igps.shapes.limbs import LimbStyle, ending
+from igps.shapes.skeleton import DOWN, ORIGIN, Part, Skeleton, aim, circle, limb, turned
+from igps.shapes.solids import Blob, Box, Cone, Frame, Prism, Ring, Shell, Solid
 
 
 def star(g: np.random.Generator, core: str, n: int, kind: str, end: str) -> Skeleton:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from igps.data.shapes.solids import Array, Cone, Solid, Vector
+from igps.shapes.solids import Array, Cone, Solid, Vector
 
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 UP: Vector = (0.0, 0.0, 1.0)

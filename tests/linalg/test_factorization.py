@@ -7,7 +7,8 @@ import pytest
 import torch
 from scipy import sparse
 
-from igps.geometry.factorization import SingularMatrixError, dissect, factorize
+from igps.linalg.factorization import SingularMatrixError, factorize
+from igps.linalg.symbolic import dissect
 
 
 def grid_matrix(n: int, seed: int = 0) -> tuple[sparse.csr_array, np.ndarray]:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from igps.data.shapes.skeleton import Placed
-from igps.data.shapes.solids import Array
 from igps.geometry.mesh import area_vectors
+from igps.shapes.skeleton import Placed
+from igps.shapes.solids import Array
 
 Faces = NDArray[np.int64]
 

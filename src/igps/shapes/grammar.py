@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from igps.data.shapes.artefacts import stack, table, tongs, tool, vessel, wheel
-from igps.data.shapes.creatures import beast, chain, comb, serpent, star, tree
-from igps.data.shapes.meshing import defect, mesh
-from igps.data.shapes.skeleton import Skeleton, pose
-from igps.data.shapes.templates import TEMPLATES
+from igps.shapes.artefacts import stack, table, tongs, tool, vessel, wheel
+from igps.shapes.creatures import beast, chain, comb, serpent, star, tree
+from igps.shapes.meshing import defect, mesh
+from igps.shapes.skeleton import Skeleton, pose
+from igps.shapes.templates import TEMPLATES
 
 _MAX_DRAWS = 20
 _TRIAL_VERTICES = 3000  # the same whatever resolution is asked for: a class does not depend on it

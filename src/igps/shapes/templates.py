@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from igps.data.shapes.skeleton import DOWN, ORIGIN, Part, Skeleton, circle, limb, turned
-from igps.data.shapes.solids import Arc, Blob, Box, Cone, Ring, Shell
+from igps.shapes.skeleton import DOWN, ORIGIN, Part, Skeleton, circle, limb, turned
+from igps.shapes.solids import Arc, Blob, Box, Cone, Ring, Shell
 
 
 def biped() -> Skeleton:

@@ -1,0 +1,10 @@
+"""Eigenpairs of sparse symmetric matrices, with a proof that none is missing.
+
+The room knows nothing of meshes: a stiffness and a mass from any library go in as plain arrays. Each module uses only
+those before it: checks, ordering, symbolic, factorization, krylov, lanczos, eigensolver.
+"""
+
+from igps.linalg.eigensolver import Spectrum, eigenpairs
+from igps.linalg.lanczos import ConvergenceError
+
+__all__ = ["ConvergenceError", "Spectrum", "eigenpairs"]

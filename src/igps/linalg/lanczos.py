@@ -1,0 +1,124 @@
+"""Block Lanczos with a shift inside the wanted part of the spectrum, or below it; `eigensolver` tells how it works."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+import torch
+from scipy import sparse
+
+from igps.linalg.factorization import Factorization, factorize
+from igps.linalg.krylov import BLOCK_SIZE, Krylov
+from igps.linalg.symbolic import Dissection, dissect
+
+logger = logging.getLogger(__name__)
+
+# Share of the wanted eigenvalues below the shift: here both ends of the spectrum converge at the same time.
+SHIFT_RANK = 0.55
+# The shift of the second try, in units of 1/area
+SHIFT_BELOW = -1.0
+# Basis size at which all pairs have converged, as measured: so many vectors a pair, and so many blocks besides
+BASIS_PER_EIGENPAIR, BASIS_PER_EIGENPAIR_BELOW, BASIS_BLOCKS = 1.55, 2.55, 11
+# The basis gives up at this multiple of that size
+BASIS_LIMIT = 3
+# How accurate the factorization must be, relative to the tolerance: the lowest modes see its error some 1000 times
+DEFECT = 2e-4
+# A gap this wide, relative to the eigenvalue, is taken at once; a multiplet has none, and the next gap is looked for
+WIDE_GAP, NARROWEST_GAP = 1e-4, 1e-7
+
+
+class ConvergenceError(RuntimeError):
+    """The eigenpairs asked for could not be computed, or not be proved complete, to the tolerance asked for."""
+
+
+def lanczos(
+    matrix: sparse.csr_array,
+    zero_mode: np.ndarray,
+    n_eigenpairs: int,
+    positions: np.ndarray | None,
+    tolerance: float,
+    seed: int,
+    inside: bool,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues (K,) and orthonormal eigenvectors (V, K) of a matrix with one zero mode, (V,) of length 1.
+
+    With the shift inside the spectrum it is fast. With the shift below, A − σI is definite: its factors are accurate.
+    """
+    dissection = dissect(matrix, positions)
+    if inside:
+        shift, factors = _factorize_inside(dissection, matrix, zero_mode, n_eigenpairs, tolerance)
+    else:
+        shift, factors = SHIFT_BELOW, factorize(dissection, matrix, SHIFT_BELOW)
+    per_eigenpair = BASIS_PER_EIGENPAIR if inside else BASIS_PER_EIGENPAIR_BELOW
+    first_look = math.ceil(per_eigenpair * n_eigenpairs) + BASIS_BLOCKS * BLOCK_SIZE
+    n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
+    krylov = Krylov(factors, zero_mode, first_look + 4 * BLOCK_SIZE, np.random.default_rng(seed))
+    limit = min(BASIS_LIMIT * first_look, len(zero_mode) - 2 * BLOCK_SIZE)
+    while krylov.size < first_look:
+        krylov.expand()
+    while True:
+        ritz = krylov.ritz_pairs(shift)
+        found = ritz.leading(n_below, tolerance)
+        gap = gap_behind(ritz.eigenvalues[found], n_eigenpairs)
+        missing = False
+        if gap is not None:
+            n_found, bound = gap
+            n_present = factorize(dissection, matrix, bound).n_negative - 1
+            if n_present == n_found:
+                return krylov.eigenvectors(ritz, found[:n_eigenpairs])
+            if n_present < n_found:
+                raise ConvergenceError(
+                    f"{n_found} eigenvalues found below {bound:.6g} / area, where there are {n_present}"
+                )
+            logger.debug("%d of %d eigenvalues found below %g", n_found, n_present, bound)
+            missing = True
+        if krylov.size > limit:
+            raise ConvergenceError(f"{len(found)} of {n_eigenpairs} eigenpairs after {krylov.size} basis vectors")
+        if missing or krylov.size > limit / 2:
+            krylov.widen()
+        for _ in range(2):
+            krylov.expand()
+
+
+def _factorize_inside(
+    dissection: Dissection, matrix: sparse.csr_array, zero_mode: np.ndarray, n_eigenpairs: int, tolerance: float
+) -> tuple[float, Factorization]:
+    """A shift with about SHIFT_RANK of the wanted eigenvalues below it, at which the factorization is accurate.
+
+    The known zero mode tells the accuracy: as A − σI is indefinite, a pivot block is close to singular now and then.
+    """
+    target = max(1.5, SHIFT_RANK * n_eigenpairs)
+    shift = 4 * math.pi * target
+    mode = torch.from_numpy(zero_mode)[:, None]
+    best: tuple[float, float, float, Factorization] | None = None
+    for _ in range(6):
+        factors = factorize(dissection, matrix, shift)
+        rank = factors.n_negative
+        off_target = max(0.0, abs(rank - target) - 0.2 * target - 1)
+        defect = float(torch.linalg.norm(shift * factors.solve(mode) + mode))
+        logger.debug("shift %.6g: %d eigenvalues below, defect %.1e", shift, rank, defect)
+        if best is None or (off_target, defect) < best[:2]:
+            best = off_target, defect, shift, factors
+        if off_target > 0:
+            shift *= min(4.0, max(0.25, target / max(rank, 1)))
+        elif defect > DEFECT * tolerance:
+            shift *= 0.97
+        else:
+            break
+    assert best is not None
+    return best[2:]
+
+
+def gap_behind(eigenvalues: torch.Tensor, n_eigenpairs: int) -> tuple[int, float] | None:
+    """Number of eigenvalues up to a gap that follows the ``n_eigenpairs``-th or a later one, and a value in the gap."""
+    values = eigenvalues[n_eigenpairs - 1 :]
+    if len(values) < 2:
+        return None
+    gaps = torch.diff(values) / values[1:]
+    wide = torch.nonzero(gaps > WIDE_GAP).flatten()
+    place = int(wide[0]) if len(wide) else int(gaps.argmax())
+    if gaps[place] < NARROWEST_GAP:
+        return None
+    return n_eigenpairs + place, float(values[place] + values[place + 1]) / 2
