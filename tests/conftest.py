@@ -9,7 +9,8 @@ import pytest
 import torch
 import trimesh
 
-from igps.geometry.mesh import Mesh, load_mesh
+from igps.geometry.mesh import Mesh
+from igps.geometry.reading import load_mesh
 
 # The meshes are small: on two threads they are hardly faster, and many times slower where another process takes a core.
 torch.set_num_threads(1)
@@ -17,8 +18,16 @@ torch.set_num_threads(1)
 SHARED = Path(__file__).parents[2] / "shared"
 
 
+TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
+FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+
+
 def as_mesh(surface: trimesh.Trimesh, name: str = "mesh") -> Mesh:
     return Mesh(np.asarray(surface.vertices), np.asarray(surface.faces), name=name)
+
+
+def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
 def horseshoe(half_gap: float = 0.05, tube: float = 0.3, n_sections: int = 48, n_around: int = 14) -> Mesh:
@@ -38,6 +47,14 @@ def horseshoe(half_gap: float = 0.05, tube: float = 0.3, n_sections: int = 48, n
     caps.append(np.stack([last + there, last + here, np.full(n_around, n + 1)], axis=1))
     faces = np.concatenate([part.reshape(-1, 3) for part in (*sides, *caps)])
     return Mesh(np.concatenate([ring, ends]), faces, name="horseshoe")
+
+
+def surface_genus(mesh: Mesh) -> int:
+    """Handles of a watertight mesh as trimesh counts them."""
+    surface = as_trimesh(mesh)
+    assert surface.is_watertight
+    assert surface.is_winding_consistent
+    return 1 - surface.euler_number // 2
 
 
 @pytest.fixture(scope="session")

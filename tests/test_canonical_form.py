@@ -18,8 +18,8 @@ from igps.baselines.canonical_form import (
     least_squares_scaling,
     moments,
 )
-from igps.baselines.geodesics import farthest_points, geodesic_distances
 from igps.baselines.system import Body
+from igps.geometry.geodesics import farthest_points, geodesic_distances
 from igps.geometry.mesh import Mesh
 
 

@@ -22,11 +22,12 @@ from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.figures import paper
 from igps.geometry.coordinates import mean_value_coordinates
-from igps.geometry.disturbances import TUBE_FACES, facing_vertices, weld
 from igps.geometry.laplacian import laplacian
-from igps.geometry.mesh import Mesh, load_mesh
+from igps.geometry.mesh import Mesh
+from igps.geometry.reading import load_mesh
 from igps.geometry.signature import SignatureConfig
 from igps.geometry.voxels import interior_samples
+from igps.geometry.weld import TUBE_FACES, facing_vertices, weld
 
 SMALL = ["--signature.n_eigenpairs", "20", "--signature.resolution", "10", "--signature.min_samples", "0"]
 SMALL += ["--signature.n_surface_samples", "60", "--workers", "1"]

@@ -9,8 +9,8 @@ from scipy.stats import special_ortho_group
 
 from conftest import as_mesh
 from igps.baselines.geodesic_spectral import GeodesicSpectral, affinity_eigenvalues
-from igps.baselines.geodesics import geodesic_distances
 from igps.baselines.system import Body
+from igps.geometry.geodesics import geodesic_distances
 from igps.geometry.mesh import Mesh
 
 

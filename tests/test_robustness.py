@@ -22,7 +22,7 @@ from igps import baselines
 from igps.baselines import Body
 from igps.cli import main
 from igps.geometry.disturbances import DISTURBANCES
-from igps.geometry.mesh import load_mesh
+from igps.geometry.reading import load_mesh
 
 SMALL = ["--signature.n_eigenpairs", "20", "--signature.resolution", "10", "--signature.min_samples", "0"]
 SMALL += ["--signature.n_surface_samples", "60", "--workers", "1"]

@@ -11,7 +11,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.utils.estimator_checks import check_estimator
 
 from igps.data.dataset import SignatureDataset
-from igps.geometry.mesh import load_mesh
+from igps.geometry.reading import load_mesh
 from igps.geometry.signature import SignatureConfig
 from igps.nn.descriptor import VolumetricDescriptor
 from igps.nn.extraction import describe

@@ -10,8 +10,10 @@ N shapes, Q queries, G gallery, D embedding width.
 from igps.data.cache import SignatureCache
 from igps.data.datamodule import SignatureDataModule
 from igps.data.dataset import LabelledSignature, SignatureBatch, SignatureDataset, collate
-from igps.geometry.mesh import Mesh, MeshError, load_mesh, simplify
+from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.reading import load_mesh
 from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
+from igps.geometry.simplification import simplify
 from igps.nn.descriptor import CombinedDescriptor, OrientedDescriptor, VolumetricDescriptor
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential, interior_distance, spectral_embedding
 from igps.nn.extraction import describe

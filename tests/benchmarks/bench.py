@@ -25,7 +25,8 @@ from scipy import sparse
 import igps
 from igps.geometry.coordinates import extend, winding_number
 from igps.geometry.laplacian import laplacian
-from igps.geometry.mesh import Mesh, load_mesh
+from igps.geometry.mesh import Mesh
+from igps.geometry.reading import load_mesh
 from igps.geometry.voxels import grid_axes, inside_grid, interior_samples
 from igps.linalg import eigenpairs
 

@@ -7,7 +7,7 @@ import trimesh
 from scipy.spatial.distance import cdist
 
 from conftest import as_mesh
-from igps.baselines.geodesics import farthest_points, geodesic_distances
+from igps.geometry.geodesics import farthest_points, geodesic_distances
 from igps.geometry.mesh import Mesh
 
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from igps.baselines.geodesics import farthest_points
 from igps.baselines.system import Body
-from igps.geometry.mesh import simplify
+from igps.geometry.geodesics import farthest_points
+from igps.geometry.simplification import simplify
 from igps.retrieval.distances import chi_square
 
 

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from igps.baselines.geodesics import farthest_points
 from igps.baselines.system import Body
-from igps.geometry.mesh import Mesh, MeshError, area_vectors
+from igps.geometry.geodesics import farthest_points
+from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.sampling import surface_points
+from igps.geometry.surface import area_vectors, unit, vertex_areas
 from igps.retrieval.distances import chi_square
 
 # Rays start so far inside the surface, in units of the bounding box, that they do not meet the face they come from.
@@ -77,9 +79,9 @@ class LocalDiameterCentricity:
             MeshError: no ray meets the far side of the surface.
         """
         mesh = body.mesh
-        face, weights = _surface_points(mesh, self.n_samples, self.seed)
-        diameter = local_diameters(mesh, face, weights, self.n_rays, self.opening_angle)
-        central = np.einsum("pi,pi->p", weights, centricity(mesh, self.n_sources)[mesh.faces[face]])
+        points = surface_points(mesh, self.n_samples, self.seed)
+        diameter = local_diameters(mesh, points.face, points.weights, self.n_rays, self.opening_angle)
+        central = points.interpolate(centricity(mesh, self.n_sources)[:, None])[:, 0]
         seen = np.isfinite(diameter)
         if not seen.any():
             raise MeshError(
@@ -125,14 +127,12 @@ def local_diameters(
     centre, size = mesh.vertices.mean(axis=0), float(np.ptp(mesh.vertices, axis=0).max())
     vertices = np.asfortranarray((mesh.vertices - centre) / size)
     faces = np.asfortranarray(mesh.faces)
-    normals = area_vectors(vertices, mesh.faces)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+    normals = unit(area_vectors(vertices, mesh.faces))
 
     # An edge of the face turns with the body, and so do the rays.
     corner = vertices[faces[face]]
     inward = -normals[face]
-    side = corner[:, 1] - corner[:, 0]
-    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), np.finfo(float).tiny)
+    side = unit(corner[:, 1] - corner[:, 0])
     along, across, ahead = _cone(n_rays, opening_angle).T
     frame = np.stack([side, np.cross(inward, side), inward], axis=1)
     directions = np.einsum("rk,pkj->prj", np.stack([along, across, ahead], axis=1), frame)
@@ -160,20 +160,9 @@ def centricity(mesh: Mesh, n_sources: int) -> NDArray[np.float64]:
     """
     n_vertices = len(mesh.vertices)
     distances = farthest_points(mesh, min(n_sources, n_vertices), _POINTS_PER_EDGE).distances
-    third = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1) / 3
-    area = np.bincount(mesh.faces.ravel(), np.repeat(third, 3), n_vertices)
+    area = vertex_areas(mesh.vertices, mesh.faces)
     weight = np.bincount(np.argmin(distances, axis=0), area, len(distances))
     return weight @ distances / weight.sum()
-
-
-def _surface_points(mesh: Mesh, n_samples: int, seed: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Faces (P,) and barycentric coordinates (P, 3) of points evenly distributed over the surface."""
-    generator = np.random.default_rng(seed)
-    area = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1)
-    face = generator.choice(len(area), size=n_samples, p=area / area.sum())
-    # Uniform in a triangle (Osada et al. 2002, equation 1).
-    r, s = np.sqrt(generator.random(n_samples)), generator.random(n_samples)
-    return face, np.stack([1 - r, r * (1 - s), r * s], axis=1)
 
 
 def _cone(n_rays: int, opening_angle: float) -> NDArray[np.float64]:

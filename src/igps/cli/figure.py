@@ -13,11 +13,13 @@ from scipy.spatial.distance import pdist
 
 from igps.cli.reading import labelled_meshes, signatures
 from igps.data.sources import MeshFiles
-from igps.geometry import disturbances
 from igps.geometry.coordinates import extend
 from igps.geometry.laplacian import laplacian
-from igps.geometry.mesh import Mesh, load_mesh
+from igps.geometry.mesh import Mesh
+from igps.geometry.reading import MeshReading, load_mesh
 from igps.geometry.voxels import grid_axes, inside_grid, interior_samples
+from igps.geometry.weld import facing_vertices
+from igps.geometry.weld import weld as weld_at
 from igps.linalg import Spectrum, eigenpairs
 from igps.nn.descriptor import VolumetricDescriptor
 from igps.nn.embedding import SpectralEmbedding
@@ -95,9 +97,9 @@ def topology(
     """
     if weld is not None and len(weld) != 2:
         raise ValueError(f"weld: expected the indices of two vertices, got {len(weld)}.")
-    before = load_mesh(mesh, repair=repair)
-    a, b = weld or disturbances.facing_vertices(before)
-    after = disturbances.weld(before, a, b)
+    before = load_mesh(mesh, MeshReading(repair=repair))
+    a, b = weld or facing_vertices(before)
+    after = weld_at(before, a, b)
     points = interior_samples(before, resolution)
     if len(points) < 2:
         raise ValueError(f"resolution: one interior sample of {mesh} makes no pair. Raise it.")
@@ -112,7 +114,7 @@ def topology(
 
     weld_change(before, after, change, out)
     print(after.notes[-1])
-    print(f"genus {_genus(before)} before, {_genus(after)} after")
+    print(f"genus {before.genus} before, {after.genus} after")
     print(f"{len(points)} interior samples, {len(change)} pairs, {n_eigenpairs} eigenpairs")
     for limit, reported in ((3, "99.6 %"), (10, None), (14, "all")):
         beside = f" (Rustamov 2010, for Homer: {reported})" if reported else ""
@@ -143,7 +145,7 @@ def potential(
     """
     from igps.figures.paper import potential_slice, upright
 
-    body = load_mesh(mesh, repair=repair)
+    body = load_mesh(mesh, MeshReading(repair=repair))
     body = Mesh(upright(body.vertices), body.faces, name=body.name)
     samples = interior_samples(body, resolution)
     x, y, _ = grid_axes(body, _SLICE_RESOLUTION)
@@ -193,11 +195,6 @@ def _around(mesh: Mesh, point: NDArray[np.float64], reach: float) -> NDArray[np.
     x, y, z = point[:, None] + reach * np.linspace(-1, 1, 9)
     index = np.nonzero(inside_grid(mesh, (x, y, z)))
     return np.stack([axis[i] for axis, i in zip((x, y, z), index, strict=True)], axis=1)
-
-
-def _genus(mesh: Mesh) -> int:
-    """Handles of a closed surface, by Euler's formula."""
-    return 1 - (len(mesh.vertices) - len(mesh.faces) // 2) // 2
 
 
 def _section(mesh: Mesh, height: float) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import MeshFiles, find_meshes
-from igps.geometry.mesh import Component
+from igps.geometry.reading import Component
 from igps.geometry.signature import SignatureConfig
 from igps.nn.presets import Preset
 

@@ -25,7 +25,8 @@ from tqdm import tqdm
 
 from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.sources import MeshFiles, find_meshes, mesh_files
-from igps.geometry.mesh import Component, Mesh, MeshError, load_mesh
+from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.reading import Component, MeshReading, load_mesh
 from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
 
 logger = logging.getLogger(__name__)
@@ -343,7 +344,7 @@ class _Recipe:
     allow_open: bool
 
     def mesh(self, path: Path) -> Mesh:
-        return load_mesh(path, repair=self.repair, component=self.component, allow_open=self.allow_open)
+        return load_mesh(path, MeshReading(self.repair, self.component, self.allow_open))
 
     def signature(self, path: Path) -> Signature:
         cache, key = SignatureCache(self.cache_dir), self._key(path)

@@ -12,7 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from igps.geometry.mesh import MeshError, area_vectors, load_mesh, simplify
+from igps.geometry.mesh import MeshError
+from igps.geometry.reading import MeshReading, load_mesh
+from igps.geometry.simplification import simplify
+from igps.geometry.surface import area_vectors, unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -95,7 +98,7 @@ def contact_sheet(shapes: ArticulatedShapes, path: str | Path, n_shown: int = 1)
 
 def draw_mesh(axis: Axes, path: Path) -> None:
     """Draw a mesh, shaded and seen along its thinnest principal axis."""
-    mesh = load_mesh(path, allow_open=True)
+    mesh = load_mesh(path, MeshReading(allow_open=True))
     with contextlib.suppress(MeshError, ImportError):  # drawn in full, it only takes longer
         mesh = simplify(mesh, _THUMBNAIL_VERTICES)
     _paint(axis, _seen_from_the_front(mesh.vertices), mesh.faces, _GREY)
@@ -105,8 +108,7 @@ def _paint(axis: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int64], 
     """Draw a surface, lit from the upper right, as seen from +z."""
     from matplotlib.collections import PolyCollection
 
-    normals = area_vectors(vertices, faces)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    normals = unit(area_vectors(vertices, faces))
     front = np.nonzero(normals[:, 2] > 0)[0]
     front = front[np.argsort(vertices[faces[front], 2].mean(axis=1))]  # the painter's algorithm: far faces first
     light = normals[front] @ np.array([0.35, 0.45, 0.82])

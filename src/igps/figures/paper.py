@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from igps.figures import _GREY, _figure, _paint
 from igps.figures.comparison import _COLOURS
-from igps.geometry.disturbances import TUBE_FACES
 from igps.geometry.mesh import Mesh
+from igps.geometry.weld import TUBE_FACES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.geometry.mesh import Mesh, area_vectors
+from igps.geometry.mesh import Mesh
+from igps.geometry.surface import area_vectors, unit, vertex_areas
 
 AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
 
@@ -48,7 +49,7 @@ def surface_attributes(
     if "surface_direction" not in names:
         return {}
     normals = area_vectors(mesh.vertices, mesh.faces)[faces]
-    return {"surface_direction": _unit(normals).astype(np.float32)}
+    return {"surface_direction": unit(normals).astype(np.float32)}
 
 
 def check_attributes(names: Sequence[str]) -> None:
@@ -89,7 +90,7 @@ def surface_direction(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.flo
     Raises:
         ImportError: libigl is not installed.
     """
-    return _unit(_to_surface(mesh, points))
+    return unit(_to_surface(mesh, points))
 
 
 def _to_surface(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -103,10 +104,6 @@ def _to_surface(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
         np.ascontiguousarray(points), np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
     )
     return np.asarray(nearest) - points
-
-
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 def electrostatic_potential(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -123,9 +120,8 @@ def electrostatic_potential(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[
     Returns:
         (P,) dimensionless.
     """
-    area = np.repeat(np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1) / 3, 3)
     # One quadrature point a vertex. The potential at a disc's centre is that of its charge at half its radius.
-    patch = np.bincount(mesh.faces.ravel(), weights=area, minlength=len(mesh.vertices))
+    patch = vertex_areas(mesh.vertices, mesh.faces)
     least = patch / (4 * np.pi)
     centre = mesh.vertices.mean(axis=0)  # keeps digits in the squared distances
     vertices = mesh.vertices - centre

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from igps.geometry.attributes import AttributeName, check_attributes, interior_attributes, surface_attributes
 from igps.geometry.coordinates import extend
 from igps.geometry.laplacian import Backend, laplacian
-from igps.geometry.mesh import Mesh, MeshError, area_vectors, simplify
+from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.sampling import surface_points
+from igps.geometry.simplification import simplify
 from igps.geometry.voxels import interior_samples
 from igps.linalg import Spectrum, eigenpairs
 
@@ -178,15 +180,6 @@ def _interior(mesh: Mesh, spectrum: Spectrum, points: NDArray[np.float64], confi
 
 
 def _surface(mesh: Mesh, spectrum: Spectrum, config: SignatureConfig) -> Samples:
-    n_samples = config.n_surface_samples
-    generator = np.random.default_rng(config.seed)
-    area = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1)
-    face = generator.choice(len(area), size=n_samples, p=area / area.sum())
-    # Uniform in a triangle (Osada et al. 2002, equation 1).
-    r = np.sqrt(generator.random(n_samples))
-    s = generator.random(n_samples)
-    weights = np.stack([1 - r, r * (1 - s), r * s], axis=1)
-    corner = mesh.faces[face]
-    points = np.einsum("pi,pij->pj", weights, mesh.vertices[corner])
-    values = np.einsum("pi,pik->pk", weights, spectrum.eigenfunctions[corner])
-    return Samples(points, values.astype(np.float32), surface_attributes(mesh, face, config.attributes))
+    points = surface_points(mesh, config.n_surface_samples, config.seed)
+    values = points.interpolate(spectrum.eigenfunctions).astype(np.float32)
+    return Samples(points.positions, values, surface_attributes(mesh, points.face, config.attributes))

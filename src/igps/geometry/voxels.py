@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from igps.geometry.coordinates import winding_number
 from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.surface import directed_edges
 
 # A cell centre closer to the surface than this share of a cell lies on it, and does not count as inside. It is far
 # above rounding, so that a moved or turned mesh keeps its samples.
@@ -108,7 +109,7 @@ def _scan(
     x_axis, y_axis, z_axis = axes
     # Rows: where each edge crosses each plane z = const, half-open in z. The edge runs from its lower to its upper end
     # whatever the face, so both faces compute the same point.
-    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    start, end = directed_edges(faces)
     upward = vertices[start, 2] < vertices[end, 2]
     low, high = np.where(upward, start, end), np.where(upward, end, start)
     first = np.searchsorted(z_axis, vertices[low, 2], side="left")

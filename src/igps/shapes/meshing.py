@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
-from igps.geometry.mesh import area_vectors
+from igps.geometry import surface
 from igps.shapes.skeleton import Placed
 from igps.shapes.solids import Array
 
@@ -50,7 +49,7 @@ def roughen(vertices: Array, faces: Faces, amplitude: float, wavelength: float, 
     noise = np.zeros(len(vertices))
     for wave, phase in zip(waves, phases, strict=True):
         noise += np.sin(vertices[:, 0] * wave[0] + vertices[:, 1] * wave[1] + vertices[:, 2] * wave[2] + phase)
-    return vertices + _vertex_normals(vertices, faces) * (amplitude * noise / np.sqrt(6.0))[:, None]
+    return vertices + surface.vertex_normals(vertices, faces) * (amplitude * noise / np.sqrt(6.0))[:, None]
 
 
 def defect(vertices: Array, faces: Faces, genus: int, n_vertices: int) -> str | None:
@@ -58,15 +57,14 @@ def defect(vertices: Array, faces: Faces, genus: int, n_vertices: int) -> str | 
     count = len(vertices)
     if abs(count / n_vertices - 1.0) > _VERTEX_TOLERANCE:
         return f"{count} vertices"
-    start, end = _edges(faces)
+    start, end = surface.directed_edges(faces)
     forward, backward = start * count + end, end * count + start
     if len(np.unique(forward)) < len(forward) or not np.array_equal(np.sort(forward), np.sort(backward)):
         return "not a closed, oriented manifold"
-    graph = sparse.csr_array((np.ones(len(start)), (start, end)), shape=(count, count))
-    components = connected_components(graph, directed=False, return_labels=False)
+    components, _ = surface.components(faces, count)
     if components != 1:
         return f"{components} components"
-    found = (2 - (count - len(faces) // 2)) // 2
+    found = surface.genus(faces, count)
     if found != genus:
         return f"genus {found} in place of {genus}"
     if np.linalg.det(vertices[faces]).sum() <= 0.0:
@@ -133,29 +131,16 @@ def _rough_area(body: Sequence[Placed]) -> float:
 
 def _relax(body: Sequence[Placed], vertices: Array, faces: Faces, spacing: float) -> Array:
     """Slide vertices (V,3) towards their neighbours' mean along the surface, and back onto the zero level set."""
-    start, end = _edges(faces)
+    start, end = surface.directed_edges(faces)
     adjacency = sparse.csr_array((np.ones(len(start)), (start, end)), shape=(len(vertices),) * 2)
     degree = np.bincount(start, minlength=len(vertices))[:, None]
     for _ in range(_RELAXATION_STEPS):
-        normals = _vertex_normals(vertices, faces)
+        normals = surface.vertex_normals(vertices, faces)
         step = (adjacency @ vertices) / degree - vertices
         step -= normals * (step * normals).sum(axis=1, keepdims=True)
         vertices = vertices + 0.7 * step
         vertices -= normals * np.clip(_distance(body, vertices), -0.5 * spacing, 0.5 * spacing)[:, None]
     return vertices
-
-
-def _vertex_normals(vertices: Array, faces: Faces) -> Array:
-    """Area-weighted unit normals (V,3)."""
-    index = faces.ravel()
-    repeated = np.repeat(area_vectors(vertices, faces), 3, axis=0)
-    normals = np.column_stack([np.bincount(index, repeated[:, i], len(vertices)) for i in range(3)])
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-
-
-def _edges(faces: Faces) -> tuple[Faces, Faces]:
-    """The first and the second vertices of the directed edges (3F,) of faces (F,3)."""
-    return faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
 
 
 def _smallest_angle(vertices: Array, faces: Faces) -> float:

@@ -16,6 +16,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
 from igps.geometry.mesh import Mesh
+from igps.geometry.surface import undirected_edges
 
 # Sources to one call of the shortest-path solver, which returns the points on the edges too.
 _BLOCK = 64
@@ -68,7 +69,7 @@ def geodesic_distances(mesh: Mesh, sources: ArrayLike, points_per_edge: int = 2)
         raise ValueError(
             f"sources: expected vertex indices from 0 to {n_vertices - 1}, got {start.min()} to {start.max()}."
         )
-    graph = _graph(mesh, points_per_edge)
+    graph = edge_graph(mesh, points_per_edge)
     blocks = (start[i : i + _BLOCK] for i in range(0, len(start), _BLOCK))
     return np.concatenate([dijkstra(graph, indices=block)[:, :n_vertices] for block in blocks])
 
@@ -92,7 +93,7 @@ def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> Far
             f"n_samples: expected 1 to {n_vertices}, the number of vertices of {mesh.name}, got {n_samples}. "
             "Lower it, or subdivide the mesh."
         )
-    graph = _graph(mesh, points_per_edge)
+    graph = edge_graph(mesh, points_per_edge)
 
     def from_vertex(vertex: int) -> NDArray[np.float64]:
         return dijkstra(graph, indices=vertex)[:n_vertices]
@@ -107,14 +108,13 @@ def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> Far
     return FarthestPoints(np.array(taken, dtype=np.int64), distances)
 
 
-def _graph(mesh: Mesh, points_per_edge: int) -> sparse.csr_array:
+def edge_graph(mesh: Mesh, points_per_edge: int = 0) -> sparse.csr_array:
     """Symmetric graph of the vertices and, after them, the points of every edge; its weights are lengths."""
     if points_per_edge < 0:
         raise ValueError(f"points_per_edge: expected at least 0, got {points_per_edge}.")
     n, n_vertices, n_faces = points_per_edge, len(mesh.vertices), len(mesh.faces)
     # Side i of a face runs from corner i to corner i + 1.
-    sides = np.stack([mesh.faces, np.roll(mesh.faces, -1, axis=1)], axis=-1)
-    edges, edge_of = np.unique(np.sort(sides.reshape(-1, 2), axis=1), axis=0, return_inverse=True)
+    edges, edge_of = undirected_edges(mesh.faces, n_vertices)
     along = (np.arange(1, n + 1) / (n + 1))[None, :, None]
     first, last = mesh.vertices[edges[:, :1]], mesh.vertices[edges[:, 1:]]
     positions = np.concatenate([mesh.vertices, ((1 - along) * first + along * last).reshape(-1, 3)])

@@ -1,0 +1,52 @@
+"""Random points of a surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.geometry.mesh import Mesh
+from igps.geometry.surface import face_areas
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points on the faces of a mesh.
+
+    Args:
+        mesh: V vertices, F faces.
+        face: (P,) int64 the face of each point.
+        weights: (P, 3) float64 its barycentric coordinates there.
+    """
+
+    mesh: Mesh
+    face: NDArray[np.int64]
+    weights: NDArray[np.float64]
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """(P, 3) length."""
+        return self.interpolate(self.mesh.vertices)
+
+    def interpolate(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(P, D) linear interpolation of values (V, D) at the vertices."""
+        return np.einsum("pi,pid->pd", self.weights, values[self.mesh.faces[self.face]])
+
+
+def surface_points(mesh: Mesh, n_points: int, seed: int) -> SurfacePoints:
+    """Random points evenly distributed over the surface.
+
+    Args:
+        mesh: the surface.
+        n_points: how many.
+        seed: the same seed gives the same points.
+    """
+    generator = np.random.default_rng(seed)
+    area = face_areas(mesh.vertices, mesh.faces)
+    face = generator.choice(len(area), size=n_points, p=area / area.sum())
+    # Uniform in a triangle (Osada et al. 2002, equation 1).
+    r = np.sqrt(generator.random(n_points))
+    s = generator.random(n_points)
+    return SurfacePoints(mesh, face, np.stack([1 - r, r * (1 - s), r * s], axis=1))

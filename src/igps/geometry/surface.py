@@ -1,0 +1,67 @@
+"""What the arrays of a triangle surface say: edges, components, areas, normals. They are not checked here."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+
+def area_vectors(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Normal of each face times its area: (F, 3), length²."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a) / 2
+
+
+def face_areas(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(F,) areas, length²."""
+    return np.linalg.norm(area_vectors(vertices, faces), axis=1)
+
+
+def vertex_areas(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(V,) a third of the areas of the faces around each vertex, length²."""
+    third = np.repeat(face_areas(vertices, faces) / 3, 3)
+    return np.asarray(np.bincount(faces.ravel(), third, len(vertices)), dtype=np.float64)
+
+
+def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(V, 3) outward unit normals of the vertices, means of those of their faces weighted by area."""
+    corners = faces.ravel()
+    vectors = np.repeat(area_vectors(vertices, faces), 3, axis=0)
+    return unit(np.column_stack([np.bincount(corners, vectors[:, i], len(vertices)) for i in range(3)]))
+
+
+def unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3) vectors of length 1 in the same directions; zero stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny)
+
+
+def diagonal(vertices: NDArray[np.float64]) -> float:
+    """Length of the diagonal of the bounding box."""
+    return float(np.linalg.norm(np.ptp(vertices, axis=0)))
+
+
+def directed_edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and second vertex of every side of every face: (3F,) each, face by face."""
+    return faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+
+
+def undirected_edges(faces: NDArray[np.int64], n_vertices: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The edges in ascending order, (E, 2) with the smaller vertex first; and (3F,) the edge of every side."""
+    start, end = directed_edges(faces)
+    keys, edge_of = np.unique(np.minimum(start, end) * n_vertices + np.maximum(start, end), return_inverse=True)
+    return np.stack([keys // n_vertices, keys % n_vertices], axis=1), edge_of
+
+
+def components(faces: NDArray[np.int64], n_vertices: int) -> tuple[int, NDArray[np.int32]]:
+    """Number of connected components, and the number of each vertex's, (V,)."""
+    start, end = directed_edges(faces)
+    graph = sparse.coo_array((np.ones(len(start), dtype=np.int8), (start, end)), shape=(n_vertices, n_vertices))
+    count, label = connected_components(graph, directed=False)
+    return int(count), label
+
+
+def genus(faces: NDArray[np.int64], n_vertices: int) -> int:
+    """Handles of a closed connected surface, by Euler's formula V − E + F = 2 − 2 genus with 2E = 3F."""
+    return (2 - (n_vertices - len(faces) // 2)) // 2

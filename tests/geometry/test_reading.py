@@ -1,0 +1,107 @@
+"""Meshes from files: formats, repair, and what makes a file unusable."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from conftest import FACES, TETRAHEDRON
+from igps.geometry.mesh import MeshError
+from igps.geometry.reading import MeshReading, load_mesh
+
+
+def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
+    lines = ["OFF", f"{len(vertices)} {len(faces)} 0", *(" ".join(map(str, v)) for v in vertices)]
+    lines += [" ".join(map(str, [len(f), *f])) for f in faces]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_missing_and_unreadable_files(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"nowhere\.off: no such file"):
+        load_mesh(tmp_path / "nowhere.off")
+    for name, text in (("empty.off", ""), ("words.off", "hello"), ("cut.ply", "ply\nformat ascii 1.0\n")):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(MeshError, match=rf"{name}: not readable"):
+            load_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", ["off", "obj", "ply", "glb"])
+def test_formats_keep_vertices_in_order(tmp_path: Path, suffix: str) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=1)
+    surface.export(tmp_path / f"mesh.{suffix}")
+    mesh = load_mesh(tmp_path / f"mesh.{suffix}")
+    np.testing.assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, surface.faces)
+
+
+def test_quads_become_triangles(tmp_path: Path) -> None:
+    corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
+    quads = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]])
+    mesh = load_mesh(write_off(tmp_path / "cube.off", corners, quads))
+    assert mesh.faces.shape == (12, 3)
+    assert mesh.volume == pytest.approx(1)
+    assert mesh.area == pytest.approx(6)
+
+
+def test_texture_seams_do_not_split_vertices(tmp_path: Path) -> None:
+    lines = [f"v {x} {y} {z}" for x, y, z in TETRAHEDRON] + ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
+    lines += [f"f {a + 1}/{i % 4 + 1} {b + 1}/2 {c + 1}/3" for i, (a, b, c) in enumerate(FACES)]
+    (tmp_path / "seams.obj").write_text("\n".join(lines) + "\n")
+    np.testing.assert_allclose(load_mesh(tmp_path / "seams.obj").vertices, TETRAHEDRON)
+
+
+def test_stl_needs_and_gets_welding(tmp_path: Path) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=2)
+    surface.export(tmp_path / "mesh.stl")
+    with pytest.raises(MeshError, match="boundary edges"):
+        load_mesh(tmp_path / "mesh.stl")
+    mesh = load_mesh(tmp_path / "mesh.stl", MeshReading(repair=True))
+    assert len(mesh.vertices) == len(surface.vertices)
+    assert mesh.volume == pytest.approx(surface.volume, rel=1e-6)
+    assert any("welded" in note for note in mesh.notes)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_repair_mends_each_fault_at_any_scale(tmp_path: Path, scale: float) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=2)
+    vertices, faces = np.asarray(surface.vertices), np.asarray(surface.faces)
+    faulty = faces.copy()
+    faulty[::3] = faulty[::3, ::-1]
+    faulty[5, 0] = len(vertices)
+    faulty = np.vstack([faulty, faulty[7], [[0, 0, 1]]])
+    vertices = np.vstack([vertices, vertices[faces[5, 0] if 5 % 3 else faces[5, 2]], [[4, 4, 4]]]) * scale
+    mesh = load_mesh(write_off(tmp_path / "faulty.off", vertices, faulty), MeshReading(repair=True))
+    assert mesh.volume == pytest.approx(surface.volume * scale**3, rel=1e-6)
+    assert len(mesh.vertices) == len(surface.vertices)
+    said = " ".join(mesh.notes)
+    assert all(word in said for word in ("welded 1", "degenerate", "duplicate", "unreferenced", "orient"))
+
+
+def test_largest_component_is_that_of_the_largest_area(tmp_path: Path) -> None:
+    fine, large = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.box((5, 5, 5))
+    vertices = np.vstack([fine.vertices + 20, large.vertices])
+    faces = np.vstack([fine.faces, large.faces + len(fine.vertices)])
+    path = write_off(tmp_path / "two.off", vertices, faces)
+    with pytest.raises(MeshError, match="2 connected components"):
+        load_mesh(path)
+    mesh = load_mesh(path, MeshReading(component="largest"))
+    assert mesh.volume == pytest.approx(125)
+    assert any("largest of 2 components" in note for note in mesh.notes)
+
+
+def test_open_files_are_read_when_allowed(tmp_path: Path) -> None:
+    path = write_off(tmp_path / "open.off", TETRAHEDRON, FACES[:3])
+    with pytest.raises(MeshError, match="3 boundary edges"):
+        load_mesh(path)
+    mesh = load_mesh(path, MeshReading(allow_open=True))
+    assert mesh.allow_open
+    assert len(mesh.faces) == 3
+
+
+def test_unknown_component_is_refused() -> None:
+    with pytest.raises(ValueError, match="component: expected 'largest' or None, got 'smallest'"):
+        MeshReading(component="smallest")  # type: ignore[arg-type]
