@@ -49,6 +49,15 @@ def horseshoe(half_gap: float = 0.05, tube: float = 0.3, n_sections: int = 48, n
     return Mesh(np.concatenate([ring, ends]), faces, name="horseshoe")
 
 
+def with_slivers(vertices: np.ndarray, faces: np.ndarray, n_slivers: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same surface, with so many random faces cut in three by a vertex hardly off the middle of a side."""
+    split = np.random.default_rng(3).choice(len(faces), n_slivers, replace=False)
+    inside = np.einsum("i,fij->fj", [0.4995, 0.4995, 0.001], vertices[faces[split]])
+    new, (a, b, c) = len(vertices) + np.arange(n_slivers), faces[split].T
+    thirds = [np.stack(corners, axis=1) for corners in ((a, b, new), (b, c, new), (c, a, new))]
+    return np.concatenate([vertices, inside]), np.concatenate([np.delete(faces, split, axis=0), *thirds])
+
+
 def surface_genus(mesh: Mesh) -> int:
     """Handles of a watertight mesh as trimesh counts them."""
     surface = as_trimesh(mesh)
