@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import torch
 import trimesh
 
+from igps.geometry import coordinates
 from igps.geometry.mesh import Mesh
 from igps.geometry.reading import load_mesh
 
@@ -64,6 +66,14 @@ def surface_genus(mesh: Mesh) -> int:
     assert surface.is_watertight
     assert surface.is_winding_consistent
     return 1 - surface.euler_number // 2
+
+
+@pytest.fixture
+def approximate_small_meshes() -> Iterator[None]:
+    """Else small meshes would be evaluated exactly. It outlives a test's `monkeypatch.undo`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(coordinates, "_FEW_VERTICES", 0)
+        yield
 
 
 @pytest.fixture(scope="session")

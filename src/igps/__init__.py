@@ -11,7 +11,7 @@ from igps.data.cache import SignatureCache
 from igps.data.datamodule import SignatureDataModule
 from igps.data.dataset import LabelledSignature, SignatureBatch, SignatureDataset, collate
 from igps.geometry.mesh import Mesh, MeshError
-from igps.geometry.reading import load_mesh
+from igps.geometry.reading import MeshReading, load_mesh
 from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
 from igps.geometry.simplification import simplify
 from igps.nn.descriptor import CombinedDescriptor, OrientedDescriptor, VolumetricDescriptor
@@ -33,6 +33,7 @@ __all__ = [
     "LabelledSignature",
     "Mesh",
     "MeshError",
+    "MeshReading",
     "MetricHead",
     "OrientedDescriptor",
     "OrientedPairHistogram",

@@ -1,0 +1,45 @@
+"""Surfaces as plain arrays, points in and around them, and functions on them."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+import trimesh
+
+Mesh = tuple[np.ndarray, np.ndarray]
+
+
+def bumpy_sphere(subdivisions: int, amplitude: float = 0.3) -> Mesh:
+    """A closed, star-shaped, asymmetric surface."""
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
+    x, y, z = sphere.vertices.T
+    radius = 1 + amplitude * np.sin(3 * x + 0.5) * np.cos(2 * y) + 0.2 * amplitude * z
+    return np.asarray(sphere.vertices * radius[:, None] * [1.0, 0.8, 1.3]), np.asarray(sphere.faces, np.int64)
+
+
+def cube() -> Mesh:
+    box = trimesh.creation.box(extents=(2, 2, 2))
+    return np.asarray(box.vertices, np.float64), np.asarray(box.faces, np.int64)
+
+
+def torus(n_major: int, n_minor: int) -> Mesh:
+    shape = trimesh.creation.torus(1.0, 0.35, major_sections=n_major, minor_sections=n_minor)
+    return np.asarray(shape.vertices, np.float64), np.asarray(shape.faces, np.int64)
+
+
+def interior_points(mesh: Mesh, n: int, seed: int = 0) -> np.ndarray:
+    vertices, faces = mesh
+    low, high = vertices.min(0), vertices.max(0)
+    points = np.random.default_rng(seed).uniform(low, high, (8 * n, 3))
+    return points[igl.winding_number(vertices, faces, points) > 0.5][:n]
+
+
+def exterior_points(mesh: Mesh, n: int, seed: int = 0) -> np.ndarray:
+    vertices, faces = mesh
+    points = np.random.default_rng(seed).uniform(2 * vertices.min(0), 2 * vertices.max(0), (8 * n, 3))
+    return points[igl.winding_number(vertices, faces, points) < 0.5][:n]
+
+
+def smooth_functions(vertices: np.ndarray) -> np.ndarray:
+    x, y, z = vertices.T
+    return np.stack([np.sin(2 * x), np.cos(3 * y + x), x * y * z, np.exp(z), np.sin(5 * z) * x, x], axis=1)
