@@ -50,9 +50,8 @@ def noise(mesh: Mesh, amplitude: float = 0.005, seed: int = 0) -> Mesh:
         raise ValueError(f"amplitude: expected a positive share of the diagonal, got {amplitude}.")
     lengths = np.random.default_rng(seed).normal(0, amplitude * mesh.diagonal, len(mesh.vertices))
     note = f"every vertex moved along its normal, standard deviation {amplitude:g} of the bounding box diagonal"
-    return _changed(
-        mesh, mesh.vertices + lengths[:, None] * vertex_normals(mesh.vertices, mesh.faces), mesh.faces, note
-    )
+    steps = lengths[:, None] * vertex_normals(mesh.vertices, mesh.faces)
+    return _changed(mesh, mesh.vertices + steps, mesh.faces, note)
 
 
 def simplified(mesh: Mesh, share: float) -> Mesh:

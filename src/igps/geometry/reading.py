@@ -45,10 +45,7 @@ class MeshReading:
             raise ValueError(f"component: expected 'largest' or None, got {self.component!r}.")
 
 
-def load_mesh(
-    path: str | Path,
-    reading: MeshReading = MeshReading(),
-) -> Mesh:
+def load_mesh(path: str | Path, reading: MeshReading = MeshReading()) -> Mesh:
     """Read a mesh file of any format that trimesh reads, and check it.
 
     Polygons are cut into triangles. Vertices keep their order, and are merged by repair alone.
