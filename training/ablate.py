@@ -11,23 +11,22 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 from statistics import mean, stdev
+from typing import Any
 
 from jsonargparse import auto_cli
 from pytorch_lightning import Trainer, seed_everything
-from torch import nn
 
+import igps
 from evaluate import score
 from igps.data.datamodule import SignatureDataModule
-from igps.geometry.signature import SignatureConfig
-from igps.nn.descriptor import CombinedDescriptor, OrientedDescriptor, VolumetricDescriptor
+from igps.nn.axes import EuclideanDistance, InteriorDistance, PairCosines, Potential
+from igps.nn.description import describe
+from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.extraction import describe
 from igps.nn.fitted import WhitenedHead
-from igps.nn.head import CorrectedDistance
 from igps.nn.histogram import PairHistogram
 from igps.nn.learner import RetrievalLearner
-from igps.nn.oriented import OrientedPairHistogram
-from igps.nn.presets import preset
+from igps.nn.metric import CorrectedDistance
 
 HEADS = ("none", "whitened", "kernel")
 # Dimensions, and whether bins and spectral filter are learned.
@@ -50,7 +49,7 @@ def ablate(
     first_seed: int = 100,
     n_epochs: int = 10,
     n_training_samples: int = 300,
-    cache: Path | None = None,
+    cache_dir: Path | None = None,
 ) -> None:
     """FT of each head on each descriptor, trained or not: mean ± standard deviation over splits.
 
@@ -61,16 +60,16 @@ def ablate(
         first_seed: see n_splits.
         n_epochs: of training bins and filters.
         n_training_samples: of each shape in training, drawn anew at each step.
-        cache: folder of cached signatures; the user's cache directory if not given.
+        cache_dir: folder of cached signatures; the user's cache directory if not given.
     """
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
-    config = preset("rich").completed(SignatureConfig())
+    config = layout("oriented", False, False, n_training_samples).needs.completed(igps.SignatureConfig())
     print(f"{'dimensions':<14}{'learned':<16}" + "".join(f"{head:>14}" for head in HEADS))
     for dimensions, bins, spectrum in ROWS:
         found: dict[str, list[float]] = {head: [] for head in HEADS}
         for seed in range(first_seed, first_seed + n_splits):
             seed_everything(seed, verbose=False)
-            data = SignatureDataModule(root, "seen", n_train, 0, split_seed=seed, config=config, cache_dir=cache)
+            data = SignatureDataModule(root, "seen", n_train, 0, split_seed=seed, config=config, cache_dir=cache_dir)
             data.prepare_data()
             descriptor = layout(dimensions, bins, spectrum, n_training_samples)
             if bins or spectrum:
@@ -84,26 +83,27 @@ def ablate(
         print(f"{dimensions:<14}{learned:<16}{cells}", flush=True)
 
 
-def layout(dimensions: str, bins: bool, spectrum: bool, n_training_samples: int) -> CombinedDescriptor:
+def layout(dimensions: str, bins: bool, spectrum: bool, n_training_samples: int) -> HistogramDescriptor:
     """Interior distance and potential alone; with Euclidean distance; and with how samples lie to the surface too."""
 
-    def embedding() -> SpectralEmbedding:
-        return SpectralEmbedding(n_eigenpairs=50, n_knots=12 if spectrum else 0)
+    def histogram(*axes: Any) -> PairHistogram:
+        embedding = SpectralEmbedding(n_eigenpairs=50, n_knots=12 if spectrum else 0)
+        return PairHistogram(axes, embedding, n_samples=1000, n_training_samples=n_training_samples)
 
-    n_samples = {"n_samples": 1000, "n_training_samples": n_training_samples}
+    potential = Potential(4, soft=True, learnable=bins)
     if dimensions == "interior":
-        histogram = PairHistogram(4, 64, soft=True, learnable=bins)
+        parts = [histogram(potential, InteriorDistance(64, learnable=bins))]
     else:
-        histogram = PairHistogram(4, 32, soft=True, learnable=bins, n_euclidean_bins=16)
-    parts: list[nn.Module] = [VolumetricDescriptor(embedding(), histogram, **n_samples)]
+        distances = InteriorDistance(32, learnable=bins), EuclideanDistance(16, learnable=bins)
+        parts = [histogram(potential, *distances)]
     if dimensions == "oriented":
-        parts.append(OrientedDescriptor(embedding(), OrientedPairHistogram(learnable=bins), **n_samples))
-    return CombinedDescriptor(parts)
+        parts.append(histogram(InteriorDistance(6, 3.0, learnable=bins), PairCosines(5, learnable=bins)))
+    return HistogramDescriptor(parts)
 
 
-def train(descriptor: CombinedDescriptor, data: SignatureDataModule, n_epochs: int) -> None:
+def train(descriptor: HistogramDescriptor, data: SignatureDataModule, n_epochs: int) -> None:
     """Train bins and filters on the training part, in place."""
-    learner = RetrievalLearner(descriptor, CorrectedDistance(WhitenedHead(descriptor.part_cells), share=1.0))
+    learner = RetrievalLearner(descriptor, CorrectedDistance(WhitenedHead(), share=1.0))
     trainer = Trainer(
         max_epochs=n_epochs, logger=False, enable_checkpointing=False, enable_progress_bar=False,
         enable_model_summary=False,

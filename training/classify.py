@@ -16,23 +16,23 @@ import torch
 from jsonargparse import auto_cli
 from torch import Tensor
 
-from igps.data.datamodule import Split, split_seen
-from igps.data.dataset import SignatureDataset
-from igps.geometry.signature import SignatureConfig
-from igps.nn.extraction import describe
+import igps
+from evaluate import histogram_descriptor
+from igps.data.datamodule import SignatureDataModule
+from igps.data.splits import Split, split_seen
+from igps.nn.description import describe
 from igps.nn.fitted import KernelHead
-from igps.nn.learner import load_learner
-from igps.nn.presets import HistogramName, preset
+from igps.nn.learner import RetrievalLearner
 
 
 def classify(
     root: Path,
-    descriptor: HistogramName = "rich",
+    descriptor: str = "rich",
     checkpoint: Path | None = None,
     n_train: int = 10,
     n_splits: int = 5,
     first_seed: int = 100,
-    cache: Path | None = None,
+    cache_dir: Path | None = None,
 ) -> None:
     """Share of test shapes whose class is found by a `KernelHead`, mean ± standard deviation over splits.
 
@@ -43,32 +43,32 @@ def classify(
         n_train: shapes of each class to train on.
         n_splits: how many splits, with the seeds from `first_seed` on.
         first_seed: see n_splits.
-        cache: folder of cached signatures; the user's cache directory if not given.
+        cache_dir: folder of cached signatures; the user's cache directory if not given.
     """
     if checkpoint is None:
-        dataset = SignatureDataset(root, preset("rich").completed(SignatureConfig()), cache)
+        module = histogram_descriptor(descriptor)
+        dataset = igps.SignatureDataset(root, module.needs.completed(igps.SignatureConfig()), cache_dir)
         dataset.precompute(strict=True)
-        module = preset(descriptor).make()
-        histograms = describe(dataset, module, progress=True)
+        histograms, part_cells = describe(dataset, module, progress=True), module.part_cells
         seeds = range(first_seed, first_seed + n_splits)
         found = [split_seen(dataset.labels, n_train, seed=seed) for seed in seeds]
         labels = dataset.labels
     else:
-        learner, data = load_learner(checkpoint)
+        learner = RetrievalLearner.load_from_checkpoint(checkpoint)
+        data = SignatureDataModule.load_from_checkpoint(checkpoint)
         data.prepare_data()
-        module = learner.descriptor
-        histograms, labels = describe(data.dataset, module, progress=True), data.dataset.labels
+        histograms, labels = describe(data.dataset, learner.descriptor, progress=True), data.dataset.labels
+        part_cells = learner.part_cells
         # The validation part chose nothing here.
         found = [Split(data.split.train + data.split.validation, (), data.split.test)]
-    accuracy = [100 * _accuracy(histograms.flatten(1), labels, split, module.part_cells) for split in found]
+    accuracy = [100 * _accuracy(histograms.flatten(1), labels, split, part_cells) for split in found]
     spread = stdev(accuracy) if len(accuracy) > 1 else 0.0
     print(f"accuracy {mean(accuracy):.1f} ± {spread:.1f} percent over {len(accuracy)} splits")
 
 
-def _accuracy(histograms: Tensor, labels: Tensor, split: Split, part_cells: Sequence[int]) -> float:
+def _accuracy(histograms: Tensor, labels: Tensor, split: Split, part_cells: Sequence[int] | None) -> float:
     train, test = torch.tensor(split.train), torch.tensor(split.test)
-    head = KernelHead(part_cells, len(train), len(labels[train].unique()))
-    predicted = head.fit(histograms[train], labels[train]).predict(histograms[test])
+    predicted = KernelHead().fit(histograms[train], labels[train], part_cells).predict(histograms[test])
     return float((predicted == labels[test]).float().mean())
 
 

@@ -17,15 +17,15 @@ import torch
 from jsonargparse import auto_cli
 from torch import Tensor, nn
 
-from igps.data.datamodule import Protocol, Split, split_seen, split_unseen
-from igps.data.dataset import SignatureDataset
-from igps.figures.learned import learned_layout
-from igps.geometry.signature import SignatureConfig
-from igps.nn.extraction import describe
+import igps
+from igps.data.datamodule import SignatureDataModule
+from igps.data.splits import Split, SplitProtocol, split_seen, split_unseen
+from igps.nn.description import describe
+from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.fitted import KernelHead, WhitenedHead
-from igps.nn.head import CorrectedDistance
-from igps.nn.learner import load_learner
-from igps.nn.presets import HistogramName, preset
+from igps.nn.learner import RetrievalLearner
+from igps.nn.metric import CorrectedDistance
+from igps.report.learned import learned_layout
 from igps.retrieval import retrieval_scores
 
 Head = Literal["none", "whitened", "kernel"]
@@ -34,13 +34,13 @@ COLUMNS = {"ft": "FT", "nn": "NN", "dcg": "DCG", "st": "ST", "adr": "ADR", "map"
 
 def splits(
     root: Path,
-    descriptor: HistogramName = "interior",
-    protocol: Protocol = "seen",
+    descriptor: str = "interior",
+    protocol: SplitProtocol = "seen",
     n_train: int = 10,
     n_test: int | None = None,
     n_splits: int = 5,
     first_seed: int = 100,
-    cache: Path | None = None,
+    cache_dir: Path | None = None,
 ) -> None:
     """Scores of the plain chi-square distance and of the fitted heads: mean ± standard deviation over splits.
 
@@ -52,11 +52,11 @@ def splits(
         n_test: classes to test (unseen); all others if not given.
         n_splits: how many splits, with the seeds from `first_seed` on.
         first_seed: see n_splits.
-        cache: folder of cached signatures; the user's cache directory if not given.
+        cache_dir: folder of cached signatures; the user's cache directory if not given.
     """
-    dataset = SignatureDataset(root, preset("rich").completed(SignatureConfig()), cache)
+    module = histogram_descriptor(descriptor)
+    dataset = igps.SignatureDataset(root, module.needs.completed(igps.SignatureConfig()), cache_dir)
     dataset.precompute(strict=True)
-    module = preset(descriptor).make()
     histograms, labels = describe(dataset, module, progress=True).flatten(1), dataset.labels
     print(f"{descriptor}, {protocol}, n_train={n_train}, {n_splits} splits from seed {first_seed}, percent")
     print(f"{'head':<10}" + "".join(f"{title:>14}" for title in COLUMNS.values()))
@@ -72,15 +72,28 @@ def splits(
         print(f"{head:<10}" + "".join(f"{mean(v):>8.1f} ± {stdev(v) if n_splits > 1 else 0:>3.1f}" for v in values))
 
 
-def score(histograms: Tensor, labels: Tensor, split: Split, head: Head, part_cells: Sequence[int]) -> dict[str, float]:
+def histogram_descriptor(name: str) -> HistogramDescriptor:
+    """The descriptor of a name, whose histograms heads are fitted to.
+
+    Raises:
+        ValueError: it gives no histograms.
+    """
+    found = igps.descriptor(name)
+    if not isinstance(found, HistogramDescriptor):
+        raise ValueError(f"descriptor: expected one of histograms, such as interior or rich, got {name}.")
+    return found
+
+
+def score(
+    histograms: Tensor, labels: Tensor, split: Split, head: Head, part_cells: Sequence[int] | None
+) -> dict[str, float]:
     """Scores of the test part, each shape against the others."""
     train, test = torch.tensor(split.train), torch.tensor(split.test)
     fitted: nn.Module | None = None
     if head == "whitened":
-        fitted = WhitenedHead(part_cells).fit(histograms[train], labels[train])
+        fitted = WhitenedHead().fit(histograms[train], labels[train], part_cells)
     elif head == "kernel":
-        n_classes = len(labels[train].unique())
-        fitted = KernelHead(part_cells, len(train), n_classes).fit(histograms[train], labels[train])
+        fitted = KernelHead().fit(histograms[train], labels[train], part_cells)
     distance = CorrectedDistance(fitted, share=1.0)
     return retrieval_scores(distance(histograms[test], histograms[test]), labels[test]).mean()
 
@@ -92,21 +105,22 @@ def checkpoint(path: Path, out: Path = Path("build/evaluation")) -> None:
     fitted to the same histograms of its training and validation parts.
 
     Args:
-        path: the checkpoint; its configuration is read from config.yaml two folders up, where train.py puts it.
+        path: the checkpoint.
         out: folder for layout.png, the learned bins and filter against their start.
     """
-    learner, data = load_learner(path)
+    learner = RetrievalLearner.load_from_checkpoint(path).eval()
+    data = SignatureDataModule.load_from_checkpoint(path)
     data.prepare_data()
     histograms, labels = describe(data.dataset, learner.descriptor, progress=True), data.dataset.labels
     test = torch.tensor(data.split.test)
     part = histograms[test]
-    found = {"plain": retrieval_scores(learner.distance.plain_distance(part, part), labels[test]).mean()}
+    found = {"plain": retrieval_scores(learner.distance.plain(part, part), labels[test]).mean()}
     with torch.inference_mode():
         found["learned"] = retrieval_scores(learner.distances(part, part), labels[test]).mean()
     # The validation part has chosen nothing that these heads depend on.
     split = Split(data.split.train + data.split.validation, (), data.split.test)
     for head in ("whitened", "kernel"):
-        found[head] = score(histograms.flatten(1), labels, split, head, learner.descriptor.part_cells)
+        found[head] = score(histograms.flatten(1), labels, split, head, learner.part_cells)
     print(f"{'':<10}" + "".join(f"{title:>8}" for title in COLUMNS.values()))
     for name, scores in found.items():
         print(f"{name:<10}" + "".join(f"{100 * scores[column]:>8.1f}" for column in COLUMNS))

@@ -1,4 +1,4 @@
-"""Train the metric of VolumetricDescriptor.pretrained on generated shapes, and measure it where it was not trained.
+"""Train the metric of the descriptor `pretrained` on generated shapes, and measure it where it was not trained.
 
     python training/pretrain.py --config configs/pretrain.yaml
     python training/pretrain.py --config configs/pretrain.yaml --data DATA
@@ -15,17 +15,17 @@ import torch
 from jsonargparse import auto_cli
 from pytorch_lightning import Trainer, seed_everything
 
-from igps.data.datamodule import SignatureDataModule, split_unseen
-from igps.data.dataset import SignatureDataset
-from igps.figures.learned import learned_layout
-from igps.geometry.signature import SignatureConfig
-from igps.nn.descriptor import PRETRAINED, CombinedDescriptor, EmbeddedDescriptor, save_embedded
-from igps.nn.extraction import describe
+import igps
+from igps.data.datamodule import SignatureDataModule
+from igps.data.splits import split_unseen
+from igps.descriptors.pretrained import PRETRAINED, save_pretrained
+from igps.descriptors.rich import rich
+from igps.nn.description import describe
+from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.fitted import WhitenedHead
-from igps.nn.head import CorrectedDistance
 from igps.nn.learner import RetrievalLearner
-from igps.nn.presets import preset
-from igps.shapes import ArticulatedShapes
+from igps.nn.metric import CorrectedDistance
+from igps.report.learned import learned_layout
 from transfer import curve, few_labels, report
 
 
@@ -42,7 +42,7 @@ def pretrain(
     shrinkage: float = 0.3,
     seed: int = 0,
     out: Path = PRETRAINED,
-    cache: Path | None = None,
+    cache_dir: Path | None = None,
     data: Path | None = None,
     figures: Path = Path("build"),
 ) -> None:
@@ -58,26 +58,24 @@ def pretrain(
         bin_rate: learning rate of bins and filters.
         n_directions, shrinkage: of the `WhitenedHead`.
         out: the file of parameters.
-        cache: folder of cached signatures; the user's cache directory if not given.
+        cache_dir: folder of cached signatures; the user's cache directory if not given.
         data: a labelled collection to measure the transfer on.
         figures: folder of pretrain.png, FT on `data` against the number of generated classes, and of
             pretrain_layout.png, the learned bins and filters.
     """
     seed_everything(seed)
     figures.mkdir(parents=True, exist_ok=True)
-    ArticulatedShapes(n_classes, n_per_class, seed).write(root, progress=True)
-    config = preset("rich").completed(SignatureConfig(n_eigenpairs=n_eigenpairs))
-    generated = SignatureDataset(root, config, cache)
+    igps.ArticulatedShapes(n_classes, n_per_class, seed).write(root, progress=True)
+    descriptor = rich(learnable=n_epochs > 0)
+    config = descriptor.needs.completed(igps.SignatureConfig(n_eigenpairs=n_eigenpairs))
+    generated = igps.SignatureDataset(root, config, cache_dir)
     generated.precompute(strict=True)
-    descriptor = CombinedDescriptor.rich(learnable=n_epochs > 0)
     if n_epochs:
-        thinned = CombinedDescriptor.rich(
-            learnable=True, n_samples=n_training_samples, n_training_samples=n_training_samples
-        )
-        distance = CorrectedDistance(WhitenedHead(thinned.part_cells, n_directions, shrinkage), share=1.0)
+        thinned = rich(learnable=True, n_samples=n_training_samples, n_training_samples=n_training_samples)
+        distance = CorrectedDistance(WhitenedHead(n_directions, shrinkage), share=1.0)
         shapes = SignatureDataModule(
             root, "unseen", n_classes - n_held_out, 0, split_seed=seed, classes_per_batch=16, config=config,
-            cache_dir=cache, n_samples_in_memory=2 * n_training_samples,
+            cache_dir=cache_dir, n_samples_in_memory=2 * n_training_samples,
         )  # fmt: skip
         trainer = Trainer(max_epochs=n_epochs, logger=False, enable_checkpointing=False, num_sanity_val_steps=0)
         trainer.fit(RetrievalLearner(thinned, distance, bin_rate=bin_rate), shapes)
@@ -88,17 +86,18 @@ def pretrain(
 
     def fit(n: int, seed: int) -> WhitenedHead:
         chosen = torch.tensor(split_unseen(labels, n, n_test=n_held_out, seed=seed).train)
-        return WhitenedHead(descriptor.part_cells, n_directions, shrinkage).fit(histograms[chosen], labels[chosen])
+        head = WhitenedHead(n_directions, shrinkage)
+        return head.fit(histograms[chosen], labels[chosen], descriptor.part_cells)
 
     n_fitted = n_classes - n_held_out
     head = fit(n_fitted, seed)
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_embedded(EmbeddedDescriptor(descriptor, head), out)
+    save_pretrained(EmbeddedDescriptor(descriptor, head), out)
     held_out = torch.tensor(split_unseen(labels, n_fitted, seed=seed).test)
     report(f"{n_held_out} held-out generated classes", histograms[held_out], labels[held_out], head)
     if data is None:
         return
-    real = SignatureDataset(data, preset("rich").completed(SignatureConfig()), cache)
+    real = igps.SignatureDataset(data, descriptor.needs.completed(igps.SignatureConfig()), cache_dir)
     real.precompute(strict=True)
     found, classes = describe(real, descriptor, progress=True), real.labels
     report(str(data), found, classes, head)

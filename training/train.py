@@ -1,11 +1,12 @@
 """Train a descriptor and a metric, or test one: `python training/train.py {fit,test} --config configs/default.yaml`.
 
-Every option of the learner, the data and the trainer can be set in the file or on the command line; the whole
-configuration is stored beside the checkpoint.
+Every option of the learner, the data and the trainer can be set in the file or on the command line. A checkpoint holds
+the configuration too: `RetrievalLearner.load_from_checkpoint` and `SignatureDataModule.load_from_checkpoint` read it.
 """
 
 from __future__ import annotations
 
+from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_lightning.cli import LightningCLI
 
 from igps.data.datamodule import SignatureDataModule
@@ -15,7 +16,12 @@ from igps.nn.learner import RetrievalLearner
 def main() -> None:
     """Entry point."""
     LightningCLI(
-        RetrievalLearner, SignatureDataModule, seed_everything_default=0, save_config_kwargs={"overwrite": True}
+        RetrievalLearner,
+        SignatureDataModule,
+        seed_everything_default=0,
+        save_config_kwargs={"overwrite": True},
+        # After every epoch, validated or not.
+        trainer_defaults={"callbacks": [ModelCheckpoint(save_on_train_epoch_end=True)]},
     )
 
 

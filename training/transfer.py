@@ -9,10 +9,9 @@ from statistics import mean, stdev
 import torch
 from torch import Tensor
 
-from igps.data.datamodule import split_seen
-from igps.figures.learned import transfer_curve
+from igps.data.splits import split_seen
 from igps.nn.fitted import KernelHead, WhitenedHead
-from igps.nn.head import square_roots
+from igps.report.learned import transfer_curve
 from igps.retrieval import chi_square, cosine, retrieval_scores
 
 COLUMNS = ("nn", "ft", "st", "dcg")
@@ -59,14 +58,11 @@ def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: WhitenedH
         split = split_seen(labels, n, seed=seed)
         train, test = torch.tensor(split.train), torch.tensor(split.test)
         fitted = {
-            name: KernelHead(pretrained.part_cells, len(train), len(labels.unique()), len(pretrained.directions))
-            for name in ("from pretrained", "from scratch")
+            "from pretrained": KernelHead(pretrained),
+            "from scratch": KernelHead(n_directions=pretrained.n_directions),
         }
-        fitted["from pretrained"].whitened.load_state_dict(pretrained.state_dict())
-        # A single shape of a class tells nothing of the variation within it; what is left is to centre.
-        fitted["from scratch"].whitened.mean.copy_(square_roots(histograms[train], histograms.shape[1]).mean(dim=0))
-        fitted["from pretrained"].fit(histograms[train], labels[train], whiten=False)
-        fitted["from scratch"].fit(histograms[train], labels[train], whiten=n > 1)
+        for head in fitted.values():
+            head.fit(histograms[train], labels[train], pretrained.part_cells.tolist())
         for name, head in {"pretrained, no labels": pretrained, **fitted}.items():
             found[name].append(100 * scores(head(histograms[test]), labels[test])["ft"])
     rows = ", ".join(f"{name} FT {mean(values):.1f} ± {stdev(values):.1f}" for name, values in found.items())

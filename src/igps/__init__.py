@@ -7,59 +7,62 @@ Shape letters in all docstrings: V vertices, F faces, K eigenpairs, P samples, C
 N shapes, Q queries, G gallery, D embedding width.
 """
 
-from igps.data.cache import SignatureCache
-from igps.data.datamodule import SignatureDataModule
-from igps.data.dataset import LabelledSignature, SignatureBatch, SignatureDataset, collate
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from igps.data.batch import SignatureBatch, collate
+from igps.data.dataset import SignatureDataset
+from igps.descriptors import descriptor
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.reading import MeshReading, load_mesh
-from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
-from igps.geometry.simplification import simplify
-from igps.nn.descriptor import CombinedDescriptor, OrientedDescriptor, VolumetricDescriptor
-from igps.nn.embedding import SpectralEmbedding, barycentroid_potential, interior_distance, spectral_embedding
-from igps.nn.extraction import describe
+from igps.geometry.signature import Signature, SignatureConfig, compute_signature
+from igps.nn.description import describe
+from igps.nn.descriptor import BodyDescriptor, Descriptor, HistogramDescriptor
+from igps.nn.embedding import SpectralEmbedding
 from igps.nn.fitted import KernelHead, WhitenedHead
-from igps.nn.head import CorrectedDistance, MetricHead
-from igps.nn.histogram import PairHistogram, pair_histogram
-from igps.nn.learner import RetrievalLearner
-from igps.nn.oriented import OrientedPairHistogram
-from igps.retrieval import RetrievalScores, chi_square, retrieval_scores, search
+from igps.nn.histogram import PairHistogram
+from igps.retrieval import chi_square, retrieval_scores, search
 from igps.shapes import ArticulatedShapes
+
+if TYPE_CHECKING:
+    from igps.data.datamodule import SignatureDataModule
+    from igps.nn.learner import RetrievalLearner
+
+# These bring Lightning, which takes seconds to import: on first use.
+_LAZY = {"RetrievalLearner": "igps.nn.learner", "SignatureDataModule": "igps.data.datamodule"}
 
 __all__ = [
     "ArticulatedShapes",
-    "CombinedDescriptor",
-    "CorrectedDistance",
+    "BodyDescriptor",
+    "Descriptor",
+    "HistogramDescriptor",
     "KernelHead",
-    "LabelledSignature",
     "Mesh",
     "MeshError",
     "MeshReading",
-    "MetricHead",
-    "OrientedDescriptor",
-    "OrientedPairHistogram",
     "PairHistogram",
     "RetrievalLearner",
-    "RetrievalScores",
-    "Samples",
     "Signature",
     "SignatureBatch",
-    "SignatureCache",
     "SignatureConfig",
     "SignatureDataModule",
     "SignatureDataset",
     "SpectralEmbedding",
-    "VolumetricDescriptor",
     "WhitenedHead",
-    "barycentroid_potential",
     "chi_square",
     "collate",
     "compute_signature",
     "describe",
-    "interior_distance",
+    "descriptor",
     "load_mesh",
-    "pair_histogram",
     "retrieval_scores",
     "search",
-    "simplify",
-    "spectral_embedding",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(importlib.import_module(_LAZY[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

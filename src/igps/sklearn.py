@@ -10,12 +10,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from igps.data.dataset import SignatureDataset, collate
+from igps.data.batch import collate
+from igps.data.dataset import SignatureDataset
+from igps.descriptors import descriptor as descriptor_of
 from igps.geometry.mesh import Mesh
+from igps.geometry.reading import MeshReading
 from igps.geometry.signature import SignatureConfig, compute_signature
-from igps.nn.extraction import describe
-from igps.nn.presets import DescriptorName, preset
-from igps.retrieval import chi_square
+from igps.nn.description import describe
+from igps.nn.descriptor import Descriptor, HistogramDescriptor
 
 try:
     from sklearn.base import BaseEstimator, TransformerMixin
@@ -24,37 +26,40 @@ except ImportError as error:
 
 
 class VolumetricFeatures(TransformerMixin, BaseEstimator):
-    """Mesh files, or meshes, in; histograms or embeddings out, one row a mesh; nothing is fitted.
+    """Mesh files, or meshes, in; descriptions out, one row a mesh; nothing is fitted.
 
     The square roots of a histogram's cells are given by default: their Euclidean distance is Hellinger's between
     histograms, what linear classifiers and Gaussian kernels can work with. For a χ² kernel ask for the cells.
 
     Args:
-        descriptor: "interior", "gps", "multiscale", "rich" or "pretrained", see `preset`.
-        square_root: give square roots of the cells; embeddings ("pretrained") are given as they are.
-        config: of the signatures; the default if None. The attributes that the descriptor asks for are added.
+        descriptor: a name, "package.module:NAME", or a `Descriptor`; see `igps.descriptor`.
+        square_root: give square roots of the cells of histograms; other descriptions are given as they are.
+        config: of the signatures; the default if None. What the descriptor needs is added.
+        reading: how mesh files are read.
         cache_dir: of the signatures of mesh files; the user's cache directory if None. Meshes are not cached.
         n_workers: processes that compute the signatures of mesh files; all cores if None.
     """
 
     def __init__(
         self,
-        descriptor: DescriptorName = "rich",
+        descriptor: str | Descriptor = "rich",
         *,
         square_root: bool = True,
         config: SignatureConfig | None = None,
+        reading: MeshReading | None = None,
         cache_dir: str | Path | None = None,
         n_workers: int | None = None,
     ) -> None:
         self.descriptor = descriptor
         self.square_root = square_root
         self.config = config
+        self.reading = reading
         self.cache_dir = cache_dir
         self.n_workers = n_workers
 
     def fit(self, X: Sequence[str | Path | Mesh], y: Any = None) -> Self:
         """Check the parameters and the kind of input; there is nothing to learn."""
-        preset(self.descriptor)
+        descriptor_of(self.descriptor)
         _checked(X)
         return self
 
@@ -66,19 +71,19 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
             TypeError: other input.
         """
         shapes = _checked(X)
-        chosen = preset(self.descriptor)
-        config = chosen.completed(self.config or SignatureConfig())
-        descriptor = chosen.make()
+        chosen = descriptor_of(self.descriptor)
+        config = chosen.needs.completed(self.config or SignatureConfig())
         if isinstance(shapes[0], Mesh):
             with torch.inference_mode():
-                parts = [descriptor(collate([compute_signature(mesh, config)])) for mesh in shapes]
+                parts = [chosen(collate([compute_signature(mesh, config)], [mesh])) for mesh in shapes]
             features = torch.cat(parts)
         else:
-            dataset = SignatureDataset(shapes, config, self.cache_dir)
+            dataset = SignatureDataset(shapes, config, self.cache_dir, reading=self.reading)
             dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
-            features = describe(dataset, descriptor)
+            features = describe(dataset, chosen, n_workers=self.n_workers)
         cells = features.flatten(1)
-        return (cells.sqrt() if self.square_root and chosen.distance is chi_square else cells).numpy()
+        rooted = self.square_root and isinstance(chosen, HistogramDescriptor)
+        return (cells.sqrt() if rooted else cells).numpy()
 
     def __sklearn_is_fitted__(self) -> bool:
         return True
@@ -88,6 +93,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         tags.input_tags.two_d_array = False
         tags.input_tags.string = True
         tags.no_validation = True
+        tags.transformer_tags.preserves_dtype = []
         tags.requires_fit = False
         return tags
 

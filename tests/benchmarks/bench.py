@@ -29,6 +29,11 @@ from igps.geometry.mesh import Mesh
 from igps.geometry.reading import load_mesh
 from igps.geometry.voxels import grid_axes, inside_grid, interior_samples
 from igps.linalg import eigenpairs
+from igps.nn.axes import InteriorDistance, Potential
+from igps.nn.centres import middles
+from igps.nn.hard_pairs import pair_histogram
+from igps.nn.histogram import joint_histogram
+from igps.nn.pair_axes import Distances, OrientedPoints
 
 K = 250
 
@@ -190,22 +195,23 @@ def histogram_pairs(data: Path | None) -> Figure:
     def plain() -> torch.Tensor:
         return torch.histc(torch.pdist(embedding), 64, 0, 4)
 
-    seconds, reference = timed(lambda: igps.pair_histogram(embedding, potential), plain, 5)
+    seconds, reference = timed(lambda: pair_histogram(embedding, potential), plain, 5)
     pairs = len(embedding) * (len(embedding) - 1) / 2e6
     note = "baseline: distances alone and one hard histogram, no classes"
     return Figure(pairs / seconds, "M pairs/s", pairs / reference, "torch pdist + histc", reference / seconds, note)
 
 
 def histogram_backward(data: Path | None) -> Figure:
-    embedding = torch.randn(1, 4096, K, generator=torch.Generator().manual_seed(0)) * 0.06
-    potential, mask = embedding.norm(dim=2), torch.ones(1, 4096, dtype=torch.bool)
-    layer = igps.PairHistogram(learnable=True)
+    embedding = torch.randn(4096, K, generator=torch.Generator().manual_seed(0)) * 0.06
+    potential = embedding.norm(dim=1)
+    classes, bins = Potential(4, learnable=True), InteriorDistance(64, learnable=True)
     upstream = torch.randn(10, 64, generator=torch.Generator().manual_seed(1))
     centres = torch.linspace(0.03, 3.97, 64, requires_grad=True)
-    small = embedding[0, :1024]
+    small = embedding[:1024]
 
     def ours() -> None:
-        (layer(embedding, potential, mask)[0] * upstream).sum().backward()
+        distances = Distances(embedding, bins.centres(), equal=False)
+        (joint_histogram(classes.memberships(potential), [distances]) * upstream).sum().backward()
 
     def by_autograd() -> None:
         # The same kernel without classes, as autograd runs it: all (pairs, bins) at once, for a sixteenth of the pairs.
@@ -223,13 +229,16 @@ def oriented_pairs(data: Path | None) -> Figure:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(1000, 3, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(1000, 3, generator=generator), dim=1)
-    layer, mask = igps.OrientedPairHistogram(distance_range=1.0), torch.ones(1, 1000, dtype=torch.bool)
+    one_class = torch.ones(1000, 1)
+    distances = Distances(points, middles(6, 1.0, "bins"), equal=True)
+    cosines = middles(5, 2.0, "bins") - 1
+    oriented = OrientedPoints(points, directions, cosines, cosines)
     x, n = points.double().numpy(), directions.double().numpy()
     i, j = np.triu_indices(1000, 1)
 
     def ours() -> None:
         with torch.inference_mode():
-            layer(points[None], points[None], directions[None], mask)
+            joint_histogram(one_class, [distances, oriented])
 
     def by_numpy() -> None:
         line = x[j] - x[i]
@@ -249,7 +258,7 @@ def descriptor_15k(data: Path | None) -> Figure:
     embedding = torch.randn(15_000, K, generator=torch.Generator().manual_seed(0)) * 0.06
     potential = embedding.norm(dim=1)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    igps.pair_histogram(embedding, potential)
+    pair_histogram(embedding, potential)
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20 - before
     return Figure(grown, "GiB", 1.0, "target", 1.0 / max(grown, 1e-3), "memory beyond the embedding's own 14 MiB")
 
@@ -257,7 +266,7 @@ def descriptor_15k(data: Path | None) -> Figure:
 def mesh_to_histogram(mesh: Mesh) -> float:
     start = time.perf_counter()
     signature = igps.compute_signature(mesh, igps.SignatureConfig.paper())
-    igps.VolumetricDescriptor.paper()(igps.collate([signature]))
+    igps.descriptor("interior")(igps.collate([signature]))
     return time.perf_counter() - start
 
 
@@ -280,7 +289,7 @@ def shrec07(data: Path | None) -> dict[str, Figure]:
         seconds = []
         for _ in range(2):
             start = time.perf_counter()
-            command = [sys.executable, "-m", "igps.cli", "retrieve", str(data), "--paper", "--cache", cache]
+            command = [sys.executable, "-m", "igps.cli", "retrieve", str(data), "--paper", "--cache_dir", cache]
             subprocess.run(command, check=True, capture_output=True)
             seconds.append(time.perf_counter() - start)
     return {"shrec07_cold": within(480, seconds[0]), "shrec07_warm": within(45, seconds[1])}

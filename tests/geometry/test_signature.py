@@ -8,20 +8,21 @@ import torch
 import trimesh
 
 from conftest import as_mesh
-from igps.data.dataset import collate
+from igps.data.batch import collate
 from igps.geometry.coordinates import mean_value_coordinates
 from igps.geometry.laplacian import laplacian
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
 from igps.linalg import eigenpairs
-from igps.nn.descriptor import VolumetricDescriptor
+from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding
+from igps.nn.histogram import PairHistogram
 
 CONFIG = SignatureConfig(n_eigenpairs=40, resolution=12, min_samples=0, n_surface_samples=300, accuracy=None)
 
 
 def histogram(signature: Signature, samples: str = "interior") -> np.ndarray:
-    return VolumetricDescriptor.paper(samples)(collate([signature]))[0].numpy()  # type: ignore[arg-type]
+    return PairHistogram([Potential(4), InteriorDistance(64)], samples=samples)(collate([signature]))[0].numpy()  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

@@ -13,12 +13,12 @@ from sklearn.metrics import average_precision_score
 from torch import Tensor
 
 from igps.retrieval import (
-    RetrievalScoresMetric,
     chi_square,
     euclidean,
     precision_recall_curve,
     retrieval_scores,
 )
+from igps.retrieval.metric import RetrievalScoresMetric
 from igps.retrieval.scores import SCORE_NAMES
 
 LOG3 = math.log2(3)

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from igps.figures import contact_sheet
+from igps.report.gallery import contact_sheet
 from igps.shapes import ArticulatedShapes, GeneratedShape
 from igps.shapes.solids import Arc, Box, Cone, Prism, Ring, Solid
 

@@ -17,6 +17,7 @@ from igps.cli.figure import pose, potential, topology
 from igps.cli.reading import FLAGS
 from igps.cli.retrieval import extract, query, retrieve
 from igps.cli.robustness import robustness
+from igps.parallel import MachineError
 
 Command = Callable[..., None]
 Commands = Mapping[str, "Command | Commands"]
@@ -34,13 +35,16 @@ COMMANDS: Commands = {
 
 
 def main() -> None:
-    """Entry point of the `igps` command."""
+    """Entry point of the `igps` command: status 1 where the input is at fault, 2 where the machine is."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     parser = ArgumentParser(prog="igps", description="Volumetric shape retrieval by interior Global Point Signatures.")
     _add_commands(parser, COMMANDS)
     command, options = _chosen(parser.instantiate(parser.parse_args()), COMMANDS)
     try:
         command(**options)
+    except MachineError as error:
+        print(f"igps: {error}", file=sys.stderr)
+        sys.exit(2)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         # Expected of bad input, and said in full by the message; a traceback would bury it.
         print(f"igps: {error}", file=sys.stderr)

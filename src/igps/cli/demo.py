@@ -8,17 +8,17 @@ from igps.cli.retrieval import retrieve
 from igps.shapes import ArticulatedShapes
 
 
-def demo(out: Path = Path("build/demo"), workers: int | None = None) -> None:
+def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> None:
     """Make a small benchmark of articulated shapes, run the retrieval on it, and save a figure of ranked results.
 
     Args:
         out: folder for the meshes, the results of `igps retrieve`, and ranked.png.
-        workers: processes that compute signatures; all cores if not given.
+        n_workers: processes that compute signatures; all cores if not given.
     """
-    from igps.figures import ranked_results
+    from igps.report.gallery import ranked_results
 
     shapes = ArticulatedShapes(n_classes=8, n_per_class=10)
     shapes.write(out / "shapes", progress=True)
-    retrieve(out / "shapes", out=out, cache=out / "cache", workers=workers)
+    retrieve(out / "shapes", out=out, cache_dir=out / "cache", n_workers=n_workers)
     ranked_results(out / "shapes", out / "ranking.csv", out / "ranked.png")
     print(f"ranked results of one query per class: {out / 'ranked.png'}")

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
+from functools import reduce
+from operator import or_
 from pathlib import Path
-from typing import Any
 
 from igps.data.dataset import Failure, SignatureDataset
-from igps.data.sources import MeshFiles, find_meshes
-from igps.geometry.reading import Component
+from igps.data.sources import MeshFiles
+from igps.geometry.reading import Component, MeshReading
 from igps.geometry.signature import SignatureConfig
-from igps.nn.presets import Preset
+from igps.nn.descriptor import Descriptor
+from igps.nn.needs import Needs
+from igps.parallel import Limits
 
 FLAGS = {
     "paper": "use the parameters of Rustamov 2010: as the defaults, but the grid is never refined",
@@ -24,14 +27,17 @@ FLAGS = {
 
 def signatures(
     source: Path | Sequence[Path] | MeshFiles,
-    cache: Path | None = None,
+    descriptors: Sequence[Descriptor] = (),
+    cache_dir: Path | None = None,
     signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
     paper: bool = False,
     repair: bool = False,
     component: Component | None = None,
     allow_open: bool = False,
     strict: bool = False,
-    workers: int | None = None,
+    n_workers: int | None = None,
+    time_limit: float | None = None,
+    memory_limit: float | None = None,
 ) -> tuple[SignatureDataset, list[Failure]]:
     """The meshes whose signatures are in the cache, after computing what was missing; and those that failed.
 
@@ -39,59 +45,28 @@ def signatures(
 
     Args:
         source: a folder, files, or what was found in a folder.
-        cache: folder where computed signatures are kept; the user's cache directory if not given.
+        descriptors: whose needs the signatures satisfy.
+        cache_dir: folder where computed signatures are kept; the user's cache directory if not given.
         signature: parameters of the signatures.
         component: largest keeps only the largest connected component of each mesh.
-        workers: processes that compute signatures; all cores if not given.
+        n_workers: processes that compute; all cores if not given.
+        time_limit: seconds that the signature of one mesh may take; no limit if not given.
+        memory_limit: gigabytes of memory that the signature of one mesh may take; no limit if not given.
         paper, repair, allow_open, strict: see `FLAGS`.
 
     Raises:
         ValueError: no mesh could be used, or `paper` beside other parameters of the signatures.
     """
-    config = _config(signature, paper)
-    dataset = SignatureDataset(source, config, cache, repair=repair, component=component, allow_open=allow_open)
-    failures = dataset.precompute(n_workers=workers, strict=strict)
+    if paper and signature != SignatureConfig():
+        raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
+    config = SignatureConfig.paper() if paper else signature
+    config = reduce(or_, (one.needs for one in descriptors), Needs()).completed(config)
+    dataset = SignatureDataset(source, config, cache_dir, reading=MeshReading(repair, component, allow_open))
+    limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
+    failures = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits)
     if len(failures) == len(dataset):
         raise ValueError(f"none of {len(dataset)} meshes could be used; the first: {failures[0].error}")
     return dataset.usable(failures), failures
-
-
-def preset_signatures(
-    chosen: Preset,
-    source: Path | Sequence[Path] | MeshFiles,
-    signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
-    paper: bool = False,
-    **reading: Any,
-) -> tuple[SignatureDataset, list[Failure]]:
-    """`signatures` that carry what a descriptor needs of them.
-
-    Args:
-        chosen: the descriptor.
-        source: a folder, files, or what was found in a folder.
-        signature: parameters of the signatures.
-        paper: see `FLAGS`.
-    """
-    return signatures(source, signature=chosen.completed(_config(signature, paper)), **reading)
-
-
-def _config(signature: SignatureConfig, paper: bool) -> SignatureConfig:
-    if not paper:
-        return signature
-    if signature != SignatureConfig():
-        raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
-    return SignatureConfig.paper()
-
-
-def labelled_meshes(root: Path) -> MeshFiles:
-    """The meshes of a folder, with their classes.
-
-    Raises:
-        ValueError: the folder tells no classes.
-    """
-    files = find_meshes(root)
-    if files.labels is None:
-        raise ValueError(f"{root}: no classes found. Expected one folder per class, or a labels.csv (file,label).")
-    return files
 
 
 def write_failures(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

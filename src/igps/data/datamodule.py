@@ -1,99 +1,31 @@
-"""Seeded splits of a labelled collection into training, validation and test parts, and their data loaders."""
+"""Data loaders over the parts of a labelled collection, for Lightning."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 from pytorch_lightning import LightningDataModule
-from torch import Tensor
+from pytorch_lightning.core.mixins.hparams_mixin import _given_hyperparameters
 from torch.utils.data import DataLoader
 
-from igps.data.dataset import LabelledSignature, SignatureBatch, SignatureDataset, collate
+from igps.data.batch import LabelledSignature, SignatureBatch, collate
+from igps.data.dataset import SignatureDataset
+from igps.data.sources import labelled_meshes
+from igps.data.splits import SplitProtocol, split_seen, split_unseen
+from igps.geometry.reading import MeshReading
 from igps.geometry.signature import Samples, SignatureConfig
 
-Protocol = Literal["seen", "unseen"]
 
+def has_configuration() -> bool:
+    """Whether Lightning's command line makes this object, from a configuration that a checkpoint can keep as words.
 
-@dataclass(frozen=True)
-class Split:
-    """Indices of the shapes of each part; no shape is in two of them.
-
-    Args:
-        train: to fit parameters to.
-        validation: taken from the training part, to choose between models; may be empty.
-        test: to be looked at once.
+    What is given as objects a checkpoint could keep only by pickling them, and it would run code to read them.
     """
-
-    train: tuple[int, ...]
-    validation: tuple[int, ...]
-    test: tuple[int, ...]
-
-
-def split_seen(labels: Tensor, n_train: int, *, n_validation: int = 0, seed: int = 0) -> Split:
-    """Every class in every part: `n_train` shapes of each train, the others test.
-
-    Args:
-        labels: (N,) integer classes.
-        n_train: shapes of each class in training and validation together.
-        n_validation: how many of those validate.
-        seed: of the draw.
-
-    Raises:
-        ValueError: a class has no more than `n_train` shapes, or `n_validation` leaves none to train on.
-    """
-    if not 0 <= n_validation < n_train:
-        raise ValueError(f"n_validation: expected 0 to n_train - 1 = {n_train - 1}, got {n_validation}.")
-    generator = torch.Generator().manual_seed(seed)
-    parts: tuple[list[int], list[int], list[int]] = ([], [], [])
-    for label in labels.unique().tolist():
-        members = torch.nonzero(labels == label).flatten()
-        if len(members) <= n_train:
-            raise ValueError(f"n_train: expected fewer than the {len(members)} shapes of class {label}, got {n_train}.")
-        drawn = members[torch.randperm(len(members), generator=generator)].tolist()
-        for part, chosen in zip(
-            parts, (drawn[n_validation:n_train], drawn[:n_validation], drawn[n_train:]), strict=True
-        ):
-            part.extend(chosen)
-    train, validation, test = (tuple(sorted(part)) for part in parts)
-    return Split(train, validation, test)
-
-
-def split_unseen(
-    labels: Tensor, n_train: int, *, n_validation: int = 0, n_test: int | None = None, seed: int = 0
-) -> Split:
-    """No class in two parts: `n_train` classes train, others test.
-
-    With the same seed and `n_test` the test classes stay the same whatever `n_train`, and the training classes of a
-    smaller `n_train` are among those of a larger.
-
-    Args:
-        labels: (N,) integer classes.
-        n_train: classes in training and validation together.
-        n_validation: how many of those validate.
-        n_test: classes to test; all others if None.
-        seed: of the draw.
-
-    Raises:
-        ValueError: not so many classes, or `n_validation` leaves none to train on.
-    """
-    classes = labels.unique()
-    n_test = len(classes) - n_train if n_test is None else n_test
-    if not 0 <= n_validation < n_train:
-        raise ValueError(f"n_validation: expected 0 to n_train - 1 = {n_train - 1}, got {n_validation}.")
-    if n_test < 1 or n_train + n_test > len(classes):
-        raise ValueError(f"n_train, n_test: expected at most {len(classes)} classes together, got {n_train}, {n_test}.")
-    drawn = classes[torch.randperm(len(classes), generator=torch.Generator().manual_seed(seed))]
-
-    def members(chosen: Tensor) -> tuple[int, ...]:
-        return tuple(torch.nonzero(torch.isin(labels, chosen)).flatten().tolist())
-
-    fit = drawn[:n_train]
-    return Split(members(fit[n_validation:]), members(fit[:n_validation]), members(drawn[len(drawn) - n_test :]))
+    return _given_hyperparameters.get() is not None
 
 
 class SignatureDataModule(LightningDataModule):
@@ -101,6 +33,8 @@ class SignatureDataModule(LightningDataModule):
 
     Training batches hold the same number of shapes of each of several classes (P×K sampling), so that every shape has
     company of its class. They need `pytorch-metric-learning`.
+
+    A checkpoint knows the data, for `load_from_checkpoint`, if they were made from a configuration.
 
     Args:
         root: a folder that tells classes, see `find_meshes`.
@@ -113,6 +47,7 @@ class SignatureDataModule(LightningDataModule):
         n_samples_in_memory: interior and surface samples of each training shape, a fixed random subset, that are kept
             in memory from step to step; None reads whole signatures from the cache at each step.
         config: of the signatures.
+        reading: how mesh files are read.
         cache_dir: of the signatures; the user's cache directory if None.
         n_workers: processes that compute missing signatures; all cores if None.
     """
@@ -120,7 +55,7 @@ class SignatureDataModule(LightningDataModule):
     def __init__(
         self,
         root: Path,
-        protocol: Protocol = "seen",
+        protocol: SplitProtocol = "seen",
         n_train: int = 10,
         n_validation: int = 2,
         n_test: int | None = None,
@@ -129,6 +64,7 @@ class SignatureDataModule(LightningDataModule):
         shapes_per_class: int = 4,
         n_samples_in_memory: int | None = 1000,
         config: SignatureConfig | None = None,
+        reading: MeshReading | None = None,
         cache_dir: Path | None = None,
         n_workers: int | None = None,
     ) -> None:
@@ -139,9 +75,9 @@ class SignatureDataModule(LightningDataModule):
             raise ValueError("n_test: expected None with protocol 'seen', which tests all shapes not trained on.")
         if n_samples_in_memory is not None and n_samples_in_memory < 2:
             raise ValueError(f"n_samples_in_memory: expected None or at least 2, got {n_samples_in_memory}.")
-        self.dataset = SignatureDataset(root, config, cache_dir)
-        if self.dataset.files.labels is None:
-            raise ValueError(f"{root}: no classes found. Expected one folder per class, or a labels.csv (file,label).")
+        if has_configuration():
+            self.save_hyperparameters()
+        self.dataset = SignatureDataset(labelled_meshes(root), config, cache_dir, reading=reading)
         self.classes_per_batch = classes_per_batch
         self.shapes_per_class = shapes_per_class
         self.n_samples_in_memory = n_samples_in_memory
@@ -174,10 +110,6 @@ class SignatureDataModule(LightningDataModule):
             self._in_memory = [_thinned(part[i], self.n_samples_in_memory) for i in range(len(part))]
         # A list is a map-style dataset to a DataLoader.
         return DataLoader(self._in_memory, batch_size=n_batch, sampler=sampler, collate_fn=collate)  # type: ignore[arg-type]
-
-    def training_in_order(self) -> DataLoader[LabelledSignature]:
-        """The training part, each shape once: for what is measured on it, such as a distance's median."""
-        return self._in_order(self.split.train)
 
     def val_dataloader(self) -> DataLoader[LabelledSignature] | list[DataLoader[LabelledSignature]]:
         """The validation part in order; nothing if it is empty."""

@@ -29,6 +29,14 @@ class MeshFiles:
     def __len__(self) -> int:
         return len(self.paths)
 
+    def subset(self, indices: Sequence[int]) -> MeshFiles:
+        """Some of the files, in the given order."""
+        return MeshFiles(
+            tuple(self.paths[i] for i in indices),
+            tuple(self.names[i] for i in indices),
+            None if self.labels is None else tuple(self.labels[i] for i in indices),
+        )
+
 
 def find_meshes(root: str | Path) -> MeshFiles:
     """The meshes below a folder, with their classes if it tells them.
@@ -57,6 +65,18 @@ def find_meshes(root: str | Path) -> MeshFiles:
             f"in one of the formats {', '.join(sorted(_suffixes()))}."
         )
     return MeshFiles(paths, _names(paths, root), None)
+
+
+def labelled_meshes(root: str | Path) -> MeshFiles:
+    """`find_meshes` of a folder that tells classes.
+
+    Raises:
+        ValueError: it tells none.
+    """
+    files = find_meshes(root)
+    if files.labels is None:
+        raise ValueError(f"{root}: no classes found. Expected one folder per class, or a {LABELS_FILE} (file,label).")
+    return files
 
 
 def mesh_files(paths: Sequence[str | Path], labels: Sequence[str] | None = None) -> MeshFiles:

@@ -12,8 +12,9 @@ from igps.geometry.surface import directed_edges
 # A cell centre closer to the surface than this share of a cell lies on it, and does not count as inside. It is far
 # above rounding, so that a moved or turned mesh keeps its samples.
 _ON_SURFACE = 1e-6
-# The finest grid that `min_samples` may ask for.
+# The finest grid that `min_samples` may ask for, and the most cells of one: some 40 bytes each while it is scanned.
 _MAX_RESOLUTION = 512
+_MAX_CELLS = 2**25
 
 
 def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> NDArray[np.float64]:
@@ -31,12 +32,18 @@ def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> 
         (P, 3) points in the mesh's coordinates, length.
 
     Raises:
-        MeshError: no cell centre is inside, or `min_samples` is out of reach.
+        MeshError: no cell centre is inside, `min_samples` is out of reach, or the grid would fill the memory.
     """
     if resolution < 1:
         raise ValueError(f"resolution: expected at least 1, got {resolution}.")
     if min_samples < 0:
         raise ValueError(f"min_samples: expected at least 0, got {min_samples}.")
+    finest = _finest_resolution(mesh)
+    if resolution > finest:
+        raise MeshError(
+            f"{mesh.name}: a grid of {resolution} cells along the longest side has more than the {_MAX_CELLS} cells "
+            f"that are held in memory at once. Lower the resolution to {finest}."
+        )
     while True:
         axes = grid_axes(mesh, resolution)
         inside = inside_grid(mesh, axes)
@@ -44,7 +51,7 @@ def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> 
         if count >= max(min_samples, 1):
             index = np.nonzero(inside)
             return np.stack([axis[i] for axis, i in zip(axes, index, strict=True)], axis=1)
-        if min_samples == 0 or resolution >= _MAX_RESOLUTION:
+        if min_samples == 0 or resolution >= finest:
             wanted = f"at least {min_samples} samples" if min_samples else "an interior sample"
             raise MeshError(
                 f"{mesh.name}: {count} cells of a grid of {resolution} along the longest side lie inside, {wanted} "
@@ -52,7 +59,16 @@ def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> 
             )
         # The count grows with the cube of the resolution for a body, with less for a thin one: approach from below.
         growth = (min_samples / max(count, 1)) ** (1 / 3)
-        resolution = min(int(np.ceil(resolution * min(max(growth, 1.05), 2.0))), _MAX_RESOLUTION)
+        resolution = min(int(np.ceil(resolution * min(max(growth, 1.05), 2.0))), finest)
+
+
+def _finest_resolution(mesh: Mesh) -> int:
+    """The largest resolution whose grid is within the limits."""
+    sides = np.ptp(mesh.vertices, axis=0) / np.ptp(mesh.vertices, axis=0).max()
+    resolution = _MAX_RESOLUTION
+    while np.prod(np.ceil(sides * resolution).clip(1)) > _MAX_CELLS:
+        resolution -= 1
+    return resolution
 
 
 def grid_axes(mesh: Mesh, resolution: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

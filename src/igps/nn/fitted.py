@@ -6,26 +6,25 @@ from collections.abc import Sequence
 from typing import Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
-from igps.nn.head import square_roots
+from igps.nn.heads import SizedByData, check_cells, square_roots
 
 
-class WhitenedHead(nn.Module):
-    """Histograms to unit vectors, with the directions damped along which shapes of one class differ.
+class WhitenedHead(SizedByData):
+    """Descriptions to unit vectors, with the directions damped along which shapes of one class differ.
 
-    The square roots of the histograms are centred on the training shapes and multiplied by (W + s·I)^(−1/2) up to a
-    factor, W the covariance within classes over its mean eigenvalue, s the shrinkage (within-class covariance
-    normalisation, Hatch, Kajarekar and Stolcke 2006). How poses change a histogram is much the same from class to
-    class, so that this metric, unlike a free one, serves classes that were not trained on. As made, it leaves
-    histograms as they are but for the root and the length.
+    The square roots of histograms are centred on the training shapes and multiplied by (W + s·I)^(−1/2) up to a factor,
+    W the covariance within classes over its mean eigenvalue, s the shrinkage (within-class covariance normalisation,
+    Hatch, Kajarekar and Stolcke 2006). How poses change a histogram is much the same from class to class, so that this
+    metric, unlike a free one, serves classes that were not trained on. Before it is fitted, it leaves histograms as
+    they are but for the root and the length.
 
-    The parts of a `CombinedDescriptor` may be treated one by one: each is whitened and brought to one length, so that
+    The parts of a `HistogramDescriptor` may be treated one by one: each is whitened and brought to one length, so that
     the cosine distance is the mean of those of the parts.
 
     Args:
-        n_cells: cells of a histogram, over all its dimensions, or of each of its parts; D is as large as all of them.
         n_directions: eigenvectors of W that are kept of each part, the largest.
         shrinkage: s; a large one leaves only the centring.
     """
@@ -33,40 +32,57 @@ class WhitenedHead(nn.Module):
     mean: Tensor
     directions: Tensor
     gains: Tensor
+    part_cells: Tensor
 
-    def __init__(self, n_cells: int | Sequence[int], n_directions: int = 64, shrinkage: float = 0.3) -> None:
+    def __init__(self, n_directions: int = 64, shrinkage: float = 0.3) -> None:
         super().__init__()
-        self.part_cells = (n_cells,) if isinstance(n_cells, int) else tuple(n_cells)
-        for name, value in (("n_cells", min(self.part_cells, default=0)), ("n_directions", n_directions)):
-            if value < 1:
-                raise ValueError(f"{name}: expected at least 1, got {value}.")
+        if n_directions < 1:
+            raise ValueError(f"n_directions: expected at least 1, got {n_directions}.")
         if shrinkage <= 0:
             raise ValueError(f"shrinkage: expected a positive number, got {shrinkage}.")
+        self.n_directions = n_directions
         self.shrinkage = shrinkage
-        self.register_buffer("mean", torch.zeros(sum(self.part_cells)))
-        self.register_buffer("directions", torch.zeros(n_directions, len(self.mean)))
-        self.register_buffer("gains", torch.ones(len(self.part_cells), n_directions))
+        self.register_buffer("mean", torch.zeros(0))
+        self.register_buffer("directions", torch.zeros(n_directions, 0))
+        self.register_buffer("gains", torch.ones(0, n_directions))
+        self.register_buffer("part_cells", torch.zeros(0, dtype=torch.long))
 
     @torch.no_grad()
-    def fit(self, histograms: Tensor, labels: Tensor) -> Self:
+    def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
         """Take mean and directions from the histograms (N, ...) and classes (N,) of the training shapes.
+
+        Args:
+            descriptions: histograms.
+            labels: integers.
+            part_cells: cells of each part, as a `HistogramDescriptor` tells them; None takes all as one part.
 
         Raises:
             ValueError: shapes that do not match, or no class of two shapes.
         """
-        roots = square_roots(histograms, len(self.mean))
+        roots = square_roots(descriptions)
         labels = _checked(roots, labels)
         _, members = labels.unique(return_inverse=True)
         n_members = torch.bincount(members)
         if len(roots) == len(n_members):
             raise ValueError("labels: expected a class of at least two shapes, got as many classes as shapes.")
         means = roots.new_zeros(len(n_members), roots.shape[1]).index_add_(0, members, roots) / n_members[:, None]
-        self.mean.copy_(roots.mean(dim=0))
-        self.directions.zero_()
-        self.gains.fill_(1)
+        self.centre(descriptions, part_cells)
         residuals = self.parts((roots - means[members]).double())
         for part, directions, gains in zip(residuals, self.parts(self.directions), self.gains, strict=True):
             self._fit_part(part, len(roots) - len(n_members), directions, gains)
+        return self
+
+    @torch.no_grad()
+    def centre(self, descriptions: Tensor, part_cells: Sequence[int] | None = None) -> Self:
+        """Take the mean alone from histograms (N, ...), and damp nothing: for shapes without labels, or one a class."""
+        roots = square_roots(descriptions)
+        cells = list(part_cells or (roots.shape[1],))
+        if min(cells) < 1 or sum(cells) != roots.shape[1]:
+            raise ValueError(f"part_cells: expected cells that add up to {roots.shape[1]}, got {cells}.")
+        self.part_cells = torch.tensor(cells, device=roots.device)
+        self.mean = roots.mean(dim=0)
+        self.directions = roots.new_zeros(self.n_directions, roots.shape[1])
+        self.gains = roots.new_ones(len(cells), self.n_directions)
         return self
 
     def _fit_part(self, residuals: Tensor, rank: int, directions: Tensor, gains: Tensor) -> None:
@@ -80,31 +96,36 @@ class WhitenedHead(nn.Module):
         directions[:n_kept] = (vectors[:, :n_kept].T @ residuals) / lengths[:, None]
         gains[:n_kept] = (self.shrinkage / (self.shrinkage + relative)).sqrt()
 
-    def forward(self, histograms: Tensor) -> Tensor:
+    def forward(self, descriptions: Tensor) -> Tensor:
         """(N, ...) histograms to (N, D) of length 1."""
-        centred = self.parts(square_roots(histograms, len(self.mean)) - self.mean)
+        roots = square_roots(descriptions)
+        if not len(self.mean):
+            return functional.normalize(roots, dim=1)
+        check_cells(roots, len(self.mean))
         whitened = [
             part - ((part @ directions.T) * (1 - gains)) @ directions
-            for part, directions, gains in zip(centred, self.parts(self.directions), self.gains, strict=True)
+            for part, directions, gains in zip(
+                self.parts(roots - self.mean), self.parts(self.directions), self.gains, strict=True
+            )
         ]
         return torch.cat([functional.normalize(part, dim=1) for part in whitened], dim=1) / len(whitened) ** 0.5
 
     def parts(self, cells: Tensor) -> tuple[Tensor, ...]:
         """Views of (N, D) values, one of each part."""
-        return cells.split(self.part_cells, dim=1)
+        return cells.split(self.part_cells.tolist(), dim=1)
 
 
-class KernelHead(nn.Module):
-    """Histograms to what they have of each training class, by kernel ridge regression on a `WhitenedHead`.
+class KernelHead(SizedByData):
+    """Descriptions to what they have of each training class, by kernel ridge regression on a `WhitenedHead`.
 
     The kernel is exp(−d/m), d the cosine distance of the whitened histograms, m its median between training shapes, and
     the mean of such kernels if there are several parts. It is regressed onto the indicators of the classes. The best
     there is here for classes that were trained on; for other classes use the `WhitenedHead`.
 
     Args:
-        n_cells, n_directions, shrinkage: see `WhitenedHead`.
-        n_shapes: training shapes.
-        n_classes: their classes; D is as large.
+        whitened: the head below: one that is fitted already stays as it is, which serves better where labels are few;
+            a new one, fitted to the same shapes, if None.
+        n_directions, shrinkage: of a new one.
         ridge: added to the kernel's diagonal, which is 1.
     """
 
@@ -115,9 +136,7 @@ class KernelHead(nn.Module):
 
     def __init__(
         self,
-        n_cells: int | Sequence[int],
-        n_shapes: int,
-        n_classes: int,
+        whitened: WhitenedHead | None = None,
         n_directions: int = 64,
         shrinkage: float = 0.3,
         ridge: float = 0.03,
@@ -125,58 +144,62 @@ class KernelHead(nn.Module):
         super().__init__()
         if ridge <= 0:
             raise ValueError(f"ridge: expected a positive number, got {ridge}.")
-        if n_classes < 2 or n_shapes < n_classes:
-            raise ValueError(
-                f"n_classes: expected at least 2 and at most n_shapes, got n_classes={n_classes}, n_shapes={n_shapes}."
-            )
-        self.whitened = WhitenedHead(n_cells, n_directions, shrinkage)
+        self.whitened = whitened or WhitenedHead(n_directions, shrinkage)
+        self._whiten = whitened is None
         self.ridge = ridge
-        self.register_buffer("anchors", torch.zeros(n_shapes, len(self.whitened.mean)))
-        self.register_buffer("medians", torch.ones(len(self.whitened.part_cells)))
-        self.register_buffer("coefficients", torch.zeros(n_shapes, n_classes))
-        self.register_buffer("classes", torch.arange(n_classes))
+        self.register_buffer("anchors", torch.zeros(0, 0))
+        self.register_buffer("medians", torch.ones(0))
+        self.register_buffer("coefficients", torch.zeros(0, 0))
+        self.register_buffer("classes", torch.zeros(0, dtype=torch.long))
 
     @torch.no_grad()
-    def fit(self, histograms: Tensor, labels: Tensor, *, whiten: bool = True) -> Self:
+    def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
         """Fit whitening and regression to the histograms (N, ...) and classes (N,) of the training shapes.
 
         Args:
-            histograms, labels: of the training shapes.
-            whiten: False leaves `whitened` as it is: where labels are few, one fitted to other shapes serves better.
+            descriptions, labels, part_cells: see `WhitenedHead.fit`.
 
         Raises:
-            ValueError: numbers of shapes or classes other than the head was made for.
+            ValueError: shapes that do not match, or fewer than two classes.
         """
-        if whiten:
-            self.whitened.fit(histograms, labels)
-        classes, members = labels.to(self.classes.device).unique(return_inverse=True)
-        if (len(histograms), len(classes)) != self.coefficients.shape:
-            raise ValueError(
-                f"histograms, labels: expected {self.coefficients.shape[0]} shapes of {self.coefficients.shape[1]} "
-                f"classes, got {len(histograms)} of {len(classes)}."
-            )
-        self.classes.copy_(classes)
-        self.anchors.copy_(self.whitened(histograms))
+        labels = _checked(descriptions, labels)
+        classes, members = labels.unique(return_inverse=True)
+        if len(classes) < 2:
+            raise ValueError(f"labels: expected at least two classes, got {len(classes)}.")
+        if self._whiten and len(classes) < len(labels):
+            self.whitened.fit(descriptions, labels, part_cells)
+        elif self._whiten:
+            # A single shape of a class tells nothing of the variation within it; what is left is to centre.
+            self.whitened.centre(descriptions, part_cells)
+        self.classes = classes
+        self.anchors = self.whitened(descriptions)
         i, j = torch.triu_indices(len(self.anchors), len(self.anchors), 1, device=self.anchors.device)
+        self.medians = self.medians.new_ones(len(self.whitened.part_cells))
         distances = self._distances(self.anchors)[:, i, j]
-        self.medians.copy_(distances.median(dim=1).values.clamp_min(torch.finfo(distances.dtype).tiny))
+        self.medians = distances.median(dim=1).values.clamp_min(torch.finfo(distances.dtype).tiny)
         kernel = self._kernel(self.anchors).double()
         kernel.diagonal().add_(self.ridge)
         targets = functional.one_hot(members, len(classes)).double()
-        self.coefficients.copy_(torch.linalg.solve(kernel, targets))
+        self.coefficients = torch.linalg.solve(kernel, targets).to(self.anchors.dtype)
         return self
 
-    def scores(self, histograms: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, n_classes), about 1 for the class that a shape is of and 0 for others."""
-        return self._kernel(self.whitened(histograms)) @ self.coefficients
+    def scores(self, descriptions: Tensor) -> Tensor:
+        """(N, ...) histograms to (N, n_classes), about 1 for the class that a shape is of and 0 for others.
 
-    def predict(self, histograms: Tensor) -> Tensor:
+        Raises:
+            RuntimeError: it has not been fitted.
+        """
+        if not len(self.anchors):
+            raise RuntimeError("KernelHead: expected to be fitted first. Call fit(descriptions, labels).")
+        return self._kernel(self.whitened(descriptions)) @ self.coefficients
+
+    def predict(self, descriptions: Tensor) -> Tensor:
         """(N, ...) histograms to (N,) classes, as they were named in `fit`."""
-        return self.classes[self.scores(histograms).argmax(dim=1)]
+        return self.classes[self.scores(descriptions).argmax(dim=1)]
 
-    def forward(self, histograms: Tensor) -> Tensor:
+    def forward(self, descriptions: Tensor) -> Tensor:
         """(N, ...) histograms to (N, D) of length 1."""
-        return functional.normalize(self.scores(histograms) - 1 / len(self.classes), dim=1)
+        return functional.normalize(self.scores(descriptions) - 1 / len(self.classes), dim=1)
 
     def _kernel(self, whitened: Tensor) -> Tensor:
         return (-self._distances(whitened) / self.medians[:, None, None]).exp().mean(dim=0)
@@ -188,7 +211,9 @@ class KernelHead(nn.Module):
         return torch.stack([1 - len(self.medians) * part @ anchors.T for part, anchors in parts])
 
 
-def _checked(roots: Tensor, labels: Tensor) -> Tensor:
-    if labels.shape != roots.shape[:1]:
-        raise ValueError(f"labels: expected one for each of {len(roots)} histograms, got shape {tuple(labels.shape)}.")
-    return labels.to(roots.device)
+def _checked(descriptions: Tensor, labels: Tensor) -> Tensor:
+    if labels.shape != descriptions.shape[:1]:
+        raise ValueError(
+            f"labels: expected one for each of {len(descriptions)} descriptions, got shape {tuple(labels.shape)}."
+        )
+    return labels.to(descriptions.device)

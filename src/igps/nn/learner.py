@@ -2,41 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Self
 
 import torch
-import yaml
-from jsonargparse import ArgumentParser
 from pytorch_lightning import LightningModule
 from pytorch_lightning.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
+from torch.utils.data import DataLoader
 
-from igps.data.datamodule import SignatureDataModule
-from igps.data.dataset import SignatureBatch
-from igps.nn.head import CorrectedDistance
-from igps.retrieval import RetrievalScoresMetric
+from igps.data.batch import SignatureBatch
+from igps.data.datamodule import has_configuration
+from igps.nn.description import evaluation_mode
+from igps.nn.descriptor import HistogramDescriptor
+from igps.nn.heads import Head
+from igps.nn.metric import CorrectedDistance
+from igps.retrieval.metric import RetrievalScoresMetric
+
+# Packages whose classes a checkpoint may name without an explicit word.
+_TRUSTED = ("igps", "torch", "pytorch_lightning", "pytorch_metric_learning")
 
 
 class RetrievalLearner(LightningModule):
     """Learns whatever has parameters in the descriptor and the distance, by a loss on the head's embeddings.
 
-    A head that is fitted in closed form, such as a `WhitenedHead`, is fitted to the training shapes before training and
-    again before each validation and checkpoint; what is trained then are bins and filters, through it.
+    It trains on any DataLoader of `SignatureBatch`es with labels. The head is fitted to the descriptions of the
+    training shapes before the first step, and one that is fitted in closed form, such as a `WhitenedHead`, again before
+    each validation and after each epoch; what is trained then are bins and filters, through it.
 
     Validation and test log the retrieval scores of the whole distance, each shape against all others of its part. With
     a distance that has no head there is nothing to train, and `Trainer.test` gives the plain descriptor's scores.
 
     Args:
-        descriptor: `SignatureBatch` to histograms (N, ...).
-        distance: between histograms; its head is trained.
+        descriptor: a `Descriptor`, or any module from `SignatureBatch` to histograms (N, ...).
+        distance: between descriptions; its head is trained.
         loss: embeddings (N, D) and labels (N,) to a scalar; supervised contrastive (Khosla et al. 2020) if None, which
             needs `pytorch-metric-learning`.
-        miner: embeddings and labels to the pairs or triplets that a loss of `pytorch-metric-learning` is to use; all of
-            a batch if None.
         learning_rate: of the head; cosine decay over the epochs.
         bin_rate: learning rate of the descriptor's parameters.
         weight_decay: of the head alone.
+        miner: embeddings and labels to the pairs or triplets that a loss of `pytorch-metric-learning` is to use; all of
+            a batch if None.
     """
 
     def __init__(
@@ -50,6 +57,8 @@ class RetrievalLearner(LightningModule):
         miner: nn.Module | None = None,
     ) -> None:
         super().__init__()
+        # Modules are made anew from a configuration, or given to load_from_checkpoint; their parameters are the state.
+        self.save_hyperparameters(ignore=() if has_configuration() else ("descriptor", "distance", "loss", "miner"))
         self.descriptor = descriptor
         self.distance = distance
         self.loss = loss if loss is not None else _supervised_contrastive()
@@ -57,15 +66,49 @@ class RetrievalLearner(LightningModule):
         self.learning_rate = learning_rate
         self.bin_rate = bin_rate
         self.weight_decay = weight_decay
+        self.part_cells = descriptor.part_cells if isinstance(descriptor, HistogramDescriptor) else None
+        if distance.head is not None and self.part_cells is not None and _is_lazy(distance.head):
+            # The optimiser needs parameters that have a size.
+            with torch.no_grad():
+                distance.head.eval()(torch.ones(1, sum(self.part_cells)))
+            distance.head.train()
         # A method, not the module: the metric's state must not repeat its parameters in the checkpoint.
         self.scores = RetrievalScoresMetric(self.distances)
+        self._fitted_at = -1
+
+    @classmethod
+    def load_from_checkpoint(
+        cls, checkpoint_path: str | Path | IO[bytes], *arguments: Any, trusted: Sequence[str] = (), **options: Any
+    ) -> Self:
+        """The learner of a checkpoint, as `LightningModule.load_from_checkpoint` gives it, on the CPU by default.
+
+        One that training/train.py wrote knows its configuration; to that of another script give `descriptor=` and
+        `distance=`. No code of the file is run: its configuration may name classes of this library, of torch, Lightning
+        and pytorch-metric-learning, and of packages that `trusted` names.
+
+        Raises:
+            ValueError: it names a class of another package.
+        """
+        options.setdefault("map_location", "cpu")
+        options.setdefault("weights_only", True)
+        stored = torch.load(checkpoint_path, map_location="cpu", weights_only=True)
+        allowed = (*_TRUSTED, *trusted)
+        for path in _class_paths(stored.get("hyper_parameters", {})):
+            if path.partition(".")[0] not in allowed:
+                raise ValueError(
+                    f"{checkpoint_path}: names the class {path}, whose package is not one of {', '.join(allowed)}. "
+                    "If you trust the file, pass trusted=[...] with that package."
+                )
+        if hasattr(checkpoint_path, "seek"):
+            checkpoint_path.seek(0)
+        return super().load_from_checkpoint(checkpoint_path, *arguments, **options)
 
     def forward(self, batch: SignatureBatch) -> Tensor:
-        """Histograms of a batch."""
+        """Descriptions of a batch."""
         return self.descriptor(batch)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, G) distances between histograms (Q, ...) and (G, ...)."""
+        """(Q, G) distances between descriptions (Q, ...) and (G, ...)."""
         return self.distance(queries, gallery)
 
     def setup(self, stage: str) -> None:
@@ -73,39 +116,40 @@ class RetrievalLearner(LightningModule):
         if stage == "fit" and self.distance.head is None:
             raise ValueError("distance: expected a head to train, got none. Use Trainer.test for a plain descriptor.")
 
-    def on_fit_start(self) -> None:
-        """Fit the head to the training shapes, or centre its inputs on them."""
-        histograms, labels = self._training_histograms()
-        if not self._fit_head(histograms, labels):
-            self.distance.head.calibrate(histograms)  # type: ignore[union-attr, operator]
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_index: int) -> Any:
+        """Lightning moves tensors and their containers, not batches of ours."""
+        if isinstance(batch, SignatureBatch):
+            return batch.to(device)
+        return super().transfer_batch_to_device(batch, device, dataloader_index)
 
-    def on_fit_end(self) -> None:
-        """Put the plain and the learned distance on one scale, by the training shapes."""
-        self._calibrate()
+    def on_train_start(self) -> None:
+        """Fit the head to the training shapes, or centre its inputs on them."""
+        self._fit(calibrate=False)
+
+    def on_train_epoch_end(self) -> None:
+        """A checkpoint of this epoch holds a distance whose parts have one scale, and a head that fits the bins."""
+        self._fit()
 
     def on_validation_epoch_start(self) -> None:
         """The scale changes with the head."""
-        self._calibrate()
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """The same for a checkpoint of an epoch that is not validated, or its distance would be on an older scale."""
-        self._calibrate()
-        checkpoint["state_dict"].update(self.state_dict())
+        if not self.trainer.sanity_checking and self.trainer.state.fn == "fit":
+            self._fit()
 
     def training_step(self, batch: SignatureBatch, batch_index: int) -> Tensor:
         """Loss of one P×K batch."""
-        embeddings = self.distance.head(self(batch))  # type: ignore[misc]
+        assert self.distance.head is not None  # setup() has made sure
+        embeddings = self.distance.head(self(batch))
         chosen = () if self.miner is None else (self.miner(embeddings, batch.labels),)
-        loss = self.loss(embeddings, batch.labels, *chosen)
+        loss: Tensor = self.loss(embeddings, batch.labels, *chosen)
         self.log("train_loss", loss, batch_size=len(batch), prog_bar=True)
         return loss
 
     def validation_step(self, batch: SignatureBatch, batch_index: int) -> None:
-        """Collect the histograms of a batch."""
+        """Collect the descriptions of a batch."""
         self.scores.update(self(batch), batch.labels)
 
     def test_step(self, batch: SignatureBatch, batch_index: int) -> None:
-        """Collect the histograms of a batch."""
+        """Collect the descriptions of a batch."""
         self.scores.update(self(batch), batch.labels)
 
     def on_validation_epoch_end(self) -> None:
@@ -127,57 +171,54 @@ class RetrievalLearner(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs)}
 
     def _log_scores(self, part: str) -> None:
-        self.log_dict({f"{part}_{name}": value for name, value in self.scores.compute().items()})
+        if not self.trainer.sanity_checking:
+            self.log_dict({f"{part}_{name}": value for name, value in self.scores.compute().items()})
         self.scores.reset()
 
-    def _calibrate(self) -> None:
-        training = self.training
-        # A checkpoint is saved in training mode, where the head drops cells.
-        self.eval()
-        histograms, labels = self._training_histograms()
-        self._fit_head(histograms, labels)
-        self.distance.calibrate(histograms)
-        self.train(training)
+    def _fit(self, calibrate: bool = True) -> None:
+        """Fit the head and the scale to the training shapes as they are described now, in evaluation mode.
 
-    def _fit_head(self, histograms: Tensor, labels: Tensor) -> bool:
-        """Whether the head is one that is fitted in closed form."""
-        fit: Any = getattr(self.distance.head, "fit", None)
-        if fit is not None:
-            fit(histograms, labels)
-        return fit is not None
+        A head that is trained by gradients is fitted, which is centred, only once.
+        """
+        if self._fitted_at == self.global_step:
+            return
+        head = self.distance.head
+        with evaluation_mode(self):
+            descriptions, labels = self._training_descriptions()
+            has_gradients = head is not None and any(True for _ in head.parameters())
+            if isinstance(head, Head) and not (has_gradients and calibrate):
+                head.fit(descriptions, labels, self.part_cells)
+            if calibrate:
+                self.distance.calibrate(descriptions)
+                self._fitted_at = self.global_step
 
     @torch.no_grad()
-    def _training_histograms(self) -> tuple[Tensor, Tensor]:
-        loader = self.trainer.datamodule.training_in_order()  # type: ignore[attr-defined]
-        training = self.training
-        self.eval()
-        parts = [(self(batch.to(self.device)), batch.labels) for batch in loader]
-        self.train(training)
-        histograms, labels = zip(*parts, strict=True)
-        return torch.cat(histograms), torch.cat(labels)
+    def _training_descriptions(self) -> tuple[Tensor, Tensor]:
+        """Descriptions of all shapes of the training loader's dataset, each once."""
+        loader = self.trainer.train_dataloader
+        if not isinstance(loader, DataLoader):
+            raise ValueError(f"train_dataloaders: expected one DataLoader, got {type(loader).__name__}.")
+        in_order = DataLoader(loader.dataset, batch_size=16, collate_fn=loader.collate_fn)
+        parts = [(self(batch.to(self.device)), batch.labels) for batch in in_order]
+        descriptions, labels = zip(*parts, strict=True)
+        return torch.cat(descriptions), torch.cat(labels)
 
 
-def load_learner(checkpoint: str | Path) -> tuple[RetrievalLearner, SignatureDataModule]:
-    """A trained learner in evaluation mode and its data, from a checkpoint of training/train.py.
+def _is_lazy(module: nn.Module) -> bool:
+    return any(isinstance(parameter, nn.UninitializedParameter) for parameter in module.parameters())
 
-    The configuration is read from config.yaml, two folders above the checkpoint, and the parameters without executing
-    any code of the file. Paths in the configuration are taken as they were given to the training.
 
-    Raises:
-        FileNotFoundError: no such checkpoint, or no configuration.
-    """
-    checkpoint = Path(checkpoint)
-    configuration = checkpoint.parent.parent / "config.yaml"
-    for path in (checkpoint, configuration):
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file. Name a checkpoint in the folder that train.py wrote.")
-    parser = ArgumentParser()
-    parser.add_class_arguments(RetrievalLearner, "model")
-    parser.add_class_arguments(SignatureDataModule, "data")
-    stored = yaml.safe_load(configuration.read_text())
-    made = parser.instantiate(parser.parse_object({name: stored[name] for name in ("model", "data")}))
-    made.model.load_state_dict(torch.load(checkpoint, map_location="cpu", weights_only=True)["state_dict"])
-    return made.model.eval(), made.data
+def _class_paths(configuration: Any) -> Iterator[str]:
+    """Everything in a configuration that is made by its import path."""
+    if isinstance(configuration, Mapping):
+        for key, value in configuration.items():
+            if key in ("class_path", "_class_path", "_instantiator") and isinstance(value, str):
+                yield value
+            else:
+                yield from _class_paths(value)
+    elif isinstance(configuration, Sequence) and not isinstance(configuration, str):
+        for value in configuration:
+            yield from _class_paths(value)
 
 
 def _supervised_contrastive() -> nn.Module:

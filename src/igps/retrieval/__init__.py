@@ -5,7 +5,6 @@ from igps.retrieval.scores import (
     Labels,
     PrecisionRecallCurve,
     RetrievalScores,
-    RetrievalScoresMetric,
     precision_recall_curve,
     retrieval_scores,
 )
@@ -16,7 +15,6 @@ __all__ = [
     "Labels",
     "PrecisionRecallCurve",
     "RetrievalScores",
-    "RetrievalScoresMetric",
     "SearchResult",
     "chi_square",
     "cosine",

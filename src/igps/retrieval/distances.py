@@ -66,7 +66,7 @@ def hellinger(queries: Tensor, gallery: Tensor) -> Tensor:
         ValueError: for shapes, dtypes or devices that do not fit, and for negative, NaN or infinite entries.
     """
     a, b = _as_rows(queries, gallery, non_negative=True)
-    return _row_distance(_root(a), _root(b)) / math.sqrt(2.0)
+    return _row_distance(square_root(a), square_root(b)) / math.sqrt(2.0)
 
 
 def euclidean(queries: Tensor, gallery: Tensor) -> Tensor:
@@ -165,10 +165,10 @@ def _row_distance(a: Tensor, b: Tensor) -> Tensor:
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
-def _root(rows: Tensor) -> Tensor:
-    """Square root with a zero gradient at zero."""
-    filled = rows > 0
-    return torch.where(filled, torch.where(filled, rows, 1.0).sqrt(), 0.0)
+def square_root(values: Tensor) -> Tensor:
+    """Square root of non-negative values, with a zero gradient at zero, where it has none."""
+    filled = values > 0
+    return torch.where(filled, torch.where(filled, values, 1.0).sqrt(), 0.0)
 
 
 def _unit(name: str, rows: Tensor) -> Tensor:

@@ -1,0 +1,229 @@
+"""Signatures of several bodies as padded tensors, and one body of them without the padding."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from igps.geometry.mesh import Mesh
+from igps.geometry.signature import Samples, Signature
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledSignature:
+    """An item of a `SignatureDataset`: a Signature, the number of its class (−1 if unknown), and its name."""
+
+    signature: Signature
+    label: int
+    id: str
+
+
+@dataclass(frozen=True, eq=False)
+class SampleBatch:
+    """Samples of N shapes, padded to the longest.
+
+    Args:
+        points: (N, P, 3) float32, length, measured from the centre of each shape's own samples.
+        eigenfunctions: (N, P, K) float32, 1/length; zero where padded.
+        mask: (N, P) true where a sample is real.
+        attributes: named scalars, each (N, P) float32, and directions, each (N, P, 3) float32.
+    """
+
+    points: Tensor
+    eigenfunctions: Tensor
+    mask: Tensor
+    attributes: Mapping[str, Tensor]
+
+    def to(self, device: torch.device | str) -> SampleBatch:
+        """The same batch on another device."""
+        attributes = {name: values.to(device) for name, values in self.attributes.items()}
+        return SampleBatch(self.points.to(device), self.eigenfunctions.to(device), self.mask.to(device), attributes)
+
+    def subset(self, n_samples: int, seed: int | None = None) -> SampleBatch:
+        """A random subset of at most `n_samples` samples of each shape.
+
+        Args:
+            n_samples: how many; a shape with fewer keeps all of them.
+            seed: makes the subset of a shape depend on its number of samples alone, not on its batch; torch's global
+                generator draws if None.
+        """
+        n_kept = min(n_samples, self.mask.shape[1])
+        index = torch.zeros(len(self.mask), n_kept, dtype=torch.long)
+        kept = torch.zeros(len(self.mask), n_kept, dtype=torch.bool)
+        for i, real in enumerate(self.mask.cpu()):
+            present = real.nonzero().flatten()
+            generator = None if seed is None else torch.Generator().manual_seed(seed)
+            chosen = present[torch.randperm(len(present), generator=generator)[:n_samples]]
+            index[i, : len(chosen)] = chosen
+            kept[i, : len(chosen)] = True
+        index, kept = index.to(self.mask.device), kept.to(self.mask.device)
+
+        def take(values: Tensor) -> Tensor:
+            over_rest = (..., *[None] * (values.ndim - 2))
+            return values.gather(1, index[over_rest].expand(-1, -1, *values.shape[2:])) * kept[over_rest]
+
+        attributes = {name: take(values) for name, values in self.attributes.items()}
+        return SampleBatch(take(self.points), take(self.eigenfunctions), kept, attributes)
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One shape of a batch, without padding, as arrays.
+
+    Args:
+        eigenvalues: (K,) float64 ascending, 1/length².
+        interior: interior samples, their points measured from their centre.
+        surface: surface samples, likewise.
+        area: of the surface, length².
+        volume: of the body, length³.
+        id: its name.
+        surface_mesh: its surface; None where the batch has no meshes.
+    """
+
+    eigenvalues: NDArray[np.float64]
+    interior: Samples
+    surface: Samples
+    area: float
+    volume: float
+    id: str
+    surface_mesh: Mesh | None
+
+    @property
+    def mesh(self) -> Mesh:
+        """The surface, for a descriptor that says it needs it.
+
+        Raises:
+            ValueError: the batch has no meshes.
+        """
+        if self.surface_mesh is None:
+            raise ValueError(f"{self.id}: expected a batch with meshes, got one without. See SignatureDataset.batch.")
+        return self.surface_mesh
+
+
+@dataclass(frozen=True, eq=False)
+class SignatureBatch:
+    """N Signatures, padded so that no descriptor changes by it.
+
+    Args:
+        eigenvalues: (N, K) float64, 1/length²; infinite where padded, so that every spectral weight is zero there.
+        interior: interior samples.
+        surface: surface samples.
+        area: (N,) float64, length².
+        volume: (N,) float64, length³.
+        labels: (N,) int64, −1 where unknown.
+        ids: N names.
+        meshes: the N surfaces, for descriptors that need more than the Signatures; None if they were not asked for.
+    """
+
+    eigenvalues: Tensor
+    interior: SampleBatch
+    surface: SampleBatch
+    area: Tensor
+    volume: Tensor
+    labels: Tensor
+    ids: tuple[str, ...]
+    meshes: tuple[Mesh, ...] | None = None
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def to(self, device: torch.device | str) -> SignatureBatch:
+        """The same batch on another device; meshes stay where they are."""
+        return replace(
+            self,
+            eigenvalues=self.eigenvalues.to(device),
+            interior=self.interior.to(device),
+            surface=self.surface.to(device),
+            area=self.area.to(device),
+            volume=self.volume.to(device),
+            labels=self.labels.to(device),
+        )
+
+    def bodies(self) -> Iterator[Body]:
+        """The shapes one by one."""
+        for i, name in enumerate(self.ids):
+            eigenvalues = self.eigenvalues[i]
+            real = torch.isfinite(eigenvalues)
+            yield Body(
+                eigenvalues=eigenvalues[real].cpu().numpy(),
+                interior=_samples_of(self.interior, i, int(real.sum())),
+                surface=_samples_of(self.surface, i, int(real.sum())),
+                area=float(self.area[i]),
+                volume=float(self.volume[i]),
+                id=name,
+                surface_mesh=None if self.meshes is None else self.meshes[i],
+            )
+
+
+def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mesh] | None = None) -> SignatureBatch:
+    """Pad Signatures to a batch: the `collate_fn` of a `DataLoader` over a `SignatureDataset`.
+
+    Args:
+        items: N Signatures, with or without labels.
+        meshes: their surfaces, for descriptors that need them.
+
+    Raises:
+        ValueError: no items, samples that carry different attributes, or not one mesh for each.
+    """
+    if not items:
+        raise ValueError("items: expected at least one signature, got none.")
+    if meshes is not None and len(meshes) != len(items):
+        raise ValueError(f"meshes: expected one for each of {len(items)} signatures, got {len(meshes)}.")
+    labelled = [
+        item if isinstance(item, LabelledSignature) else LabelledSignature(item, -1, item.name) for item in items
+    ]
+    signatures = [item.signature for item in labelled]
+    eigenvalues = [torch.from_numpy(np.asarray(s.eigenvalues, dtype=np.float64)) for s in signatures]
+    return SignatureBatch(
+        eigenvalues=pad_sequence(eigenvalues, batch_first=True, padding_value=float("inf")),
+        interior=_pad_samples([s.interior for s in signatures]),
+        surface=_pad_samples([s.surface for s in signatures]),
+        area=torch.tensor([s.area for s in signatures], dtype=torch.float64),
+        volume=torch.tensor([s.volume for s in signatures], dtype=torch.float64),
+        labels=torch.tensor([item.label for item in labelled], dtype=torch.int64),
+        ids=tuple(item.id for item in labelled),
+        meshes=None if meshes is None else tuple(meshes),
+    )
+
+
+def _pad_samples(samples: Sequence[Samples]) -> SampleBatch:
+    n_shapes, longest = len(samples), max(len(s) for s in samples)
+    eigenfunctions = torch.zeros(n_shapes, longest, max(s.eigenfunctions.shape[1] for s in samples))
+    points = torch.zeros(n_shapes, longest, 3)
+    mask = torch.zeros(n_shapes, longest, dtype=torch.bool)
+    names = set(samples[0].attributes)
+    attributes = {
+        name: torch.zeros(n_shapes, longest, *samples[0].attributes[name].shape[1:]) for name in sorted(names)
+    }
+    for i, s in enumerate(samples):
+        if set(s.attributes) != names:
+            raise ValueError(
+                f"items: all must carry the same sample attributes, got {sorted(names)} and {sorted(s.attributes)}."
+            )
+        n_points, n_eigenpairs = s.eigenfunctions.shape
+        eigenfunctions[i, :n_points, :n_eigenpairs] = torch.from_numpy(s.eigenfunctions)
+        # Centred before the cast, or a shape far from the origin would lose its digits.
+        points[i, :n_points] = torch.from_numpy(s.points - s.points.mean(axis=0)).float()
+        mask[i, :n_points] = True
+        for name, values in s.attributes.items():
+            attributes[name][i, :n_points] = torch.from_numpy(values)
+    return SampleBatch(points, eigenfunctions, mask, attributes)
+
+
+def _samples_of(batch: SampleBatch, i: int, n_eigenpairs: int) -> Samples:
+    real = batch.mask[i]
+
+    def array(values: Tensor) -> NDArray[np.float32]:
+        return values[i, real].cpu().numpy()
+
+    return Samples(
+        array(batch.points).astype(np.float64),
+        array(batch.eigenfunctions)[:, :n_eigenpairs],
+        {name: array(values) for name, values in batch.attributes.items()},
+    )

@@ -1,0 +1,71 @@
+"""How a mesh file becomes a Signature: read, computed and cached, in this process or in a worker."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from igps.data.cache import SignatureCache
+from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.reading import MeshReading, load_mesh
+from igps.geometry.signature import Signature, SignatureConfig, compute_signature
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """All that the Signature of a file depends on, and where it is kept; small, so that workers get no more than this.
+
+    Args:
+        config: parameters of the Signature.
+        reading: how the file is read.
+        cache_dir: where Signatures are kept.
+    """
+
+    config: SignatureConfig
+    reading: MeshReading
+    cache_dir: Path
+
+    def mesh(self, path: Path) -> Mesh:
+        """The checked mesh of a file.
+
+        Raises:
+            MeshError: it cannot be used.
+        """
+        return load_mesh(path, self.reading)
+
+    def signature(self, path: Path) -> Signature:
+        """The Signature of a file, from the cache where it is there, and there afterwards."""
+        cache, key = SignatureCache(self.cache_dir), self.key(path)
+        signature = cache.get(key)
+        if signature is None:
+            signature = compute_signature(self.mesh(path), self.config)
+            cache.put(key, signature)
+        return signature
+
+    def fill(self, path: Path) -> None:
+        """Put the Signature of a file into the cache; it is not returned, so that it need not travel to the caller."""
+        self.signature(path)
+
+    def is_cached(self, path: Path) -> bool:
+        """Whether the Signature of a file can be read; false for a file that cannot."""
+        try:
+            return self.key(path) in SignatureCache(self.cache_dir)
+        except MeshError:
+            return False
+
+    def key(self, path: Path) -> str:
+        """The name of the Signature in the cache: content of the file, how it is read, every parameter and version.
+
+        Raises:
+            MeshError: the file cannot be read.
+        """
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise MeshError(f"{path}: cannot be read ({error.strerror}). Check the path.") from error
+        # The suffix chooses the reader, so the same bytes under another suffix are another mesh.
+        reading = [path.suffix.lower(), self.reading.repair, self.reading.component, self.reading.allow_open]
+        parameters = json.dumps([reading, self.config.as_dict()], sort_keys=True)
+        return hashlib.sha256(parameters.encode() + b"\0" + content).hexdigest()

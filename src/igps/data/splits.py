@@ -1,0 +1,89 @@
+"""Seeded splits of a labelled collection into training, validation and test parts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+SplitProtocol = Literal["seen", "unseen"]
+"""Whether the classes of the test part are seen in training (each class is split) or not (the classes are split)."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Indices of the shapes of each part; no shape is in two of them.
+
+    Args:
+        train: to fit parameters to.
+        validation: taken from the training part, to choose between models; may be empty.
+        test: to be looked at once.
+    """
+
+    train: tuple[int, ...]
+    validation: tuple[int, ...]
+    test: tuple[int, ...]
+
+
+def split_seen(labels: Tensor, n_train: int, *, n_validation: int = 0, seed: int = 0) -> Split:
+    """Every class in every part: `n_train` shapes of each train, the others test.
+
+    Args:
+        labels: (N,) integer classes.
+        n_train: shapes of each class in training and validation together.
+        n_validation: how many of those validate.
+        seed: of the draw.
+
+    Raises:
+        ValueError: a class has no more than `n_train` shapes, or `n_validation` leaves none to train on.
+    """
+    if not 0 <= n_validation < n_train:
+        raise ValueError(f"n_validation: expected 0 to n_train - 1 = {n_train - 1}, got {n_validation}.")
+    generator = torch.Generator().manual_seed(seed)
+    parts: tuple[list[int], list[int], list[int]] = ([], [], [])
+    for label in labels.unique().tolist():
+        members = torch.nonzero(labels == label).flatten()
+        if len(members) <= n_train:
+            raise ValueError(f"n_train: expected fewer than the {len(members)} shapes of class {label}, got {n_train}.")
+        drawn = members[torch.randperm(len(members), generator=generator)].tolist()
+        for part, chosen in zip(
+            parts, (drawn[n_validation:n_train], drawn[:n_validation], drawn[n_train:]), strict=True
+        ):
+            part.extend(chosen)
+    train, validation, test = (tuple(sorted(part)) for part in parts)
+    return Split(train, validation, test)
+
+
+def split_unseen(
+    labels: Tensor, n_train: int, *, n_validation: int = 0, n_test: int | None = None, seed: int = 0
+) -> Split:
+    """No class in two parts: `n_train` classes train, others test.
+
+    With the same seed and `n_test` the test classes stay the same whatever `n_train`, and the training classes of a
+    smaller `n_train` are among those of a larger.
+
+    Args:
+        labels: (N,) integer classes.
+        n_train: classes in training and validation together.
+        n_validation: how many of those validate.
+        n_test: classes to test; all others if None.
+        seed: of the draw.
+
+    Raises:
+        ValueError: not so many classes, or `n_validation` leaves none to train on.
+    """
+    classes = labels.unique()
+    n_test = len(classes) - n_train if n_test is None else n_test
+    if not 0 <= n_validation < n_train:
+        raise ValueError(f"n_validation: expected 0 to n_train - 1 = {n_train - 1}, got {n_validation}.")
+    if n_test < 1 or n_train + n_test > len(classes):
+        raise ValueError(f"n_train, n_test: expected at most {len(classes)} classes together, got {n_train}, {n_test}.")
+    drawn = classes[torch.randperm(len(classes), generator=torch.Generator().manual_seed(seed))]
+
+    def members(chosen: Tensor) -> tuple[int, ...]:
+        return tuple(torch.nonzero(torch.isin(labels, chosen)).flatten().tolist())
+
+    fit = drawn[:n_train]
+    return Split(members(fit[n_validation:]), members(fit[:n_validation]), members(drawn[len(drawn) - n_test :]))

@@ -1,0 +1,5 @@
+"""Every descriptor by its name, one file each."""
+
+from igps.descriptors.registry import NAMES, descriptor
+
+__all__ = ["NAMES", "descriptor"]

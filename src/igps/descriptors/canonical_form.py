@@ -1,0 +1,169 @@
+"""Canonical forms: a bent surface is unbent, and then compared like a rigid one (Elad and Kimmel 2003)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from igps.data.batch import Body
+from igps.geometry.geodesics import farthest_points
+from igps.geometry.simplification import simplify
+from igps.nn.descriptor import BodyDescriptor
+from igps.nn.needs import Needs
+from igps.retrieval.distances import euclidean
+
+Scaling = Literal["least squares", "classical"]
+
+_DIMENSION = 3
+# The iteration ends where a step takes off less than this share of the stress, or after so many steps.
+_TOLERANCE = 1e-4
+_MAX_STEPS = 300
+
+
+@dataclass(eq=False, repr=False)
+class CanonicalForm(BodyDescriptor):
+    """Moments of the points in space whose straight distances come closest to the geodesic distances of the surface.
+
+    The form is known up to motions and reflections. It is laid along its principal axes, and of the eight reflections
+    of one form against another the closest counts. Elad and Kimmel compare raw moments of surfaces of one size; here
+    lengths are in units of the square root of the surface area, and a moment of order k is divided by the (k − 1)-th
+    power of the root mean square radius, so that moments of all orders are lengths of similar size.
+
+    Args:
+        scaling: "least squares" minimises Σ (‖xᵢ−xⱼ‖ − dᵢⱼ)² from the classical solution on; "classical" is that
+            solution, which is faster and fits less well.
+        max_order: of the moments.
+        n_samples: farthest points of the surface.
+        max_vertices: larger meshes are simplified first.
+
+    Raises:
+        ValueError: a parameter out of range.
+    """
+
+    name = "canonical_form"
+    source = "Elad and Kimmel 2003"
+    invariant_to = ("motion", "scale", "pose")
+    needs = Needs(mesh=True)
+
+    scaling: Scaling = "least squares"
+    max_order: int = 4
+    n_samples: int = 200
+    max_vertices: int = 1000
+
+    def __post_init__(self) -> None:
+        super().__init__()
+        if self.scaling not in ("least squares", "classical"):
+            raise ValueError(f"scaling: expected 'least squares' or 'classical', got {self.scaling!r}.")
+        if self.max_order < 2:
+            raise ValueError(f"max_order: expected at least 2 (lower moments are fixed), got {self.max_order}.")
+        if not _DIMENSION < self.n_samples <= self.max_vertices:
+            raise ValueError(
+                f"n_samples: expected {_DIMENSION + 1} to max_vertices = {self.max_vertices}, got {self.n_samples}."
+            )
+
+    def describe_body(self, body: Body) -> NDArray[np.float32]:
+        """(number of moments,) in units of √area, ordered as `exponents(max_order)`.
+
+        Raises:
+            ValueError: the mesh has fewer than `n_samples` vertices.
+            MeshError: it cannot be simplified.
+        """
+        samples = farthest_points(simplify(body.mesh, self.max_vertices), self.n_samples)
+        distances = samples.mutual / np.sqrt(body.mesh.area)
+        form = classical_scaling(distances)
+        if self.scaling == "least squares":
+            form = least_squares_scaling(distances, form)
+        return moments(form, self.max_order).astype(np.float32)
+
+    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        """(Q, G) Euclidean distances of the moments, the least over the eight reflections of the query."""
+        odd = torch.as_tensor(exponents(self.max_order) % 2, dtype=queries.dtype, device=queries.device)
+        reflections = product((0.0, 1.0), repeat=_DIMENSION)
+        signs = ((1 - 2 * odd * odd.new_tensor(axes)).prod(dim=1) for axes in reflections)
+        reflected = [euclidean(queries * sign, gallery) for sign in signs]
+        return torch.stack(reflected).amin(dim=0)
+
+
+def classical_scaling(distances: NDArray[np.float64], dimension: int = _DIMENSION) -> NDArray[np.float64]:
+    """Points whose inner products come closest to those that the distances imply (Torgerson 1952).
+
+    Args:
+        distances: (P, P), symmetric.
+        dimension: of the space.
+
+    Returns:
+        (P, dimension) centred points along their principal axes, longest first. Where the distances span fewer
+        dimensions, the remaining coordinates are zero.
+    """
+    squared = distances**2
+    row = squared.mean(axis=0)
+    gram = -(squared - row - row[:, None] + row.mean()) / 2
+    values, vectors = np.linalg.eigh(gram)
+    values, vectors = values[::-1][:dimension], vectors[:, ::-1][:, :dimension]
+    return vectors * np.sqrt(np.maximum(values, 0))
+
+
+def least_squares_scaling(distances: NDArray[np.float64], start: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points that locally minimise the stress Σ (‖xᵢ−xⱼ‖ − dᵢⱼ)², by majorisation (SMACOF, de Leeuw 1977).
+
+    No step raises the stress.
+
+    Args:
+        distances: (P, P), symmetric.
+        start: (P, D) points.
+
+    Returns:
+        (P, D) centred points.
+    """
+    points = start - start.mean(axis=0)
+    lengths = _lengths(points)
+    stress = float(np.square(lengths - distances).sum())
+    for _ in range(_MAX_STEPS):
+        # Guttman transform for weights 1. Points that coincide do not pull.
+        pull = np.divide(distances, lengths, out=np.zeros_like(distances), where=lengths > 0)
+        points = (pull.sum(axis=1)[:, None] * points - pull @ points) / len(points)
+        lengths = _lengths(points)
+        before, stress = stress, float(np.square(lengths - distances).sum())
+        if before - stress <= _TOLERANCE * before:
+            break
+    return points
+
+
+def exponents(max_order: int) -> NDArray[np.int64]:
+    """(M, 3) exponents of the moments that principal axes leave open: orders 2 to `max_order` without xy, xz and yz."""
+    every = np.array(list(product(range(max_order + 1), repeat=_DIMENSION)))
+    order = every.sum(axis=1)
+    fixed = (order == 2) & (every.max(axis=1) == 1)
+    return every[(order >= 2) & (order <= max_order) & ~fixed]
+
+
+def moments(points: NDArray[np.float64], max_order: int) -> NDArray[np.float64]:
+    """Mean of xᵖ yᵠ zʳ over points laid along their principal axes, over ρ^(p+q+r−1) with their rms radius ρ.
+
+    The signs of the axes are arbitrary: a reflection in x changes the sign of the moments with odd p.
+
+    Args:
+        points: (P, 3), length.
+        max_order: of the moments.
+
+    Returns:
+        (M,) length, ordered as `exponents(max_order)`.
+    """
+    centred = points - points.mean(axis=0)
+    radius = np.sqrt(np.square(centred).sum(axis=1).mean())
+    axes = np.linalg.eigh(centred.T @ centred)[1][:, ::-1]
+    unit = centred @ axes / radius
+    powers = unit[:, None, :] ** exponents(max_order)
+    return radius * powers.prod(axis=2).mean(axis=0)
+
+
+def _lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    inner = points @ points.T
+    norm = np.diag(inner)
+    return np.sqrt(np.maximum(norm[:, None] + norm - 2 * inner, 0))

@@ -1,0 +1,76 @@
+"""Eigenvalues of the affinities of geodesic distances (Jain and Zhang 2007)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.data.batch import Body
+from igps.geometry.geodesics import farthest_points
+from igps.geometry.simplification import simplify
+from igps.nn.descriptor import BodyDescriptor
+from igps.nn.needs import Needs
+
+
+@dataclass(eq=False, repr=False)
+class GeodesicSpectral(BodyDescriptor):
+    """Square roots of the largest eigenvalues of exp(−d²/2σ²), d the geodesic distances and σ the longest of them.
+
+    The matrix is that of farthest points, as for Nyström's method, and its eigenvalues are taken per point, so that
+    their number does not matter but for accuracy. σ takes out the scale.
+
+    Args:
+        n_eigenvalues: largest first.
+        n_samples: farthest points of the surface.
+        max_vertices: larger meshes are simplified first.
+
+    Raises:
+        ValueError: a parameter out of range.
+    """
+
+    name = "geodesic_spectral"
+    source = "Jain and Zhang 2007"
+    invariant_to = ("motion", "scale", "pose")
+    needs = Needs(mesh=True)
+
+    n_eigenvalues: int = 20
+    n_samples: int = 200
+    max_vertices: int = 1000
+
+    def __post_init__(self) -> None:
+        super().__init__()
+        if self.n_eigenvalues < 1:
+            raise ValueError(f"n_eigenvalues: expected at least 1, got {self.n_eigenvalues}.")
+        if not max(self.n_eigenvalues, 2) <= self.n_samples <= self.max_vertices:
+            raise ValueError(
+                f"n_samples: expected {max(self.n_eigenvalues, 2)} to max_vertices = {self.max_vertices}, "
+                f"got {self.n_samples}."
+            )
+
+    def describe_body(self, body: Body) -> NDArray[np.float32]:
+        """(n_eigenvalues,) √|λₖ|, without unit.
+
+        Raises:
+            ValueError: the mesh has fewer than `n_samples` vertices.
+            MeshError: it cannot be simplified.
+        """
+        samples = farthest_points(simplify(body.mesh, self.max_vertices), self.n_samples)
+        values = affinity_eigenvalues(samples.mutual, self.n_eigenvalues)
+        return np.sqrt(np.abs(values)).astype(np.float32)
+
+
+def affinity_eigenvalues(distances: NDArray[np.float64], n_eigenvalues: int) -> NDArray[np.float64]:
+    """The largest eigenvalues of exp(−d²/2σ²) over the number of points, σ the longest distance.
+
+    Args:
+        distances: (P, P), symmetric, not all zero.
+        n_eigenvalues: at most P.
+
+    Returns:
+        (n_eigenvalues,) descending, without unit. The last ones may be below zero: geodesic distances need not fit
+        into a Euclidean space.
+    """
+    affinity = np.exp(-np.square(distances / distances.max()) / 2)
+    return np.linalg.eigvalsh(affinity / len(affinity))[::-1][:n_eigenvalues]

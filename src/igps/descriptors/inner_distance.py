@@ -1,0 +1,168 @@
+"""Inner distance: how far apart two points of a body are for something that cannot leave it (Ling and Jacobs 2007).
+
+The interior samples are centres of cells of a cubic grid. They are the nodes of a graph that links each to those of the
+5³ cells around it that it can see: 98 directions. The segment to a cell of the 3³ next ones may pass between two
+cells, a longer one must run through cells of the body. A path along the links is never shorter than the inner distance
+of the cells' body, and where all cells between two samples are inside, as in a box, at most `METRICATION` times
+their Euclidean distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import KDTree
+
+from igps.data.batch import Body
+from igps.nn.descriptor import BodyDescriptor
+
+METRICATION = 1.0495
+"""Largest ratio of the length of a path of links to the Euclidean distance of its ends, in free space."""
+
+# The largest distance from a multiple of the cell, in cells, that rounding can make.
+_OFF_GRID = 1e-3
+
+
+@dataclass(eq=False, repr=False)
+class InnerDistance(BodyDescriptor):
+    """Histogram of the lengths of the shortest paths inside the body between its interior samples, over √area.
+
+    Source: Ling and Jacobs 2007 for the distance, Liu, Fang and Ramani 2009 for its histogram as a signature of a
+    solid, there over samples of its surface. Pairs go from a random choice of the samples to all of them.
+
+    Args:
+        n_bins: distance bins, with a linear kernel.
+        max_distance: upper end of the last bin, in units of √area; larger distances go into it.
+        n_sources: samples from which paths start; all of them if there are fewer.
+        seed: of the choice of the sources.
+
+    Raises:
+        ValueError: a parameter out of range.
+    """
+
+    name = "inner_distance"
+    source = "Liu, Fang and Ramani 2009"
+    invariant_to = ("motion", "scale", "pose")
+
+    n_bins: int = 64
+    max_distance: float = 3.0
+    n_sources: int = 200
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__init__()
+        for name, least in (("n_bins", 2), ("n_sources", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}.")
+        if not self.max_distance > 0:
+            raise ValueError(f"max_distance: expected a positive number, got {self.max_distance}.")
+
+    def describe_body(self, body: Body) -> NDArray[np.float32]:
+        """(n_bins,) histogram that sums to 1.
+
+        Raises:
+            ValueError: fewer than two interior samples, or samples that are not on a grid.
+        """
+        points = body.interior.points
+        n_sources = min(self.n_sources, len(points))
+        sources = np.random.default_rng(self.seed).permutation(len(points))[:n_sources]
+        lengths = inner_distances(points, sources)
+        lengths[np.arange(n_sources), sources] = np.nan
+        ratio = lengths[~np.isnan(lengths)] / np.sqrt(body.area)
+        # A value at the centre of a bin counts there alone, one between two centres for both.
+        position = np.clip(ratio / self.max_distance * self.n_bins - 0.5, 0, self.n_bins - 1)
+        low = np.minimum(position.astype(int), self.n_bins - 2)
+        part = position - low
+        histogram = np.bincount(low, 1 - part, self.n_bins) + np.bincount(low + 1, part, self.n_bins)
+        return (histogram / len(ratio)).astype(np.float32)
+
+
+def inner_distances(points: NDArray[np.float64], sources: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Lengths of the shortest paths along the links inside a body, from some of its samples to all.
+
+    Where the grid is too coarse for a thin part, the cells fall into pieces. Each piece is then joined to its nearest
+    one by a straight link between their closest samples, until all are one.
+
+    Args:
+        points: (P, 3) cell centres of a cubic grid, length.
+        sources: (S,) indices of points.
+
+    Returns:
+        (S, P) length.
+
+    Raises:
+        ValueError: fewer than two points, or points that are not on a grid.
+    """
+    cells, cell = _grid_indices(points)
+    graph = _joined(_visible_links(cells), cells) * cell
+    return np.atleast_2d(dijkstra(graph, directed=True, indices=sources))
+
+
+def _grid_indices(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
+    """(P, 3) indices of the cells, from 0 on, and the cell's side."""
+    if len(points) < 2:
+        raise ValueError(f"points: expected at least two interior samples, got {len(points)}. Raise the resolution.")
+    origin = points.min(axis=0)
+    relative = points - origin
+    gaps = np.concatenate([np.diff(np.sort(column)) for column in relative.T])
+    gaps = gaps[gaps > 1e-9 * relative.max()]
+    # Each gap is a whole number of cells; where no two samples are neighbours in any plane, the least gap is several.
+    for divisor in (1, 2, 3, 4, 5):
+        cell = float(gaps.min()) / divisor
+        position = relative / cell
+        cells = np.round(position).astype(np.int64)
+        if np.abs(position - cells).max() < _OFF_GRID * divisor:
+            return cells, cell
+    raise ValueError("points: expected cell centres of a cubic grid along the axes; take those of a Signature.")
+
+
+def _visible_links(cells: NDArray[np.int64]) -> sparse.csr_array:
+    """(P, P) lengths of the links, in cells, both ways."""
+    # Padded by two cells, so that no offset wraps around.
+    shape = tuple(cells.max(axis=0) + 5)
+    flat = np.ravel_multi_index(tuple((cells + 2).T), shape)
+    number = np.full(int(np.prod(shape)), -1)
+    number[flat] = np.arange(len(cells))
+    strides = np.array([shape[1] * shape[2], shape[2], 1])
+    rows, columns, lengths = [], [], []
+    for offset in _offsets():
+        target = number[flat + offset @ strides]
+        linked = target >= 0
+        if np.abs(offset).max() == 2:
+            # Between its first and its last quarter the segment crosses two cells, and changes over at the middle.
+            for part in (0.375, 0.625):
+                crossed = np.round(part * offset).astype(int)
+                linked &= number[flat + crossed @ strides] >= 0
+        rows.append(np.nonzero(linked)[0])
+        columns.append(target[linked])
+        lengths.append(np.full(linked.sum(), np.linalg.norm(offset)))
+    entries = (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns)))
+    return sparse.coo_array(entries, shape=(len(cells), len(cells))).tocsr()
+
+
+def _offsets() -> NDArray[np.int64]:
+    """(98, 3) steps of at most two cells along each axis, without those that are multiples of shorter ones."""
+    steps = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    return steps[np.gcd.reduce(steps, axis=1) == 1]
+
+
+def _joined(graph: sparse.csr_array, cells: NDArray[np.int64]) -> sparse.csr_array:
+    """The graph with all its pieces linked, each to its nearest one (Borůvka 1926)."""
+    while True:
+        n_pieces, piece = connected_components(graph, directed=False)
+        if n_pieces == 1:
+            return graph
+        ends = []
+        for i in range(n_pieces):
+            own, other = np.nonzero(piece == i)[0], np.nonzero(piece != i)[0]
+            length, nearest = KDTree(cells[own]).query(cells[other])
+            closest = int(np.argmin(length))
+            ends.append((own[nearest[closest]], other[closest], length[closest]))
+        a, b, length = (np.array(column) for column in zip(*ends, strict=True))
+        # Two pieces that are nearest to each other give the same link twice, which must not add up.
+        bridge = sparse.coo_array((length, (a.astype(int), b.astype(int))), shape=graph.shape).tocsr()
+        graph = graph.maximum(bridge).maximum(bridge.T).tocsr()

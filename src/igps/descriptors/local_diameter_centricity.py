@@ -1,0 +1,203 @@
+"""Pose-oblivious signature: how thick a body is at its surface, and how central (Gal, Shamir and Cohen-Or 2007)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.data.batch import Body
+from igps.geometry.geodesics import farthest_points
+from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.sampling import surface_points
+from igps.geometry.surface import area_vectors, unit, vertex_areas
+from igps.nn.descriptor import BodyDescriptor
+from igps.nn.needs import Needs
+
+# Rays start so far inside the surface, in units of the bounding box, that they do not meet the face they come from.
+_LIFT = 1e-6
+# Of the graph of geodesics: distances come out 1 % longer than with two, in less than half the time.
+_POINTS_PER_EDGE = 1
+
+
+@dataclass(eq=False, repr=False)
+class LocalDiameterCentricity(BodyDescriptor):
+    """Joint histogram, over the surface, of the local diameter and the centricity, both over √area.
+
+    Source: Gal, Shamir and Cohen-Or 2007, with the cone and the statistics of its rays as in Shapira, Shamir and
+    Cohen-Or 2008, and scale taken from the area. Of the histogram distances that they compare, this is χ².
+
+    Args:
+        n_diameter_bins: bins of the local diameter, with a linear kernel.
+        n_centricity_bins: bins of the centricity, with a linear kernel.
+        max_diameter: upper end of the last diameter bin, in units of √area; larger values go into it.
+        max_centricity: the same of the centricity.
+        n_samples: area-weighted random points of the surface.
+        n_rays: rays of each sample.
+        opening_angle: of the cone about the inward normal, degrees.
+        n_sources: points of the surface over which the geodesic distances are averaged.
+        seed: of the samples.
+
+    Raises:
+        ValueError: a parameter out of range.
+    """
+
+    name = "local_diameter_centricity"
+    source = "Gal, Shamir and Cohen-Or 2007"
+    invariant_to = ("motion", "scale", "pose")
+    needs = Needs(mesh=True)
+
+    n_diameter_bins: int = 32
+    n_centricity_bins: int = 32
+    max_diameter: float = 0.45
+    max_centricity: float = 2.0
+    n_samples: int = 2000
+    n_rays: int = 30
+    opening_angle: float = 120.0
+    n_sources: int = 40
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__init__()
+        for name in ("n_diameter_bins", "n_centricity_bins"):
+            if getattr(self, name) < 2:
+                raise ValueError(f"{name}: expected at least 2, got {getattr(self, name)}.")
+        for name in ("n_samples", "n_rays", "n_sources"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}.")
+        for name in ("max_diameter", "max_centricity"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
+        if not 0 < self.opening_angle < 180:
+            raise ValueError(f"opening_angle: expected between 0 and 180 degrees, got {self.opening_angle}.")
+
+    def describe_body(self, body: Body) -> NDArray[np.float32]:
+        """(n_diameter_bins, n_centricity_bins) histogram that sums to 1.
+
+        Raises:
+            ImportError: libigl is not installed.
+            MeshError: no ray meets the far side of the surface.
+        """
+        mesh = body.mesh
+        points = surface_points(mesh, self.n_samples, self.seed)
+        diameter = local_diameters(mesh, points.face, points.weights, self.n_rays, self.opening_angle)
+        central = points.interpolate(centricity(mesh, self.n_sources)[:, None])[:, 0]
+        seen = np.isfinite(diameter)
+        if not seen.any():
+            raise MeshError(
+                f"{mesh.name}: no ray from the surface inwards meets its far side. Close the surface or repair it."
+            )
+        scale = np.sqrt(mesh.area)
+        return _joint_histogram(
+            diameter[seen] / scale / self.max_diameter,
+            central[seen] / scale / self.max_centricity,
+            (self.n_diameter_bins, self.n_centricity_bins),
+        ).astype(np.float32)
+
+
+def local_diameters(
+    mesh: Mesh, face: NDArray[np.int64], weights: NDArray[np.float64], n_rays: int, opening_angle: float
+) -> NDArray[np.float64]:
+    """Thickness of the body at points of its surface: the mean length of inward rays that is left without outliers.
+
+    The rays fill the cone about the inward normal evenly. A ray counts if it meets the surface from within; of the
+    lengths that count, those within a standard deviation of their median are averaged (Shapira et al. 2008, section 3).
+
+    Args:
+        mesh: the body.
+        face: (P,) face of each point.
+        weights: (P, 3) barycentric coordinates in it.
+        n_rays: rays a point.
+        opening_angle: of the cone, degrees.
+
+    Returns:
+        (P,) length, NaN where no ray counts.
+
+    Raises:
+        ImportError: libigl is not installed.
+    """
+    try:
+        import igl
+    except ImportError as error:
+        raise ImportError('local_diameters needs libigl: pip install "interior-gps[igl]".') from error
+    centre, size = mesh.vertices.mean(axis=0), float(np.ptp(mesh.vertices, axis=0).max())
+    vertices = np.asfortranarray((mesh.vertices - centre) / size)
+    faces = np.asfortranarray(mesh.faces)
+    normals = unit(area_vectors(vertices, mesh.faces))
+
+    # An edge of the face turns with the body, and so do the rays.
+    corner = vertices[faces[face]]
+    inward = -normals[face]
+    side = unit(corner[:, 1] - corner[:, 0])
+    along, across, ahead = _cone(n_rays, opening_angle).T
+    frame = np.stack([side, np.cross(inward, side), inward], axis=1)
+    directions = np.einsum("rk,pkj->prj", np.stack([along, across, ahead], axis=1), frame)
+    origins = np.einsum("pi,pij->pj", weights, corner) + _LIFT * inward
+
+    tree = igl.AABB()
+    tree.init(vertices, faces)
+    rays = directions.reshape(-1, 3)
+    hit, length, _ = tree.intersect_ray_first(vertices, faces, np.repeat(origins, n_rays, axis=0), rays)
+    within = (hit >= 0) & (np.einsum("ij,ij->i", normals[hit], rays) > 0)
+    return size * _robust_mean(np.where(within, length, np.nan).reshape(-1, n_rays))
+
+
+def centricity(mesh: Mesh, n_sources: int) -> NDArray[np.float64]:
+    """Average geodesic distance of each vertex from the whole surface.
+
+    The integral over the surface is a sum over evenly spread vertices, each weighted by the area that is nearest to it.
+
+    Args:
+        mesh: the surface.
+        n_sources: how many; all vertices if there are fewer.
+
+    Returns:
+        (V,) length.
+    """
+    n_vertices = len(mesh.vertices)
+    distances = farthest_points(mesh, min(n_sources, n_vertices), _POINTS_PER_EDGE).distances
+    area = vertex_areas(mesh.vertices, mesh.faces)
+    weight = np.bincount(np.argmin(distances, axis=0), area, len(distances))
+    return weight @ distances / weight.sum()
+
+
+def _cone(n_rays: int, opening_angle: float) -> NDArray[np.float64]:
+    """(R, 3) unit vectors of equal solid angle about the third axis, on a golden spiral (Vogel 1979)."""
+    rank = np.arange(n_rays) + 0.5
+    cosine = 1 - rank / n_rays * (1 - np.cos(np.radians(opening_angle / 2)))
+    azimuth = rank * np.pi * (3 - np.sqrt(5))
+    sine = np.sqrt(1 - cosine**2)
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=1)
+
+
+def _robust_mean(lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean of each row's numbers within a standard deviation of their median; NaN for a row of NaN alone."""
+    result = np.full(len(lengths), np.nan)
+    rows = np.isfinite(lengths).any(axis=1)
+    values = lengths[rows]
+    median, deviation = np.nanmedian(values, axis=1, keepdims=True), np.nanstd(values, axis=1, keepdims=True)
+    # The slack keeps the median itself where all lengths are equal but for rounding.
+    outlier = np.abs(values - median) > deviation + 1e-9 * median
+    trimmed = np.where(outlier, np.nan, values)
+    # Of an even number of lengths in two distant groups, none may be near the median.
+    none_left = np.isnan(trimmed).all(axis=1, keepdims=True)
+    result[rows] = np.nanmean(np.where(none_left, values, trimmed), axis=1)
+    return result
+
+
+def _joint_histogram(
+    first: NDArray[np.float64], second: NDArray[np.float64], n_bins: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Histogram of pairs of numbers in [0, 1], larger ones in the last bin, with a linear kernel in both."""
+    histogram = np.zeros(n_bins)
+    parts = []
+    for values, n in ((first, n_bins[0]), (second, n_bins[1])):
+        # A value at the centre of a bin counts there alone, one between two centres for both.
+        position = np.clip(values * n - 0.5, 0, n - 1)
+        low = np.minimum(position.astype(int), n - 2)
+        parts.append(((low, 1 - (position - low)), (low + 1, position - low)))
+    for row, row_part in parts[0]:
+        for column, column_part in parts[1]:
+            np.add.at(histogram, (row, column), row_part * column_part)
+    return histogram / len(first)

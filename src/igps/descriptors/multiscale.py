@@ -1,0 +1,40 @@
+"""Interior distances alone, on several scales, side by side."""
+
+from __future__ import annotations
+
+from igps.nn.axes import EmbeddedPairCosines, InteriorDistance, Potential
+from igps.nn.descriptor import HistogramDescriptor
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histogram import PairHistogram
+
+# Of the bodies with the most samples so many tell the histograms well enough, and the time grows with their square.
+N_SAMPLES = 1500
+N_ORIENTED_SAMPLES = 1000
+
+
+def multiscale() -> HistogramDescriptor:
+    """Interior distances alone, in four parts.
+
+    The histograms of the first 250, 50 and 16 eigenpairs (fine, middle and coarse); the joint histogram of the
+    distances of 50 and of 4; how the interior samples lie to the surface in the embedding of 16, and how the surface
+    samples lie to the interior ones in that of 8.
+    """
+    embeddings = {n: SpectralEmbedding(n_eigenpairs=n) for n in (250, 50, 16, 8, 4)}
+
+    def scale(n_eigenpairs: int, reach: float) -> PairHistogram:
+        return PairHistogram([Potential(8), InteriorDistance(64, reach)], embeddings[n_eigenpairs], n_samples=N_SAMPLES)
+
+    two_scales = [InteriorDistance(24, 3.0), InteriorDistance(24, 2.5, embedding=embeddings[4])]
+    oriented = [InteriorDistance(6, 3.0), EmbeddedPairCosines(5)]
+    on_surface = [InteriorDistance(6, 3.0), EmbeddedPairCosines(5)]
+    return HistogramDescriptor(
+        [
+            [scale(250, 4.0), scale(50, 4.0), scale(16, 3.0)],
+            PairHistogram(two_scales, embeddings[50], n_samples=N_SAMPLES),
+            PairHistogram(oriented, embeddings[16], n_samples=N_ORIENTED_SAMPLES),
+            PairHistogram(on_surface, embeddings[8], "surface", n_samples=N_ORIENTED_SAMPLES),
+        ],
+        name="multiscale",
+        source="Rustamov 2010, on several scales",
+        invariant_to=("motion", "scale", "pose"),
+    )

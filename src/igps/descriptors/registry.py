@@ -1,0 +1,74 @@
+"""Descriptors by name."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+
+from igps.descriptors.canonical_form import CanonicalForm
+from igps.descriptors.d2 import D2
+from igps.descriptors.geodesic_spectral import GeodesicSpectral
+from igps.descriptors.gps import gps
+from igps.descriptors.inner_distance import InnerDistance
+from igps.descriptors.interior import interior
+from igps.descriptors.local_diameter_centricity import LocalDiameterCentricity
+from igps.descriptors.multiscale import multiscale
+from igps.descriptors.pretrained import pretrained
+from igps.descriptors.rich import rich
+from igps.descriptors.shape_dna import ShapeDNA
+from igps.descriptors.spectral_gw import SpectralGromovWasserstein
+from igps.descriptors.volume_shape_dna import VolumeShapeDNA
+from igps.nn.descriptor import Descriptor
+
+_MAKERS: Mapping[str, Callable[[], Descriptor]] = {
+    "interior": interior,
+    "gps": gps,
+    "multiscale": multiscale,
+    "rich": rich,
+    "pretrained": pretrained,
+    "d2": D2,
+    "shape_dna": ShapeDNA,
+    "volume_shape_dna": VolumeShapeDNA,
+    "local_diameter_centricity": LocalDiameterCentricity,
+    "inner_distance": InnerDistance,
+    "canonical_form": CanonicalForm,
+    "geodesic_spectral": GeodesicSpectral,
+    "spectral_gw": SpectralGromovWasserstein,
+}
+
+NAMES: tuple[str, ...] = tuple(_MAKERS)
+"""The names of the library's descriptors."""
+
+
+def descriptor(which: str | Descriptor) -> Descriptor:
+    """A descriptor by its name, in evaluation mode; one that is given is returned as it is.
+
+    Args:
+        which: one of `NAMES`; or "package.module:NAME", where NAME is a descriptor of your own or makes one when
+            called; or a descriptor.
+
+    Raises:
+        ValueError: no descriptor has this name.
+    """
+    if isinstance(which, Descriptor):
+        return which
+    if which in _MAKERS:
+        return _MAKERS[which]().eval()
+    module, colon, name = which.partition(":")
+    if not colon:
+        raise ValueError(
+            f"descriptor: expected one of {', '.join(NAMES)}, or package.module:NAME of one of your own, got {which!r}."
+        )
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"descriptor: expected package.module:NAME to be importable, got {which!r} ({error}). Check the spelling, "
+            "and that its folder is on the Python path."
+        ) from error
+    made = found if isinstance(found, Descriptor) or not callable(found) else found()
+    if not isinstance(made, Descriptor):
+        raise ValueError(
+            f"descriptor: expected {which} to be or to make an igps.Descriptor, got {type(made).__name__}."
+        )
+    return made.eval()

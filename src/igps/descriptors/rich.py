@@ -1,0 +1,88 @@
+"""Interior distances joined with all else there is of the body in space."""
+
+from __future__ import annotations
+
+from igps.descriptors.multiscale import N_ORIENTED_SAMPLES, N_SAMPLES
+from igps.nn.axes import (
+    Attribute,
+    EuclideanDistance,
+    InteriorDistance,
+    PairAxis,
+    PairCosines,
+    PointAxis,
+    Potential,
+)
+from igps.nn.descriptor import HistogramDescriptor
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histogram import PairHistogram
+
+# Centres of classes; those of the depth have their boundaries at 0.015, 0.03 and 0.06 of √area.
+_DEPTH = (0.0075, 0.0225, 0.0375, 0.0825)
+_ELECTROSTATIC_POTENTIAL = (2.4, 2.8, 3.2, 3.6)
+_N_KNOTS = 12
+
+
+def rich(
+    *, learnable: bool = False, n_samples: int | None = None, n_training_samples: int | None = None
+) -> HistogramDescriptor:
+    """Interior distances joined with all else there is, in three parts.
+
+    The histograms with Euclidean distances, depth and electrostatic potential of the samples; how interior samples lie
+    to each other and to the surface, by interior distance; and the same of surface samples, by Euclidean distance.
+
+    Args:
+        learnable: whether the centres of bins and classes and the spectral filters, one for each histogram, are
+            parameters; the classes are soft ones then.
+        n_samples: of each histogram; by default as many as it needs.
+        n_training_samples: of each histogram, see `PairHistogram`.
+    """
+    # Fixed embeddings are the same for all, and computed once; learned filters go their own way.
+    fixed = {n: SpectralEmbedding(n_eigenpairs=n) for n in (50, 16)}
+
+    def histogram(n_eigenpairs: int, *axes: PointAxis | PairAxis) -> PairHistogram:
+        embedding = SpectralEmbedding(n_eigenpairs=n_eigenpairs, n_knots=_N_KNOTS) if learnable else fixed[n_eigenpairs]
+        return PairHistogram(axes, embedding, n_samples=n_samples or N_SAMPLES, n_training_samples=n_training_samples)
+
+    def potential(n_classes: int) -> Potential:
+        return Potential(n_classes, learnable=learnable)
+
+    def distance(n_bins: int, reach: float = 4.0) -> InteriorDistance:
+        return InteriorDistance(n_bins, reach, learnable=learnable)
+
+    def euclidean(n_bins: int) -> EuclideanDistance:
+        return EuclideanDistance(n_bins, learnable=learnable)
+
+    def depth() -> Attribute:
+        return Attribute("depth", _DEPTH, learnable=learnable)
+
+    charge = Attribute("electrostatic_potential", _ELECTROSTATIC_POTENTIAL, learnable=learnable)
+    oriented = PairHistogram(
+        [distance(6, 3.0), PairCosines(5, learnable=learnable)],
+        SpectralEmbedding(n_eigenpairs=50, n_knots=_N_KNOTS) if learnable else fixed[50],
+        n_samples=n_samples or N_ORIENTED_SAMPLES,
+        n_training_samples=n_training_samples,
+    )
+    on_surface = PairHistogram(
+        [EuclideanDistance(6, 1.0, learnable=learnable), PairCosines(5, learnable=learnable)],
+        fixed[50],
+        samples="surface",
+        n_samples=n_samples or N_ORIENTED_SAMPLES,
+        n_training_samples=n_training_samples,
+    )
+    return HistogramDescriptor(
+        [
+            [
+                histogram(50, potential(8), distance(64)),
+                histogram(16, potential(8), distance(64, 3.0)),
+                histogram(50, potential(4), distance(32), euclidean(16)),
+                histogram(50, potential(3), depth(), distance(12), euclidean(8)),
+                histogram(50, potential(4), depth(), distance(32)),
+                histogram(50, potential(4), charge, distance(32)),
+            ],
+            oriented,
+            on_surface,
+        ],
+        name="rich",
+        source="Rustamov 2010; Wahl, Hillenbrand and Hirzinger 2003",
+        invariant_to=("motion", "scale"),
+    )

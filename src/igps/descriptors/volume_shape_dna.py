@@ -1,0 +1,229 @@
+"""Volumetric Shape-DNA: the spectrum of the Laplacian in the body (Reuter, Wolter and Peinecke 2005, 2006).
+
+The body is cut into cubic cells of one share of its volume, so that a thin body gets as fine cells as a stout one, and
+the grid adapts to scale. Each cell is sampled at 3³ points, which tell how much of it the body fills.
+
+Neumann: finite volumes of the cut cells (Ng, Min and Gibou 2009 for the fractions). A cell's mass is its filled volume,
+and the flux between two cells goes through the open share of their common face. A limb thinner than a cell keeps
+its cross-section and its connection. The second-lowest eigenvalue of a body of several pieces is zero, as the limit of
+ever thinner necks demands: only the first zero is left out.
+
+Dirichlet: finite differences at the cell centres inside, with the wall at its distance along the grid line, in the
+symmetric second-order form of Gibou, Fedkiw, Cheng and Kang 2002. Parts thinner than a cell take no part; they would
+only add eigenvalues far above the first ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from torch import Tensor
+
+from igps.data.batch import Body
+from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.voxels import grid_axes, inside_grid
+from igps.nn.descriptor import BodyDescriptor
+from igps.nn.needs import Needs
+from igps.retrieval.distances import euclidean
+
+Boundary = Literal["dirichlet", "neumann"]
+
+# Pieces of a smaller share of the volume are crumbs of the sampling, at tips and seams. Each would add a zero.
+_CRUMB = 0.01
+# Cells along the longest side at most: 3³ points each must fit into memory.
+_MAX_RESOLUTION = 128
+# The shift of the inverse iteration, in units of volume^(-2/3): below the zero mode, and far from singular.
+_SHIFT = -1.0
+# Relative accuracy of the eigenvalues' distance from the shift, far below the grid's.
+_TOLERANCE = 1e-8
+# Eigenvalues looked for at a time when searching for missed ones.
+_N_RECHECKED = 3
+
+
+@dataclass(eq=False, repr=False)
+class VolumeShapeDNA(BodyDescriptor):
+    """The first eigenvalues of the Laplacian in the body, times volume^(2/3).
+
+    Source: Reuter, Wolter and Peinecke 2005, 2006 (normalisation, Euclidean distance); 12 eigenvalues as in `ShapeDNA`.
+
+    Args:
+        boundary: "dirichlet" (zero on the surface) or "neumann" (no flux through it).
+        n_eigenvalues: eigenvalues kept, without the first zero of Neumann's.
+        n_voxels: the cells have 1/`n_voxels` of the volume each, but at least 1/128 of the longest side.
+
+    Raises:
+        ValueError: a parameter out of range.
+    """
+
+    name = "volume_shape_dna"
+    source = "Reuter, Wolter and Peinecke 2005"
+    invariant_to = ("motion", "scale")
+    needs = Needs(mesh=True)
+
+    boundary: Boundary = "dirichlet"
+    n_eigenvalues: int = 12
+    n_voxels: int = 4000
+
+    def __post_init__(self) -> None:
+        super().__init__()
+        if self.boundary not in ("dirichlet", "neumann"):
+            raise ValueError(f"boundary: expected 'dirichlet' or 'neumann', got {self.boundary!r}.")
+        if self.n_eigenvalues < 1:
+            raise ValueError(f"n_eigenvalues: expected at least 1, got {self.n_eigenvalues}.")
+        if self.n_voxels < 1:
+            raise ValueError(f"n_voxels: expected at least 1, got {self.n_voxels}.")
+
+    def describe_body(self, body: Body) -> NDArray[np.float32]:
+        """(n_eigenvalues,) normalised eigenvalues, ascending, without unit.
+
+        Raises:
+            MeshError: the body is too thin for the grid, or has too few cells for the eigenvalues.
+        """
+        return volume_spectrum(body.mesh, self.n_eigenvalues, self.boundary, self.n_voxels).astype(np.float32)
+
+    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        """(Q, G) Euclidean distances."""
+        return euclidean(queries, gallery)
+
+
+def volume_spectrum(mesh: Mesh, n_eigenvalues: int, boundary: Boundary, n_voxels: int) -> NDArray[np.float64]:
+    """The smallest eigenvalues of −Δ in the body, times its volume^(2/3), ascending, without Neumann's first zero.
+
+    Returns:
+        (n_eigenvalues,) without unit.
+
+    Raises:
+        MeshError: the body is too thin for the grid, or has too few cells for the eigenvalues.
+    """
+    fine, cell = _sampled_cells(mesh, n_voxels)
+    stiffness, mass = _dirichlet(fine) if boundary == "dirichlet" else _neumann(fine)
+    skipped = int(boundary == "neumann")
+    # ARPACK needs room for its basis, and the search for what it missed room in the complement.
+    least = 2 * (n_eigenvalues + skipped + _N_RECHECKED) + 1
+    if len(mass) < least:
+        raise MeshError(
+            f"{mesh.name}: {len(mass)} cells are too few for {n_eigenvalues} eigenvalues; at least {least} are needed. "
+            "Raise n_voxels, or lower n_eigenvalues."
+        )
+    scale = (abs(mesh.volume) / cell**3) ** (2 / 3)
+    values = _smallest(stiffness, mass, n_eigenvalues + skipped, _SHIFT / scale)
+    return np.maximum(values[skipped:], 0) * scale
+
+
+def _sampled_cells(mesh: Mesh, n_voxels: int) -> tuple[NDArray[np.bool_], float]:
+    """Whether the 3³ points of every cell are inside: (X, 3, Y, 3, Z, 3), with a layer of empty cells all round.
+
+    The second result is the side of a cell, length.
+    """
+    longest = float(np.ptp(mesh.vertices, axis=0).max())
+    resolution = int(np.clip(np.ceil(longest * (n_voxels / abs(mesh.volume)) ** (1 / 3)), 1, _MAX_RESOLUTION))
+    cell = longest / resolution
+    axes = []
+    for axis in grid_axes(mesh, resolution):
+        centres = np.concatenate([[axis[0] - cell], axis, [axis[-1] + cell]])
+        axes.append((centres[:, None] + np.array([-1, 0, 1]) * cell / 3).ravel())
+    inside = inside_grid(mesh, (axes[0], axes[1], axes[2]))
+    x, y, z = (len(axis) // 3 for axis in axes)
+    return inside.reshape(x, 3, y, 3, z, 3), cell
+
+
+def _neumann(fine: NDArray[np.bool_]) -> tuple[sparse.csr_array, NDArray[np.float64]]:
+    """Stiffness and diagonal mass of the cells that are not empty, lengths in cells."""
+    filled = fine.mean(axis=(1, 3, 5))
+    mass = filled[filled > 0]
+    number = np.full(filled.shape, -1)
+    number[filled > 0] = np.arange(len(mass))
+    rows, columns, weights = [], [], []
+    for i in range(3):
+        # Along axis i first: (X, 3, Y, 3, Z, 3) becomes (X, 3, others), and the facing layers of neighbours are
+        # sampled at the same 3 × 3 places.
+        along = np.moveaxis(fine, (2 * i, 2 * i + 1), (0, 1))
+        aperture = (along[:-1, 2] & along[1:, 0]).mean(axis=(2, 4))
+        here = np.nonzero(aperture)
+        cell = np.moveaxis(number, i, 0)
+        rows.append(cell[:-1][here])
+        columns.append(cell[1:][here])
+        weights.append(aperture[here])
+    graph = _symmetric(np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), len(mass))
+    kept = _without_crumbs(graph, mass)
+    graph, mass = graph[kept][:, kept], mass[kept]
+    return sparse.diags_array(graph.sum(axis=1)) - graph, mass
+
+
+def _without_crumbs(graph: sparse.csr_array, mass: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The cells of all pieces but the crumbs."""
+    n_pieces, piece = connected_components(graph, directed=False)
+    share = np.bincount(piece, weights=mass, minlength=n_pieces) / mass.sum()
+    return np.nonzero((share >= _CRUMB)[piece])[0]
+
+
+def _dirichlet(fine: NDArray[np.bool_]) -> tuple[sparse.csr_array, NDArray[np.float64]]:
+    """Stiffness and unit mass of the cells whose centre is inside, lengths in cells."""
+    inside = fine[:, 1, :, 1, :, 1]
+    n_cells = int(inside.sum())
+    number = np.full(inside.shape, -1)
+    number[inside] = np.arange(n_cells)
+    rows, columns = [], []
+    diagonal = np.zeros(inside.shape)
+    for i in range(3):
+        # The points on the grid line through the cell centres along axis i.
+        line = np.moveaxis(fine, (2 * i, 2 * i + 1), (0, 1))[:, :, :, 1, :, 1]
+        cell = np.moveaxis(number, i, 0)
+        for step in (-1, 1):
+            # The layer of empty cells all round makes the wrap harmless.
+            first, second = line[:, 1 + step], np.roll(line, -step, axis=0)[:, 1 - step]
+            beyond = np.roll(line, -step, axis=0)[:, 1]
+            linked = line[:, 1] & first & second & beyond
+            # The wall lies between the last point inside and the next one: on average half way.
+            wall = (first.astype(int) + (first & second) + 0.5) / 3
+            diagonal += np.moveaxis(np.where(linked, 1.0, 1.0 / wall), 0, i)
+            if step == 1:
+                rows.append(cell[linked])
+                columns.append(np.roll(cell, -1, axis=0)[linked])
+    row, column = np.concatenate(rows), np.concatenate(columns)
+    graph = _symmetric(row, column, np.ones(len(row)), n_cells)
+    return sparse.diags_array(diagonal[inside]) - graph, np.ones(n_cells)
+
+
+def _symmetric(
+    rows: NDArray[np.int64], columns: NDArray[np.int64], weights: NDArray[np.float64], size: int
+) -> sparse.csr_array:
+    entries = (np.concatenate([weights, weights]), (np.concatenate([rows, columns]), np.concatenate([columns, rows])))
+    return sparse.coo_array(entries, shape=(size, size)).tocsr()
+
+
+def _smallest(stiffness: sparse.csr_array, mass: NDArray[np.float64], count: int, shift: float) -> NDArray[np.float64]:
+    """The smallest eigenvalues of K u = λ M u, ascending, by Lanczos iteration on (K − shift M)⁻¹."""
+    scaling = sparse.diags_array(1 / np.sqrt(mass))
+    matrix = (scaling @ stiffness @ scaling).tocsc()
+    shifted = (matrix - shift * sparse.eye_array(len(mass))).tocsc()
+    # Positive definite: no pivoting, and the elimination order of a symmetric matrix.
+    factor = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    inverse = LinearOperator(matrix.shape, factor.solve, dtype=np.float64)
+    start = np.random.default_rng(0).standard_normal(len(mass))
+    values, vectors = eigsh(matrix, count, sigma=shift, OPinv=inverse, v0=start, tol=_TOLERANCE)
+    while True:
+        # The iteration from one vector may see one copy of a multiple eigenvalue: the others lie in the complement of
+        # what was found.
+        found = vectors
+        complement = LinearOperator(
+            matrix.shape, lambda u, q=found: _project(factor.solve(_project(u, q)), q), dtype=np.float64
+        )
+        inverted, more = eigsh(complement, _N_RECHECKED, which="LA", v0=_project(start, found), tol=_TOLERANCE)
+        missed = shift + 1 / inverted < values.max() - _TOLERANCE * (values.max() - shift)
+        if not missed.any():
+            return np.sort(values)
+        values = np.concatenate([values, shift + 1 / inverted[missed]])
+        kept = np.argsort(values)[:count]
+        values, vectors = values[kept], np.hstack([vectors, more[:, missed]])[:, kept]
+
+
+def _project(vector: NDArray[np.float64], basis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The part of a vector orthogonal to an orthonormal basis."""
+    return vector - basis @ (basis.T @ vector)

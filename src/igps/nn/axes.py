@@ -1,0 +1,39 @@
+"""The axes of pair histograms, of points and of pairs, and those that have a layout of their own by name."""
+
+from __future__ import annotations
+
+from igps.nn.pair_axes import EmbeddedPairCosines, EuclideanDistance, InteriorDistance, PairAxis, PairCosines
+from igps.nn.point_axes import Attribute, PointAxis, Potential
+
+__all__ = [
+    "AXES",
+    "Attribute",
+    "EmbeddedPairCosines",
+    "EuclideanDistance",
+    "InteriorDistance",
+    "PairAxis",
+    "PairCosines",
+    "PointAxis",
+    "Potential",
+    "axis_of",
+]
+
+AXES: dict[str, type[PointAxis | PairAxis]] = {
+    "potential": Potential,
+    "interior_distance": InteriorDistance,
+    "euclidean_distance": EuclideanDistance,
+    "pair_cosines": PairCosines,
+    "embedded_pair_cosines": EmbeddedPairCosines,
+}
+"""The axes that have a layout of their own, by name."""
+
+
+def axis_of(name: str) -> PointAxis | PairAxis:
+    """The axis of a name, as it is by default.
+
+    Raises:
+        ValueError: no axis has this name.
+    """
+    if name not in AXES:
+        raise ValueError(f"axes: expected one of {', '.join(AXES)}, or an axis, got {name!r}.")
+    return AXES[name]()  # type: ignore[call-arg]

@@ -1,0 +1,55 @@
+"""What all heads share: they turn descriptions into unit vectors, and take their sizes from what they are fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol, Self, runtime_checkable
+
+from torch import Tensor, nn
+
+from igps.retrieval.distances import square_root
+
+
+@runtime_checkable
+class Head(Protocol):
+    """Descriptions to unit vectors, whose cosine distance is a metric."""
+
+    def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
+        """Take from the descriptions (N, ...) and classes (N,) of training shapes what is not learned by gradients.
+
+        `part_cells` tells the cells of the parts that a description consists of; None takes all as one part.
+        """
+        ...
+
+    def __call__(self, descriptions: Tensor) -> Tensor:
+        """(N, ...) descriptions to (N, D) of length 1."""
+        ...
+
+
+class SizedByData(nn.Module):
+    """A module whose buffers have the size of the data that it was fitted to, also when it is loaded."""
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *arguments: Any) -> None:
+        for name, buffer in self.named_buffers(recurse=False):
+            stored = state_dict.get(prefix + name)
+            if stored is not None and stored.shape != buffer.shape:
+                setattr(self, name, buffer.new_zeros(stored.shape))
+        super()._load_from_state_dict(state_dict, prefix, *arguments)
+
+
+def square_roots(histograms: Tensor) -> Tensor:
+    """(N, ...) histograms to the (N, cells) square roots of their cells, unit vectors with a finite gradient.
+
+    Raises:
+        ValueError: an entry below zero, as embeddings have.
+    """
+    cells = histograms.flatten(1)
+    if bool((cells < 0).any()):
+        raise ValueError("descriptions: expected histograms, entries ≥ 0, got a negative one.")
+    return square_root(cells)
+
+
+def check_cells(cells: Tensor, n_expected: int) -> None:
+    """Raise a ValueError unless these (N, cells) are as many as the head was fitted to."""
+    if cells.shape[1] != n_expected:
+        raise ValueError(f"descriptions: expected {n_expected} cells as in training, got {cells.shape[1]}.")

@@ -1,0 +1,81 @@
+"""What a descriptor needs of a body."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import torch
+from torch import nn
+
+from igps.data.batch import SignatureBatch
+from igps.geometry.attributes import AttributeName
+from igps.geometry.signature import SignatureConfig
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a descriptor needs of a body, beside its samples, area and volume.
+
+    Args:
+        n_eigenpairs: at least so many; with fewer it would be another descriptor.
+        attributes: of the samples, see `SignatureConfig`.
+        mesh: whether the surface itself.
+    """
+
+    n_eigenpairs: int = 0
+    attributes: tuple[AttributeName, ...] = ()
+    mesh: bool = False
+
+    def __or__(self, other: Needs) -> Needs:
+        """What both need."""
+        return Needs(
+            max(self.n_eigenpairs, other.n_eigenpairs),
+            tuple(dict.fromkeys((*self.attributes, *other.attributes))),
+            self.mesh or other.mesh,
+        )
+
+    def completed(self, config: SignatureConfig) -> SignatureConfig:
+        """The configuration with the attributes that are needed.
+
+        Raises:
+            ValueError: too few eigenpairs.
+        """
+        self._check_eigenpairs(config.n_eigenpairs)
+        return replace(config, attributes=tuple(dict.fromkeys((*config.attributes, *self.attributes))))
+
+    def check_config(self, config: SignatureConfig) -> None:
+        """Raise a ValueError that names what Signatures of this configuration lack, if they lack anything."""
+        self._check_eigenpairs(config.n_eigenpairs)
+        self._check_attributes(config.attributes)
+
+    def check(self, batch: SignatureBatch) -> None:
+        """Raise a ValueError that names what the batch lacks, if it lacks anything."""
+        if self.n_eigenpairs:
+            self._check_eigenpairs(int(torch.isfinite(batch.eigenvalues).sum(dim=1).min()))
+        self._check_attributes({*batch.interior.attributes, *batch.surface.attributes})
+        if self.mesh and batch.meshes is None:
+            raise ValueError(
+                "meshes: this descriptor needs the surfaces too. Make the batch by SignatureDataset.batch(..., "
+                "meshes=True), or by collate(signatures, meshes)."
+            )
+
+    def _check_attributes(self, found: Collection[str]) -> None:
+        if missing := [name for name in self.attributes if name not in found]:
+            raise ValueError(
+                f"attributes: this descriptor needs signatures with {', '.join(missing)}, got {sorted(found)}. Compute "
+                "them with SignatureConfig(attributes=...), or with descriptor.needs.completed(config)."
+            )
+
+    def _check_eigenpairs(self, found: int) -> None:
+        if found < self.n_eigenpairs:
+            raise ValueError(
+                f"n_eigenpairs: this descriptor needs signatures of at least {self.n_eigenpairs}, got {found}. "
+                "Raise SignatureConfig(n_eigenpairs=...), or choose another descriptor."
+            )
+
+
+def needs_of_embedding(embedding: nn.Module) -> Needs:
+    """What an embedding needs: the eigenpairs that it says it uses."""
+    n_eigenpairs = getattr(embedding, "n_eigenpairs", None)
+    return Needs(n_eigenpairs=n_eigenpairs if isinstance(n_eigenpairs, int) else 0)

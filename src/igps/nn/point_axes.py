@@ -1,0 +1,131 @@
+"""Axes of points: the classes that the samples of a body are sorted into, by their potential or by any attribute."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import get_args
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+
+from igps.geometry.attributes import AttributeName
+from igps.nn.centres import OrderedCentres, middles
+from igps.nn.embedding import barycentroid_potential
+from igps.nn.needs import Needs, needs_of_embedding
+from igps.nn.view import View
+
+
+class PointAxis(nn.Module, ABC):
+    """Classes of points.
+
+    Args:
+        centres: (C,) of the classes, ascending.
+        soft: whether a point belongs to the two classes whose centres surround its value, in linear proportion, or to
+            the nearest alone.
+        learnable: whether the centres are parameters; implies `soft`, as only soft classes have gradients.
+    """
+
+    def __init__(self, centres: Tensor | Sequence[float], soft: bool, learnable: bool) -> None:
+        super().__init__()
+        self.centres = OrderedCentres(centres, learnable)
+        self.soft = soft or learnable
+
+    @property
+    def n_classes(self) -> int:
+        """C."""
+        return len(self.centres.start)
+
+    def needs(self, embedding: nn.Module) -> Needs:
+        """Of a body, with this embedding for the histogram."""
+        return Needs()
+
+    @abstractmethod
+    def values(self, view: View, embedding: nn.Module) -> Tensor:
+        """(N, P) of the samples."""
+
+    def memberships(self, values: Tensor) -> Tensor:
+        """(P, C) non-negative, rows of sum 1, from (P,) values.
+
+        Raises:
+            ValueError: values that are not finite.
+        """
+        if not torch.isfinite(values).all():
+            raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
+        return soft_memberships(values, self.centres()) if self.soft else _nearest(values, self.centres())
+
+
+class Potential(PointAxis):
+    """Classes of the barycentroid potential U, the norm of the embedding (Rustamov 2010, section 4).
+
+    Args:
+        n_classes: C equal intervals of [0, `reach`], with their centres in the middle.
+        reach: largest potential told apart; what lies beyond counts in the last class.
+        soft, learnable: see `PointAxis`.
+    """
+
+    def __init__(self, n_classes: int = 4, reach: float = 1.5, *, soft: bool = False, learnable: bool = False) -> None:
+        super().__init__(middles(n_classes, reach, "classes"), soft, learnable)
+
+    def needs(self, embedding: nn.Module) -> Needs:
+        """Those of the embedding."""
+        return needs_of_embedding(embedding)
+
+    def values(self, view: View, embedding: nn.Module) -> Tensor:
+        """(N, P) potential."""
+        return barycentroid_potential(view.embedded(embedding))
+
+
+class Attribute(PointAxis):
+    """Classes of a scalar attribute of the samples: "depth", "electrostatic_potential", or one of your own.
+
+    Args:
+        name: of the attribute.
+        centres: of the classes, ascending, in the attribute's unit.
+        soft, learnable: see `PointAxis`.
+    """
+
+    def __init__(self, name: str, centres: Sequence[float], *, soft: bool = False, learnable: bool = False) -> None:
+        super().__init__(centres, soft, learnable)
+        self.name = name
+
+    def needs(self, embedding: nn.Module) -> Needs:
+        """The attribute, if it is one that Signatures are computed with."""
+        return Needs(attributes=tuple(name for name in get_args(AttributeName) if name == self.name))
+
+    def values(self, view: View, embedding: nn.Module) -> Tensor:
+        """(N, P) of the attribute.
+
+        Raises:
+            ValueError: the samples have no such attribute, or it is a direction.
+        """
+        values = view.attribute(self.name)
+        if values.ndim != 2:
+            raise ValueError(f"attributes: expected a scalar to split by, but {self.name!r} is a direction.")
+        return values
+
+    def extra_repr(self) -> str:
+        return repr(self.name)
+
+
+def soft_memberships(values: Tensor, centres: Tensor) -> Tensor:
+    """Soft classes: linear kernels (hats) around ascending centres; all in the first below it, in the last beyond it.
+
+    Args:
+        values: (..., P) of the points.
+        centres: (C,) ascending.
+
+    Returns:
+        (..., P, C) non-negative, rows of sum 1; differentiable in both arguments.
+    """
+    # How far past each centre on the way to the next, 0 to 1: successive differences are the hats, and sum to 1.
+    passed = ((values.unsqueeze(-1) - centres[:-1]) / centres.diff()).clamp(0, 1)
+    one, none = torch.ones_like(values).unsqueeze(-1), torch.zeros_like(values).unsqueeze(-1)
+    return torch.cat([one, passed], dim=-1) - torch.cat([passed, none], dim=-1)
+
+
+def _nearest(values: Tensor, centres: Tensor) -> Tensor:
+    """(P, C) memberships, 1 in the class whose centre is nearest."""
+    between = (centres[1:] + centres[:-1]) / 2
+    return one_hot(torch.bucketize(values.detach(), between, right=True), len(centres)).to(values.dtype)

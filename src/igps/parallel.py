@@ -1,0 +1,301 @@
+"""Many jobs at once: on processes, where one that fails or kills its process costs no other its result; on threads.
+
+Each worker is a `ProcessPoolExecutor` of one process: where that process dies, the job it had is known by name, and a
+job that takes too long is ended by ending its process. Any other `concurrent.futures.Executor`, such as that of a
+cluster, may do the work instead.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    as_completed,
+    wait,
+)
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import torch
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# A job whose process died is tried once more: an administrator or another program may have been the cause.
+_MOST_DEATHS = 2
+_KILLED = (
+    "the process that worked on it was killed, twice. It may need more memory than there is: use fewer workers, or set "
+    "a memory limit to be told."
+)
+_NOT_STARTED = (
+    "no worker process could be started. A script that computes on several processes must call it under "
+    "`if __name__ == '__main__':`; otherwise look for a want of memory, or pass n_workers=1."
+)
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EMFILE, errno.ENFILE)
+
+
+class MachineError(RuntimeError):
+    """The machine, not a job, is at fault: a full disk, no memory, no process. What is done so far is kept."""
+
+
+@dataclass(frozen=True)
+class Failed:
+    """Why a job has no result, in one sentence."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one job may use.
+
+    Args:
+        seconds: of wall time; None for no limit.
+        memory: bytes of data of its process; None for no limit. Linux alone enforces it.
+    """
+
+    seconds: float | None = None
+    memory: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("time_limit", self.seconds), ("memory_limit", self.memory)):
+            if value is not None and not value > 0:
+                raise ValueError(f"{name}: expected None or a positive number, got {value}.")
+
+
+def run(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    *,
+    n_workers: int | None = None,
+    executor: Executor | None = None,
+    limits: Limits | None = None,
+) -> Generator[tuple[int, Result | Failed], None, None]:
+    """The result of every job with its number, as they come.
+
+    Args:
+        function: picklable; the exceptions that it raises, but for those of the machine, are failures of the job.
+        jobs: picklable.
+        n_workers: processes; as many as cores if None. One works in this process, unless there are limits.
+        executor: works in place of these processes.
+        limits: of each job, in processes of ours.
+
+    Raises:
+        MachineError: the disk is full, memory runs out without a limit, or no process can be started.
+    """
+    limits = limits or Limits()
+    limited = limits != Limits()
+    if executor is not None:
+        if limited:
+            raise ValueError("limits: expected none beside an executor, which has its own.")
+        yield from _by_executor(executor, function, jobs)
+        return
+    n_workers = min(n_workers or n_cores(), len(jobs))
+    if n_workers > 1 or (limited and jobs):
+        yield from _by_workers(function, jobs, n_workers, limits)
+        return
+    for number, job in enumerate(jobs):
+        yield number, _attempt(lambda job=job: function(job), limits)  # type: ignore[misc]
+
+
+def on_threads(function: Callable[[Job], Result], jobs: Sequence[Job], n_threads: int) -> Iterator[Result]:
+    """The result of every job in order, each job on one thread of its own, as PyTorch lets many compute at once.
+
+    Splitting each small product over all cores instead makes every one of them wait for the slowest core, which on a
+    machine with other work to do costs many times the product itself.
+    """
+    with one_thread():
+        if n_threads == 1:
+            yield from map(function, jobs)
+            return
+        with ThreadPoolExecutor(n_threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            yield from pool.map(function, jobs)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch on one thread, and afterwards on as many as before."""
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(n_threads)
+
+
+def n_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _attempt(result: Callable[[], Result], limits: Limits) -> Result | Failed:
+    """The result; the job's failure in words, where the machine is not at fault."""
+    try:
+        return result()
+    except BrokenExecutor:
+        raise
+    except MachineError:
+        raise
+    except MemoryError as error:
+        if limits.memory is not None:
+            return Failed(f"it needs more than the memory_limit of {limits.memory / 2**20:.0f} MiB.")
+        raise MachineError("out of memory. Use fewer workers or set a memory limit; what is done is kept.") from error
+    except OSError as error:
+        if error.errno in _NO_SPACE:
+            raise MachineError(f"{error}. Make room and run again: what is done is kept.") from error
+        return Failed(_sentence(error))
+    except Exception as error:
+        return Failed(_sentence(error))
+
+
+def _sentence(error: Exception) -> str:
+    return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+
+
+def _by_executor(
+    executor: Executor, function: Callable[[Job], Result], jobs: Sequence[Job]
+) -> Generator[tuple[int, Result | Failed], None, None]:
+    futures: dict[Future[Result], int] = {executor.submit(function, job): number for number, job in enumerate(jobs)}
+    try:
+        for future in as_completed(futures):
+            try:
+                yield futures[future], _attempt(future.result, Limits())
+            except BrokenExecutor as error:
+                raise MachineError(f"the executor broke ({error}). Run again: what is done is kept.") from error
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+class _Worker(Generic[Job, Result]):
+    """A process, and the job it has."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._pool: ProcessPoolExecutor | None = None
+        self._pid: Future[int] = Future()
+        self.number = -1
+        self.future: Future[Result] | None = None
+        self.deadline = float("inf")
+
+    def give(self, number: int, function: Callable[[Job], Result], job: Job) -> None:
+        if self._pool is None:
+            self._start()
+        assert self._pool is not None
+        self.number, self.future = number, self._pool.submit(function, job)
+        if self._limits.seconds is not None:
+            wait([self._pid])  # the seconds that a process takes to start are not the job's
+            self.deadline = time.monotonic() + self._limits.seconds
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        with _one_thread_each():
+            self._pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(self._limits.memory,))
+            # The process starts with its first job; the answer is not waited for, so that all workers start at once.
+            self._pid = self._pool.submit(os.getpid)
+
+    @property
+    def has_started(self) -> bool:
+        """Whether the process came as far as to take a job."""
+        return self._pid.done() and self._pid.exception() is None
+
+    def end(self, kill: bool = False) -> None:
+        """End the process, in the midst of its work if need be."""
+        if self._pool is None:
+            return
+        if kill and self.has_started:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._pid.result(), getattr(signal, "SIGKILL", signal.SIGTERM))
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._pool, self.future, self.deadline = None, None, float("inf")
+
+
+def _by_workers(
+    function: Callable[[Job], Result], jobs: Sequence[Job], n_workers: int, limits: Limits
+) -> Generator[tuple[int, Result | Failed], None, None]:
+    waiting = list(range(len(jobs)))[::-1]
+    deaths = [0] * len(jobs)
+    workers: list[_Worker[Job, Result]] = [_Worker(limits) for _ in range(n_workers)]
+    finished = False
+    try:
+        while True:
+            for worker in workers:
+                if worker.future is None and waiting:
+                    number = waiting.pop()
+                    worker.give(number, function, jobs[number])
+            busy = {worker.future: worker for worker in workers if worker.future is not None}
+            if not busy:
+                finished = True
+                return
+            soonest = min(worker.deadline for worker in busy.values())
+            timeout = None if soonest == float("inf") else max(0.0, soonest - time.monotonic())
+            done, _ = wait(busy, timeout=timeout, return_when=FIRST_COMPLETED)
+            for future in done:
+                worker = busy[future]
+                worker.future = None
+                try:
+                    yield worker.number, _attempt(future.result, limits)
+                except BrokenExecutor as error:
+                    if not worker.has_started:
+                        raise MachineError(_NOT_STARTED) from error
+                    worker.end()
+                    deaths[worker.number] += 1
+                    if deaths[worker.number] < _MOST_DEATHS:
+                        waiting.insert(0, worker.number)
+                    else:
+                        yield worker.number, Failed(_KILLED)
+            for worker in busy.values():
+                if worker.future is not None and time.monotonic() >= worker.deadline:
+                    worker.end(kill=True)
+                    yield worker.number, Failed(f"it took longer than the time_limit of {limits.seconds:g} s.")
+    finally:
+        for worker in workers:
+            worker.end(kill=not finished)
+
+
+@contextlib.contextmanager
+def _one_thread_each() -> Generator[None, None, None]:
+    """The environment of a process with one thread for linear algebra, or n workers on n cores run n² threads.
+
+    The libraries read it when they are first imported, which in a spawned process is before any initialiser runs.
+    """
+    before: dict[str, Any] = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _begin(memory: int | None) -> None:
+    """What a worker does first: bound its memory, and watch its parent, without which it would wait for ever."""
+    if memory is not None:
+        with contextlib.suppress(ImportError, ValueError):
+            import resource
+
+            resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

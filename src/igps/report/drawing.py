@@ -1,0 +1,48 @@
+"""What the pictures share: colours, a figure without a window, and a shaded surface."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.geometry.surface import area_vectors, unit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Colour = tuple[float, float, float]
+
+GREY: Colour = (0.86, 0.88, 0.92)
+BLUE: Colour = (0.55, 0.72, 0.95)
+PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""They stay apart for every kind of colour vision (Okabe and Ito 2008)."""
+
+
+def paint(axis: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int64], colour: Colour) -> None:
+    """Draw a surface, lit from the upper right, as seen from +z."""
+    from matplotlib.collections import PolyCollection
+
+    normals = unit(area_vectors(vertices, faces))
+    front = np.nonzero(normals[:, 2] > 0)[0]
+    front = front[np.argsort(vertices[faces[front], 2].mean(axis=1))]  # the painter's algorithm: far faces first
+    light = normals[front] @ np.array([0.35, 0.45, 0.82])
+    colours = np.outer(np.clip(0.35 + 0.6 * light, 0, 1), colour)
+    polygons = list(vertices[faces[front], :2])
+    axis.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=colours, linewidths=0.3))
+    low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
+    (x, y), reach = (low + high) / 2, 0.54 * (high - low).max()
+    axis.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", xticks=[], yticks=[])
+
+
+def new_figure(width: float, height: float) -> Figure:
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('figures need matplotlib: pip install "interior-gps[plot]".') from error
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)  # draws to a file without touching the user's pyplot state
+    return figure

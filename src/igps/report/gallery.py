@@ -1,0 +1,114 @@
+"""Pictures of ranked results and of generated shapes, saved as PNG."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from igps.geometry.mesh import MeshError
+from igps.geometry.reading import MeshReading, load_mesh
+from igps.geometry.simplification import simplify
+from igps.report.drawing import BLUE, GREY, new_figure, paint
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from igps.shapes import ArticulatedShapes
+
+# Blue for a hit and orange for a miss stay apart for every kind of colour vision (Okabe and Ito 2008).
+_RELEVANT, _IRRELEVANT, _QUERY = "#0072B2", "#D55E00", "#444444"
+# A thumbnail shows no more detail than this, and drawing takes time with every face.
+_THUMBNAIL_VERTICES = 800
+
+
+def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8) -> None:
+    """One row per class: its first mesh as the query, then the meshes ranked nearest to it.
+
+    Args:
+        root: folder of the meshes.
+        ranking: the ranking.csv that `igps retrieve` wrote.
+        out: the PNG file.
+        top: results in a row.
+    """
+    results: dict[str, list[tuple[str, float, bool]]] = {}
+    with ranking.open(newline="") as file:
+        for row in csv.DictReader(file):
+            found = results.setdefault(row["query"], [])
+            if len(found) < top:
+                found.append((row["model"], float(row["distance"]), row["relevant"] == "1"))
+    # A class is a folder in the layouts that this figure is drawn for.
+    first = {name.split("/")[0]: name for name in sorted(results, reverse=True)}
+    queries = [first[label] for label in sorted(first)]
+    figure = new_figure(1.25 * (top + 1), 1.45 * len(queries) + 0.6)
+    axes = figure.subplots(len(queries), top + 1, squeeze=False)
+    for row_axes, query in zip(axes, queries, strict=True):
+        draw_mesh(row_axes[0], root / query)
+        _frame(row_axes[0], f"query {query}", _QUERY)
+        for axis, (model, distance, relevant) in zip(row_axes[1:], results[query], strict=False):
+            draw_mesh(axis, root / model)
+            _frame(axis, f"{model}\n{distance:.3f}", _RELEVANT if relevant else _IRRELEVANT)
+    figure.suptitle(
+        "Query (left) and its nearest meshes with their chi-square distance; "
+        "blue: same class, orange and dashed: another",
+        fontsize=9,
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, dpi=110)
+
+
+def contact_sheet(shapes: ArticulatedShapes, path: str | Path, n_shown: int = 1) -> None:
+    """Save a picture of the first shapes of every class, all turned the same way.
+
+    Args:
+        shapes: the generated benchmark.
+        path: the PNG file.
+        n_shown: shapes of each class.
+
+    Raises:
+        ValueError: `n_shown` is out of range.
+        ImportError: matplotlib or scikit-image is missing.
+    """
+    if not 1 <= n_shown <= shapes.n_per_class:
+        raise ValueError(f"n_shown: expected 1 to n_per_class={shapes.n_per_class}, got {n_shown}. Ask for fewer.")
+    chosen = [c * shapes.n_per_class + i for c in range(shapes.n_classes) for i in range(n_shown)]
+    columns = min(len(chosen), max(4, math.ceil(math.sqrt(1.6 * len(chosen)))))
+    rows = math.ceil(len(chosen) / columns)
+    figure = new_figure(1.7 * columns, 1.85 * rows)
+    view = Rotation.from_euler("zx", (-35, -70), degrees=True).as_matrix()  # from the left, in front and above
+    for place, index in enumerate(chosen, 1):
+        shape = shapes[index]
+        axis = figure.add_subplot(rows, columns, place)
+        paint(axis, shape.vertices @ shape.rotation @ view.T, shape.faces, BLUE)
+        axis.set_axis_off()
+        axis.set_title(shape.name if n_shown > 1 else shape.label, fontsize=5, pad=1)
+    figure.savefig(path, dpi=110)
+
+
+def draw_mesh(axis: Axes, path: Path) -> None:
+    """Draw a mesh, shaded and seen along its thinnest principal axis."""
+    mesh = load_mesh(path, MeshReading(allow_open=True))
+    with contextlib.suppress(MeshError, ImportError):  # drawn in full, it only takes longer
+        mesh = simplify(mesh, _THUMBNAIL_VERTICES)
+    paint(axis, _seen_from_the_front(mesh.vertices), mesh.faces, GREY)
+
+
+def _seen_from_the_front(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    centred = vertices - vertices.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2]
+    # The slender end up, the wider side left, so that poses of one body are drawn alike.
+    axes *= np.where(((centred @ axes.T) ** 3).mean(axis=0) < 0, -1, 1)[:, None]
+    axes[2] = np.cross(axes[1], axes[0])
+    return vertices @ axes[[1, 0, 2]].T
+
+
+def _frame(axis: Axes, title: str, colour: str) -> None:
+    axis.set_title(title, fontsize=5.5, pad=2)
+    for side in axis.spines.values():
+        side.set(color=colour, linewidth=1.6, linestyle="--" if colour == _IRRELEVANT else "-")

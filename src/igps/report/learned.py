@@ -1,0 +1,91 @@
+"""What a descriptor has learned, against where it started."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from igps.nn.centres import OrderedCentres
+from igps.nn.descriptor import HistogramDescriptor
+from igps.nn.embedding import SpectralEmbedding, spectral_weights
+from igps.nn.histogram import PairHistogram
+from igps.report.drawing import new_figure
+
+
+def learned_layout(descriptor: HistogramDescriptor, path: str | Path) -> None:
+    """Save a picture of the bin and class centres and of the spectral filter g(λ·area), learned and as they started.
+
+    Args:
+        descriptor: its histograms are drawn one a row.
+        path: of the picture, such as layout.png.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    histograms = [histogram for part in descriptor.parts for histogram in part]
+    rows = [(histogram.embedding, _centres(histogram)) for histogram in histograms]
+    n_columns = 1 + max(len(centres) for _, centres in rows)
+    figure = new_figure(4 * n_columns, 3.2 * len(rows))
+    grid = figure.subplots(len(rows), n_columns, squeeze=False)
+    for panels, (embedding, centres) in zip(grid, rows, strict=True):
+        if isinstance(embedding, SpectralEmbedding):
+            _filter(panels[0], embedding)
+        else:
+            panels[0].set_axis_off()
+        for panel, (title, bins) in zip(panels[1:], centres.items(), strict=False):
+            panel.plot(bins.start, bins.start, color="#888888", linestyle="--", label="start")
+            panel.plot(bins.start, bins().detach(), color="#D55E00", marker=".", markersize=3, label="learned")
+            panel.set(xlabel="centre at the start", ylabel="centre", title=title)
+            panel.legend(frameon=False)
+        for panel in panels[1 + len(centres) :]:
+            panel.set_axis_off()
+    figure.savefig(path, dpi=150)
+
+
+def _filter(panel: Any, embedding: SpectralEmbedding) -> None:
+    x = torch.logspace(0.5, 3.6, 200, dtype=torch.float64)
+    area = torch.ones((), dtype=torch.float64)
+    start = spectral_weights(x, area, embedding.kind, embedding.time)
+    panel.loglog(x, start, color="#888888", linestyle="--", label="start")
+    panel.loglog(x, embedding.weights(x, area).detach(), color="#0072B2", label="learned")
+    panel.set(xlabel="eigenvalue × area", ylabel="weight of the eigenfunction g", title="spectral filter")
+    panel.legend(frameon=False)
+
+
+def _centres(histogram: PairHistogram) -> dict[str, OrderedCentres]:
+    """The centres along each axis of a histogram, by what they are centres of."""
+    return {
+        f"{type(axis).__name__}: {name}": module
+        for axis in histogram.axes
+        for name, module in axis.named_modules()
+        if isinstance(module, OrderedCentres)
+    }
+
+
+def transfer_curve(curve: Mapping[int, Sequence[float]], plain: float, path: str | Path) -> None:
+    """Save a picture of the first tier against the number of generated classes that a metric was fitted to.
+
+    Args:
+        curve: FT, fractions, of several draws by the number of classes.
+        plain: FT of the plain distance.
+        path: of the picture.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    figure = new_figure(4.5, 3.2)
+    axes = figure.subplots()
+    counts = sorted(curve)
+    means = [100 * sum(curve[n]) / len(curve[n]) for n in counts]
+    axes.axhline(100 * plain, color="#888888", linestyle="--", label="plain distance")
+    axes.plot(counts, means, color="#0072B2", label="pretrained, mean of the draws")
+    for n in counts:
+        axes.plot([n] * len(curve[n]), [100 * value for value in curve[n]], ".", color="#0072B2")
+    axes.set(xscale="log", xlabel="generated classes fitted to", ylabel="first tier (percent)")
+    axes.set_xticks(counts, [str(n) for n in counts])
+    axes.minorticks_off()
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=150)

@@ -1,0 +1,63 @@
+"""Results as tables of text, for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from igps.geometry.disturbances import DISTURBANCES
+from igps.retrieval import RetrievalScores
+from igps.studies.comparison import Result
+from igps.studies.robustness import POSE, Movement
+
+TITLES = dict(nn="NN", ft="FT", st="ST", e="E", dcg="DCG", adr="ADR", adr_self="ADR self", map="mAP")  # noqa: C408
+"""Column titles of the scores, by name."""
+
+
+def scores_table(scores: RetrievalScores) -> str:
+    """The scores in percent: one line over all queries, one per class."""
+    columns = {name: title for name, title in TITLES.items() if name in scores.mean()}
+    rows = {"all": scores.mean(), **{str(label): values for label, values in scores.per_class().items()}}
+    width = max(len(name) for name in rows)
+    lines = [" " * width + "".join(f"{title:>10}" for title in columns.values())]
+    lines += [f"{name:<{width}}" + "".join(f"{100 * row[key]:>10.1f}" for key in columns) for name, row in rows.items()]
+    lines.append(f"percent, {scores.n_queries} queries, each against all others")
+    if scores.n_excluded:
+        lines.append(f"{scores.n_excluded} meshes are the only one of their class and were not scored as queries")
+    return "\n".join(lines)
+
+
+def comparison_table(results: Sequence[Result]) -> str:
+    """One line a descriptor: scores in percent, meshes described, seconds for each."""
+    rows = [result.row() for result in results]
+    width = max(len(row["descriptor"]) for row in rows)
+    lines = [" " * width + "".join(f"{title:>10}" for title in (*TITLES.values(), "meshes", "s/mesh"))]
+    for row in rows:
+        scores = "".join(f"{'–' if row[key] is None else f'{100 * row[key]:.1f}':>10}" for key in TITLES)
+        seconds = "–" if row["seconds_per_mesh"] is None else f"{row['seconds_per_mesh']:.3f}"
+        lines.append(f"{row['descriptor']:<{width}}{scores}{row['n_models']:>10}{seconds:>10}")
+    lines.append("scores in percent, each mesh against all others that the descriptor describes")
+    lines.append("s/mesh: mean processor time of a description, beyond that of the cached signature")
+    lines += [f"{result.descriptor.name}: no scores: {result.error}" for result in results if result.error is not None]
+    return "\n".join(lines)
+
+
+def robustness_table(table: Mapping[str, Mapping[str, Movement]]) -> str:
+    """The mean movements in percent, one line a descriptor and one column a disturbance, and what the columns mean."""
+    columns = list(next(iter(table.values())))
+    width = max(len(name) for name in table)
+    lines = [" " * width + "".join(f"{column:>9}" for column in columns)]
+    notes = []
+    for name, movements in table.items():
+        means = [movements[column].mean for column in columns]
+        lines.append(f"{name:<{width}}" + "".join(f"{'-' if x is None else f'{100 * x:.1f}':>9}" for x in means))
+        for column in columns:
+            missing = movements[column].notes
+            if missing:
+                first = next(iter(missing.values()))
+                n_all = len(movements[column].distances) + len(missing)
+                notes.append(f"{name}, {column}: {len(missing)} of {n_all} missing; {first}")
+    lines.append("mean movement in percent of the median distance between classes")
+    lines += [f"  {column}: {DISTURBANCES[column].description}" for column in columns if column in DISTURBANCES]
+    if POSE in columns:
+        lines.append(f"  {POSE}: from one pose of a body to another, over all pairs")
+    return "\n".join(lines + notes)

@@ -1,0 +1,1 @@
+"""What takes many descriptors or many bodies, as functions that return data."""

@@ -1,0 +1,303 @@
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from igps import cli
+from igps.cli import main
+from igps.data.dataset import SignatureDataset
+from igps.descriptors import NAMES, descriptor
+from igps.descriptors.d2 import D2
+from igps.geometry.signature import SignatureConfig
+from igps.nn.description import describe
+from igps.retrieval import chi_square, retrieval_scores
+from own_descriptors import SMALL, small_interior
+
+INTERIOR = "own_descriptors:small_interior"
+CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Three balls and three long eggs."""
+    for label, ratio in (("ball", 1.0), ("egg", 2.2)):
+        for i in range(3):
+            body = trimesh.creation.icosphere(subdivisions=2)
+            body.vertices *= [1.0, 1.0 + 0.06 * i, ratio]
+            path = tmp_path / "meshes" / label / f"{i}.off"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            body.export(path)
+    return tmp_path / "meshes"
+
+
+def igps(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
+    main()
+
+
+def test_retrieve_prints_and_writes_what_python_computes(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    igps(
+        monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--out", out, "--cache_dir", tmp_path / "cache", *SMALL
+    )
+    printed = capsys.readouterr().out
+
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
+    histograms = describe(dataset, small_interior())
+    distances = chi_square(histograms, histograms)
+    expected = retrieval_scores(distances, dataset.files.labels or ())
+
+    scores = json.loads((out / "scores.json").read_text())
+    assert {"nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map", "n_queries", "per_class", "config"} | {
+        "n_given",
+        "n_used",
+        "n_refused",
+    } == set(scores)
+    assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [6, 6, 6, 0]
+    assert {name: scores[name] for name in expected.mean()} == pytest.approx(expected.mean())
+    assert scores["per_class"]["egg"]["ft"] == pytest.approx(expected.per_class()["egg"]["ft"])
+    assert scores["config"]["resolution"] == 10
+    assert f"{100 * expected.mean()['ft']:.1f}" in printed
+    assert all(word in printed for word in ("NN", "ADR self", "mAP", "ball", "egg", "6 queries"))
+
+    with np.load(out / "distances.npz") as archive:
+        np.testing.assert_allclose(archive["distances"], distances, atol=1e-7)
+        assert archive["names"].tolist() == list(dataset.files.names)
+        assert archive["labels"].tolist() == ["ball"] * 3 + ["egg"] * 3
+    rows = list(csv.DictReader((out / "ranking.csv").open(newline="")))
+    assert len(rows) == 6 * 5
+    for i, name in enumerate(dataset.files.names):
+        ranked = [row for row in rows if row["query"] == name]
+        others = [j for j in torch.argsort(distances[i], stable=True).tolist() if j != i]
+        assert [row["model"] for row in ranked] == [dataset.files.names[j] for j in others]
+        assert [row["relevant"] for row in ranked] == [str(int(i // 3 == j // 3)) for j in others]
+    assert not (out / "failures.csv").exists()
+
+
+def test_gps_is_another_descriptor_on_the_same_cache(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("interior", "gps"):
+        arguments = [
+            "--descriptor",
+            f"own_descriptors:small_{name}",
+            "--out",
+            tmp_path / name,
+            "--cache_dir",
+            tmp_path / "cache",
+            *SMALL,
+        ]
+        igps(monkeypatch, "retrieve", root, *arguments)
+    interior, gps = (json.loads((tmp_path / name / "scores.json").read_text()) for name in ("interior", "gps"))
+    assert interior["config"].pop("descriptor") == INTERIOR
+    assert gps["config"].pop("descriptor") == "own_descriptors:small_gps"
+    assert interior["config"] == gps["config"]
+    archives = [np.load(tmp_path / name / "distances.npz")["distances"] for name in ("interior", "gps")]
+    assert np.abs(archives[0] - archives[1]).max() > 1e-3
+    assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 6
+
+
+def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (root / "egg" / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    arguments = [
+        "retrieve",
+        root,
+        "--descriptor",
+        INTERIOR,
+        "--cache_dir",
+        tmp_path / "cache",
+        "--out",
+        tmp_path / "out",
+        *SMALL,
+    ]
+    igps(monkeypatch, *arguments)
+    assert "1 of 7 meshes could not be used" in capsys.readouterr().out
+    (row,) = csv.DictReader((tmp_path / "out" / "failures.csv").open(newline=""))
+    assert row["file"] == "egg/bad.off"
+    assert "3 boundary edges" in row["error"]
+    scores = json.loads((tmp_path / "out" / "scores.json").read_text())
+    assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [6, 7, 6, 1]
+
+    with pytest.raises(SystemExit, match="1"):
+        igps(monkeypatch, *arguments, "--strict")
+    error = capsys.readouterr().err
+    assert "bad.off" in error
+    assert "Traceback" not in error
+
+    (root / "egg" / "bad.off").unlink()
+    igps(monkeypatch, *arguments)
+    assert not (tmp_path / "out" / "failures.csv").exists()
+
+
+def test_extract_files_and_folder(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = [root / "egg" / "1.off", root / "ball" / "0.off"]
+    common = ["--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL]
+    igps(monkeypatch, "extract", *files, "--out", tmp_path / "two.npz", *common)
+    igps(monkeypatch, "extract", root, "--out", tmp_path / "deep" / "all.npz", *common)
+    with np.load(tmp_path / "two.npz") as two, np.load(tmp_path / "deep" / "all.npz") as everything:
+        assert two["names"].tolist() == [str(f) for f in files]
+        assert two["features"].shape == (2, 10, 64)
+        np.testing.assert_allclose(two["features"].sum(axis=(1, 2)), 1, atol=1e-5)
+        assert everything["labels"].tolist() == ["ball"] * 3 + ["egg"] * 3
+        np.testing.assert_allclose(two["features"], everything["features"][[4, 0]], atol=1e-7)
+
+
+def test_query_lists_the_nearest(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wanted = tmp_path / "wanted.off"
+    wanted.write_bytes((root / "egg" / "1.off").read_bytes())
+    igps(
+        monkeypatch,
+        "query",
+        wanted,
+        "--gallery",
+        root,
+        "--top",
+        "4",
+        "--descriptor",
+        INTERIOR,
+        "--cache_dir",
+        tmp_path / "cache",
+        *SMALL,
+    )
+    header, *lines = capsys.readouterr().out.splitlines()
+    assert header.split() == ["rank", "distance", "mesh", "class"]
+    assert len(lines) == 4
+    assert lines[0].split() == ["1", "0.0000", "egg/1.off", "egg"]
+    histograms = describe(SignatureDataset(root, CONFIG, tmp_path / "cache"), small_interior())
+    distances = chi_square(histograms[4:5], histograms)[0]
+    names = [f"{label}/{i}.off" for label in ("ball", "egg") for i in range(3)]
+    nearest = torch.argsort(distances, stable=True)[:4].tolist()
+    assert [line.split()[2] for line in lines] == [names[i] for i in nearest]
+    assert [float(line.split()[1]) for line in lines] == pytest.approx(distances[nearest].tolist(), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["retrieve", "nowhere"], "no such folder"),
+        (["retrieve", "ROOT/egg"], "no classes found"),
+        (["retrieve", "ROOT", "--descriptor", "best"], f"expected one of {', '.join(NAMES)}, or .*, got 'best'"),
+        (["retrieve", "ROOT"], "n_eigenpairs: this descriptor needs signatures of at least 250, got 20"),
+        (["query", "ROOT/egg/1.off", "--gallery", "ROOT", "--top", "0"], "top"),
+        (["query", "nowhere.off", "--gallery", "ROOT", "--descriptor", "d2"], "no such file|cannot be read"),
+        (["retrieve", "ROOT", "--paper"], "none of 6 meshes could be used.*too few for 250 eigenpairs"),
+    ],
+)
+def test_errors_are_one_line(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    arguments: list[str], message: str,
+) -> None:  # fmt: skip
+    logging.disable(logging.WARNING)
+    options = [] if "--paper" in arguments else SMALL
+    try:
+        with pytest.raises(SystemExit, match="1"):
+            igps(monkeypatch, *[a.replace("ROOT", str(root)) for a in arguments], "--cache_dir", tmp_path, *options)
+    finally:
+        logging.disable(logging.NOTSET)
+    error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("igps: ")]
+    assert len(error) == 1
+    assert re.search(message, error[0])
+
+
+def test_too_few_eigenpairs_are_refused_in_the_same_words_as_in_python(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
+    with pytest.raises(ValueError, match="needs signatures of at least 250, got 20") as raised:
+        describe(dataset, descriptor("interior"))
+    with pytest.raises(ValueError, match="got 20") as of_batch:
+        descriptor("interior")(dataset.batch([0]))
+    assert str(of_batch.value) == str(raised.value)
+    for command in (["retrieve", root], ["extract", root, "--out", tmp_path / "x.npz"], ["compare", root]):
+        chosen = ["--descriptors" if command[0] == "compare" else "--descriptor", "interior"]
+        with pytest.raises(SystemExit, match="1"):
+            igps(monkeypatch, *command, *chosen, "--cache_dir", tmp_path / "cache", *SMALL)
+        assert f"igps: {raised.value}" in capsys.readouterr().err.splitlines()
+
+
+def test_a_compared_descriptor_retrieves(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, options = tmp_path / "out", ["--cache_dir", tmp_path / "cache", *SMALL]
+    igps(monkeypatch, "retrieve", root, "--descriptor", "d2", "--out", out, *options)
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
+    described = describe(dataset, D2(), n_workers=1)
+    expected = torch.cdist(described, described, p=1) / 2
+    with np.load(out / "distances.npz") as archive:
+        np.testing.assert_allclose(archive["distances"], expected, atol=1e-6)
+    scores = json.loads((out / "scores.json").read_text())
+    assert scores["ft"] == pytest.approx(retrieval_scores(expected, dataset.labels).mean()["ft"])
+    assert scores["config"]["descriptor"] == "d2"
+
+
+def test_a_mesh_that_cannot_be_described_is_a_failure(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logging.disable(logging.WARNING)
+    (root / "egg" / "bad.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    arguments = ["retrieve", root, "--descriptor", "own_descriptors:picky", "--out", tmp_path / "out"]
+    arguments += ["--cache_dir", tmp_path / "cache", *SMALL]
+    try:
+        igps(monkeypatch, *arguments)
+        assert "2 of 7 meshes could not be used" in capsys.readouterr().out
+        rows = list(csv.DictReader((tmp_path / "out" / "failures.csv").open(newline="")))
+        assert [row["file"] for row in rows] == ["egg/bad.off", "egg/1.off"]
+        assert "too much" in rows[1]["error"]
+        scores = json.loads((tmp_path / "out" / "scores.json").read_text())
+        assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [5, 7, 5, 2]
+        (root / "egg" / "bad.off").unlink()
+        with pytest.raises(SystemExit, match="1"):
+            igps(monkeypatch, *arguments, "--strict")
+        assert "too much" in capsys.readouterr().err
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+@pytest.mark.parametrize("command", ["retrieve", "extract", "query", "demo", "compare", "robustness"])
+def test_help_explains_every_option(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        igps(monkeypatch, command, "--help")
+    text = capsys.readouterr().out
+    assert "--n_workers" in text
+    assert "--workers" not in text
+    if command != "demo":
+        for word in ("--cache_dir", "--strict", "--repair", "--signature.min_samples", "refined until"):
+            assert word in text, word
+
+
+def test_commands_may_be_grouped(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def pose(mesh: Path, classes: list[int] | None = None, exact: bool = False, size: float = 2.0) -> None:
+        """Draw a pose.
+
+        Args:
+            mesh: what to draw.
+            classes: which to show.
+            exact: without a tolerance
+            size: in inches.
+        """
+        print(mesh, classes, exact, size)
+
+    monkeypatch.setattr(cli, "COMMANDS", {"figure": {"pose": pose, "demo": cli.demo}, "query": cli.query})
+    igps(monkeypatch, "figure", "pose", "a.off", "--classes", "1", "2", "--exact")
+    igps(monkeypatch, "figure", "pose", "a.off", "--size", "3")
+    assert capsys.readouterr().out.splitlines() == ["a.off [1, 2] True 2.0", "a.off None False 3.0"]
+    for arguments, words in ((["figure"], ("pose", "demo")), (["figure", "pose"], ("what to draw", "which to show"))):
+        with pytest.raises(SystemExit, match="0"):
+            igps(monkeypatch, *arguments, "--help")
+        text = capsys.readouterr().out
+        assert all(word in text for word in words)

@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch, collate
+from igps.geometry.mesh import Mesh
+from igps.geometry.signature import Samples, Signature, SignatureConfig
+from igps.nn.histogram import PairHistogram
+
+
+def samples(generator: np.random.Generator, n_points: int, n_eigenpairs: int) -> Samples:
+    functions = generator.standard_normal((n_points, n_eigenpairs)).astype(np.float32)
+    attributes = {"depth": generator.random(n_points).astype(np.float32)}
+    attributes["surface_direction"] = generator.standard_normal((n_points, 3)).astype(np.float32)
+    return Samples(generator.random((n_points, 3)) * 3 + 5, functions, attributes)
+
+
+@pytest.fixture
+def signatures() -> list[Signature]:
+    """Three, of different numbers of samples and of eigenpairs."""
+    generator = np.random.default_rng(0)
+    return [
+        Signature(
+            np.cumsum(generator.random(n_eigenpairs) + 1),
+            samples(generator, n_points, n_eigenpairs),
+            samples(generator, 9 - i, n_eigenpairs),
+            area=2.0 + i,
+            volume=0.5 + i,
+            config=SignatureConfig(n_eigenpairs=n_eigenpairs),
+            name=f"body {i}",
+        )
+        for i, (n_points, n_eigenpairs) in enumerate([(12, 5), (7, 8), (15, 3)])
+    ]
+
+
+def centred(signature: Signature, room: str) -> np.ndarray:
+    points = getattr(signature, room).points
+    return points - points.mean(axis=0)
+
+
+def test_bodies_are_the_signatures_without_padding(signatures: list[Signature]) -> None:
+    batch = collate(signatures)
+    assert batch.eigenvalues.shape == (3, 8)
+    assert batch.interior.points.shape == (3, 15, 3)
+    bodies = list(batch.bodies())
+    for body, signature in zip(bodies, signatures, strict=True):
+        assert body.id == signature.name
+        assert (body.area, body.volume) == (signature.area, signature.volume)
+        assert body.eigenvalues.dtype == np.float64
+        np.testing.assert_array_equal(body.eigenvalues, signature.eigenvalues)
+        for room in ("interior", "surface"):
+            found, expected = getattr(body, room), getattr(signature, room)
+            np.testing.assert_allclose(found.points, centred(signature, room), atol=1e-6)
+            np.testing.assert_array_equal(found.eigenfunctions, expected.eigenfunctions)
+            assert found.attributes.keys() == expected.attributes.keys()
+            for name, values in expected.attributes.items():
+                np.testing.assert_array_equal(found.attributes[name], values)
+
+
+def test_padding_is_marked(signatures: list[Signature]) -> None:
+    batch = collate(signatures)
+    assert batch.interior.mask.sum(dim=1).tolist() == [12, 7, 15]
+    assert torch.isfinite(batch.eigenvalues).sum(dim=1).tolist() == [5, 8, 3]
+    assert (batch.eigenvalues[~torch.isfinite(batch.eigenvalues)] > 0).all()
+    for part in (batch.interior, batch.surface):
+        for values in (part.points, part.eigenfunctions, *part.attributes.values()):
+            assert (values[~part.mask] == 0).all()
+
+
+def test_collate_pads_without_changing_any_description(signatures: list[Signature]) -> None:
+    batch = collate(signatures)
+    for kind in ("interior", "surface"):
+        histogram = PairHistogram(samples=kind)  # type: ignore[arg-type]
+        together = histogram(batch)
+        alone = torch.cat([histogram(collate([signature])) for signature in signatures])
+        assert together.shape == (3, 10, 64)
+        torch.testing.assert_close(together, alone, atol=1e-7, rtol=0)
+        torch.testing.assert_close(together.sum(dim=(1, 2)), torch.ones(3))
+
+
+def test_labels_and_names(signatures: list[Signature]) -> None:
+    items = [LabelledSignature(signatures[0], 4, "a"), LabelledSignature(signatures[2], 0, "b"), signatures[1]]
+    batch = collate(items)
+    assert batch.labels.tolist() == [4, 0, -1]
+    assert batch.ids == ("a", "b", "body 1")
+    assert len(batch) == 3
+
+
+def test_meshes_go_with_their_bodies(signatures: list[Signature]) -> None:
+    box = trimesh.creation.box()
+    meshes = [Mesh(np.asarray(box.vertices) * s, np.asarray(box.faces), name=str(s)) for s in (1.0, 2.0, 3.0)]
+    batch = collate(signatures, meshes)
+    assert batch.meshes == tuple(meshes)
+    assert [body.mesh for body in batch.bodies()] == meshes
+    assert batch.to("cpu").meshes == tuple(meshes)
+    (first, *_) = collate(signatures).bodies()
+    assert first.surface_mesh is None
+    with pytest.raises(ValueError, match="body 0: expected a batch with meshes, got one without"):
+        _ = first.mesh
+    with pytest.raises(ValueError, match="meshes: expected one for each of 3 signatures, got 2"):
+        collate(signatures, meshes[:2])
+
+
+def test_points_are_centred_before_they_lose_digits() -> None:
+    generator = np.random.default_rng(1)
+    near = samples(generator, 20, 2)
+    far = replace(near, points=near.points + 1e6)
+    whole = Signature(np.array([1.0, 2.0]), near, near, 1.0, 1.0, SignatureConfig(n_eigenpairs=2))
+    batch = collate([whole, replace(whole, interior=far, surface=far)])
+    torch.testing.assert_close(batch.interior.points[0], batch.interior.points[1], atol=1e-6, rtol=0)
+    np.testing.assert_allclose(batch.interior.points.mean(dim=1), 0, atol=1e-6)
+
+
+def test_nothing_and_unlike_attributes_are_refused(signatures: list[Signature]) -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        collate([])
+    bare = replace(signatures[0].interior, attributes={})
+    with pytest.raises(ValueError, match=r"same sample attributes, got \['depth', 'surface_direction'\] and \[\]"):
+        collate([signatures[1], replace(signatures[0], interior=bare)])
+
+
+def of_samples(batch: SampleBatch, i: int) -> set[tuple[float, ...]]:
+    return {tuple(row) for row in torch.cat([batch.points[i], batch.eigenfunctions[i]], dim=1)[batch.mask[i]].tolist()}
+
+
+@pytest.mark.parametrize("seed", [None, 0])
+def test_subset_takes_real_samples_each_once(signatures: list[Signature], seed: int | None) -> None:
+    batch = collate(signatures).interior
+    some = batch.subset(10, seed)
+    assert some.mask.sum(dim=1).tolist() == [10, 7, 10]
+    for i, n in enumerate((10, 7, 10)):
+        assert len(of_samples(some, i)) == n
+        assert of_samples(some, i) <= of_samples(batch, i)
+        for name, values in some.attributes.items():
+            order = [batch.points[i].tolist().index(point) for point in some.points[i, some.mask[i]].tolist()]
+            assert torch.equal(values[i, some.mask[i]], batch.attributes[name][i, order])
+    assert (some.eigenfunctions[~some.mask] == 0).all()
+
+
+def test_subset_with_a_seed_depends_on_nothing_but_the_shape(signatures: list[Signature]) -> None:
+    together = collate(signatures).interior.subset(6, seed=3)
+    for i, signature in enumerate(signatures):
+        single = collate([signature]).interior.subset(6, seed=3)
+        width = single.eigenfunctions.shape[2]
+        assert torch.equal(single.eigenfunctions[0], together.eigenfunctions[i, :, :width])
+    other = collate(signatures).interior.subset(6, seed=4)
+    assert not torch.equal(other.points, together.points)
+    torch.manual_seed(0)
+    first = collate(signatures).interior.subset(6)
+    assert not torch.equal(collate(signatures).interior.subset(6).points, first.points)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_batches_go_to_a_device_and_bodies_come_back(signatures: list[Signature]) -> None:
+    batch: SignatureBatch = collate(signatures).to("cuda")
+    assert batch.interior.attributes["depth"].is_cuda
+    assert batch.labels.is_cuda
+    for body, signature in zip(batch.bodies(), signatures, strict=True):
+        np.testing.assert_array_equal(body.interior.eigenfunctions, signature.interior.eigenfunctions)

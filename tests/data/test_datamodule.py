@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from bodies_on_disk import write_body
+
+from igps.data.datamodule import SignatureDataModule
+from igps.geometry.mesh import MeshError
+from igps.geometry.reading import MeshReading
+from igps.geometry.signature import SignatureConfig
+
+CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface_samples=20)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    for label in range(3):
+        for i in range(4):
+            write_body(tmp_path / "meshes" / f"class{label}" / f"{i}.off", 1.0 + 0.1 * i, 1.0 + label)
+    return tmp_path / "meshes"
+
+
+def test_loaders_give_the_parts_and_balanced_batches(root: Path, tmp_path: Path) -> None:
+    module = SignatureDataModule(
+        root, "seen", n_train=3, n_validation=1, classes_per_batch=3, shapes_per_class=2, config=CONFIG,
+        cache_dir=tmp_path / "cache", n_workers=1,
+    )  # fmt: skip
+    module.prepare_data()
+    names = module.dataset.files.names
+    (batch,) = module.train_dataloader()
+    assert sorted(batch.labels.tolist()) == [0, 0, 1, 1, 2, 2]
+    assert set(batch.ids) <= {names[i] for i in module.split.train}
+    for loader, part in (
+        (module.val_dataloader(), module.split.validation),
+        (module.test_dataloader(), module.split.test),
+    ):
+        ids = [name for batch in loader for name in batch.ids]  # type: ignore[union-attr]
+        assert ids == [names[i] for i in part]
+
+
+@pytest.mark.parametrize("n_samples", [20, None])
+def test_training_shapes_are_kept_in_memory_thinned(root: Path, tmp_path: Path, n_samples: int | None) -> None:
+    module = SignatureDataModule(
+        root, n_train=3, n_validation=1, classes_per_batch=3, shapes_per_class=2, config=CONFIG,
+        cache_dir=tmp_path / "cache", n_workers=1, n_samples_in_memory=n_samples,
+    )  # fmt: skip
+    module.prepare_data()
+    whole = {item.id: item.signature.interior for item in (module.dataset[i] for i in module.split.train)}
+    (batch,) = module.train_dataloader()
+    shutil.rmtree(tmp_path / "cache")
+    for i, name in enumerate(batch.ids):
+        kept = batch.interior.eigenfunctions[i, batch.interior.mask[i]]
+        assert len(kept) == (n_samples or len(whole[name]))
+        among = (kept[:, None] == torch.from_numpy(whole[name].eigenfunctions)).all(dim=2)
+        assert among.any(dim=1).all()
+    if n_samples is not None:
+        assert len(list(module.train_dataloader())) == 1  # without the cache
+        shutil.rmtree(root)
+        assert len(list(module.train_dataloader())) == 1
+
+
+def test_a_single_sample_in_memory_is_refused(root: Path) -> None:
+    with pytest.raises(ValueError, match="n_samples_in_memory: expected None or at least 2, got -3"):
+        SignatureDataModule(root, n_samples_in_memory=-3)
+
+
+def test_a_bad_mesh_stops_training(root: Path, tmp_path: Path) -> None:
+    (root / "class1" / "9.off").write_text("nothing")
+    module = SignatureDataModule(root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path, n_workers=1)
+    with pytest.raises(MeshError, match=r"9\.off"):
+        module.prepare_data()
+
+
+def test_needs_classes(root: Path) -> None:
+    with pytest.raises(ValueError, match="no classes found"):
+        SignatureDataModule(root / "class0")
+
+
+def test_impossible_protocols_are_refused(root: Path) -> None:
+    with pytest.raises(ValueError, match="protocol: expected 'seen' or 'unseen', got 'some'"):
+        SignatureDataModule(root, "some")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="n_test: expected None with protocol 'seen'"):
+        SignatureDataModule(root, "seen", n_test=2)
+
+
+def test_meshes_are_read_as_asked(root: Path, tmp_path: Path) -> None:
+    """A mesh with a hole stops training, unless holes are allowed."""
+    mesh = trimesh.load(root / "class1" / "2.off", process=False)
+    mesh.update_faces(np.arange(len(mesh.faces)) > 0)
+    mesh.export(root / "class1" / "2.off")
+
+    def module(**options: MeshReading) -> SignatureDataModule:
+        return SignatureDataModule(
+            root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path / "cache", n_workers=1, **options
+        )
+
+    with pytest.raises(MeshError, match=r"2\.off.*boundary edges"):
+        module().prepare_data()
+    module(reading=MeshReading(allow_open=True)).prepare_data()
+
+
+def test_nothing_to_validate_on_is_no_loader(root: Path, tmp_path: Path) -> None:
+    module = SignatureDataModule(root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path, n_workers=1)
+    assert module.val_dataloader() == []
+
+
+def test_without_a_configuration_a_checkpoint_keeps_nothing_of_the_data(root: Path) -> None:
+    """Paths and configurations could be read only by running code."""
+    assert SignatureDataModule(root, n_train=2, n_validation=0, config=CONFIG).hparams == {}

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from igps.data.splits import Split, split_seen, split_unseen
+
+LABELS = torch.arange(8).repeat_interleave(6)[torch.randperm(48, generator=torch.Generator().manual_seed(1))]
+
+
+def classes(indices: tuple[int, ...]) -> list[int]:
+    return sorted(LABELS[list(indices)].tolist())
+
+
+def disjoint(split: Split) -> bool:
+    parts = [set(part) for part in (split.train, split.validation, split.test)]
+    return sum(map(len, parts)) == len(set.union(*parts))
+
+
+def test_seen_split_takes_the_same_number_of_every_class() -> None:
+    split = split_seen(LABELS, 4, n_validation=1, seed=3)
+    assert disjoint(split)
+    assert classes(split.train) == sorted([*range(8)] * 3)
+    assert classes(split.validation) == [*range(8)]
+    assert classes(split.test) == sorted([*range(8)] * 2)
+
+
+def test_unseen_split_shares_no_class() -> None:
+    split = split_unseen(LABELS, 5, n_validation=2, seed=3)
+    assert disjoint(split)
+    parts = [set(classes(part)) for part in (split.train, split.validation, split.test)]
+    assert [len(part) for part in parts] == [3, 2, 3]
+    assert len(set.union(*parts)) == 8
+    assert len(split.train) == 3 * 6
+
+
+def test_fewer_training_classes_keep_the_test_classes() -> None:
+    many, few = (split_unseen(LABELS, n, n_test=2, seed=5) for n in (6, 3))
+    assert many.test == few.test
+    assert set(few.train) < set(many.train)
+
+
+def test_validation_is_taken_from_the_training_part_alone() -> None:
+    for split in (split_seen, split_unseen):
+        assert split(LABELS, 4, seed=2).test == split(LABELS, 4, n_validation=2, seed=2).test
+
+
+def test_splits_depend_on_the_seed_alone() -> None:
+    for split in (split_seen, split_unseen):
+        torch.manual_seed(0)
+        first = split(LABELS, 4, seed=1)
+        torch.manual_seed(1)
+        assert split(LABELS, 4, seed=1) == first
+        assert split(LABELS, 4, seed=2) != first
+
+
+@pytest.mark.parametrize(
+    ("split", "arguments", "name"),
+    [
+        (split_seen, {"n_train": 6}, "n_train"),
+        (split_seen, {"n_train": 3, "n_validation": 3}, "n_validation"),
+        (split_unseen, {"n_train": 8}, "n_train"),
+        (split_unseen, {"n_train": 6, "n_test": 3}, "n_test"),
+        (split_unseen, {"n_train": 3, "n_validation": 3}, "n_validation"),
+    ],
+)
+def test_impossible_splits_are_refused(split, arguments: dict[str, int], name: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=name):
+        split(LABELS, **arguments)

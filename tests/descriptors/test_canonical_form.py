@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from one_body import of_mesh
+from scipy.spatial.distance import cdist
+from scipy.stats import special_ortho_group
+from sklearn.manifold import smacof
+
+from conftest import as_mesh
+from igps.descriptors.canonical_form import (
+    CanonicalForm,
+    classical_scaling,
+    exponents,
+    least_squares_scaling,
+    moments,
+)
+from igps.geometry.geodesics import farthest_points, geodesic_distances
+from igps.geometry.mesh import Mesh
+
+
+def distance(a: np.ndarray, b: np.ndarray, descriptor: CanonicalForm) -> float:
+    return descriptor.distances(torch.from_numpy(a)[None], torch.from_numpy(b)[None]).item()
+
+
+def sheet(curvature: float) -> Mesh:
+    """A thin sheet of 2 × 1, rolled up along its length to a circular arc of the given curvature."""
+    u, v = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 2, 33), np.linspace(0, 1, 17), indexing="ij"))
+    bent = np.stack([np.sin(curvature * u), 1 - np.cos(curvature * u)], axis=1) / curvature if curvature else None
+    x, z = (u, 0 * u) if bent is None else bent.T
+    inner = np.stack([x, v, z], axis=1)
+    normal = np.stack([-np.sin(curvature * u), 0 * u, np.cos(curvature * u)], axis=1)
+    index = np.arange(33 * 17).reshape(33, 17)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    top = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    rim = np.concatenate([index[:-1, 0], index[-1, :-1], index[:0:-1, -1], index[0, :0:-1]])
+    following = np.roll(rim, -1)
+    n = index.size
+    sides = np.concatenate(
+        [np.stack([following, rim, rim + n], axis=1), np.stack([following, rim + n, following + n], axis=1)]
+    )
+    vertices = np.concatenate([inner + 0.005 * normal, inner - 0.005 * normal])
+    return Mesh(vertices, np.concatenate([top, top[:, ::-1] + n, sides]), "sheet")
+
+
+def test_a_rolled_up_sheet_has_the_form_of_the_flat_one() -> None:
+    descriptor = CanonicalForm(max_vertices=1200)
+    flat, rolled = (descriptor.describe_body(of_mesh(sheet(curvature))) for curvature in (0.0, 2.0))
+    other = descriptor.describe_body(of_mesh(as_mesh(trimesh.creation.icosphere(subdivisions=3))))
+    assert flat.dtype == np.float32
+    assert flat.shape == (len(exponents(4)),)
+    assert distance(flat, rolled, descriptor) < 0.05 * distance(flat, other, descriptor)
+    # The rigid moments tell the two apart.
+    rigid = [moments(m.vertices / np.sqrt(m.area), 4).astype(np.float32) for m in (sheet(0.0), sheet(2.0))]
+    assert distance(*rigid, descriptor) > 10 * distance(flat, rolled, descriptor)
+
+
+def test_the_geodesics_of_the_rolled_up_sheet_are_straight_when_flat() -> None:
+    # The sheet is developable: the oracle of its canonical form is the flat rectangle itself.
+    source = 5 * 17 + 3
+    distances = geodesic_distances(sheet(2.0), [source])[0][: 33 * 17]
+    flat = sheet(0.0).vertices[: 33 * 17]
+    np.testing.assert_allclose(distances, np.linalg.norm(flat - flat[source], axis=1), rtol=0.05, atol=0.02)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_points_of_space_come_back(dimension: int) -> None:
+    points = np.random.default_rng(0).normal(size=(40, dimension)) * [3, 2, 1][:dimension]
+    distances = cdist(points, points)
+    form = classical_scaling(distances)
+    assert form.shape == (40, 3)
+    np.testing.assert_allclose(cdist(form, form), distances, atol=1e-6)
+    np.testing.assert_allclose(form.mean(axis=0), 0, atol=1e-6)
+    refined = least_squares_scaling(distances, form)
+    np.testing.assert_allclose(cdist(refined, refined), distances, atol=1e-6)
+
+
+def test_least_squares_equals_scikit_learn(sphere: Mesh) -> None:
+    sources = np.arange(0, 2562, 40)
+    distances = np.arccos(np.clip(sphere.vertices[sources] @ sphere.vertices[sources].T, -1, 1))
+    start = classical_scaling(distances)
+    form = least_squares_scaling(distances, start)
+    reference, stress = smacof(
+        distances, n_components=3, init=start, n_init=1, max_iter=500, eps=1e-9, normalized_stress=False
+    )
+    ours = np.square(cdist(form, form) - distances).sum() / 2
+    before = np.square(cdist(start, start) - distances).sum() / 2
+    assert stress <= ours < 1.001 * stress
+    assert before > 1.5 * ours
+    np.testing.assert_allclose(cdist(form, form), cdist(reference, reference), atol=0.02)
+
+
+def test_no_step_raises_the_stress() -> None:
+    generator = np.random.default_rng(1)
+    distances = cdist(*[generator.normal(size=(25, 6))] * 2)
+    start = generator.normal(size=(25, 3))
+    start[3] = start[4]  # coincident points must not divide by zero
+    form = least_squares_scaling(distances, start)
+    assert np.isfinite(form).all()
+    assert np.square(cdist(form, form) - distances).sum() < np.square(cdist(start, start) - distances).sum() / 4
+
+
+def test_moments_of_a_box_by_closed_form() -> None:
+    # Midpoints of a fine grid on [−3, 3] × [−2, 2] × [−1, 1]: E x² = a²/3, E x⁴ = a⁴/5, odd moments zero.
+    axes = [(np.arange(40) + 0.5) / 20 - 1] * 3
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * [3, 2, 1]
+    turned = points @ special_ortho_group.rvs(3, random_state=0) + 7
+    half = {0: np.ones(3), 2: np.array([9, 4, 1]) / 3, 4: np.array([81, 16, 1]) / 5}
+    radius = np.sqrt(half[2].sum())
+    for value, (p, q, r) in zip(moments(turned, 4), exponents(4), strict=True):
+        odd = p % 2 or q % 2 or r % 2
+        expected = 0 if odd else half[p][0] * half[q][1] * half[r][2] / radius ** (p + q + r - 1)
+        assert value == pytest.approx(expected, rel=3e-3, abs=1e-9)
+
+
+def test_exponents_are_complete() -> None:
+    every = {e for e in product(range(5), repeat=3) if 2 <= sum(e) <= 4} - {(1, 1, 0), (1, 0, 1), (0, 1, 1)}
+    assert {tuple(e) for e in exponents(4).tolist()} == every
+    assert len(exponents(4)) == len(every)
+
+
+def test_distances_ignore_reflections_but_not_their_mixture() -> None:
+    descriptor = CanonicalForm()
+    powers = exponents(4)
+    form = np.random.default_rng(0).gamma(2.0, size=(60, 3)) * [3, 2, 1]
+    described = moments(form, 4).astype(np.float32)
+    for flips in product((1, -1), repeat=3):
+        reflected = (described * np.prod(np.array(flips) ** powers, axis=1)).astype(np.float32)
+        assert distance(described, reflected, descriptor) == 0
+    # Changing one sign alone is no reflection.
+    changed = described.copy()
+    changed[np.flatnonzero((powers == [3, 0, 0]).all(axis=1))] *= -1
+    assert distance(described, changed, descriptor) > 0.1
+    # The least over the reflections, by a loop.
+    other = moments(np.random.default_rng(1).gamma(2.0, size=(60, 3)), 4).astype(np.float32)
+    loop = min(
+        np.linalg.norm(described * np.prod(np.array(flips) ** powers, axis=1) - other)
+        for flips in product((1, -1), repeat=3)
+    )
+    assert distance(described, other, descriptor) == pytest.approx(loop, rel=1e-6)
+    assert distance(other, described, descriptor) == pytest.approx(loop, rel=1e-6)
+
+
+@pytest.mark.parametrize("scaling", ["least squares", "classical"])
+def test_motion_reflection_and_scale(blob: Mesh, scaling: str) -> None:
+    descriptor = CanonicalForm(scaling=scaling)  # type: ignore[arg-type]
+    turn = special_ortho_group.rvs(3, random_state=1) * 2.5
+    moved = Mesh(blob.vertices @ turn + 3, blob.faces)
+    mirrored = Mesh(blob.vertices * [1, -1, 1], blob.faces[:, ::-1])
+    described = descriptor.describe_body(of_mesh(blob))
+    for mesh in (moved, mirrored):
+        assert distance(described, descriptor.describe_body(of_mesh(mesh)), descriptor) < 1e-5 * np.linalg.norm(
+            described
+        )
+
+
+def test_scaling_is_chosen(blob: Mesh) -> None:
+    distances = farthest_points(blob, 200).mutual / np.sqrt(blob.area)
+    expected = moments(classical_scaling(distances), 4)
+    classical, least_squares = (
+        CanonicalForm(scaling=scaling).describe_body(of_mesh(blob))  # type: ignore[arg-type]
+        for scaling in ("classical", "least squares")
+    )
+    np.testing.assert_allclose(classical, expected, rtol=1e-5)
+    assert not np.allclose(least_squares, expected, rtol=1e-2)
+
+
+def test_parameters_are_checked(blob: Mesh) -> None:
+    with pytest.raises(ValueError, match="scaling"):
+        CanonicalForm(scaling="none")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="max_order"):
+        CanonicalForm(max_order=1)
+    for n_samples in (3, 1001):
+        with pytest.raises(ValueError, match="n_samples"):
+            CanonicalForm(n_samples=n_samples)
+    with pytest.raises(ValueError, match="642"):
+        CanonicalForm(n_samples=700).describe_body(of_mesh(blob))

@@ -1,0 +1,183 @@
+"""What all descriptors of the library promise, shown on a rod, the same rod changed, and another body."""
+
+from __future__ import annotations
+
+import pickle
+import re
+from collections.abc import Callable
+from functools import cache, reduce
+from operator import or_
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+import igps
+from igps.data.batch import Body, SignatureBatch, collate
+from igps.descriptors import NAMES, descriptor
+from igps.geometry.mesh import Mesh
+from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
+from igps.nn.needs import Needs
+
+ROTATION = trimesh.transformations.euler_matrix(0.4, 1.1, -0.7)[:3, :3]
+CHANGES = [(name, change) for name in NAMES for change in descriptor(name).invariant_to]
+
+
+def rod() -> NDArray[np.float64]:
+    """Vertices of a rod along x, thicker at one end: the faces are those of `unit_sphere`."""
+    x, y, z = unit_sphere().vertices.T
+    radius = 0.25 + 0.06 * x
+    ring = np.maximum(np.hypot(y, z), 1e-12)
+    # Caps as on a capsule, a tube between them.
+    profile = np.sqrt(np.clip(1 - np.abs(x) ** 6, 0, 1))
+    return np.stack([1.6 * np.sign(x) * np.abs(x) ** 1.2, radius * profile * y / ring, radius * profile * z / ring], 1)
+
+
+@cache
+def unit_sphere() -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(subdivisions=4)
+
+
+def bent(vertices: NDArray[np.float64], angle: float = 1.6) -> NDArray[np.float64]:
+    """Bent around an arc that keeps the lengths along the axis."""
+    x, y, z = vertices.T
+    radius = 2 * 1.6 / angle
+    return np.stack([(radius + y) * np.sin(x / radius), (radius + y) * np.cos(x / radius), z], 1)
+
+
+def disc(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    return unit_sphere().vertices * [1.0, 0.8, 0.3]
+
+
+@cache
+def body(kind: str) -> SignatureBatch:
+    """A rod; the same moved, scaled and bent; and another body, with all that any descriptor needs."""
+    change: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+        "rod": lambda v: v,
+        "motion": lambda v: (v * [1, 1, -1]) @ ROTATION.T + [3.0, -2.0, 5.0],
+        "scale": lambda v: 7.3 * v,
+        "pose": bent,
+        "other": disc,
+    }
+    # Mesh turns what a reflection has turned inside out.
+    mesh = Mesh(change[kind](rod()), np.asarray(unit_sphere().faces), name=kind)
+    everything = reduce(or_, (descriptor(name).needs for name in NAMES), Needs())
+    config = SignatureConfig(n_eigenpairs=250, resolution=24, min_samples=400, n_surface_samples=600)
+    return collate([compute_signature(mesh, everything.completed(config))], [mesh])
+
+
+def signature(eigenvalues: NDArray[np.float64], interior: Samples, surface: Samples, of: Body) -> Signature:
+    config = SignatureConfig(n_eigenpairs=len(eigenvalues))
+    return Signature(eigenvalues, interior, surface, of.area, of.volume, config, of.id)
+
+
+@cache
+def description(name: str, kind: str) -> torch.Tensor:
+    with torch.inference_mode():
+        return descriptor(name)(body(kind))
+
+
+def test_descriptors_are_named_and_say_where_they_are_from() -> None:
+    for name in NAMES:
+        found = igps.descriptor(name)
+        assert found.name == name
+        assert re.fullmatch("[a-z][a-z0-9_]*", name), "a name is typed in a shell, and names a file"
+        assert re.search(r"(19|20)\d\d", found.source) or name == "pretrained"
+        assert set(found.invariant_to) <= {"motion", "scale", "pose"}
+        assert not found.training
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_descriptions_are_finite_numbers_of_one_shape_and_repeat(name: str) -> None:
+    first, other = description(name, "rod"), description(name, "other")
+    assert first.dtype == other.dtype == torch.float32
+    assert first.shape == other.shape
+    assert first.ndim >= 2
+    assert torch.isfinite(first).all()
+    assert torch.isfinite(other).all()
+    with torch.inference_mode():
+        again = pickle.loads(pickle.dumps(descriptor(name)))(body("rod"))
+    torch.testing.assert_close(again, first, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_padding_changes_no_description(name: str) -> None:
+    signatures, meshes = [], []
+    for batch in (body("rod"), body("other")):
+        (one,) = batch.bodies()
+        signatures.append(signature(one.eigenvalues, one.interior, one.surface, one))
+        meshes += batch.meshes or ()
+    assert len(signatures[0].interior) != len(signatures[1].interior)
+    with torch.inference_mode():
+        together = descriptor(name)(collate(signatures, meshes))
+    for row, kind in zip(together, ("rod", "other"), strict=True):
+        scale = float(description(name, kind).abs().max())
+        torch.testing.assert_close(row[None], description(name, kind), rtol=1e-4, atol=1e-5 * scale)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_distances_are_a_matrix_of_what_pairs_give(name: str) -> None:
+    distance = descriptor(name).distances
+    queries = torch.cat([description(name, kind) for kind in ("rod", "other")])
+    gallery = torch.cat([description(name, kind) for kind in ("other", "pose", "rod")])
+    matrix = distance(queries, gallery)
+    assert matrix.shape == (2, 3)
+    assert (matrix >= 0).all()
+    scale = float(matrix.max())
+    assert scale > 0
+    assert abs(float(matrix[0, 2])) < 1e-3 * scale
+    assert abs(float(matrix[1, 0])) < 1e-3 * scale
+    for i in range(2):
+        for j in range(3):
+            pair = distance(queries[i : i + 1], gallery[j : j + 1])
+            torch.testing.assert_close(pair, matrix[i : i + 1, j : j + 1], rtol=1e-4, atol=1e-5 * scale)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_bent_body_is_closer_than_another(name: str) -> None:
+    distance = descriptor(name).distances
+    bent_rod, other = (float(distance(description(name, "rod"), description(name, kind))) for kind in ("pose", "other"))
+    assert bent_rod < 0.75 * other
+
+
+@pytest.mark.parametrize(("name", "change"), CHANGES)
+def test_descriptions_stay_under_what_the_descriptor_claims(name: str, change: str) -> None:
+    distance = descriptor(name).distances
+    changed = float(distance(description(name, "rod"), description(name, change)))
+    other = float(distance(description(name, "rod"), description(name, "other")))
+    # Rounding alone may let a descriptor simplify a mesh or choose its samples otherwise.
+    assert changed < {"scale": 0.05, "motion": 0.2, "pose": 0.35}[change] * other
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if "pose" not in descriptor(name).invariant_to])
+def test_who_claims_no_pose_sees_it(name: str) -> None:
+    distance = descriptor(name).distances
+    changed = float(distance(description(name, "rod"), description(name, "pose")))
+    scaled = float(distance(description(name, "rod"), description(name, "scale")))
+    assert changed > 0.02 * float(distance(description(name, "rod"), description(name, "other")))
+    assert changed > 3 * scaled
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_batch_without_what_is_needed_is_refused(name: str) -> None:
+    found, whole = descriptor(name), body("rod")
+    (one,) = whole.bodies()
+    if found.needs.n_eigenpairs:
+        n = found.needs.n_eigenpairs - 1
+        fewer = [Samples(of.points, of.eigenfunctions[:, :n], of.attributes) for of in (one.interior, one.surface)]
+        batch = collate([signature(one.eigenvalues[:n], *fewer, one)], whole.meshes)
+        with pytest.raises(ValueError, match=f"^n_eigenpairs: .* at least {n + 1}, got {n}"):
+            found(batch)
+    if found.needs.attributes:
+        bare = [Samples(of.points, of.eigenfunctions) for of in (one.interior, one.surface)]
+        batch = collate([signature(one.eigenvalues, *bare, one)], whole.meshes)
+        with pytest.raises(
+            ValueError, match=f"^attributes: .* needs signatures with {', '.join(found.needs.attributes)}"
+        ):
+            found(batch)
+    if found.needs.mesh:
+        batch = collate([signature(one.eigenvalues, one.interior, one.surface, one)])
+        with pytest.raises(ValueError, match=r"^meshes: this descriptor needs the surfaces too"):
+            found(batch)

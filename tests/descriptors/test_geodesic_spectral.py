@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from one_body import of_mesh
+from scipy.special import eval_legendre
+from scipy.stats import special_ortho_group
+
+from conftest import as_mesh
+from igps.descriptors.geodesic_spectral import GeodesicSpectral, affinity_eigenvalues
+from igps.geometry.geodesics import geodesic_distances
+from igps.geometry.mesh import Mesh
+
+
+def sphere_eigenvalues(count: int) -> np.ndarray:
+    """Of exp(−θ²/2π²) on the sphere over its area: ½ ∫ exp(−θ²/2π²) Pₗ(cos θ) sin θ dθ, 2l + 1 times (Funk, Hecke)."""
+    nodes, weights = np.polynomial.legendre.leggauss(400)
+    angle = (nodes + 1) * np.pi / 2
+    kernel = np.exp(-(angle**2) / (2 * np.pi**2)) * np.sin(angle) * weights * np.pi / 4
+    values = [[(kernel * eval_legendre(degree, np.cos(angle))).sum()] * (2 * degree + 1) for degree in range(12)]
+    return np.sort(np.concatenate(values))[::-1][:count]
+
+
+def test_eigenvalues_of_great_circles(sphere: Mesh) -> None:
+    # Vertices of an icosphere are nearly uniform, so that the matrix is a quadrature of the integral operator.
+    points = sphere.vertices[:642]  # the vertices of the next coarser icosphere
+    distances = np.arccos(np.clip(points @ points.T, -1, 1))
+    expected = sphere_eigenvalues(16)
+    assert expected[0] > 5 * expected[1] > 0
+    assert expected[1] == pytest.approx(expected[3])
+    np.testing.assert_allclose(affinity_eigenvalues(distances, 16), expected, atol=1e-3)
+
+
+def test_description_of_the_sphere(sphere: Mesh) -> None:
+    descriptor = GeodesicSpectral(n_eigenvalues=9, n_samples=300, max_vertices=2562)
+    described = descriptor.describe_body(of_mesh(sphere))
+    assert described.shape == (9,)
+    assert described.dtype == np.float32
+    np.testing.assert_allclose(described, np.sqrt(np.abs(sphere_eigenvalues(9))), atol=0.02)
+
+
+def test_eigenvalues_of_two_and_of_equidistant_points() -> None:
+    # exp(−½) everywhere but on the diagonal: (1 + (n − 1) e^−½) / n once, (1 − e^−½) / n otherwise.
+    distances = 3.0 * (1 - np.eye(5))
+    expected = np.array([1 + 4 * np.exp(-0.5)] + [1 - np.exp(-0.5)] * 4) / 5
+    np.testing.assert_allclose(affinity_eigenvalues(distances, 5), expected)
+
+
+def test_trace_is_one(blob: Mesh) -> None:
+    descriptor = GeodesicSpectral(n_eigenvalues=60, n_samples=60)
+    described = descriptor.describe_body(of_mesh(blob)).astype(float)
+    distances = geodesic_distances(blob, np.arange(60))[:, :60]
+    assert affinity_eigenvalues(distances, 60).sum() == pytest.approx(1)
+    # The description takes absolute values; those below zero are few and small.
+    assert 1 < (described**2).sum() < 1.1
+    assert (np.diff(described[:10]) <= 0).all()
+
+
+def test_number_of_samples_matters_little(blob: Mesh) -> None:
+    few, many = (GeodesicSpectral(n_samples=n).describe_body(of_mesh(blob)) for n in (100, 400))
+    np.testing.assert_allclose(few[:4], many[:4], rtol=0.1)
+
+
+def test_motion_scale_and_bending(blob: Mesh) -> None:
+    descriptor = GeodesicSpectral()
+    described = descriptor.describe_body(of_mesh(blob))
+    turn = special_ortho_group.rvs(3, random_state=1) * 2.5
+    np.testing.assert_allclose(
+        descriptor.describe_body(of_mesh(Mesh(blob.vertices @ turn + 3, blob.faces))), described, rtol=1e-5
+    )
+    # A bent tube stays close to the straight one, and a sphere is far.
+    straight, bent = (_tube(angle) for angle in (0.0, 2.0))
+    shapes = [
+        descriptor.describe_body(of_mesh(m))
+        for m in (straight, bent, as_mesh(trimesh.creation.icosphere(subdivisions=3)))
+    ]
+    near, far = descriptor.distances(torch.from_numpy(shapes[0])[None], torch.from_numpy(np.stack(shapes[1:])))[
+        0
+    ].tolist()
+    assert 0 < near < 0.02 * far
+
+
+def _tube(angle: float) -> Mesh:
+    """A thin capsule of length 6 along z, bent by an angle."""
+    cap = np.linspace(0, np.pi / 2, 6)
+    profile = np.concatenate(
+        [
+            np.stack([0.1 * np.sin(cap), -3 - 0.1 * np.cos(cap)], axis=1),
+            np.stack([np.full(60, 0.1), np.linspace(-3, 3, 62)[1:-1]], axis=1),
+            np.stack([0.1 * np.cos(cap), 3 + 0.1 * np.sin(cap)], axis=1),
+        ]
+    )
+    surface = trimesh.creation.revolve(profile, sections=12)
+    x, y, z = surface.vertices.T
+    if angle == 0:
+        return as_mesh(surface)
+    radius, turn = 6 / angle, z * angle / 6
+    return Mesh(np.stack([(radius + x) * np.cos(turn), y, (radius + x) * np.sin(turn)], axis=1), surface.faces)
+
+
+def test_distances_are_chi_square() -> None:
+    a, b = np.array([[0.9, 0.3]], dtype=np.float32), np.array([[0.5, 0.1]], dtype=np.float32)
+    expected = (0.4**2 / 1.4 + 0.2**2 / 0.4) / 2
+    found = GeodesicSpectral(n_eigenvalues=2).distances(torch.from_numpy(a), torch.from_numpy(b)).item()
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_parameters_are_checked(blob: Mesh) -> None:
+    with pytest.raises(ValueError, match="n_eigenvalues"):
+        GeodesicSpectral(n_eigenvalues=0)
+    for n_samples in (19, 1001):
+        with pytest.raises(ValueError, match="n_samples"):
+            GeodesicSpectral(n_samples=n_samples)
+    with pytest.raises(ValueError, match="642"):
+        GeodesicSpectral(n_samples=700).describe_body(of_mesh(blob))

@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+import igl
+import numpy as np
+import pytest
+import torch
+import trimesh
+from one_body import of_mesh
+
+from conftest import as_mesh
+from igps.descriptors.local_diameter_centricity import (
+    LocalDiameterCentricity,
+    _joint_histogram,
+    centricity,
+    local_diameters,
+)
+from igps.geometry.mesh import Mesh, MeshError
+
+
+def centres(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """The centroid of every face, as its face and barycentric coordinates."""
+    return np.arange(len(mesh.faces)), np.full((len(mesh.faces), 3), 1 / 3)
+
+
+def tube(radius: float, length: float, sections: int, rings: int) -> Mesh:
+    """A closed cylinder about the z axis, with rounded ends."""
+    heights = np.linspace(-length / 2, length / 2, rings)
+    ends = radius * np.sin(np.linspace(0, np.pi / 2, 6))[1:]
+    z = np.concatenate([-length / 2 - ends[::-1], heights, length / 2 + ends])
+    beyond = np.maximum(np.abs(z) - length / 2, 0)
+    profile = np.stack([np.sqrt(np.maximum(radius**2 - beyond**2, 0)), z], axis=1)
+    profile[[0, -1], 0] = 0.0
+    return as_mesh(trimesh.creation.revolve(profile, sections=sections))
+
+
+@pytest.mark.parametrize("angle", [60.0, 120.0])
+def test_local_diameter_of_a_sphere_is_its_mean_chord(sphere: Mesh, angle: float) -> None:
+    # A chord at the angle t to the normal is 2 r cos t long; over a solid angle, cos t is uniform, so that neither the
+    # median nor the trimming moves the mean.
+    radius = 3.0
+    diameters = local_diameters(Mesh(sphere.vertices * radius, sphere.faces), *centres(sphere), 200, angle)
+    expected = radius * (1 + np.cos(np.radians(angle / 2)))
+    assert diameters.mean() == pytest.approx(expected, rel=0.004)  # the polyhedron lies within the sphere
+    assert diameters.std() < 0.004 * expected
+
+
+def test_local_diameter_of_a_long_cylinder() -> None:
+    # Chords of the infinite cylinder of radius 1, in random directions of the cone: 2 cos t / (cos²t + sin²t cos²f).
+    generator = np.random.default_rng(0)
+    cosine, azimuth = generator.uniform(0.5, 1, 200_000), generator.uniform(0, 2 * np.pi, 200_000)
+    chords = 2 * cosine / (cosine**2 + (1 - cosine**2) * np.cos(azimuth) ** 2)
+    expected = chords[np.abs(chords - np.median(chords)) <= chords.std()].mean()
+    mesh = tube(1.0, 20.0, 64, 60)
+    face, weights = centres(mesh)
+    middle = np.abs(mesh.vertices[mesh.faces].mean(axis=1)[:, 2]) < 5
+    diameters = local_diameters(mesh, face[middle], weights[middle], 400, 120.0)
+    assert diameters.mean() == pytest.approx(expected, rel=0.02)
+
+
+def test_rays_that_leave_through_a_hole_do_not_count(sphere: Mesh) -> None:
+    # The lower half of the sphere: seen from near the pole, the narrow cone leads out through the opening.
+    height = sphere.vertices[sphere.faces, 2].mean(axis=1)
+    faces = sphere.faces[np.argsort(height)][: (height < 0.3).sum()]  # the last one faces upwards, along the rays
+    used, index = np.unique(faces, return_inverse=True)
+    bowl = Mesh(sphere.vertices[used], index.reshape(-1, 3), allow_open=True)
+    height = bowl.vertices[bowl.faces].mean(axis=1)[:, 2]
+    diameters = local_diameters(bowl, *centres(bowl), 30, 20.0)
+    assert np.isnan(diameters[height < -0.95]).all()
+    np.testing.assert_allclose(diameters[np.abs(height) < 0.05], 1 + np.cos(np.radians(10)), rtol=0.02)
+
+
+def test_surface_that_no_ray_meets_again_is_refused(sphere: Mesh) -> None:
+    faces = sphere.faces[sphere.vertices[sphere.faces, 2].mean(axis=1) < -0.75]
+    used, index = np.unique(faces, return_inverse=True)
+    dish = Mesh(sphere.vertices[used], index.reshape(-1, 3), allow_open=True)
+    with pytest.raises(MeshError, match="no ray"):
+        LocalDiameterCentricity(opening_angle=10.0).describe_body(of_mesh(dish))
+
+
+def test_centricity_of_a_sphere_is_a_quarter_of_its_circumference(sphere: Mesh) -> None:
+    values = centricity(Mesh(sphere.vertices * 2, sphere.faces), 100)
+    assert values.mean() == pytest.approx(np.pi, rel=0.02)
+    assert values.std() < 0.005 * np.pi
+
+
+def test_centricity_of_a_thin_tube_rises_from_a_quarter_to_half_its_length() -> None:
+    mesh = tube(0.1, 20.0, 12, 300)
+    values, z = centricity(mesh, 200), mesh.vertices[:, 2]
+    # The mean distance from a point z of a stick of length L is L/4 + z²/L.
+    np.testing.assert_allclose(values, 5 + z**2 / 20, rtol=0.03)
+
+
+def test_sources_are_a_quadrature_of_the_whole_surface(blob: Mesh) -> None:
+    everything = np.arange(len(blob.vertices))
+    area = np.bincount(blob.faces.ravel(), np.repeat(igl.doublearea(np.array(blob.vertices), np.array(blob.faces)), 3))
+    values = centricity(blob, 60)
+    for vertex in (0, 17, 333):
+        exact = igl.exact_geodesic(np.array(blob.vertices), np.array(blob.faces), VS=np.array([vertex]), VT=everything)
+        assert values[vertex] == pytest.approx(exact @ area / area.sum(), rel=0.04)
+
+
+def test_histogram_lies_where_the_sphere_is(sphere: Mesh) -> None:
+    descriptor = LocalDiameterCentricity()
+    histogram = descriptor.describe_body(of_mesh(sphere))
+    assert histogram.dtype == np.float32
+    assert histogram.shape == (descriptor.n_diameter_bins, descriptor.n_centricity_bins)
+    assert histogram.sum() == pytest.approx(1, abs=1e-5)
+    assert histogram.min() >= 0
+    root = np.sqrt(4 * np.pi)
+    mean = histogram.sum(axis=1) @ (np.arange(32) + 0.5) / 32 * descriptor.max_diameter
+    assert mean == pytest.approx(1.5 / root, rel=0.01)
+    mean = histogram.sum(axis=0) @ (np.arange(32) + 0.5) / 32 * descriptor.max_centricity
+    assert mean == pytest.approx(np.pi / 2 / root, rel=0.02)
+
+
+def test_values_beyond_the_range_go_to_the_last_bins(sphere: Mesh) -> None:
+    histogram = LocalDiameterCentricity(max_diameter=0.1, max_centricity=0.1).describe_body(of_mesh(sphere))
+    assert histogram[-1, -1] == pytest.approx(1, abs=1e-5)
+
+
+def test_histogram_equals_a_loop_over_the_samples() -> None:
+    generator = np.random.default_rng(0)
+    first, second = generator.uniform(0, 1.3, 50), generator.uniform(0, 1.1, 50)
+    expected = np.zeros((8, 5))
+    for x, y in zip(first * 8 - 0.5, second * 5 - 0.5, strict=True):
+        for i in range(8):
+            for j in range(5):
+                row = max(0.0, 1 - abs(min(max(x, 0.0), 7.0) - i))
+                column = max(0.0, 1 - abs(min(max(y, 0.0), 4.0) - j))
+                expected[i, j] += row * column / 50
+    np.testing.assert_allclose(_joint_histogram(first, second, (8, 5)), expected, atol=1e-12)
+
+
+def test_seed_chooses_the_samples(blob: Mesh) -> None:
+    one, other = (LocalDiameterCentricity(n_samples=20, seed=seed).describe_body(of_mesh(blob)) for seed in (0, 1))
+    assert not np.allclose(one, other)
+    np.testing.assert_array_equal(LocalDiameterCentricity(n_samples=20).describe_body(of_mesh(blob)), one)
+
+
+def test_triangles_count_by_their_area() -> None:
+    # The same tapered body, with small triangles at its thin end or at its thick one.
+    rows = []
+    for power in (0.5, 2.0):
+        z = np.linspace(0, 1, 60) ** power * 6
+        radius = np.concatenate([[0], 0.3 + 0.15 * z, [0]])
+        profile = np.stack([radius, np.concatenate([z[:1], z, z[-1:]])], axis=1)
+        mesh = as_mesh(trimesh.creation.revolve(profile, sections=24))
+        rows.append(
+            LocalDiameterCentricity(n_diameter_bins=8, n_centricity_bins=2).describe_body(of_mesh(mesh)).sum(axis=1)
+        )
+    assert np.abs(rows[0] - rows[1]).sum() < 0.1
+
+
+def test_scale_and_motion_do_not_matter(blob: Mesh) -> None:
+    turn = trimesh.transformations.rotation_matrix(1.1, [1, -2, 0.5])[:3, :3]
+    moved = Mesh(blob.vertices @ turn.T * 40 + [300, -20, 7], blob.faces)
+    descriptor = LocalDiameterCentricity(n_samples=500)
+    np.testing.assert_allclose(
+        descriptor.describe_body(of_mesh(moved)), descriptor.describe_body(of_mesh(blob)), atol=1e-4
+    )
+
+
+def test_bending_matters_less_than_thickness() -> None:
+    straight = tube(0.5, 12.0, 24, 80)
+    x, y, z = straight.vertices.T
+    bent = Mesh(np.stack([8 - (8 - x) * np.cos(z / 8), y, (8 - x) * np.sin(z / 8)], axis=1), straight.faces)
+    thicker = tube(0.8, 12.0, 24, 80)
+    descriptor = LocalDiameterCentricity()
+    rows = torch.from_numpy(np.stack([descriptor.describe_body(of_mesh(mesh)) for mesh in (straight, bent, thicker)]))
+    distance = descriptor.distances(rows[:1], rows)[0]
+    assert distance[0] == 0
+    assert distance[1] < 0.5 * distance[2]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("n_diameter_bins", 1),
+        ("n_centricity_bins", 1),
+        ("n_samples", 0),
+        ("n_rays", 0),
+        ("n_sources", 0),
+        ("max_diameter", 0.0),
+        ("max_centricity", -1.0),
+        ("opening_angle", 180.0),
+    ],
+)
+def test_bad_parameters_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        LocalDiameterCentricity(**{name: value})  # type: ignore[arg-type]

@@ -1,0 +1,124 @@
+"""Descriptors by name, by import path, and as objects; and what they need of signatures."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import igps
+from igps.descriptors import NAMES
+from igps.descriptors.d2 import D2
+from igps.geometry.signature import SignatureConfig
+from igps.nn.needs import Needs
+
+THIRTEEN = (
+    "interior", "gps", "multiscale", "rich", "pretrained", "d2", "shape_dna", "volume_shape_dna",
+    "local_diameter_centricity", "inner_distance", "canonical_form", "geodesic_spectral", "spectral_gw",
+)  # fmt: skip
+
+OWN = """
+import numpy as np
+
+import igps
+from igps.descriptors.d2 import D2
+
+
+class Roundness(igps.BodyDescriptor):
+    name = "roundness"
+
+    def describe_body(self, body):
+        return np.array([body.volume / body.area**1.5])
+
+    def distances(self, queries, gallery):
+        return (queries - gallery.T).abs()
+
+
+def coarse():
+    return D2(n_bins=8)
+
+
+ready = D2(n_bins=16)
+number = 5
+
+
+def nothing():
+    return None
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A package with a module of one's own on the Python path."""
+    package = f"mine_{tmp_path.name}"
+    (tmp_path / package).mkdir()
+    (tmp_path / package / "__init__.py").write_text("")
+    (tmp_path / package / "shapes.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    return f"{package}.shapes"
+
+
+def test_names_are_the_thirteen() -> None:
+    assert NAMES == THIRTEEN
+
+
+def test_a_wrong_name_lists_all() -> None:
+    with pytest.raises(ValueError, match=f"^descriptor: expected one of {', '.join(THIRTEEN)}, or .*, got 'best'"):
+        igps.descriptor("best")
+
+
+def test_an_object_is_itself() -> None:
+    mine = D2(n_bins=3)
+    assert igps.descriptor(mine) is mine
+
+
+def test_own_class_function_and_object_by_import_path(own: str, blob: igps.Mesh) -> None:
+    config = SignatureConfig(n_eigenpairs=5, resolution=6, min_samples=0, n_surface_samples=50)
+    batch = igps.collate([igps.compute_signature(blob, config)])
+    made = {name: igps.descriptor(f"{own}:{name}") for name in ("Roundness", "coarse", "ready")}
+    assert all(isinstance(one, igps.Descriptor) and not one.training for one in made.values())
+    assert made["Roundness"].name == "roundness"
+    assert made["Roundness"](batch).item() == pytest.approx(blob.volume / blob.area**1.5)
+    torch.testing.assert_close(made["coarse"](batch), D2(n_bins=8)(batch))
+    torch.testing.assert_close(made["ready"](batch), D2(n_bins=16)(batch))
+    assert igps.descriptor(f"{own}:ready") is made["ready"]
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("no.such.module:NAME", "expected package.module:NAME to be importable, got 'no.such.module:NAME'"),
+        ("OWN:missing", "to be importable, .*missing"),
+        ("OWN:number", "number to be or to make an igps.Descriptor, got int"),
+        ("OWN:nothing", "nothing to be or to make an igps.Descriptor, got NoneType"),
+    ],
+)
+def test_what_is_no_descriptor_is_refused(own: str, path: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        igps.descriptor(path.replace("OWN", own))
+
+
+def test_what_a_descriptor_needs_is_added_or_asked_for() -> None:
+    config = SignatureConfig(n_eigenpairs=50, attributes=("electrostatic_potential",))
+    assert igps.descriptor("rich").needs.completed(config) == replace(
+        config, attributes=("electrostatic_potential", "depth", "surface_direction")
+    )
+    assert igps.descriptor("d2").needs.completed(config) == config
+    for name, least in {"pretrained": 50, "rich": 50, "interior": 250, "gps": 250, "multiscale": 250}.items():
+        needs = igps.descriptor(name).needs
+        assert needs.n_eigenpairs == least
+        needs.completed(SignatureConfig(n_eigenpairs=least))
+        message = re.escape(f"n_eigenpairs: this descriptor needs signatures of at least {least}, got {least - 1}")
+        with pytest.raises(ValueError, match=message):
+            needs.completed(SignatureConfig(n_eigenpairs=least - 1))
+
+
+def test_needs_together_are_the_most_of_each() -> None:
+    one = Needs(n_eigenpairs=5, attributes=("depth",))
+    other = Needs(n_eigenpairs=3, attributes=("surface_direction", "depth"), mesh=True)
+    assert one | other == Needs(5, ("depth", "surface_direction"), mesh=True)
+    with pytest.raises(ValueError, match=r"^attributes: .* needs signatures with surface_direction, depth, got \[\]"):
+        other.check_config(SignatureConfig(n_eigenpairs=5))

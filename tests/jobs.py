@@ -1,0 +1,52 @@
+"""Jobs for other processes: functions that a worker can import."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import time
+from pathlib import Path
+
+
+def square(x: int) -> int:
+    if x < 0:
+        raise ValueError(f"x: expected a natural number, got {x}.")
+    if x == 13:
+        raise KeyError("thirteen")
+    return x * x
+
+
+def die_at_zero(x: int) -> int:
+    if x == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return x
+
+
+def die_once(marker: Path) -> str:
+    """Die if the file is missing, and leave it."""
+    if not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return marker.name
+
+
+def sleep(seconds: float) -> float:
+    time.sleep(seconds)
+    return seconds
+
+
+def allocate(n_bytes: int) -> int:
+    return len(bytearray(n_bytes))
+
+
+def fail_with(number: int) -> int:
+    """Raise the system's error of a number; a MemoryError for 0."""
+    if number == 0:
+        raise MemoryError
+    raise OSError(number, errno.errorcode[number])
+
+
+def process(_: int) -> tuple[int, str | None]:
+    """Which process this is, and how many threads it was told to take."""
+    return os.getpid(), os.environ.get("OMP_NUM_THREADS")

@@ -1,0 +1,118 @@
+"""Batches of made-up bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from igps.data.batch import SampleBatch, SignatureBatch
+
+N_POINTS = (40, 25)
+N_EIGENPAIRS = (12, 7)
+
+
+def two_bodies() -> SignatureBatch:
+    """Two shapes of different numbers of samples and eigenpairs."""
+    generator = torch.Generator().manual_seed(11)
+    eigenvalues = torch.rand(2, 12, generator=generator, dtype=torch.float64).cumsum(dim=1) * 10 + 5
+    eigenvalues[1, 7:] = torch.inf
+    return SignatureBatch(
+        eigenvalues=eigenvalues,
+        interior=_samples(generator),
+        surface=_samples(generator),
+        area=torch.tensor([2.0, 3.0], dtype=torch.float64),
+        volume=torch.tensor([0.2, 0.3], dtype=torch.float64),
+        labels=torch.tensor([0, 1]),
+        ids=("a", "b"),
+    )
+
+
+def _samples(generator: torch.Generator) -> SampleBatch:
+    longest = max(N_POINTS)
+    mask = torch.arange(longest) < torch.tensor(N_POINTS)[:, None]
+    functions = torch.randn(2, longest, max(N_EIGENPAIRS), generator=generator) * mask[:, :, None]
+    for i, n in enumerate(N_EIGENPAIRS):
+        functions[i, :, n:] = 0
+    points = torch.rand(2, longest, 3, generator=generator) * mask[:, :, None]
+    attributes = {
+        "depth": torch.rand(2, longest, generator=generator) * mask,
+        "surface_direction": normalize(torch.randn(2, longest, 3, generator=generator), dim=2) * mask[:, :, None],
+    }
+    return SampleBatch(points, functions, mask, attributes)
+
+
+def alone(batch: SignatureBatch, i: int) -> SignatureBatch:
+    """One shape without its padding."""
+
+    def unpadded(samples: SampleBatch) -> SampleBatch:
+        n_points, n_eigenpairs = int(samples.mask[i].sum()), int(torch.isfinite(batch.eigenvalues[i]).sum())
+        return SampleBatch(
+            samples.points[i : i + 1, :n_points],
+            samples.eigenfunctions[i : i + 1, :n_points, :n_eigenpairs],
+            samples.mask[i : i + 1, :n_points],
+            {name: values[i : i + 1, :n_points] for name, values in samples.attributes.items()},
+        )
+
+    return replace(
+        batch,
+        eigenvalues=batch.eigenvalues[i : i + 1, torch.isfinite(batch.eigenvalues[i])],
+        interior=unpadded(batch.interior),
+        surface=unpadded(batch.surface),
+        area=batch.area[i : i + 1],
+        volume=batch.volume[i : i + 1],
+        labels=batch.labels[i : i + 1],
+        ids=batch.ids[i : i + 1],
+    )
+
+
+def scaled(batch: SignatureBatch, scale: float) -> SignatureBatch:
+    """The same shapes, larger."""
+
+    def grown(samples: SampleBatch) -> SampleBatch:
+        return replace(samples, points=samples.points * scale, eigenfunctions=samples.eigenfunctions / scale)
+
+    return replace(
+        batch,
+        eigenvalues=batch.eigenvalues / scale**2,
+        interior=grown(batch.interior),
+        surface=grown(batch.surface),
+        area=batch.area * scale**2,
+        volume=batch.volume * scale**3,
+    )
+
+
+def embedded(batch: SignatureBatch, i: int, kind: str = "interior", n_eigenpairs: int | None = None) -> Tensor:
+    """(P, K) commute time embedding of one shape's samples, φₖ/√λₖ, float64, by its definition."""
+    samples: SampleBatch = getattr(batch, kind)
+    eigenvalues = batch.eigenvalues[i, torch.isfinite(batch.eigenvalues[i])][:n_eigenpairs]
+    return samples.eigenfunctions[i, samples.mask[i], : len(eigenvalues)].double() / eigenvalues.sqrt()
+
+
+def batch_of(
+    embedding: Tensor,
+    mask: Tensor | None = None,
+    points: Tensor | None = None,
+    attributes: Mapping[str, Tensor] | None = None,
+) -> SignatureBatch:
+    """Shapes whose commute time embedding, (N, P, D), is the given one: their eigenvalues are 1, and their areas.
+
+    All that is given is as it is, gradients and padding included; the surface samples are the interior ones.
+    """
+    n_shapes, n_points, dimension = embedding.shape
+    mask = torch.ones(n_shapes, n_points, dtype=torch.bool, device=embedding.device) if mask is None else mask
+    samples = SampleBatch(torch.zeros_like(embedding[..., :3]) if points is None else points, embedding, mask,
+                          attributes or {})  # fmt: skip
+    ones = torch.ones(n_shapes, dtype=torch.float64, device=embedding.device)
+    return SignatureBatch(
+        eigenvalues=ones[:, None].expand(-1, dimension),
+        interior=samples,
+        surface=samples,
+        area=ones,
+        volume=ones,
+        labels=torch.full((n_shapes,), -1),
+        ids=tuple(map(str, range(n_shapes))),
+    )

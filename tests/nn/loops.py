@@ -1,0 +1,83 @@
+"""Histograms by their definition: one pair of points, one dimension at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import reduce
+from itertools import combinations_with_replacement
+
+import numpy as np
+from torch import Tensor
+
+Axis = tuple[np.ndarray, Sequence[float]]
+
+
+def hat(value: float, centres: Sequence[float]) -> list[float]:
+    """The linear kernel of one value, one centre at a time."""
+    shares = [0.0] * len(centres)
+    if value <= centres[0]:
+        shares[0] = 1.0
+    elif value >= centres[-1]:
+        shares[-1] = 1.0
+    else:
+        upper = next(k for k, centre in enumerate(centres) if centre > value)
+        shares[upper] = (value - centres[upper - 1]) / (centres[upper] - centres[upper - 1])
+        shares[upper - 1] = 1 - shares[upper]
+    return shares
+
+
+def equal_bins(n: int, reach: float) -> list[float]:
+    """Middles of n equal intervals of [0, reach]."""
+    return [(k + 0.5) * reach / n for k in range(n)]
+
+
+def hard_classes(values: Tensor | np.ndarray, edges: Sequence[float]) -> np.ndarray:
+    """(P, C) one-hot rows: how many of the edges between classes a value has reached."""
+    return np.array([np.eye(len(edges) + 1)[sum(float(value) >= edge for edge in edges)] for value in values])
+
+
+def soft_classes(values: Tensor | np.ndarray, centres: Sequence[float]) -> np.ndarray:
+    """(P, C) hats."""
+    return np.array([hat(float(value), centres) for value in values])
+
+
+def product(*classes: np.ndarray) -> np.ndarray:
+    """(P, C₁·C₂…) combinations, the first changing slowest."""
+    return np.array([reduce(np.kron, rows) for rows in zip(*classes, strict=True)])
+
+
+def distances(points: Tensor) -> np.ndarray:
+    """(P, P)."""
+    rows = points.tolist()
+    return np.array([[math.dist(p, q) for q in rows] for p in rows])
+
+
+def cosines(points: Tensor, directions: Tensor) -> list[np.ndarray]:
+    """The three cosines of each pair of oriented points (Wahl et al. 2003), each (P, P)."""
+    p, n = points.double().numpy(), directions.double().numpy()
+    features = np.zeros((3, len(p), len(p)))
+    for i in range(len(p)):
+        for j in range(len(p)):
+            if i != j:
+                line = (p[j] - p[i]) / math.dist(p[i], p[j])
+                ends = (float(n[i] @ line), -float(n[j] @ line))
+                features[:, i, j] = max(ends), min(ends), n[i] @ n[j]
+    return list(features)
+
+
+def pair_histogram_by_loops(memberships: np.ndarray | Tensor, axes: Sequence[Axis]) -> np.ndarray:
+    """(C(C+1)/2, B, ...) of memberships (P, C) and, for each dimension, values (P, P) of the pairs and centres (B,)."""
+    m = np.asarray(memberships, dtype=float)
+    rows = list(combinations_with_replacement(range(m.shape[1]), 2))
+    histogram = np.zeros((len(rows), *(len(centres) for _, centres in axes)))
+    n_pairs = 0
+    for i in range(len(m)):
+        for j in range(i):
+            share = reduce(np.multiply.outer, [np.array(hat(values[i, j], centres)) for values, centres in axes])
+            for row, (a, b) in enumerate(rows):
+                weight = m[i, a] * m[j, b] + (m[i, b] * m[j, a] if a != b else 0)
+                if weight:
+                    histogram[row] += weight * share
+            n_pairs += 1
+    return histogram / n_pairs

@@ -1,0 +1,200 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from numpy.typing import NDArray
+from torch import Tensor
+
+import jobs
+from igps.data.batch import Body, SignatureBatch
+from igps.data.dataset import SignatureDataset
+from igps.geometry.mesh import MeshError
+from igps.geometry.signature import SignatureConfig
+from igps.nn.axes import InteriorDistance, Potential
+from igps.nn.description import (
+    Description,
+    describe,
+    describe_each,
+    describe_usable,
+    evaluation_mode,
+    one_thread,
+)
+from igps.nn.descriptor import BodyDescriptor, HistogramDescriptor
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histogram import PairHistogram
+from igps.nn.needs import Needs
+
+CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface_samples=20)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataset:
+    root = tmp_path_factory.mktemp("described")
+    for i in range(4):
+        body = trimesh.creation.icosphere(subdivisions=2)
+        body.vertices *= [1.0, 1.0 + 0.2 * i, 1.5]
+        body.export(root / f"{i}.off")
+    return SignatureDataset(sorted(root.glob("*.off")), CONFIG, root / "cache")
+
+
+def histogram(n_eigenpairs: int = 12) -> HistogramDescriptor:
+    axes = [Potential(2), InteriorDistance(8)]
+    return HistogramDescriptor(PairHistogram(axes, SpectralEmbedding(n_eigenpairs=n_eigenpairs)))
+
+
+class Area(BodyDescriptor):
+    """The area as the mesh has it, and of one body none."""
+
+    name = "area"
+    needs = Needs(mesh=True)
+
+    def __init__(self, refused: str = "none", dies: bool = False) -> None:
+        super().__init__()
+        self.refused = refused
+        self.dies = dies
+
+    def describe_body(self, body: Body) -> NDArray[np.float32]:
+        if body.id.endswith(self.refused):
+            if self.dies:
+                jobs.die_at_zero(0)
+            raise ValueError("it is not to my liking")
+        return np.array([body.mesh.area, body.area], dtype=np.float32)
+
+
+@pytest.mark.parametrize(("batch_size", "n_workers"), [(1, 1), (3, 1), (1, 3)])
+def test_describe_is_the_descriptor_of_each_batch(dataset: SignatureDataset, batch_size: int, n_workers: int) -> None:
+    descriptor = histogram()
+    expected = torch.cat([descriptor(dataset.batch([i])) for i in range(4)])
+    threads = torch.get_num_threads()
+    found = describe(dataset, descriptor, batch_size=batch_size, n_workers=n_workers)
+    torch.testing.assert_close(found, expected, atol=1e-7, rtol=0)
+    assert torch.get_num_threads() == threads
+    usable, failures = describe_usable(dataset, descriptor, n_workers=n_workers)
+    torch.testing.assert_close(usable, expected, atol=1e-7, rtol=0)
+    assert failures == []
+
+
+def test_meshes_come_to_descriptors_that_need_them(dataset: SignatureDataset) -> None:
+    expected = [[dataset.mesh(i).area, dataset[i].signature.area] for i in range(4)]
+    np.testing.assert_allclose(describe(dataset, Area(), n_workers=1), expected, rtol=1e-6)
+
+
+def test_any_module_describes_in_evaluation_mode_and_keeps_its_modes(dataset: SignatureDataset) -> None:
+    modes: list[bool] = []
+
+    class Looking(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.frozen, self.trained = torch.nn.Dropout().eval(), torch.nn.Dropout()
+
+        def forward(self, batch: SignatureBatch) -> Tensor:
+            modes.extend(one.training for one in self.modules())
+            assert not torch.is_grad_enabled()
+            return self.trained(torch.ones(len(batch), 50))
+
+    module = Looking()
+    assert torch.equal(describe(dataset, module, batch_size=2, n_workers=2), torch.ones(4, 50))
+    assert modes == [False] * 6
+    assert (module.training, module.frozen.training, module.trained.training) == (True, False, True)
+
+
+def test_modes_are_put_back_after_an_error() -> None:
+    module = torch.nn.Sequential(torch.nn.Dropout(), torch.nn.Dropout().eval())
+
+    def fail() -> None:
+        with evaluation_mode(module):
+            assert not any(one.training for one in module.modules())
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert [one.training for one in module.modules()] == [True, True, False]
+
+
+def test_training_subsets_are_for_training_alone(dataset: SignatureDataset) -> None:
+    drawn = HistogramDescriptor(PairHistogram(["interior_distance"], n_training_samples=5)).train()
+    torch.testing.assert_close(
+        describe(dataset, drawn), describe(dataset, HistogramDescriptor(PairHistogram(["interior_distance"])))
+    )
+
+
+def test_one_thread_is_put_back() -> None:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with one_thread():
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("function", [describe, describe_usable])
+def test_a_descriptor_that_needs_more_refuses(dataset: SignatureDataset, function) -> None:  # type: ignore[no-untyped-def]
+    """Before anything is computed, and names what is missing."""
+    with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 13, got 12"):
+        function(dataset, histogram(13))
+    cosines = HistogramDescriptor(PairHistogram(["pair_cosines"]))
+    with pytest.raises(ValueError, match=r"attributes: this descriptor needs signatures with surface_direction, got "):
+        function(dataset, cosines)
+
+
+def test_what_cannot_be_described_is_listed(dataset: SignatureDataset) -> None:
+    area = Area(refused="2.off")
+    values, failures = describe_usable(dataset, area, n_workers=1)
+    np.testing.assert_allclose(values[:, 1], [dataset[i].signature.area for i in (0, 1, 3)], rtol=1e-6)
+    (failure,) = failures
+    assert failure.path == dataset.files.paths[2]
+    assert failure.error == f"{failure.path}: it is not to my liking"
+    with pytest.raises(MeshError, match=re.escape(failure.error)):
+        describe_usable(dataset, area, n_workers=1, strict=True)
+    with pytest.raises(MeshError, match=re.escape(failure.error)):
+        describe(dataset, area, n_workers=1)
+    with pytest.raises(MeshError, match="it is not to my liking"):
+        describe_usable(dataset, Area(refused=".off"), n_workers=1)
+
+
+def test_a_mesh_that_cannot_be_read_is_listed(dataset: SignatureDataset, tmp_path: Path) -> None:
+    (tmp_path / "bad.off").write_text("nothing")
+    paths = [dataset.files.paths[0], tmp_path / "bad.off"]
+    both = SignatureDataset(paths, CONFIG, tmp_path / "cache")
+    values, failures = describe_usable(both, histogram(), n_workers=1)
+    assert values.shape == (1, 3, 8)
+    assert [failure.path for failure in failures] == [tmp_path / "bad.off"]
+    with pytest.raises(MeshError, match=r"bad\.off"):
+        describe(both, histogram(), n_workers=1)
+
+
+def test_a_body_that_kills_its_process_costs_no_other_its_description(dataset: SignatureDataset) -> None:
+    values, failures = describe_usable(dataset, Area(refused="1.off", dies=True), n_workers=2)
+    np.testing.assert_allclose(values[:, 1], [dataset[i].signature.area for i in (0, 2, 3)], rtol=1e-6)
+    assert [failure.path for failure in failures] == [dataset.files.paths[1]]
+    assert "was killed, twice" in failures[0].error
+
+
+def test_several_descriptors_at_once(dataset: SignatureDataset) -> None:
+    work = [(one, dataset, i) for one in (histogram(), Area()) for i in (3, 0)]
+    found = dict(describe_each(work, n_workers=1))
+    assert sorted(found) == [0, 1, 2, 3]
+    for number, (descriptor, _, i) in enumerate(work):
+        description = found[number]
+        assert isinstance(description, Description)
+        assert description.seconds >= 0
+        expected = descriptor(dataset.batch([i], meshes=True))[0]
+        np.testing.assert_allclose(description.values, expected, atol=1e-6)
+    assert all(one.training for descriptor, *_ in work for one in descriptor.modules())
+
+
+def test_descriptions_that_are_not_finite_are_failures(dataset: SignatureDataset) -> None:
+    class Broken(Area):
+        def describe_body(self, body: Body) -> NDArray[np.float32]:
+            return np.array([np.nan if body.id.endswith("0.off") else 1.0], dtype=np.float32)
+
+    values, failures = describe_usable(dataset, Broken(), n_workers=1)
+    assert values.shape == (3, 1)
+    assert "0.off: the description has entries that are not finite" in failures[0].error

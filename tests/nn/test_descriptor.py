@@ -1,0 +1,282 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from batches import alone, scaled, two_bodies
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from igps.data.batch import Body, SignatureBatch
+from igps.nn.axes import (
+    Attribute,
+    EmbeddedPairCosines,
+    EuclideanDistance,
+    InteriorDistance,
+    PairCosines,
+    Potential,
+)
+from igps.nn.descriptor import BodyDescriptor, Descriptor, EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.fitted import WhitenedHead
+from igps.nn.histogram import PairHistogram
+from igps.nn.needs import Needs
+from igps.retrieval import chi_square, cosine
+
+
+@pytest.fixture(scope="module")
+def batch() -> SignatureBatch:
+    return two_bodies()
+
+
+def paper() -> HistogramDescriptor:
+    return HistogramDescriptor(PairHistogram())
+
+
+def learned() -> HistogramDescriptor:
+    axes = [Potential(3, learnable=True), Attribute("depth", [0.2, 0.5, 0.9], learnable=True)]
+    distances = [InteriorDistance(8, learnable=True), EuclideanDistance(4, learnable=True)]
+    return HistogramDescriptor(PairHistogram([*axes, *distances], SpectralEmbedding(n_knots=8)))
+
+
+def oriented(*, in_embedding: bool = False, learnable: bool = False) -> HistogramDescriptor:
+    angles = EmbeddedPairCosines if in_embedding else PairCosines
+    axes = [InteriorDistance(4, 3.0, learnable=learnable), angles(3, learnable=learnable)]
+    return HistogramDescriptor(PairHistogram(axes, SpectralEmbedding(n_knots=6 if learnable else 0)))
+
+
+def combined() -> HistogramDescriptor:
+    """Every kind of part."""
+    fine, coarse = (SpectralEmbedding(n_eigenpairs=n) for n in (5, 2))
+    two_scales = PairHistogram([Potential(2), InteriorDistance(6), InteriorDistance(4, 1.0, embedding=coarse)], fine)
+    surface = PairHistogram([EuclideanDistance(6), PairCosines(5)], samples="surface")
+    nested = [*learned().histograms, *paper().histograms]
+    return HistogramDescriptor(
+        [nested, two_scales, *oriented().histograms, *oriented(in_embedding=True).histograms, surface]  # type: ignore[list-item]
+    )
+
+
+MAKERS = [paper, learned, oriented, lambda: oriented(in_embedding=True), combined]
+
+
+@pytest.mark.parametrize("make", MAKERS)
+def test_padding_never_shows(batch: SignatureBatch, make: Callable[[], Descriptor]) -> None:
+    descriptor = make()
+    with torch.no_grad():
+        together = descriptor(batch)
+        for i in range(2):
+            torch.testing.assert_close(descriptor(alone(batch, i))[0], together[i], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("make", MAKERS)
+def test_does_not_change_with_scale(batch: SignatureBatch, make: Callable[[], Descriptor]) -> None:
+    descriptor = make()
+    with torch.no_grad():
+        torch.testing.assert_close(descriptor(scaled(batch, 8.0)), descriptor(batch), rtol=0, atol=1e-6)
+
+
+def test_everything_learns(batch: SignatureBatch) -> None:
+    descriptor = learned()
+    result = descriptor(batch)
+    assert result.shape == (2, 45, 8, 4)
+    np.testing.assert_allclose(result.detach().sum(dim=(1, 2, 3)), 1, atol=1e-6)
+    (result[0] - result[1]).square().sum().backward()
+    parameters = dict(descriptor.named_parameters())
+    assert set(parameters) == {
+        "histograms.0.embedding.log_gain",
+        *(f"histograms.0.axes.{i}.centres.log_gap" for i in range(4)),
+    }
+    check_gradients(parameters)
+
+
+@pytest.mark.parametrize("in_embedding", [False, True])
+def test_cosines_and_their_filter_learn(batch: SignatureBatch, in_embedding: bool) -> None:
+    descriptor = oriented(in_embedding=in_embedding, learnable=True)
+    result = descriptor(batch)
+    (result[0] - result[1]).square().sum().backward()
+    parameters = dict(descriptor.named_parameters())
+    assert len(parameters) == 4
+    check_gradients(parameters)
+
+
+def check_gradients(parameters: dict[str, nn.Parameter]) -> None:
+    for name, parameter in parameters.items():
+        assert parameter.grad is not None, name
+        assert torch.isfinite(parameter.grad).all(), name
+        assert (parameter.grad != 0).any(), name
+
+
+def gradients(module: nn.Module, batch: SignatureBatch, parameters: list[nn.Parameter]) -> tuple[Tensor, ...]:
+    result = module(batch)
+    return result.detach(), *torch.autograd.grad(result.square().sum(), parameters)
+
+
+def test_compiled_equals_eager(batch: SignatureBatch) -> None:
+    descriptor = learned()
+    parameters = list(descriptor.parameters())
+    torch.compiler.reset()
+    compiled = torch.compile(descriptor, backend="aot_eager")
+    torch.testing.assert_close(
+        gradients(compiled, batch, parameters), gradients(descriptor, batch, parameters), rtol=1e-4, atol=1e-7
+    )
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_cuda_equals_cpu(batch: SignatureBatch) -> None:
+    descriptor = learned()
+    expected = gradients(descriptor, batch, list(descriptor.parameters()))
+    descriptor.cuda()
+    result = gradients(descriptor, batch.to("cuda"), list(descriptor.parameters()))
+    torch.testing.assert_close([value.cpu() for value in result], list(expected), rtol=1e-3, atol=1e-6)
+
+
+def test_cells_are_counted_by_part(batch: SignatureBatch) -> None:
+    descriptor = combined()
+    assert descriptor(batch).shape == (2, sum(descriptor.part_cells))
+    assert descriptor.part_cells == (45 * 8 * 4 + 10 * 64, 3 * 6 * 4, 4 * 27, 4 * 27, 6 * 125)
+    assert [len(part) for part in descriptor.parts] == [2, 1, 1, 1, 1]
+    assert paper().part_cells == (640,)
+
+
+def test_a_single_histogram_keeps_its_shape_and_a_list_of_one_is_flat(batch: SignatureBatch) -> None:
+    histogram = PairHistogram()
+    single, listed = HistogramDescriptor(histogram)(batch), HistogramDescriptor([histogram])(batch)
+    assert torch.equal(single, histogram(batch))
+    assert torch.equal(listed, single.flatten(1))
+
+
+def small(n_eigenpairs: int, n_classes: int, **options: int) -> PairHistogram:
+    axes = [Potential(n_classes), InteriorDistance(16)]
+    return PairHistogram(axes, SpectralEmbedding(n_eigenpairs=n_eigenpairs), **options)  # type: ignore[arg-type]
+
+
+def test_parts_have_equal_shares_and_so_have_their_histograms(batch: SignatureBatch) -> None:
+    first, second, third = histograms = [small(3, 2), small(5, 3), small(4, 1)]
+    result = HistogramDescriptor([[first, second], third])(batch)
+    expected = [share * one(batch).flatten(1) for share, one in zip((1 / 4, 1 / 4, 1 / 2), histograms, strict=True)]
+    torch.testing.assert_close(result, torch.cat(expected, dim=1))
+    torch.testing.assert_close(result.sum(dim=1), torch.ones(2))
+
+
+def test_chi_square_of_parts_is_the_mean(batch: SignatureBatch) -> None:
+    parts = [small(3, 2), small(5, 3)]
+    descriptor = HistogramDescriptor(parts)
+    combined = descriptor(batch)
+    separate = [chi_square(histograms, histograms) for histograms in (part(batch) for part in parts)]
+    expected = torch.stack(separate).mean(dim=0)
+    torch.testing.assert_close(descriptor.distances(combined, combined), expected)
+
+
+class Counting(SpectralEmbedding):
+    """Counts its calls."""
+
+    calls = 0
+
+    def forward(self, *arguments: Tensor) -> Tensor:
+        self.calls += 1
+        return super().forward(*arguments)
+
+
+def test_what_histograms_share_is_computed_once(batch: SignatureBatch) -> None:
+    embedding, other = Counting(n_eigenpairs=5), Counting(n_eigenpairs=5)
+    first = PairHistogram([Potential(2), InteriorDistance(8)], embedding)
+    second = PairHistogram([InteriorDistance(6), InteriorDistance(4, embedding=other)], embedding)
+    third = PairHistogram([Potential(3), InteriorDistance(5, embedding=embedding)], other)
+    surface = PairHistogram(["interior_distance"], embedding, "surface")
+    fewer = PairHistogram(["interior_distance"], embedding, n_samples=9)
+    HistogramDescriptor([first, [second, third]])(batch)
+    assert (embedding.calls, other.calls) == (1, 1)
+    HistogramDescriptor([first, [second, third], surface, fewer])(batch)
+    assert (embedding.calls, other.calls) == (4, 2)
+
+
+def test_sharing_changes_no_number(batch: SignatureBatch) -> None:
+    shared = SpectralEmbedding(n_eigenpairs=5)
+    made = [
+        HistogramDescriptor([PairHistogram([Potential(n), InteriorDistance(8)], embedding) for n in (2, 3)])
+        for embedding in (shared, None)
+    ]
+    for histogram in made[1].histograms:
+        histogram.embedding = SpectralEmbedding(n_eigenpairs=5)
+    assert torch.equal(made[0](batch), made[1](batch))
+
+
+def test_subset_of_samples_is_the_same_in_any_batch(batch: SignatureBatch) -> None:
+    descriptor = HistogramDescriptor(small(5, 2, n_samples=5))
+    together = descriptor(batch)
+    for i in range(2):
+        torch.testing.assert_close(descriptor(alone(batch, i))[0], together[i])
+    assert not torch.allclose(together, HistogramDescriptor(small(5, 2))(batch))
+
+
+def test_training_draws_another_subset_each_time(batch: SignatureBatch) -> None:
+    descriptor = HistogramDescriptor([small(5, 2, n_training_samples=5), small(5, 1)])
+    torch.manual_seed(0)
+    one, other = descriptor(batch), descriptor(batch)
+    first = descriptor.part_cells[0]
+    assert not torch.equal(one[:, :first], other[:, :first])
+    assert torch.equal(one[:, first:], other[:, first:])
+    descriptor.eval()
+    torch.testing.assert_close(descriptor(batch), HistogramDescriptor([small(5, 2), small(5, 1)])(batch))
+
+
+def test_histograms_that_draw_alike_draw_the_same_subset(batch: SignatureBatch) -> None:
+    twice = HistogramDescriptor([small(5, 2, n_training_samples=5), small(5, 2, n_training_samples=5)])
+    first, second = twice(batch).chunk(2, dim=1)
+    assert torch.equal(first, second)
+
+
+def test_needs_are_those_of_all_histograms(batch: SignatureBatch) -> None:
+    descriptor = HistogramDescriptor([[small(5, 2), oriented().histograms[0]], small(9, 1)])  # type: ignore[list-item]
+    assert descriptor.needs == Needs(9, ("surface_direction",))
+    with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 9, got 7"):
+        descriptor(batch)
+    bare = replace(batch, interior=replace(batch.interior, attributes={}))
+    with pytest.raises(ValueError, match="expected 'surface_direction' among those of the interior samples"):
+        oriented()(bare)
+    barest = replace(bare, surface=replace(batch.surface, attributes={}))
+    with pytest.raises(ValueError, match="attributes: this descriptor needs signatures with surface_direction"):
+        oriented()(barest)
+
+
+@pytest.mark.parametrize("histograms", [[], [[]], [PairHistogram(), []]])
+def test_no_histogram_is_refused(histograms: list) -> None:
+    with pytest.raises(ValueError, match="histograms: expected at least one in each part, got none"):
+        HistogramDescriptor(histograms)
+
+
+class Extent(BodyDescriptor):
+    """The largest distance from the centre, in space and in the embedding; for it the mesh must be there."""
+
+    name = "extent"
+    needs = Needs(n_eigenpairs=7, mesh=True)
+
+    def describe_body(self, body: Body) -> NDArray[np.float32]:
+        assert body.mesh is body.surface_mesh
+        points, functions = body.interior.points, body.interior.eigenfunctions
+        return np.array([len(points), functions.shape[1], np.abs(points).max(), body.area])
+
+
+def test_a_descriptor_of_bodies_sees_each_without_padding(batch: SignatureBatch) -> None:
+    descriptor = Extent()
+    with pytest.raises(ValueError, match="meshes: this descriptor needs the surfaces too"):
+        descriptor(batch)
+    described = descriptor(replace(batch, meshes=(object(), object())))  # type: ignore[arg-type]
+    assert described.dtype == torch.float32
+    largest = [float(batch.interior.points[i].abs().max()) for i in range(2)]
+    expected = torch.tensor([[40, 12, largest[0], 2], [25, 7, largest[1], 3]])
+    torch.testing.assert_close(described, expected)
+
+
+def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch: SignatureBatch) -> None:
+    below = HistogramDescriptor([small(5, 2), small(3, 1)], name="two", invariant_to=("motion", "scale"))
+    descriptor = EmbeddedDescriptor(below, WhitenedHead().centre(below(batch)), source="nobody")
+    assert (descriptor.name, descriptor.source) == ("embedded", "nobody")
+    assert (descriptor.invariant_to, descriptor.needs) == (below.invariant_to, below.needs)
+    embedding = descriptor(batch)
+    roots = below(batch).sqrt() - below(batch).sqrt().mean(dim=0)
+    torch.testing.assert_close(embedding, roots / roots.norm(dim=1, keepdim=True), atol=1e-5, rtol=0)
+    torch.testing.assert_close(descriptor.distances(embedding, embedding), cosine(embedding, embedding))

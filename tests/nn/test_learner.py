@@ -1,0 +1,346 @@
+from __future__ import annotations
+
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from pytorch_lightning import Callback, Trainer, seed_everything
+from pytorch_lightning.callbacks import ModelCheckpoint
+from pytorch_metric_learning.losses import TripletMarginLoss
+from torch.utils.data import DataLoader
+
+from igps.data.batch import LabelledSignature, SignatureBatch, collate
+from igps.data.datamodule import SignatureDataModule
+from igps.geometry.signature import SignatureConfig
+from igps.nn.axes import InteriorDistance, Potential
+from igps.nn.description import describe
+from igps.nn.descriptor import HistogramDescriptor
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.fitted import KernelHead, WhitenedHead
+from igps.nn.histogram import PairHistogram
+from igps.nn.learner import RetrievalLearner
+from igps.nn.metric import CorrectedDistance, MetricHead
+from igps.retrieval import chi_square, retrieval_scores
+from igps.shapes import ArticulatedShapes
+
+PROJECT = Path(__file__).parents[2]
+CONFIG = SignatureConfig(n_eigenpairs=20, resolution=12, min_samples=0, n_surface_samples=20)
+
+
+@pytest.fixture(scope="module")
+def shapes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("shapes")
+    ArticulatedShapes(n_classes=3, n_per_class=6, n_vertices=700).write(root / "meshes")
+    return root
+
+
+def data(shapes: Path) -> SignatureDataModule:
+    return SignatureDataModule(
+        shapes / "meshes", n_train=4, n_validation=2, classes_per_batch=3, shapes_per_class=3, config=CONFIG,
+        cache_dir=shapes / "cache", n_workers=1,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def items(shapes: Path) -> list[LabelledSignature]:
+    """The training shapes, in memory."""
+    module = data(shapes)
+    module.prepare_data()
+    part = module.dataset.subset(module.split.train)
+    return [part[i] for i in range(len(part))]
+
+
+def loader(items: list[LabelledSignature]) -> DataLoader[LabelledSignature]:
+    """Of no datamodule."""
+    return DataLoader(items, batch_size=6, collate_fn=collate)  # type: ignore[arg-type]
+
+
+def bins() -> HistogramDescriptor:
+    axes = [Potential(2, learnable=True), InteriorDistance(16, learnable=True)]
+    return HistogramDescriptor(PairHistogram(axes, SpectralEmbedding(n_knots=5)))
+
+
+def two_parts() -> HistogramDescriptor:
+    return HistogramDescriptor([bins().histograms[0], PairHistogram([InteriorDistance(9)])])  # type: ignore[list-item]
+
+
+def learner(head: torch.nn.Module | None = None) -> RetrievalLearner:
+    seed_everything(3, verbose=False)
+    return RetrievalLearner(bins(), CorrectedDistance(head or MetricHead(width=8, n_hidden=16)))
+
+
+def state_of(model: torch.nn.Module) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in model.state_dict().items()}
+
+
+def assert_same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        assert torch.equal(value, other[name]), name
+
+
+def trainer(epochs: int, root: Path) -> Trainer:
+    return Trainer(
+        max_epochs=epochs, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
+        enable_model_summary=False, default_root_dir=root, num_sanity_val_steps=0,
+    )  # fmt: skip
+
+
+def test_training_moves_bins_filter_and_head_and_is_reproducible(shapes: Path, tmp_path: Path) -> None:
+    states = []
+    for _ in range(2):
+        model = learner()
+        before = state_of(model)
+        run = trainer(3, tmp_path)
+        run.fit(model, data(shapes))
+        states.append(model.state_dict())
+        assert {"val_ft", "val_nn", "val_dcg", "train_loss"} <= set(run.callback_metrics)
+    moved = {name for name, value in states[0].items() if not torch.equal(value, before[name])}
+    for part in ("log_gain", "axes.0.centres", "axes.1.centres", "head.layers", "plain_unit", "learned_unit"):
+        assert any(part in name for name in moved), part
+    for name, value in states[0].items():
+        torch.testing.assert_close(states[1][name], value, atol=0, rtol=0)
+    assert not any(name.startswith("scores") for name in states[0])
+
+
+def test_a_checkpoint_has_the_scale_of_its_own_epoch(shapes: Path, tmp_path: Path) -> None:
+    module, model = data(shapes), learner()
+    run = trainer(1, tmp_path)
+    run.limit_val_batches = 0
+    # Saved at the end of an epoch that is not validated, and before the end of the fit.
+    run.callbacks.append(ModelCheckpoint(tmp_path, filename="last", every_n_epochs=1, save_on_train_epoch_end=True))  # type: ignore[attr-defined]
+    run.fit(model, module)
+    state = torch.load(tmp_path / "last.ckpt", weights_only=True)["state_dict"]
+    fresh = learner()
+    fresh.load_state_dict(state)
+    fresh.eval()
+    histograms = describe(module.dataset.subset(module.split.train), fresh.descriptor)
+    fresh.distance.calibrate(histograms)
+    for name in ("plain_unit", "learned_unit"):
+        torch.testing.assert_close(state[f"distance.{name}"], getattr(fresh.distance, name))
+        assert state[f"distance.{name}"] != 1
+
+
+def test_the_loss_uses_what_the_miner_chose(shapes: Path, tmp_path: Path) -> None:
+    seen = []
+
+    class First(torch.nn.Module):
+        """One triplet."""
+
+        def forward(self, embeddings: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            anchor, positive = (labels == labels[0]).nonzero().flatten()[:2]
+            return tuple(i.reshape(1) for i in (anchor, positive, (labels != labels[0]).nonzero().flatten()[0]))
+
+    class Loss(TripletMarginLoss):
+        def forward(self, embeddings: torch.Tensor, labels: torch.Tensor, chosen: tuple) -> torch.Tensor:  # type: ignore[override]
+            seen.append([len(indices) for indices in chosen])
+            return super().forward(embeddings, labels, chosen)
+
+    plain = learner()
+    model = RetrievalLearner(plain.descriptor, plain.distance, Loss(), miner=First())
+    trainer(1, tmp_path).fit(model, data(shapes))
+    assert seen
+    assert all(lengths == [1, 1, 1] for lengths in seen)
+
+
+@pytest.mark.parametrize("validated", [True, False])
+def test_a_head_in_closed_form_follows_the_bins(shapes: Path, tmp_path: Path, validated: bool) -> None:
+    seed_everything(3, verbose=False)
+    model = RetrievalLearner(two_parts(), CorrectedDistance(WhitenedHead(4), share=1.0))
+    module = data(shapes)
+    run = trainer(2, tmp_path)
+    run.limit_val_batches = 1.0 if validated else 0
+    run.fit(model, module)
+    assert all((parameter != 0).any() for parameter in model.parameters())
+    part = module.dataset.subset(module.split.train)
+    cells = model.descriptor.part_cells
+    assert cells == (3 * 16, 9)
+    expected = WhitenedHead(4).fit(describe(part, model.descriptor), part.labels, cells)
+    for name, value in expected.state_dict().items():
+        torch.testing.assert_close(model.distance.head.state_dict()[name].abs(), value.abs(), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("make", [MetricHead, WhitenedHead, KernelHead])
+def test_any_loader_of_labelled_batches_trains(
+    items: list[LabelledSignature], tmp_path: Path, make: type[torch.nn.Module]
+) -> None:
+    """Without a datamodule and without validation data, and the default checkpoint of an epoch holds a fitted head."""
+    model = learner(make())
+    before = state_of(model.descriptor)
+    run = Trainer(
+        max_epochs=2, accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False,
+        default_root_dir=tmp_path, callbacks=[ModelCheckpoint(save_on_train_epoch_end=True)],
+    )  # fmt: skip
+    run.fit(model, loader(items))
+    assert any(not torch.equal(value, before[name]) for name, value in model.descriptor.state_dict().items())
+    (checkpoint,) = tmp_path.rglob("*.ckpt")
+    loaded = RetrievalLearner.load_from_checkpoint(
+        checkpoint, descriptor=bins(), distance=CorrectedDistance(make())
+    ).eval()
+    assert_same(loaded.state_dict(), model.state_dict())
+    with torch.no_grad():
+        descriptions = loaded(collate(items))
+        found = loaded.distances(descriptions, descriptions)
+        model.eval()
+        torch.testing.assert_close(found, model.distances(descriptions, descriptions), atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(model(collate(items)), descriptions, atol=1e-6, rtol=0)
+    head = loaded.distance.head
+    fitted = head.whitened if isinstance(head, KernelHead) else head
+    if make is MetricHead:
+        assert len(fitted.mean) == 48
+        assert (fitted.mean > 0).any()
+    else:
+        torch.testing.assert_close(fitted.mean, descriptions.flatten(1).sqrt().mean(dim=0), atol=1e-6, rtol=1e-4)
+    # Both parts of the distance on the scale of the training shapes.
+    pairs = torch.triu_indices(len(items), len(items), 1).unbind()
+    plain = chi_square(descriptions, descriptions)[pairs].median()
+    torch.testing.assert_close(loaded.distance.plain_unit, plain, atol=1e-6, rtol=1e-4)
+    assert found[pairs].median() == pytest.approx(1, abs=0.5)
+
+
+@pytest.mark.parametrize("make", [MetricHead, WhitenedHead])
+def test_saving_a_checkpoint_changes_nothing(
+    items: list[LabelledSignature], tmp_path: Path, make: type[torch.nn.Module]
+) -> None:
+    model, run = learner(make()), trainer(1, tmp_path)
+    seen: list[bool] = []
+
+    class Save(Callback):
+        """In the midst of an epoch, in training mode."""
+
+        def on_train_batch_end(self, trainer: Trainer, module: RetrievalLearner, *_: object) -> None:  # type: ignore[override]
+            before, modes = state_of(module), [one.training for one in module.modules()]
+            generator = torch.get_rng_state()
+            trainer.save_checkpoint(tmp_path / "now.ckpt")
+            assert_same(state_of(module), before)
+            assert_same(torch.load(tmp_path / "now.ckpt", weights_only=True)["state_dict"], before)
+            assert [one.training for one in module.modules()] == modes
+            assert torch.equal(torch.get_rng_state(), generator)
+            seen.append(module.training)
+
+    run.callbacks.append(Save())  # type: ignore[attr-defined]
+    run.fit(model, loader(items))
+    assert seen == [True]
+    before = state_of(model)
+    run.save_checkpoint(tmp_path / "after.ckpt")
+    assert_same(state_of(model), before)
+
+
+def test_the_mode_of_each_module_outlives_a_fit(items: list[LabelledSignature], tmp_path: Path) -> None:
+    """A module that the caller froze in evaluation mode stays there, whenever the head is fitted."""
+    modes: list[list[bool]] = []
+    frozen = learner()
+    frozen.descriptor.eval()
+
+    class Look(Callback):
+        def on_train_batch_start(self, trainer: Trainer, module: RetrievalLearner, *_: object) -> None:  # type: ignore[override]
+            modes.append([module.training, module.descriptor.training, module.distance.training])
+
+    run = trainer(2, tmp_path)
+    run.callbacks.append(Look())  # type: ignore[attr-defined]
+    run.fit(frozen, loader(items))
+    assert modes == [[True, False, True]] * 2
+
+
+def test_a_checkpoint_that_names_a_foreign_class_is_refused(items: list[LabelledSignature], tmp_path: Path) -> None:
+    model, run = learner(), trainer(1, tmp_path)
+    run.fit(model, loader(items))
+    run.save_checkpoint(tmp_path / "own.ckpt")
+    made = {"descriptor": bins(), "distance": CorrectedDistance(MetricHead(width=8, n_hidden=16))}
+    loaded = RetrievalLearner.load_from_checkpoint(tmp_path / "own.ckpt", **made)
+    assert loaded.hparams["learning_rate"] == 1e-3
+    stored = torch.load(tmp_path / "own.ckpt", weights_only=True)
+    foreign = tmp_path / "foreign.ckpt"
+    for miner in (
+        {"class_path": "elsewhere.miners.Harmless"},
+        {"class_path": "torch.nn.Identity", "init_args": {"inner": [{"class_path": "elsewhere.Harmless"}]}},
+        {"_class_path": "elsewhere.Harmless"},
+    ):
+        torch.save({**stored, "hyper_parameters": {**stored["hyper_parameters"], "miner": miner}}, foreign)
+        with pytest.raises(ValueError, match=r"foreign.ckpt: names the class elsewhere\..*pass trusted=\[...\]"):
+            RetrievalLearner.load_from_checkpoint(foreign, **made)
+        with foreign.open("rb") as stream, pytest.raises(ValueError, match=r"names the class elsewhere\."):
+            RetrievalLearner.load_from_checkpoint(stream, **made)
+        RetrievalLearner.load_from_checkpoint(foreign, **made, miner=None, trusted=["elsewhere"])
+    with foreign.open("wb") as stream:
+        torch.save(stored, stream)
+    with foreign.open("rb") as stream:
+        assert_same(RetrievalLearner.load_from_checkpoint(stream, **made).state_dict(), model.state_dict())
+
+
+def test_a_lazy_head_has_its_size_before_the_optimiser_is_made() -> None:
+    model = RetrievalLearner(two_parts(), CorrectedDistance(MetricHead(width=4)))
+    assert not any(isinstance(one, torch.nn.UninitializedParameter) for one in model.parameters())
+    assert model.distance.head.layers[1].in_features == 3 * 16 + 9
+    assert model.distance.head.training
+
+
+def test_any_module_describes(items: list[LabelledSignature], tmp_path: Path) -> None:
+    class Plain(torch.nn.Module):
+        """Cells that are learned, whatever the shape."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.cells = torch.nn.Parameter(torch.zeros(5))
+
+        def forward(self, batch: SignatureBatch) -> torch.Tensor:
+            return (self.cells + batch.interior.points.abs().mean(dim=1)[:, [0, 1, 2, 0, 1]]).softmax(dim=1)
+
+    seed_everything(3, verbose=False)
+    model = RetrievalLearner(Plain(), CorrectedDistance(WhitenedHead(2)))
+    trainer(1, tmp_path).fit(model, loader(items))
+    assert model.distance.head.part_cells.tolist() == [5]
+    assert (model.descriptor.cells != 0).any()
+
+
+def test_several_training_loaders_are_refused(items: list[LabelledSignature], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="train_dataloaders: expected one DataLoader, got list"):
+        trainer(1, tmp_path).fit(learner(), [loader(items), loader(items)])
+
+
+def test_without_head_the_test_scores_are_the_plain_ones(shapes: Path, tmp_path: Path) -> None:
+    module = data(shapes)
+    module.prepare_data()
+    model = RetrievalLearner(HistogramDescriptor(PairHistogram()), CorrectedDistance())
+    (logged,) = trainer(1, tmp_path).test(model, module, verbose=False)
+    part = module.dataset.subset(module.split.test)
+    histograms = describe(part, HistogramDescriptor(PairHistogram()))
+    expected = retrieval_scores(chi_square(histograms, histograms), part.labels).mean()
+    assert {name.removeprefix("test_"): value for name, value in logged.items()} == pytest.approx(expected, abs=1e-6)
+    with pytest.raises(ValueError, match="expected a head to train"):
+        trainer(1, tmp_path).fit(model, module)
+
+
+def test_smoke_configuration_trains_and_its_checkpoint_loads_without_running_code(
+    shapes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ["fit", "--config", PROJECT / "configs/default.yaml", "--config", PROJECT / "configs/smoke.yaml"]
+    arguments += ["--data.root", shapes / "meshes", "--data.cache_dir", shapes / "cache", "--data.n_train", "4"]
+    arguments += [
+        "--data.config.n_eigenpairs",
+        "20",
+        "--data.config.resolution",
+        "12",
+        "--data.config.min_samples",
+        "0",
+    ]
+    arguments += ["--data.config.n_surface_samples", "20", "--data.n_workers", "1"]
+    arguments += ["--trainer.default_root_dir", tmp_path]
+    monkeypatch.setattr(sys, "argv", ["train.py", *map(str, arguments)])
+    runpy.run_path(str(PROJECT / "training/train.py"), run_name="__main__")
+    (checkpoint,) = tmp_path.rglob("*.ckpt")
+    state = torch.load(checkpoint, weights_only=True)["state_dict"]
+    assert state["descriptor.histograms.0.embedding.log_gain"].shape == (12,)
+    (stored,) = tmp_path.rglob("config.yaml")
+    configuration = yaml.safe_load(stored.read_text())
+    assert configuration["data"]["split_seed"] == 0
+    histogram = configuration["model"]["descriptor"]["init_args"]["histograms"]["init_args"]
+    assert histogram["axes"][1]["init_args"]["n_bins"] == 64
+    checkpoint.rename(tmp_path / "moved.ckpt")  # away from the files beside it
+    assert_same(RetrievalLearner.load_from_checkpoint(tmp_path / "moved.ckpt").state_dict(), state)
+    module = SignatureDataModule.load_from_checkpoint(tmp_path / "moved.ckpt", weights_only=True)
+    assert module.dataset.config.n_eigenpairs == 20
+    assert len(module.split.train) == 3 * 2

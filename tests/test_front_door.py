@@ -1,0 +1,155 @@
+"""What `import igps` gives and costs, and that all it takes is declared."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import igps
+
+PROJECT = Path(__file__).parents[1]
+PACKAGE = Path(igps.__file__).parent
+
+# Frozen: whoever adds a name takes one away, and says so here and in the documentation.
+NAMES = [
+    "ArticulatedShapes",
+    "BodyDescriptor",
+    "Descriptor",
+    "HistogramDescriptor",
+    "KernelHead",
+    "Mesh",
+    "MeshError",
+    "MeshReading",
+    "PairHistogram",
+    "RetrievalLearner",
+    "Signature",
+    "SignatureBatch",
+    "SignatureConfig",
+    "SignatureDataModule",
+    "SignatureDataset",
+    "SpectralEmbedding",
+    "WhitenedHead",
+    "chi_square",
+    "collate",
+    "compute_signature",
+    "describe",
+    "descriptor",
+    "load_mesh",
+    "retrieval_scores",
+    "search",
+]
+
+# Import names whose distribution is called otherwise.
+DISTRIBUTIONS = {
+    "igl": "libigl",
+    "ot": "POT",
+    "skimage": "scikit-image",
+    "sklearn": "scikit-learn",
+    "yaml": "PyYAML",
+}
+
+
+def test_front_door_has_these_names_and_no_others() -> None:
+    assert sorted(igps.__all__) == sorted(NAMES)
+    assert len(set(NAMES)) == len(NAMES) <= 25
+    rooms = {path.stem for path in PACKAGE.iterdir()}
+    public = {name for name in vars(igps) if not name.startswith("_")} - rooms - {"annotations"}
+    assert public <= {*NAMES, "importlib", "TYPE_CHECKING", "Any"}, "a name that __all__ does not tell of"
+
+
+def test_every_name_opens() -> None:
+    for name in NAMES:
+        assert getattr(igps, name).__module__.startswith("igps."), name
+
+
+def test_import_loads_nothing_heavy() -> None:
+    heavy = ("pytorch_lightning", "torch._dynamo", "torchmetrics", "matplotlib", "sklearn", "skimage", "igl", "pandas")
+    words = f"import sys; import igps; print([name for name in {heavy!r} if name in sys.modules])"
+    command = [sys.executable, "-c", words]
+    environment = {"PYTHONPATH": str(PACKAGE.parent), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.strip() == "[]"
+
+
+def test_lazy_names_do_load_what_they_need() -> None:
+    words = "import sys, igps; igps.RetrievalLearner; print('pytorch_lightning' in sys.modules)"
+    environment = {"PYTHONPATH": str(PACKAGE.parent), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.strip() == "True"
+
+
+def imported(path: Path) -> set[str]:
+    """Top-level modules that a file imports when it runs: not those for type checkers alone."""
+    found: set[str] = set()
+
+    def look(node: ast.AST) -> None:
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            for child in node.orelse:
+                look(child)
+            return
+        if isinstance(node, ast.Import):
+            found.update(alias.name.split(".")[0] for alias in node.names)
+        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found.add(node.module.split(".")[0])
+        for child in ast.iter_child_nodes(node):
+            look(child)
+
+    look(ast.parse(path.read_text()))
+    return found
+
+
+def normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def declared(requirements: list[str]) -> set[str]:
+    return {normal(re.split(r"[\s\[<>=!~;]", requirement, maxsplit=1)[0]) for requirement in requirements}
+
+
+def test_every_import_is_declared() -> None:
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
+    core = declared(project["dependencies"])
+    extras = {
+        name: declared(several)
+        for name, several in project["optional-dependencies"].items()
+        if name not in ("test", "lint")
+    }
+    optional = set().union(*extras.values()) - {"interior-gps"}
+    own = {"igps", *(path.stem for path in (PROJECT / "training").glob("*.py"))}
+    for folder in (PACKAGE, PROJECT / "training"):
+        for path in sorted(folder.rglob("*.py")):
+            for module in imported(path) - set(sys.stdlib_module_names) - own:
+                distribution = normal(DISTRIBUTIONS.get(module, module))
+                assert distribution in core | optional, (
+                    f"{path} imports {module}, which pyproject.toml does not declare"
+                )
+    # And nothing is declared that is not used.
+    every = set().union(*(imported(path) for path in [*PACKAGE.rglob("*.py"), *(PROJECT / "training").rglob("*.py")]))
+    used = {normal(DISTRIBUTIONS.get(module, module)) for module in every}
+    assert core <= used
+    assert optional <= used
+
+
+def test_modules_that_import_at_once_need_no_extra() -> None:
+    """What a file imports at its top must be a dependency, unless the file is the door of an extra."""
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
+    core = declared(project["dependencies"])
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.parse(path.read_text()).body:
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            for module in {name.split(".")[0] for name in names} - set(sys.stdlib_module_names) - {"igps", ""}:
+                assert normal(DISTRIBUTIONS.get(module, module)) in core, f"{path} needs {module} at once"
+
+
+def test_distributions_are_called_so() -> None:
+    """The names above are those under which the modules are installed."""
+    installed = importlib.metadata.packages_distributions()
+    for module, distribution in DISTRIBUTIONS.items():
+        if module in installed:
+            assert normal(distribution) in {normal(one) for one in installed[module]}

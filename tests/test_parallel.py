@@ -1,0 +1,183 @@
+from __future__ import annotations
+
+import errno
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+import jobs
+from igps.parallel import Failed, Limits, MachineError, n_cores, run
+
+GIB = 2**30
+needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc to see whether a process lives")
+
+
+def all_of(*arguments, **options) -> dict:  # type: ignore[no-untyped-def]
+    """Results by number; none comes twice."""
+    results = list(run(*arguments, **options))
+    assert len(dict(results)) == len(results)
+    return dict(results)
+
+
+def ended(pid: int) -> bool:
+    """Whether a process ends within ten seconds."""
+    for _ in range(100):
+        if not Path(f"/proc/{pid}").exists():
+            return True
+        time.sleep(0.1)
+    return False
+
+
+@pytest.mark.parametrize("n_workers", [1, 2, 3])
+def test_every_job_has_its_result_whatever_the_number_of_workers(n_workers: int) -> None:
+    numbers = [3, -1, 5, 13, 0, 8, 2, 9]
+    expected: dict[int, object] = {i: x * x for i, x in enumerate(numbers)}
+    expected[1] = Failed("x: expected a natural number, got -1.")
+    expected[3] = Failed("KeyError: 'thirteen'")
+    assert all_of(jobs.square, numbers, n_workers=n_workers) == expected
+
+
+def test_nothing_to_do() -> None:
+    assert all_of(jobs.square, [], n_workers=4) == {}
+    assert all_of(jobs.square, [], n_workers=4, limits=Limits(seconds=1)) == {}
+
+
+def test_one_worker_is_this_process_unless_there_are_limits() -> None:
+    assert all_of(jobs.process, [0, 0], n_workers=1)[1][0] == os.getpid()
+    limited = all_of(jobs.process, [0, 0], n_workers=1, limits=Limits(seconds=100))
+    assert limited[0][0] == limited[1][0] != os.getpid()
+
+
+def test_workers_have_one_thread_and_the_environment_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    results = all_of(jobs.process, [0] * 4, n_workers=2)
+    assert {threads for _, threads in results.values()} == {"1"}
+    assert os.environ["OMP_NUM_THREADS"] == "3"
+    assert "MKL_NUM_THREADS" not in os.environ
+
+
+def test_a_job_that_kills_its_process_is_named_and_costs_no_other_its_result() -> None:
+    results = all_of(jobs.die_at_zero, [1, 0, 2, 3, 4, 5], n_workers=2)
+    killed = results.pop(1)
+    assert isinstance(killed, Failed)
+    assert killed.reason.startswith("the process that worked on it was killed, twice. It may need more memory")
+    assert results == {0: 1, 2: 2, 3: 3, 4: 4, 5: 5}
+
+
+def test_a_job_that_is_killed_once_is_tried_again(tmp_path: Path) -> None:
+    markers = [tmp_path / name for name in ("a", "b", "c")]
+    assert all_of(jobs.die_once, markers, n_workers=2) == {0: "a", 1: "b", 2: "c"}
+
+
+def test_a_job_that_takes_too_long_is_ended() -> None:
+    start = time.monotonic()
+    results = all_of(jobs.sleep, [0.0, 1000.0, 0.1, 0.2], n_workers=2, limits=Limits(seconds=3))
+    assert time.monotonic() - start < 300
+    assert results == {0: 0.0, 1: Failed("it took longer than the time_limit of 3 s."), 2: 0.1, 3: 0.2}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux alone enforces a memory limit")
+def test_a_job_that_needs_too_much_memory_is_named() -> None:
+    results = all_of(jobs.allocate, [1000, 2 * GIB, 2000], n_workers=1, limits=Limits(memory=GIB))
+    assert results == {0: 1000, 1: Failed("it needs more than the memory_limit of 1024 MiB."), 2: 2000}
+
+
+@pytest.mark.parametrize("where", ["here", "workers", "executor"])
+@pytest.mark.parametrize(
+    ("number", "message"), [(errno.ENOSPC, "ENOSPC.*Make room and run again"), (0, "out of memory. Use fewer workers")]
+)
+def test_the_machine_is_not_the_jobs_fault(where: str, number: int, message: str) -> None:
+    with ThreadPoolExecutor(1) as pool, pytest.raises(MachineError, match=message):
+        list(
+            run(
+                jobs.fail_with,
+                [number] * 3,
+                n_workers=2 if where == "workers" else 1,
+                executor=pool if where == "executor" else None,
+            )
+        )
+
+
+def test_other_errors_of_the_system_are_those_of_a_job() -> None:
+    failed = Failed("FileNotFoundError: [Errno 2] ENOENT")
+    assert all_of(jobs.fail_with, [errno.ENOENT], n_workers=1) == {0: failed}
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: ThreadPoolExecutor(2), lambda: ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))]
+)
+def test_another_executor_does_the_work(make: Callable[[], Executor]) -> None:
+    with make() as pool:
+        results = all_of(jobs.square, [4, -2, 6], executor=pool)
+    assert results == {0: 16, 1: Failed("x: expected a natural number, got -2."), 2: 36}
+
+
+def test_an_executor_that_breaks_is_the_machine() -> None:
+    with (
+        ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool,
+        pytest.raises(MachineError, match="the executor broke"),
+    ):
+        list(run(jobs.die_at_zero, [1, 0, 2], executor=pool))
+
+
+def test_an_executor_has_limits_of_its_own() -> None:
+    with ThreadPoolExecutor(1) as pool, pytest.raises(ValueError, match="limits: expected none beside an executor"):
+        list(run(jobs.square, [1], executor=pool, limits=Limits(seconds=1)))
+
+
+@pytest.mark.parametrize(("name", "options"), [("time_limit", {"seconds": 0}), ("memory_limit", {"memory": -5})])
+def test_impossible_limits_are_refused(name: str, options: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=f"{name}: expected None or a positive number"):
+        Limits(**options)
+
+
+def test_a_script_without_a_main_guard_is_told(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text("from igps.parallel import run\nlist(run(abs, [1, 2, 3], n_workers=2))\n")
+    told = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=300, check=False)
+    assert told.returncode != 0
+    assert "MachineError: no worker process could be started" in told.stderr
+    assert "under `if __name__ == '__main__':`" in told.stderr
+
+
+@needs_proc
+def test_no_process_is_left_when_the_caller_stops_early() -> None:
+    results = run(jobs.process, [0] * 20, n_workers=2)
+    _, (first, _) = next(results)
+    results.close()
+    assert ended(first)
+    assert multiprocessing.active_children() == []
+
+
+@needs_proc
+def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import os, signal, sys\n"
+        f"sys.path.append({str(Path(jobs.__file__).parent)!r})\n"
+        "import jobs\n"
+        "from igps.parallel import run\n"
+        "if __name__ == '__main__':\n"
+        "    for _, (worker, _) in run(jobs.process, [0, 0], n_workers=2):\n"
+        "        print(worker, flush=True)\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        worker = int(parent.stdout.readline())
+    if not ended(worker):
+        os.kill(worker, signal.SIGKILL)
+        pytest.fail("the worker outlived its parent")
+
+
+def test_cores_are_those_that_this_process_may_use() -> None:
+    assert 1 <= n_cores() <= (os.cpu_count() or 1)

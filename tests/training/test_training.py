@@ -1,0 +1,200 @@
+"""The scripts of training/, run as a user runs them, on generated shapes."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import mean, stdev
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+import igps
+from igps.data.datamodule import SignatureDataModule
+from igps.data.splits import Split, split_seen, split_unseen
+from igps.nn.axes import InteriorDistance, Potential
+from igps.nn.fitted import KernelHead, WhitenedHead
+from igps.nn.learner import RetrievalLearner
+from igps.retrieval import chi_square, retrieval_scores
+from igps.shapes import ArticulatedShapes
+
+PROJECT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("training")
+    ArticulatedShapes(n_classes=4, n_per_class=6, n_vertices=700).write(root / "meshes")
+    return root
+
+
+def run(script: str, *arguments: object) -> str:
+    command = [sys.executable, str(PROJECT / "training" / script), *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(PROJECT / "src")}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def described(root: Path, name: str) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """Flat histograms, classes, and the cells of the parts, by the library, from the cache that the scripts filled."""
+    module = igps.descriptor(name)
+    assert isinstance(module, igps.HistogramDescriptor)
+    config = module.needs.completed(igps.SignatureConfig())
+    dataset = igps.SignatureDataset(root / "meshes", config, root / "cache")
+    return igps.describe(dataset, module).flatten(1), dataset.labels, module.part_cells
+
+
+def expected(
+    histograms: Tensor, labels: Tensor, split: Split, part_cells: Sequence[int]
+) -> dict[str, dict[str, float]]:
+    """Scores of the test part in percent, of the plain distance and of each head."""
+    train, test = torch.tensor(split.train), torch.tensor(split.test)
+    seen, found = histograms[train], histograms[test]
+    whitened = WhitenedHead().fit(seen, labels[train], part_cells)(found)
+    kernel = KernelHead().fit(seen, labels[train], part_cells)(found)
+    distances = {
+        "none": chi_square(found, found), "whitened": 1 - whitened @ whitened.T, "kernel": 1 - kernel @ kernel.T,
+    }  # fmt: skip
+    return {
+        name: {key: 100 * value for key, value in retrieval_scores(one.clamp_min(0), labels[test]).mean().items()}
+        for name, one in distances.items()
+    }
+
+
+def rows(table: str) -> dict[str, list[float]]:
+    """The numbers of each line that begins with a word."""
+    lines = [line.split() for line in table.splitlines() if re.match(r"\w+ +\d", line)]
+    return {words[0]: [float(word) for word in words[1:] if word != "±"] for words in lines}
+
+
+@pytest.mark.parametrize(("name", "protocol"), [("rich", "seen"), ("interior", "unseen")])
+def test_splits_are_scored_as_by_the_librarys_parts(root: Path, name: str, protocol: str) -> None:
+    n_train = 3 if protocol == "seen" else 2
+    table = run(
+        "evaluate.py", "splits", root / "meshes", "--descriptor", name, "--protocol", protocol, "--n_train", n_train,
+        "--n_splits", 2, "--cache_dir", root / "cache",
+    )  # fmt: skip
+    assert f"{name}, {protocol}, n_train={n_train}, 2 splits from seed 100" in table
+    histograms, labels, part_cells = described(root, name)
+    found = []
+    for seed in (100, 101):
+        split = split_seen(labels, 3, seed=seed) if protocol == "seen" else split_unseen(labels, 2, seed=seed)
+        assert not set(split.train) & set(split.test)
+        found.append(expected(histograms, labels, split, part_cells))
+    printed = rows(table)
+    assert list(printed) == ["none", "whitened", "kernel"]
+    for head, numbers in printed.items():
+        values = [[one[head][key] for one in found] for key in ("ft", "nn", "dcg", "st", "adr", "map")]
+        assert numbers == pytest.approx([x for v in values for x in (mean(v), stdev(v))], abs=0.06)
+    # A shuffled labelling would not do: a third of 8 shapes, or of 11, are of the query's class.
+    assert printed["none"][0] > 55
+    assert any(one["none"]["ft"] != one["whitened"]["ft"] for one in found)
+
+
+def test_classification_counts_what_the_kernel_head_finds(root: Path) -> None:
+    printed = run("classify.py", root / "meshes", "--n_train", 3, "--n_splits", 2, "--cache_dir", root / "cache")
+    histograms, labels, part_cells = described(root, "rich")
+    shares = []
+    for seed in (100, 101):
+        split = split_seen(labels, 3, seed=seed)
+        train, test = torch.tensor(split.train), torch.tensor(split.test)
+        predicted = KernelHead().fit(histograms[train], labels[train], part_cells).predict(histograms[test])
+        shares.append(100 * float((predicted == labels[test]).double().mean()))
+    _, accuracy, _, spread, *_ = printed.split()
+    assert float(accuracy) == pytest.approx(mean(shares), abs=0.06)
+    assert float(spread) == pytest.approx(stdev(shares), abs=0.06)
+    assert mean(shares) > 75  # by chance 25
+
+
+def test_checkpoint_to_table_figure_and_classifier(root: Path) -> None:
+    out = root / "out"
+    run(
+        "train.py", "fit", "--config", PROJECT / "configs/default.yaml", "--config", PROJECT / "configs/smoke.yaml",
+        "--data.root", root / "meshes", "--data.cache_dir", root / "cache_plain", "--data.n_train", 4,
+        "--data.n_validation", 2, "--data.shapes_per_class", 2, "--trainer.default_root_dir", out,
+    )  # fmt: skip
+    (checkpoint,) = out.rglob("*.ckpt")
+    table = run("evaluate.py", "checkpoint", checkpoint, "--out", out / "evaluation")
+    printed = rows(table)
+    assert list(printed) == ["plain", "learned", "whitened", "kernel"]
+
+    learner = RetrievalLearner.load_from_checkpoint(checkpoint).eval()
+    data = SignatureDataModule.load_from_checkpoint(checkpoint)
+    start = learner.descriptor.histograms[0].axes[1].centres
+    assert not torch.allclose(start(), start.start), "bins were trained"
+    labels, test = data.dataset.labels, torch.tensor(data.split.test)
+    histograms = igps.describe(data.dataset, learner.descriptor)
+    split = Split(data.split.train + data.split.validation, (), data.split.test)
+    scores = expected(histograms.flatten(1), labels, split, learner.part_cells)
+    part = histograms[test]
+    with torch.no_grad():
+        embedded = learner.distance.head(part)
+        plain, learned = chi_square(part, part), 1 - embedded @ embedded.T
+        both = plain / learner.distance.plain_unit + learned / learner.distance.learned_unit
+    learned_scores = retrieval_scores(both.clamp_min(0), labels[test]).mean()
+    by_row = {
+        "plain": scores["none"], "learned": {key: 100 * value for key, value in learned_scores.items()},
+        "whitened": scores["whitened"], "kernel": scores["kernel"],
+    }  # fmt: skip
+    for name, numbers in printed.items():
+        wanted = [by_row[name][key] for key in ("ft", "nn", "dcg", "st", "adr", "map")]
+        assert numbers == pytest.approx(wanted, abs=0.06), name
+    assert (out / "evaluation/layout.png").stat().st_size > 10_000
+
+    accuracy = run("classify.py", root / "meshes", "--checkpoint", checkpoint)
+    train = torch.tensor(split.train)
+    head = KernelHead().fit(histograms[train].flatten(1), labels[train], learner.part_cells)
+    share = 100 * float((head.predict(part.flatten(1)) == labels[test]).double().mean())
+    assert float(accuracy.split()[1]) == pytest.approx(share, abs=0.06)
+
+
+def test_ablation_prints_every_head_of_every_layout(root: Path) -> None:
+    table = run(
+        "ablate.py", root / "meshes", "--n_train", 3, "--n_splits", 1, "--n_epochs", 1, "--n_training_samples", 50,
+        "--cache_dir", root / "cache",
+    )  # fmt: skip
+    pattern = r"^(interior|euclidean|oriented) +(nothing|bins|spectrum|bins \+ spectrum)  +(.*)$"
+    found = {row[:2]: re.findall(r"(\d+\.\d) ± ", row[2]) for row in re.findall(pattern, table, re.M)}
+    assert len(found) == 8, table
+    assert all(len(numbers) == 3 for numbers in found.values()), table
+    # What is not learned can be had without training: the paper's layout with soft classes, of 50 eigenpairs.
+    histogram = igps.PairHistogram(
+        [Potential(4, soft=True), InteriorDistance(64)], igps.SpectralEmbedding(n_eigenpairs=50), n_samples=1000
+    )
+    module = igps.HistogramDescriptor(histogram)
+    config = igps.descriptor("rich").needs.completed(igps.SignatureConfig())
+    dataset = igps.SignatureDataset(root / "meshes", config, root / "cache")
+    split = split_seen(dataset.labels, 3, seed=100)
+    scores = expected(igps.describe(dataset, module).flatten(1), dataset.labels, split, module.part_cells)
+    wanted = [scores[head]["ft"] for head in ("none", "whitened", "kernel")]
+    assert [float(x) for x in found["interior", "nothing"]] == pytest.approx(wanted, abs=0.06)
+
+
+def test_pretraining_saves_a_metric_and_measures_it(root: Path, tmp_path: Path) -> None:
+    out = run(
+        "pretrain.py", "--root", tmp_path / "generated", "--n_classes", 7, "--n_per_class", 3, "--n_held_out", 3,
+        "--n_eigenpairs", 50, "--n_directions", 4, "--cache_dir", root / "cache", "--data", root / "meshes",
+        "--out", tmp_path / "metric.safetensors", "--figures", tmp_path / "figures", "--n_epochs", 1,
+        "--n_training_samples", 50,
+    )  # fmt: skip
+    stored = load_file(tmp_path / "metric.safetensors")
+    head = {name: tuple(value.shape) for name, value in stored.items() if name.startswith("head.")}
+    assert head == {
+        "head.mean": (27420,), "head.directions": (4, 27420), "head.gains": (3, 4), "head.part_cells": (3,),
+    }  # fmt: skip
+    learned = [value for name, value in stored.items() if name.endswith(("log_gain", "log_gap"))]
+    assert learned
+    assert all((value != 0).any() for value in learned)
+    for name in ("pretrain.png", "pretrain_layout.png"):
+        assert (tmp_path / "figures" / name).stat().st_size > 5_000
+    assert "3 held-out generated classes" in out
+    assert "   4 generated classes: FT" in out
+    assert "1 labels a class" in out
+    assert "5 labels a class" not in out  # a single shape of each class would be left to score
