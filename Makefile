@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 # Threads that spin while they wait slow each other down many times where another process takes a core.
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo test lint shrec07 bench clean
+.PHONY: demo test lint campaign shrec07 bench clean
 
 demo: $(READY)
 	$(BIN)/igps demo --out build/demo
@@ -19,11 +19,19 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# make shrec07 DATA=folder-of-meshes-with-labels.csv
+# make campaign [SMALL=1]: broken meshes, kills, a machine at fault, properties, deliberate faults; half an hour on two
+# cores, the small one two minutes and without deliberate faults.
+campaign: $(READY) $(if $(SMALL),,$(VENV)/.ready-campaign)
+	$(BIN)/python tests/campaign/campaign.py $(if $(SMALL),--small)
+
+$(VENV)/.ready-campaign: $(READY)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[campaign]"
+	touch $@
+
+# make shrec07 DATA=folder-of-meshes-with-labels.csv [WRITE=1]: the scores of the named descriptors are those expected
 shrec07: $(READY)
 	@test -n "$(DATA)" || { echo "make shrec07 DATA=FOLDER: name the folder of the SHREC'07 meshes (with labels.csv)"; exit 2; }
-	$(BIN)/igps retrieve "$(DATA)" --paper --descriptor interior --out build/shrec07/interior
-	$(BIN)/igps retrieve "$(DATA)" --paper --descriptor gps --out build/shrec07/gps
+	$(BIN)/python tests/campaign/shrec07.py "$(DATA)" $(if $(WRITE),--write)
 
 # torch comes first and pinned: the newest build would bring gigabytes of CUDA libraries.
 $(READY): pyproject.toml constraints.txt

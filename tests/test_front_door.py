@@ -117,7 +117,7 @@ def test_every_import_is_declared() -> None:
     extras = {
         name: declared(several)
         for name, several in project["optional-dependencies"].items()
-        if name not in ("test", "lint")
+        if name not in ("test", "lint", "campaign")
     }
     optional = set().union(*extras.values()) - {"interior-gps"}
     own = {"igps", *(path.stem for path in (PROJECT / "training").glob("*.py"))}
@@ -132,7 +132,7 @@ def test_every_import_is_declared() -> None:
     every = set().union(*(imported(path) for path in [*PACKAGE.rglob("*.py"), *(PROJECT / "training").rglob("*.py")]))
     used = {normal(DISTRIBUTIONS.get(module, module)) for module in every}
     assert core <= used
-    assert optional <= used
+    assert optional - extras["formats"] <= used  # trimesh imports these, where a file asks for them
 
 
 def test_modules_that_import_at_once_need_no_extra() -> None:

@@ -40,11 +40,13 @@ _KILLED = (
     "the process that worked on it was killed, twice. It may need more memory than there is: use fewer workers, or set "
     "a memory limit to be told."
 )
-_NOT_STARTED = (
-    "no worker process could be started. A script that computes on several processes must call it under "
-    "`if __name__ == '__main__':`; otherwise look for a want of memory, or pass n_workers=1."
+_MACHINES = frozenset(
+    getattr(errno, name, 0)
+    for name in ("ENOSPC", "EDQUOT", "EFBIG", "EIO", "EROFS", "EACCES", "EPERM", "EMFILE", "ENFILE", "ENOMEM")
 )
-_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EMFILE, errno.ENFILE)
+_FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
+# A process that is killed while it starts is started once more: an administrator may have been the cause.
+_MOST_STARTS = 2
 
 
 class MachineError(RuntimeError):
@@ -136,6 +138,17 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(n_threads)
 
 
+def is_machines(error: OSError) -> bool:
+    """Whether an error tells of the machine and not of a file: no room, no right to write, a broken disk."""
+    return error.errno in _MACHINES
+
+
+def machines_words(error: OSError) -> str:
+    """What to do about it."""
+    remedy = "Choose a folder that can be written" if error.errno in _FORBIDDEN else "Make room"
+    return f"{error}. {remedy} and run again: what is done is kept."
+
+
 def n_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -154,8 +167,8 @@ def _attempt(result: Callable[[], Result], limits: Limits) -> Result | Failed:
             return Failed(f"it needs more than the memory_limit of {limits.memory / 2**20:.0f} MiB.")
         raise MachineError("out of memory. Use fewer workers or set a memory limit; what is done is kept.") from error
     except OSError as error:
-        if error.errno in _NO_SPACE:
-            raise MachineError(f"{error}. Make room and run again: what is done is kept.") from error
+        if is_machines(error):
+            raise MachineError(machines_words(error)) from error
         return Failed(_sentence(error))
     except Exception as error:
         return Failed(_sentence(error))
@@ -186,39 +199,48 @@ class _Worker(Generic[Job, Result]):
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         self._pool: ProcessPoolExecutor | None = None
-        self._pid: Future[int] = Future()
+        self._pid = 0
         self.number = -1
         self.future: Future[Result] | None = None
         self.deadline = float("inf")
 
     def give(self, number: int, function: Callable[[Job], Result], job: Job) -> None:
-        if self._pool is None:
-            self._start()
-        assert self._pool is not None
-        self.number, self.future = number, self._pool.submit(function, job)
-        if self._limits.seconds is not None:
-            wait([self._pid])  # the seconds that a process takes to start are not the job's
-            self.deadline = time.monotonic() + self._limits.seconds
+        try:
+            self.future = self.started().submit(function, job)
+        except BrokenExecutor:  # killed while it waited for a job
+            self.end()
+            self.future = self.started().submit(function, job)
+        self.number = number
+        self.deadline = time.monotonic() + (self._limits.seconds or float("inf"))
 
-    def _start(self) -> None:
+    def started(self) -> ProcessPoolExecutor:
+        """The process, started if there is none."""
         context = multiprocessing.get_context("spawn")
-        with _one_thread_each():
-            self._pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(self._limits.memory,))
-            # The process starts with its first job; the answer is not waited for, so that all workers start at once.
-            self._pid = self._pool.submit(os.getpid)
-
-    @property
-    def has_started(self) -> bool:
-        """Whether the process came as far as to take a job."""
-        return self._pid.done() and self._pid.exception() is None
+        starts = 0
+        while self._pool is None:
+            starts += 1
+            with _one_thread_each():
+                pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(self._limits.memory,))
+                try:
+                    self._pid = pool.submit(os.getpid).result()
+                    self._pool = pool
+                except BrokenExecutor as error:
+                    pool.shutdown()
+                    if starts == _MOST_STARTS:
+                        raise MachineError(
+                            "no worker process could be started. A script that computes on several processes must call "
+                            "it under `if __name__ == '__main__':`; otherwise look for a want of memory, or pass "
+                            "n_workers=1. What is done is kept."
+                        ) from error
+        return self._pool
 
     def end(self, kill: bool = False) -> None:
         """End the process, in the midst of its work if need be."""
         if self._pool is None:
             return
-        if kill and self.has_started:
+        if kill:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(self._pid.result(), getattr(signal, "SIGKILL", signal.SIGTERM))
+                os.kill(self._pid, getattr(signal, "SIGKILL", signal.SIGTERM))
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._pool, self.future, self.deadline = None, None, float("inf")
 
@@ -231,6 +253,9 @@ def _by_workers(
     workers: list[_Worker[Job, Result]] = [_Worker(limits) for _ in range(n_workers)]
     finished = False
     try:
+        # All at once: a process takes seconds to import what it needs.
+        with _one_thread_each(), ThreadPoolExecutor(n_workers) as starters:
+            list(starters.map(lambda worker: worker.started(), workers))
         while True:
             for worker in workers:
                 if worker.future is None and waiting:
@@ -248,9 +273,7 @@ def _by_workers(
                 worker.future = None
                 try:
                     yield worker.number, _attempt(future.result, limits)
-                except BrokenExecutor as error:
-                    if not worker.has_started:
-                        raise MachineError(_NOT_STARTED) from error
+                except BrokenExecutor:
                     worker.end()
                     deaths[worker.number] += 1
                     if deaths[worker.number] < _MOST_DEATHS:

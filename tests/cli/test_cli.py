@@ -127,7 +127,7 @@ def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(
     assert "1 of 7 meshes could not be used" in capsys.readouterr().out
     (row,) = csv.DictReader((tmp_path / "out" / "failures.csv").open(newline=""))
     assert row["file"] == "egg/bad.off"
-    assert "3 boundary edges" in row["error"]
+    assert "a single triangle" in row["error"]
     scores = json.loads((tmp_path / "out" / "scores.json").read_text())
     assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [6, 7, 6, 1]
 
@@ -195,7 +195,10 @@ def test_query_lists_the_nearest(
         (["retrieve", "ROOT"], "n_eigenpairs: this descriptor needs signatures of at least 250, got 20"),
         (["query", "ROOT/egg/1.off", "--gallery", "ROOT", "--top", "0"], "top"),
         (["query", "nowhere.off", "--gallery", "ROOT", "--descriptor", "d2"], "no such file|cannot be read"),
-        (["retrieve", "ROOT", "--paper"], "none of 6 meshes could be used.*too few for 250 eigenpairs"),
+        (
+            ["retrieve", "ROOT", "--paper", "--mend", "never"],
+            "none of 6 meshes could be used.*too few for 250 eigenpairs",
+        ),
     ],
 )
 def test_errors_are_one_line(
@@ -276,7 +279,7 @@ def test_help_explains_every_option(
     assert "--n_workers" in text
     assert "--workers" not in text
     if command != "demo":
-        for word in ("--cache_dir", "--strict", "--repair", "--signature.min_samples", "refined until"):
+        for word in ("--cache_dir", "--strict", "--mend", "--signature.min_samples", "refined until"):
             assert word in text, word
 
 

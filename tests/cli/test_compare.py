@@ -108,7 +108,7 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(
         rows = list(csv.reader((tmp_path / "failures.csv").open(newline="")))
         assert rows[0] == ["descriptor", "file", "error"]
         assert [row[:2] for row in rows[1:]] == [["all", "egg/bad.off"], ["picky", "egg/1.off"]]
-        assert "boundary" in rows[1][2]
+        assert "a single triangle" in rows[1][2]
         assert "too much" in rows[2][2]
         printed = capsys.readouterr().out
         assert "2 meshes could not be used or described" in printed

@@ -1,11 +1,16 @@
 from __future__ import annotations
 
 import logging
+import math
+import os
+import stat
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from safetensors.numpy import save_file
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 
 from igps.data.cache import SignatureCache, default_cache_dir
 from igps.geometry.signature import Samples, Signature, SignatureConfig
@@ -22,8 +27,9 @@ def signature() -> Signature:
         return Samples(generator.random((n, 3)), values, {"depth": values[:, 0].copy()})
 
     return Signature(
-        np.array([1.0, 2.0, 3.5]), samples(7), samples(4), 3.25, 0.1, SignatureConfig(n_eigenpairs=3), "a", ("turned",)
-    )
+        np.array([1.0, 2.0, 3.5]), samples(7), samples(4), 3.25, 0.1, SignatureConfig(n_eigenpairs=3), "a",
+        ("turned",), 2e-9,
+    )  # fmt: skip
 
 
 def test_round_trip_is_exact(tmp_path: Path, signature: Signature) -> None:
@@ -37,6 +43,7 @@ def test_round_trip_is_exact(tmp_path: Path, signature: Signature) -> None:
     assert restored.config == signature.config
     assert (restored.area, restored.volume) == (signature.area, signature.volume)
     assert (restored.name, restored.notes) == (signature.name, signature.notes)
+    assert restored.residual == signature.residual
     np.testing.assert_array_equal(restored.eigenvalues, signature.eigenvalues)
     for room in ("interior", "surface"):
         before, after = getattr(signature, room), getattr(restored, room)
@@ -80,6 +87,67 @@ def test_damaged_or_foreign_file_is_noticed(
     assert cache.get(KEY) is not None
 
 
+@pytest.mark.parametrize("what", ["surface.eigenfunctions", "interior.points", "eigenvalues", "area"])
+def test_damaged_payload_is_noticed(
+    tmp_path: Path, signature: Signature, what: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One bit or digit of what has no structure that could show it."""
+    cache = SignatureCache(tmp_path)
+    cache.put(KEY, signature)
+    path = cache.path(KEY)
+    content = bytearray(path.read_bytes())
+    payload = b"3.25" if what == "area" else load_file(path)[what].tobytes()
+    assert content.count(payload) == 1
+    content[content.index(payload) + len(payload) - 1] ^= 1
+    path.write_bytes(content)
+    with caplog.at_level(logging.WARNING):
+        assert cache.get(KEY) is None
+    assert f"{path}: cached signature is not usable (its content is damaged" in caplog.text
+    cache.put(KEY, signature)
+    assert cache.get(KEY) is not None
+
+
+def test_file_without_a_checksum_is_valid(tmp_path: Path, signature: Signature) -> None:
+    cache = SignatureCache(tmp_path)
+    cache.put(KEY, signature)
+    path = cache.path(KEY)
+    with safe_open(path, framework="numpy") as file:
+        metadata = file.metadata()
+    del metadata["checksum"], metadata["residual"]
+    save_file(load_file(path), path, metadata=metadata)
+    restored = cache.get(KEY)
+    assert restored is not None
+    np.testing.assert_array_equal(restored.eigenvalues, signature.eigenvalues)
+    assert math.isnan(restored.residual)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions are those of POSIX")
+@pytest.mark.parametrize(("umask", "expected"), [(0o002, 0o664), (0o027, 0o640)])
+def test_umask_says_who_may_read(tmp_path: Path, signature: Signature, umask: int, expected: int) -> None:
+    before = os.umask(umask)
+    try:
+        SignatureCache(tmp_path / "cache").put(KEY, signature)
+    finally:
+        os.umask(before)
+    path = SignatureCache(tmp_path / "cache").path(KEY)
+    assert stat.S_IMODE(path.stat().st_mode) == expected
+    for folder in (path.parent, path.parent.parent):
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o777 & ~umask
+
+
+def test_what_a_killed_run_left_is_removed_later(tmp_path: Path, signature: Signature) -> None:
+    cache = SignatureCache(tmp_path)
+    folder = cache.path(KEY).parent
+    folder.mkdir(parents=True)
+    old, fresh = folder / "old.partial", folder / "fresh.partial"
+    for path in (old, fresh):
+        path.write_bytes(b"half of a file")
+    os.utime(old, (time.time() - 2 * 24 * 3600,) * 2)
+    cache.put(KEY, signature)
+    cache.remove_abandoned()
+    assert sorted(folder.iterdir()) == sorted([cache.path(KEY), fresh])  # another process may still write the fresh one
+
+
 def test_older_algorithm_is_not_trusted(tmp_path: Path, signature: Signature, monkeypatch: pytest.MonkeyPatch) -> None:
     cache = SignatureCache(tmp_path)
     cache.put(KEY, signature)
@@ -91,7 +159,7 @@ def test_failed_write_leaves_nothing(tmp_path: Path, signature: Signature, monke
     def fail(*_: object, **__: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr("igps.data.cache.save_file", fail)
+    monkeypatch.setattr("igps.data.cache.os.replace", fail)
     cache = SignatureCache(tmp_path)
     with pytest.raises(OSError, match="disk full"):
         cache.put(KEY, signature)

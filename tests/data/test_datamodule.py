@@ -100,8 +100,8 @@ def test_meshes_are_read_as_asked(root: Path, tmp_path: Path) -> None:
         )
 
     with pytest.raises(MeshError, match=r"2\.off.*boundary edges"):
-        module().prepare_data()
-    module(reading=MeshReading(allow_open=True)).prepare_data()
+        module(reading=MeshReading("never")).prepare_data()
+    module(reading=MeshReading("never", allow_open=True)).prepare_data()
 
 
 def test_nothing_to_validate_on_is_no_loader(root: Path, tmp_path: Path) -> None:

@@ -96,7 +96,7 @@ def test_parametrisation_above_is_complete() -> None:
     assert set(CONFIG.as_dict()) == changed | {"algorithm_version"}
 
 
-@pytest.mark.parametrize("option", [{"repair": True}, {"component": "largest"}, {"allow_open": True}])
+@pytest.mark.parametrize("option", [{"mend": "always"}, {"component": "largest"}, {"allow_open": True}])
 def test_key_covers_how_the_file_is_read(
     root: Path, tmp_path: Path, counted: list[str], option: dict[str, object]
 ) -> None:
@@ -146,7 +146,7 @@ def test_precompute_fills_the_cache_and_lists_bad_meshes(root: Path, tmp_path: P
         failures = dataset.precompute(n_workers=2 if how == "processes" else 1, progress=False)
     (failure,) = failures
     assert failure.id == "egg/bad.off"
-    assert "boundary edges" in failure.error
+    assert "a single triangle" in failure.error
     assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 4
     usable = dataset.usable(failures)
     assert usable.files.names == ("ball/1.off", "ball/2.off", "egg/1.off", "egg/2.off")

@@ -70,7 +70,12 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
     recipes = [recipe, replace(recipe, config=replace(CONFIG, seed=1))]
     recipes += [
         replace(recipe, reading=reading)
-        for reading in (MeshReading(repair=True), MeshReading(component="largest"), MeshReading(allow_open=True))
+        for reading in (
+            MeshReading("never"),
+            MeshReading("always"),
+            MeshReading(component="largest"),
+            MeshReading(allow_open=True),
+        )
     ]
     keys = [one.key(path) for one in recipes] + [recipe.key(renamed), recipe.key(other)]
     assert len(set(keys)) == len(keys)
@@ -79,8 +84,8 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
 def test_keys_are_those_of_the_caches_that_exist(recipe: Recipe, tmp_path: Path) -> None:
     """Frozen: another key leaves all caches useless. It changes with ALGORITHM_VERSION alone."""
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
-    assert SignatureConfig.ALGORITHM_VERSION == 2
-    assert recipe.key(tmp_path / "frozen.off") == "776c078095e2f7dc8f127ef93cd3407cd62a7171c1114971877983bb3113bbcf"
+    assert SignatureConfig.ALGORITHM_VERSION == 3
+    assert recipe.key(tmp_path / "frozen.off") == "f3de6688b1db864db53947e7043284b6dae4394c17e8a65a0ef5a8e84af8b84f"
 
 
 def test_a_missing_file_is_named(recipe: Recipe, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import logging
 
 import numpy as np
 import pytest
@@ -246,3 +247,61 @@ def test_cluster_error_falls_with_the_third_power() -> None:
     assert errors[0] < 1e-2
     for before, after in itertools.pairwise(errors):
         assert after < before / 6.5
+
+
+def test_a_mesh_on_which_the_approximation_is_worse_gets_a_finer_one(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Constants that promise too much stand for a mesh on which the measured ones do."""
+    mesh = bumpy_sphere(5)
+    points, functions = interior_points(mesh, 250), smooth_functions(mesh[0])
+    exact = extend(*mesh, functions, points)
+    caplog.set_level(logging.INFO, logger=coordinates.logger.name)
+
+    def error(accuracy: float) -> float:
+        found = extend(*mesh, functions, points, accuracy=accuracy)
+        return float(np.quantile(np.abs(pdist(found) / pdist(exact) - 1), 0.99))
+
+    accuracy = 1e-4
+    assert error(accuracy) < accuracy
+    assert not caplog.records
+    monkeypatch.setattr(coordinates, "_CLUSTER_ERROR", 1e-7)
+    monkeypatch.setattr(coordinates, "_HAT_ERROR", 1e-4)
+    with monkeypatch.context() as unchecked:
+        unchecked.setattr(coordinates, "_sampled_error", lambda *_: 0.0)
+        assert error(accuracy) > 2 * accuracy
+    assert error(accuracy) < accuracy
+    assert "evaluated again" in caplog.text
+
+
+def test_where_no_approximation_serves_the_closed_form_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = bumpy_sphere(5)
+    points, functions = interior_points(mesh, 60), smooth_functions(mesh[0])
+    settings = []
+
+    def never(*_: object) -> float:
+        settings.append(1)
+        return 1.0
+
+    monkeypatch.setattr(coordinates, "_sampled_error", never)
+    found = extend(*mesh, functions, points, accuracy=1e-3, dtype=torch.float64)
+    np.testing.assert_allclose(found, extend(*mesh, functions, points), atol=1e-12)
+    assert settings
+
+
+def test_the_sampled_error_is_that_of_the_distances() -> None:
+    mesh = bumpy_sphere(4)
+    points, functions = interior_points(mesh, 100), smooth_functions(mesh[0])
+    surface, x = coordinates._prepare(*mesh, points, "cpu")
+    hats, listed = far_field.HatMoments.of(surface), closed_forms.ListedRule.of(surface)
+    columns = torch.cat([torch.as_tensor(functions), torch.ones(len(functions), 1)], 1).double()
+    exact = extend(*mesh, functions, points)
+    assert coordinates._sampled_error(hats, listed, columns, x, exact, 1e-3) < 1e-4
+    wrong = exact.mean(axis=0) + 1.01 * (exact - exact.mean(axis=0))
+    assert coordinates._sampled_error(hats, listed, columns, x, wrong, 1e-3) == pytest.approx(0.01, rel=0.02)
+    order = np.random.default_rng(0).permutation(len(points))
+    half = exact.copy()
+    half[:50] *= 1.003
+    expected = coordinates._sampled_error(hats, listed, columns, x, half, 1e-3)
+    shuffled = coordinates._sampled_error(hats, listed, columns, x[order], half[order], 1e-3)
+    assert shuffled == pytest.approx(expected, rel=1e-6)  # the same points, whatever the order

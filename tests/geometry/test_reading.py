@@ -1,4 +1,4 @@
-"""Meshes from files: formats, repair, and what makes a file unusable."""
+"""Meshes from files: formats, clouds of points, mending, and what makes a file unusable."""
 
 from __future__ import annotations
 
@@ -58,15 +58,15 @@ def test_stl_needs_and_gets_welding(tmp_path: Path) -> None:
     surface = trimesh.creation.icosphere(subdivisions=2)
     surface.export(tmp_path / "mesh.stl")
     with pytest.raises(MeshError, match="boundary edges"):
-        load_mesh(tmp_path / "mesh.stl")
-    mesh = load_mesh(tmp_path / "mesh.stl", MeshReading(repair=True))
+        load_mesh(tmp_path / "mesh.stl", MeshReading("never"))
+    mesh = load_mesh(tmp_path / "mesh.stl")
     assert len(mesh.vertices) == len(surface.vertices)
     assert mesh.volume == pytest.approx(surface.volume, rel=1e-6)
     assert any("welded" in note for note in mesh.notes)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_repair_mends_each_fault_at_any_scale(tmp_path: Path, scale: float) -> None:
+def test_each_fault_is_mended_at_any_scale(tmp_path: Path, scale: float) -> None:
     surface = trimesh.creation.icosphere(subdivisions=2)
     vertices, faces = np.asarray(surface.vertices), np.asarray(surface.faces)
     faulty = faces.copy()
@@ -74,7 +74,7 @@ def test_repair_mends_each_fault_at_any_scale(tmp_path: Path, scale: float) -> N
     faulty[5, 0] = len(vertices)
     faulty = np.vstack([faulty, faulty[7], [[0, 0, 1]]])
     vertices = np.vstack([vertices, vertices[faces[5, 0] if 5 % 3 else faces[5, 2]], [[4, 4, 4]]]) * scale
-    mesh = load_mesh(write_off(tmp_path / "faulty.off", vertices, faulty), MeshReading(repair=True))
+    mesh = load_mesh(write_off(tmp_path / "faulty.off", vertices, faulty))
     assert mesh.volume == pytest.approx(surface.volume * scale**3, rel=1e-6)
     assert len(mesh.vertices) == len(surface.vertices)
     said = " ".join(mesh.notes)
@@ -87,8 +87,8 @@ def test_largest_component_is_that_of_the_largest_area(tmp_path: Path) -> None:
     faces = np.vstack([fine.faces, large.faces + len(fine.vertices)])
     path = write_off(tmp_path / "two.off", vertices, faces)
     with pytest.raises(MeshError, match="2 connected components"):
-        load_mesh(path)
-    mesh = load_mesh(path, MeshReading(component="largest"))
+        load_mesh(path, MeshReading("never"))
+    mesh = load_mesh(path, MeshReading("never", component="largest"))
     assert mesh.volume == pytest.approx(125)
     assert any("largest of 2 components" in note for note in mesh.notes)
 
@@ -96,7 +96,7 @@ def test_largest_component_is_that_of_the_largest_area(tmp_path: Path) -> None:
 def test_open_files_are_read_when_allowed(tmp_path: Path) -> None:
     path = write_off(tmp_path / "open.off", TETRAHEDRON, FACES[:3])
     with pytest.raises(MeshError, match="3 boundary edges"):
-        load_mesh(path)
+        load_mesh(path, MeshReading("never"))
     mesh = load_mesh(path, MeshReading(allow_open=True))
     assert mesh.allow_open
     assert len(mesh.faces) == 3
@@ -105,3 +105,58 @@ def test_open_files_are_read_when_allowed(tmp_path: Path) -> None:
 def test_unknown_component_is_refused() -> None:
     with pytest.raises(ValueError, match="component: expected 'largest' or None, got 'smallest'"):
         MeshReading(component="smallest")  # type: ignore[arg-type]
+
+
+def test_unknown_way_to_mend_is_refused() -> None:
+    with pytest.raises(ValueError, match="mend: expected 'auto', 'never' or 'always', got 'please'"):
+        MeshReading(mend="please")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("normals", [False, True])
+@pytest.mark.parametrize("suffix", ["xyz", "ply"])
+def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(tmp_path: Path, suffix: str, normals: bool) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=4)
+    rows = np.asarray(surface.vertices) * [1, 0.8, 1.3]
+    names = ["x", "y", "z"]
+    if normals:
+        rows, names = np.hstack([rows, surface.vertex_normals]), [*names, "nx", "ny", "nz"]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(rows)}", *(f"property float {n}" for n in names)]
+    lines = [*header, "end_header"] if suffix == "ply" else []
+    lines += [" ".join(f"{x:.7f}" for x in row) for row in rows]
+    path = tmp_path / f"cloud.{suffix}"
+    path.write_text("\n".join(lines) + "\n")
+    mesh = load_mesh(path)
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * 1.04, rel=0.02)
+    assert mesh.genus == 0
+    assert any("watertight" in note for note in mesh.notes)
+    with pytest.raises(MeshError, match=r"cloud.*no faces"):
+        load_mesh(path, MeshReading("never"))
+
+
+def test_a_body_is_left_as_it_is_bit_for_bit(tmp_path: Path) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=3)
+    path = write_off(tmp_path / "body.off", surface.vertices, surface.faces)
+    mended, untouched = load_mesh(path), load_mesh(path, MeshReading("never"))
+    np.testing.assert_array_equal(mended.vertices, untouched.vertices)
+    np.testing.assert_array_equal(mended.faces, untouched.faces)
+    assert mended.notes == ()
+
+
+def test_too_few_vertices_for_the_eigenpairs_are_made_more(tmp_path: Path) -> None:
+    box = trimesh.creation.box()
+    path = write_off(tmp_path / "box.off", box.vertices, box.faces)
+    mesh = load_mesh(path, least_vertices=100)
+    assert len(mesh.vertices) >= 100
+    assert mesh.volume == pytest.approx(1)
+    assert mesh.area == pytest.approx(6)
+
+
+def test_a_format_without_its_module_says_which_extra_has_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "part.3mf").write_bytes(b"PK")
+
+    def missing(*_: object, **__: object) -> None:
+        raise ImportError("No module named 'lxml'")
+
+    monkeypatch.setattr(trimesh, "load", missing)
+    with pytest.raises(MeshError, match=r"part\.3mf.*lxml.*interior-gps\[formats\]"):
+        load_mesh(tmp_path / "part.3mf")

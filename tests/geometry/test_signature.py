@@ -13,7 +13,7 @@ from igps.geometry.coordinates import mean_value_coordinates
 from igps.geometry.laplacian import laplacian
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
-from igps.linalg import eigenpairs
+from igps.linalg import ConvergenceError, eigenpairs
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding
 from igps.nn.histogram import PairHistogram
@@ -150,6 +150,40 @@ def test_robust_backend_and_seed_are_honoured(blob: Mesh, signature: Signature) 
     other = compute_signature(blob, replace(CONFIG, seed=1))
     assert not np.array_equal(other.surface.points, signature.surface.points)
     np.testing.assert_array_equal(compute_signature(blob, CONFIG).surface.points, signature.surface.points)
+
+
+@pytest.fixture(scope="module")
+def needles(blob: Mesh) -> Mesh:
+    """The blob with two vertices a billionth of its size apart."""
+    vertices = blob.vertices.copy()
+    a, b = blob.faces[100, :2]
+    vertices[a] = vertices[b] + (vertices[a] - vertices[b]) * 2e-8
+    return Mesh(vertices, blob.faces, name="needles")
+
+
+def test_other_matrices_serve_where_the_cotangent_ones_fail(needles: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = compute_signature(needles, CONFIG)
+    assert 1e-12 < plain.residual < 1e-6
+    assert plain.notes == ()
+    # What rounding leaves of the cotangent matrices' eigenpairs is far from that of the others'.
+    limit = plain.residual / 2
+    monkeypatch.setattr("igps.geometry.signature._RESIDUAL", limit)
+    monkeypatch.setattr("igps.linalg.eigensolver.RESIDUAL_LIMIT", limit)
+    signature = compute_signature(needles, CONFIG)
+    (note,) = signature.notes
+    assert note.startswith("intrinsic-Delaunay matrices were used: ")
+    assert f"relative residual above {limit:.1e}" in note
+    assert signature.residual < limit
+    robust = compute_signature(needles, replace(CONFIG, backend="robust"))
+    np.testing.assert_array_equal(signature.eigenvalues, robust.eigenvalues)
+    np.testing.assert_array_equal(signature.interior.eigenfunctions, robust.interior.eigenfunctions)
+
+
+def test_a_mesh_that_no_matrices_serve_is_refused(needles: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("igps.geometry.signature._RESIDUAL", 1e-18)
+    monkeypatch.setattr("igps.linalg.eigensolver.RESIDUAL_LIMIT", 1e-18)
+    with pytest.raises(ConvergenceError, match=r"needles: .* cotangent matrices .* intrinsic-Delaunay ones .*remesh"):
+        compute_signature(needles, CONFIG)
 
 
 def test_too_few_vertices_say_so(blob: Mesh) -> None:

@@ -16,6 +16,8 @@ from problems import Problem, cotangent_problem, torus
 from scipy import sparse
 from scipy.linalg import eigh
 
+from igps.geometry.laplacian import laplacian
+from igps.geometry.mesh import Mesh
 from igps.linalg import ConvergenceError, Spectrum, eigenpairs, eigensolver, krylov, lanczos
 from igps.linalg.factorization import factorize
 from igps.linalg.symbolic import dissect
@@ -297,6 +299,18 @@ def test_takes_the_matrices_of_other_libraries() -> None:
     np.testing.assert_allclose(of_lapy.eigenvalues, values, rtol=1e-5)  # LaPy computes in single precision
     of_igl = eigenpairs(-igl.cotmatrix(vertices, faces), igl.massmatrix(vertices, faces, 0), 24)
     np.testing.assert_allclose(of_igl.eigenvalues, values, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("length", "usable"), [(400, True), (8000, False)])
+def test_rounding_excuses_only_a_small_residual(length: float, usable: bool) -> None:
+    """A needle's cotangents: what rounding allows grows with the square of its length, what is accepted does not."""
+    needle = trimesh.creation.cylinder(0.2, length, sections=300)
+    stiffness, mass = laplacian(Mesh(needle.vertices, needle.faces))
+    if usable:
+        assert 1e-6 < eigenpairs(stiffness, mass, 50, tolerance=1e-6).residual < 1e-4
+    else:
+        with pytest.raises(ConvergenceError, match=r"relative residual above 1.0e-04"):
+            eigenpairs(stiffness, mass, 50, tolerance=1e-6)
 
 
 def test_arguments_are_left_alone(torus_problem: Problem) -> None:

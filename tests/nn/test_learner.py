@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import runpy
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -312,6 +313,16 @@ def test_without_head_the_test_scores_are_the_plain_ones(shapes: Path, tmp_path:
     assert {name.removeprefix("test_"): value for name, value in logged.items()} == pytest.approx(expected, abs=1e-6)
     with pytest.raises(ValueError, match="expected a head to train"):
         trainer(1, tmp_path).fit(model, module)
+
+
+def test_a_repeated_shape_counts_once(shapes: Path, tmp_path: Path) -> None:
+    """As a distributed sampler repeats some to give every process the same number."""
+    module = data(shapes)
+    model = RetrievalLearner(bins(), CorrectedDistance(), loss=torch.nn.Identity())
+    (once,) = trainer(1, tmp_path).test(model, module, verbose=False)
+    module.split = replace(module.split, test=(*module.split.test, *module.split.test[:2]))
+    (repeated,) = trainer(1, tmp_path).test(model, module, verbose=False)
+    assert repeated == once
 
 
 def test_smoke_configuration_trains_and_its_checkpoint_loads_without_running_code(

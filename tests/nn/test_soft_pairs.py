@@ -224,3 +224,20 @@ def test_bad_input_is_refused(change: dict[str, Tensor], message: str, first: bo
     soft_pair_histogram(good["memberships"], [(good["points"], good["centres"])] * 2)
     with pytest.raises(ValueError, match=message):
         soft_pair_histogram(changed["memberships"], axes)
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_no_cell_is_negative(joint: bool) -> None:
+    """Isolated pairs just below a centre: what rounding leaves in the cell before it would have no other to hide in."""
+    generator = torch.Generator().manual_seed(0)
+    centres = (torch.arange(12) + 0.5) / 3
+    below = torch.nextafter(centres[1:], torch.zeros(())).repeat(40)
+    for length in torch.cat([below, below * (1 - 6e-8 * torch.rand(len(below), generator=generator))]):
+        direction = torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0)
+        ends = torch.stack([torch.zeros(3), length * direction])
+        soft_classes = torch.rand(2, 1, generator=generator)
+        memberships = torch.cat([soft_classes, 1 - soft_classes], dim=1)
+        axes = [(ends, centres), (ends.roll(1, dims=1), centres)] if joint else [(ends, centres)]
+        histogram = soft_pair_histogram(memberships, axes)
+        assert histogram.min() >= 0
+        assert float(histogram.sum()) == pytest.approx(1, abs=1e-6)

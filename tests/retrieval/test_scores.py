@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -329,3 +330,59 @@ def test_metric_compares_by_chi_square_unless_told() -> None:
 def test_metric_refuses_labels_that_are_not_aligned(descriptors: Tensor, labels: Tensor) -> None:
     with pytest.raises(ValueError, match="labels: expected one integer for each"):
         RetrievalScoresMetric().update(descriptors, labels)
+
+
+def _score_part(process: int, folder: str, with_ids: bool) -> None:
+    """One of two processes: its part of 7 shapes as a distributed sampler deals them out, the first one twice."""
+    torch.distributed.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=process, world_size=2)
+    descriptors, labels = seven_shapes()
+    part = [0, 2, 4, 6] if process == 0 else [1, 3, 5, 0]
+    metric = RetrievalScoresMetric(euclidean)
+    for chosen in (part[:3], part[3:]):
+        ids = [f"shape {i}" for i in chosen] if with_ids else None
+        metric.update(descriptors[chosen], labels[chosen], ids)
+    torch.save(metric.compute(), f"{folder}/scores-{process}.pt")
+    torch.distributed.destroy_process_group()
+
+
+def seven_shapes() -> tuple[Tensor, Tensor]:
+    return torch.tensor([[0.0], [0.4], [1.1], [1.9], [3.0], [3.2], [5.0]]), torch.tensor([0, 1, 0, 1, 0, 1, 1])
+
+
+@pytest.mark.parametrize("with_ids", [True, False])
+def test_metric_counts_a_shape_once_over_processes(with_ids: bool, tmp_path: Path) -> None:
+    torch.multiprocessing.spawn(_score_part, (str(tmp_path), with_ids), nprocs=2)
+    descriptors, labels = seven_shapes()
+    expected = retrieval_scores(euclidean(descriptors, descriptors), labels).mean()
+    for process in range(2):
+        result = {name: value.item() for name, value in torch.load(tmp_path / f"scores-{process}.pt").items()}
+        if with_ids:
+            assert result == pytest.approx(expected)
+        else:  # what the repeated shape does
+            assert result["nn"] > expected["nn"] + 0.1
+
+
+def test_metric_drops_repetitions_of_one_process() -> None:
+    descriptors, labels = seven_shapes()
+    once, twice = RetrievalScoresMetric(euclidean), RetrievalScoresMetric(euclidean)
+    once.update(descriptors, labels)
+    ids = [str(i) for i in range(7)]
+    twice.update(descriptors, labels, ids)
+    twice.update(descriptors[3:], labels[3:], ids[3:])
+    assert twice.compute() == once.compute()
+    twice.reset()
+    twice.update(descriptors, labels)
+    assert twice.compute() == once.compute()
+
+
+def test_metric_refuses_names_that_are_not_aligned() -> None:
+    metric = RetrievalScoresMetric()
+    with pytest.raises(ValueError, match="ids: expected one name for each of 2"):
+        metric.update(torch.ones(2, 2), torch.tensor([0, 0]), ["a"])
+    metric.update(torch.ones(2, 2), torch.tensor([0, 0]), ["a", "b"])
+    with pytest.raises(ValueError, match="ids: expected with every update or with none"):
+        metric.update(torch.ones(2, 2), torch.tensor([0, 0]))
+    metric.reset()
+    metric.update(torch.ones(2, 2), torch.tensor([0, 0]))
+    with pytest.raises(ValueError, match="ids: expected with every update or with none"):
+        metric.update(torch.ones(2, 2), torch.tensor([0, 0]), ["a", "b"])

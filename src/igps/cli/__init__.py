@@ -12,12 +12,14 @@ from docstring_parser import parse
 from jsonargparse import ArgumentParser, Namespace
 
 from igps.cli.compare import compare
+from igps.cli.damage import damage
 from igps.cli.demo import demo
+from igps.cli.doctor import doctor
 from igps.cli.figure import pose, potential, topology
 from igps.cli.reading import FLAGS
 from igps.cli.retrieval import extract, query, retrieve
 from igps.cli.robustness import robustness
-from igps.parallel import MachineError
+from igps.parallel import MachineError, is_machines, machines_words
 
 Command = Callable[..., None]
 Commands = Mapping[str, "Command | Commands"]
@@ -30,6 +32,8 @@ COMMANDS: Commands = {
     "compare": compare,
     "figure": {"pose": pose, "topology": topology, "potential": potential},
     "robustness": robustness,
+    "damage": damage,
+    "doctor": doctor,
 }
 """What follows `igps`: a function, or the commands of a group by name."""
 
@@ -47,6 +51,9 @@ def main() -> None:
         sys.exit(2)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         # Expected of bad input, and said in full by the message; a traceback would bury it.
+        if isinstance(error, OSError) and is_machines(error):
+            print(f"igps: {machines_words(error)}", file=sys.stderr)
+            sys.exit(2)
         print(f"igps: {error}", file=sys.stderr)
         sys.exit(1)
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from igps.cli.reading import signatures, write_failures
+from igps.cli.reading import signatures, write_notes, write_rows
 from igps.data.dataset import Failure
 from igps.data.sources import labelled_meshes
 from igps.descriptors import NAMES
@@ -52,6 +52,7 @@ def compare(
     if n_failed:
         print(f"{n_failed} meshes could not be used or described.")
     if out is not None:
+        write_notes(out, dataset)
         _write_figure(out, results)
         print(f"written to {out}")
 
@@ -71,7 +72,7 @@ def _write(out: Path, results: Sequence[Result], failures: Sequence[Failure]) ->
     rows = [("all", failure.id, failure.error) for failure in failures]
     for result in results:
         rows += [(result.descriptor.name, failure.id, failure.error) for failure in result.failures]
-    write_failures(out / "failures.csv", ("descriptor", "file", "error"), rows)
+    write_rows(out / "failures.csv", ("descriptor", "file", "error"), rows)
 
 
 def _write_figure(out: Path, results: Sequence[Result]) -> None:

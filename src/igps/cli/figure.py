@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from igps.cli.reading import signatures
 from igps.data.sources import labelled_meshes
+from igps.geometry.mending import Mending
 from igps.geometry.mesh import Mesh
 from igps.geometry.reading import MeshReading, load_mesh
 from igps.geometry.surface import genus
@@ -57,7 +58,7 @@ def topology(
     out: Path = Path("topology.png"),
     n_eigenpairs: int = 250,
     resolution: int = 32,
-    repair: bool = False,
+    mend: Mending = "auto",
 ) -> None:
     """Weld two places of a body, and draw how its interior distances change (Rustamov 2010, figure 2).
 
@@ -71,12 +72,13 @@ def topology(
         out: the picture, a PNG file.
         n_eigenpairs: eigenpairs of the embedding; 250 in the paper.
         resolution: voxels along the longest side, one sample each; 32 in the paper.
-        repair: weld vertices, drop degenerate, duplicate and unused elements, and orient the faces of the mesh
+        mend: auto does the least that makes a body of the mesh, never refuses what is no body, always makes it
+            watertight.
     """
     if weld is not None and len(weld) != 2:
         raise ValueError(f"weld: expected the indices of two vertices, got {len(weld)}.")
     ends = None if weld is None else (weld[0], weld[1])
-    found = weld_change(load_mesh(mesh, MeshReading(repair)), ends, n_eigenpairs, resolution)
+    found = weld_change(load_mesh(mesh, MeshReading(mend)), ends, n_eigenpairs, resolution)
 
     from igps.report.paper import draw_weld_change
 
@@ -99,7 +101,7 @@ def potential(
     out: Path = Path("potential.png"),
     n_eigenpairs: int = 250,
     resolution: int = 32,
-    repair: bool = False,
+    mend: Mending = "auto",
 ) -> None:
     """Draw the barycentroid potential of a body on a plane through its barycentroid (Rustamov 2010, section 4).
 
@@ -110,11 +112,12 @@ def potential(
         out: the picture, a PNG file.
         n_eigenpairs: eigenpairs of the embedding; 250 in the paper.
         resolution: voxels along the longest side, near the best of which the barycentroid is searched; 32 in the paper.
-        repair: weld vertices, drop degenerate, duplicate and unused elements, and orient the faces of the mesh
+        mend: auto does the least that makes a body of the mesh, never refuses what is no body, always makes it
+            watertight.
     """
     from igps.report.paper import draw_potential_slice, upright
 
-    body = load_mesh(mesh, MeshReading(repair))
+    body = load_mesh(mesh, MeshReading(mend))
     body = Mesh(upright(body.vertices), body.faces, name=body.name)
     found = potential_slice(body, n_eigenpairs, resolution)
     draw_potential_slice(found.axes, found.values, found.section, found.barycentroid, out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import reduce
 from operator import or_
@@ -10,6 +11,7 @@ from pathlib import Path
 
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import MeshFiles
+from igps.geometry.mending import Mending, mended_by
 from igps.geometry.reading import Component, MeshReading
 from igps.geometry.signature import SignatureConfig
 from igps.nn.descriptor import Descriptor
@@ -18,7 +20,6 @@ from igps.parallel import Limits
 
 FLAGS = {
     "paper": "use the parameters of Rustamov 2010: as the defaults, but the grid is never refined",
-    "repair": "weld vertices, drop degenerate, duplicate and unused elements, and orient the faces of each mesh",
     "allow_open": "accept surfaces with holes",
     "strict": "stop at the first mesh that cannot be used instead of skipping it",
 }
@@ -31,7 +32,7 @@ def signatures(
     cache_dir: Path | None = None,
     signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
     paper: bool = False,
-    repair: bool = False,
+    mend: Mending = "auto",
     component: Component | None = None,
     allow_open: bool = False,
     strict: bool = False,
@@ -48,11 +49,13 @@ def signatures(
         descriptors: whose needs the signatures satisfy.
         cache_dir: folder where computed signatures are kept; the user's cache directory if not given.
         signature: parameters of the signatures.
+        mend: auto does the least that makes a body of each mesh, never refuses what is no body, always makes all
+            watertight, for collections of mixed quality.
         component: largest keeps only the largest connected component of each mesh.
         n_workers: processes that compute; all cores if not given.
         time_limit: seconds that the signature of one mesh may take; no limit if not given.
         memory_limit: gigabytes of memory that the signature of one mesh may take; no limit if not given.
-        paper, repair, allow_open, strict: see `FLAGS`.
+        paper, allow_open, strict: see `FLAGS`.
 
     Raises:
         ValueError: no mesh could be used, or `paper` beside other parameters of the signatures.
@@ -61,16 +64,37 @@ def signatures(
         raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
     config = SignatureConfig.paper() if paper else signature
     config = reduce(or_, (one.needs for one in descriptors), Needs()).completed(config)
-    dataset = SignatureDataset(source, config, cache_dir, reading=MeshReading(repair, component, allow_open))
+    dataset = SignatureDataset(source, config, cache_dir, reading=MeshReading(mend, component, allow_open))
     limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
     failures = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits)
     if len(failures) == len(dataset):
         raise ValueError(f"none of {len(dataset)} meshes could be used; the first: {failures[0].error}")
-    return dataset.usable(failures), failures
+    usable = dataset.usable(failures)
+    if summary := mending_summary(usable, len(dataset)):
+        print(summary)
+    return usable, failures
 
 
-def write_failures(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Write a list of failures, or remove the one of an earlier run where there are none."""
+def mending_summary(dataset: SignatureDataset, n_given: int) -> str:
+    """How many meshes were mended and by what, in one line; nothing where none was."""
+    steps = [mended_by(dataset.notes(i)) for i in range(len(dataset))]
+    counts = Counter(step for taken in steps for step in taken)
+    if not counts:
+        return ""
+    n_mended = sum(bool(taken) for taken in steps)
+    words = {"watertight": "made watertight"}
+    told = ", ".join(f"{count} {words.get(step, step)}" for step, count in counts.most_common())
+    return f"{n_mended} of {n_given} meshes were mended: {told}"
+
+
+def write_notes(out: Path, dataset: SignatureDataset) -> None:
+    """Write notes.csv, what was done to which mesh; or remove that of an earlier run where nothing was done."""
+    notes = ((name, dataset.notes(i)) for i, name in enumerate(dataset.files.names))
+    write_rows(out / "notes.csv", ("file", "note"), [(name, note) for name, told in notes for note in told])
+
+
+def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Write a table, or remove the one of an earlier run where there are no rows."""
     rows = list(rows)
     path.unlink(missing_ok=True)
     if rows:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from igps.cli.reading import signatures, write_failures
+from igps.cli.reading import signatures, write_notes, write_rows
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import MeshFiles, find_meshes, labelled_meshes
 from igps.descriptors import descriptor as descriptor_of
@@ -159,4 +159,5 @@ def _write_retrieval(
                 row = [names[i], place, names[j], f"{float(distances[i, j]):.6g}", int(labels[i] == labels[j])]
                 writer.writerow(row)
     rows = [(failure.id, failure.error) for failure in failures]
-    write_failures(out / "failures.csv", ("file", "error"), rows)
+    write_rows(out / "failures.csv", ("file", "error"), rows)
+    write_notes(out, dataset)

@@ -46,20 +46,20 @@ class SampleBatch:
         return SampleBatch(self.points.to(device), self.eigenfunctions.to(device), self.mask.to(device), attributes)
 
     def subset(self, n_samples: int, seed: int | None = None) -> SampleBatch:
-        """A random subset of at most `n_samples` samples of each shape.
+        """At most `n_samples` samples of each shape.
 
         Args:
             n_samples: how many; a shape with fewer keeps all of them.
-            seed: makes the subset of a shape depend on its number of samples alone, not on its batch; torch's global
-                generator draws if None.
+            seed: takes samples at equal steps along the order they come in, from a start that it draws. In a Signature
+                that order is by what the body looks like, and so is the choice: it depends neither on its batch nor on
+                how grid and mesh are numbered. If None, torch's global generator draws the samples at random.
         """
         n_kept = min(n_samples, self.mask.shape[1])
         index = torch.zeros(len(self.mask), n_kept, dtype=torch.long)
         kept = torch.zeros(len(self.mask), n_kept, dtype=torch.bool)
         for i, real in enumerate(self.mask.cpu()):
             present = real.nonzero().flatten()
-            generator = None if seed is None else torch.Generator().manual_seed(seed)
-            chosen = present[torch.randperm(len(present), generator=generator)[:n_samples]]
+            chosen = present[_chosen(len(present), n_samples, seed)]
             index[i, : len(chosen)] = chosen
             kept[i, : len(chosen)] = True
         index, kept = index.to(self.mask.device), kept.to(self.mask.device)
@@ -70,6 +70,16 @@ class SampleBatch:
 
         attributes = {name: take(values) for name, values in self.attributes.items()}
         return SampleBatch(take(self.points), take(self.eigenfunctions), kept, attributes)
+
+
+def _chosen(n_present: int, n_samples: int, seed: int | None) -> Tensor:
+    if seed is None:
+        return torch.randperm(n_present)[:n_samples]
+    if n_present <= n_samples:
+        return torch.arange(n_present)
+    start = torch.rand(1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    steps = (torch.arange(n_samples) + start) * (n_present / n_samples)
+    return steps.long().clamp_(max=n_present - 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import logging
 import os
-import tempfile
-from collections.abc import Callable, Mapping
+import secrets
+import time
+import zlib
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from igps.geometry.signature import Samples, Signature, SignatureConfig
 
@@ -20,6 +22,9 @@ logger = logging.getLogger(__name__)
 
 _FORMAT = "igps-signature-1"
 _ROOMS = ("interior", "surface")
+_PARTIAL = ".partial"
+# A file still being written after so many seconds was left by a process that was killed: a write takes well below one.
+_ABANDONED = 24 * 3600
 T = TypeVar("T")
 
 
@@ -31,8 +36,9 @@ def default_cache_dir() -> Path:
 class SignatureCache:
     """Signatures by key, shared safely by any number of processes.
 
-    A file is written beside its place and moved there in one step, so that a reader sees all of it or nothing, and a
-    killed run leaves no half of a file behind. Two processes that compute the same Signature write the same content.
+    A file is written beside its place and moved there in one step, so that a reader sees all of it or nothing. What a
+    killed run leaves of one is removed a day later, see `remove_abandoned`. Two processes that compute the same
+    Signature write the same content. Who may read folders and files is for the umask to say.
 
     Args:
         directory: made if it is missing.
@@ -67,19 +73,64 @@ class SignatureCache:
             logger.warning("%s: cached signature is not usable (%s); it is computed again", path, error)
             return None
 
+    def notes(self, key: str) -> tuple[str, ...]:
+        """What was done to the mesh of the Signature under `key`, in words; nothing if there is none."""
+        return self._read(key, lambda file, metadata: tuple(json.loads(metadata["notes"]))) or ()
+
     def put(self, key: str, signature: Signature) -> None:
         """Store a Signature under `key`."""
         path = self.path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
         tensors, metadata = _encode(signature)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".partial")
-        os.close(handle)
+        metadata["checksum"] = _checksum(tensors, metadata)
+        _remove_abandoned(path.parent.glob(f"*{_PARTIAL}"))
+        # By an ordinary open: files that tempfile or safetensors make are for their owner alone, whatever the umask.
+        temporary = path.with_name(f"{key}.{os.getpid()}-{secrets.token_hex(8)}{_PARTIAL}")
         try:
-            save_file(tensors, temporary, metadata={"format": _FORMAT, "key": key, **metadata})
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
+            with open(temporary, "xb") as file:
+                file.write(save(tensors, metadata={"format": _FORMAT, "key": key, **metadata}))
+            self._move(temporary, key)
+        except BaseException as error:
+            temporary.unlink(missing_ok=True)
+            if isinstance(error, OSError) and error.errno is not None and error.filename is None:
+                # That of a full disk does not say which.
+                raise OSError(error.errno, error.strerror, str(path)) from error
             raise
+
+    def _move(self, temporary: Path, key: str) -> None:
+        try:
+            os.replace(temporary, self.path(key))
+        except PermissionError:
+            # Some file systems replace no file that another process holds open. Where that process was first with the
+            # same Signature, its file serves as well.
+            if key not in self:
+                raise
+            temporary.unlink()
+
+    def remove_abandoned(self) -> None:
+        """Remove what killed processes left of files that they were writing, a day after."""
+        _remove_abandoned(self.directory.glob(f"*/*{_PARTIAL}"))
+
+
+def _remove_abandoned(partials: Iterable[Path]) -> None:
+    for partial in partials:
+        try:
+            if time.time() - partial.stat().st_mtime > _ABANDONED:
+                partial.unlink()
+        except OSError:  # another process was first, or may and we may not
+            continue
+
+
+def _checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
+    """CRC-32 of all that a Signature is read from, in hexadecimal."""
+    checksum = 0
+    for name, value in sorted(metadata.items()):
+        if name not in ("format", "key", "checksum"):
+            checksum = zlib.crc32(f"{name}\0{value}\0".encode(), checksum)
+    for name, tensor in sorted(tensors.items()):
+        checksum = zlib.crc32(f"{name} {tensor.dtype.str} {tensor.shape}\0".encode(), checksum)
+        checksum = zlib.crc32(np.ascontiguousarray(tensor).data, checksum)
+    return f"{checksum:08x}"
 
 
 def _encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]:
@@ -96,6 +147,7 @@ def _encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]
         "config": signature.config.as_dict(),
         "name": signature.name,
         "notes": signature.notes,
+        "residual": signature.residual,
     }
     # safetensors writes the buffer as it lies in memory.
     contiguous = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
@@ -104,6 +156,9 @@ def _encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]
 
 def _decode(file: Any, metadata: Mapping[str, str]) -> Signature:
     tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no Mapping: it cannot be iterated)
+    # Files of before there was one are as good as any.
+    if metadata.get("checksum", "unknown") not in ("unknown", _checksum(tensors, metadata)):
+        raise ValueError("its content is damaged: it does not have the checksum that it was written with")
     config: dict[str, Any] = json.loads(metadata["config"])
     if config.pop("algorithm_version") != SignatureConfig.ALGORITHM_VERSION:
         raise ValueError("made by another version of the algorithm")
@@ -124,4 +179,5 @@ def _decode(file: Any, metadata: Mapping[str, str]) -> Signature:
         config=SignatureConfig(**config),
         name=json.loads(metadata["name"]),
         notes=tuple(json.loads(metadata["notes"])),
+        residual=json.loads(metadata.get("residual", "NaN")),
     )

@@ -17,7 +17,7 @@ from torch.utils.data import Dataset
 from tqdm import tqdm
 
 from igps.data.batch import LabelledSignature, SignatureBatch, collate
-from igps.data.cache import default_cache_dir
+from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.recipe import Recipe
 from igps.data.sources import MeshFiles, find_meshes, mesh_files
 from igps.geometry.mesh import Mesh, MeshError
@@ -111,6 +111,10 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """
         return self._recipe.mesh(self.files.paths[index])
 
+    def notes(self, index: int) -> tuple[str, ...]:
+        """What was done to a mesh on its way to its cached Signature, in words."""
+        return self._recipe.notes(self.files.paths[index])
+
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
         """Some of the items as a batch, with or without their meshes."""
         return collate([self[i] for i in indices], [self.mesh(i) for i in indices] if meshes else None)
@@ -146,6 +150,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
             MeshError: a bad mesh, if `strict`.
             MachineError: the disk is full, or the like; what is done is kept.
         """
+        SignatureCache(self._recipe.cache_dir).remove_abandoned()
         missing = [i for i in range(len(self)) if not self._recipe.is_cached(self.files.paths[i])]
         paths = [self.files.paths[i] for i in missing]
         failures: dict[int, Failure] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from igps.data.cache import SignatureCache
@@ -33,7 +33,7 @@ class Recipe:
         Raises:
             MeshError: it cannot be used.
         """
-        return load_mesh(path, self.reading)
+        return load_mesh(path, self.reading, least_vertices=self.config.n_eigenpairs + 2)
 
     def signature(self, path: Path) -> Signature:
         """The Signature of a file, from the cache where it is there, and there afterwards."""
@@ -47,6 +47,10 @@ class Recipe:
     def fill(self, path: Path) -> None:
         """Put the Signature of a file into the cache; it is not returned, so that it need not travel to the caller."""
         self.signature(path)
+
+    def notes(self, path: Path) -> tuple[str, ...]:
+        """What was done to the mesh of a cached Signature, in words."""
+        return SignatureCache(self.cache_dir).notes(self.key(path))
 
     def is_cached(self, path: Path) -> bool:
         """Whether the Signature of a file can be read; false for a file that cannot."""
@@ -66,6 +70,6 @@ class Recipe:
         except OSError as error:
             raise MeshError(f"{path}: cannot be read ({error.strerror}). Check the path.") from error
         # The suffix chooses the reader, so the same bytes under another suffix are another mesh.
-        reading = [path.suffix.lower(), self.reading.repair, self.reading.component, self.reading.allow_open]
+        reading = [path.suffix.lower(), asdict(self.reading)]
         parameters = json.dumps([reading, self.config.as_dict()], sort_keys=True)
         return hashlib.sha256(parameters.encode() + b"\0" + content).hexdigest()

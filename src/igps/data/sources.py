@@ -9,6 +9,8 @@ from pathlib import Path
 
 import trimesh
 
+from igps.geometry.reading import POINT_CLOUDS
+
 LABELS_FILE = "labels.csv"
 
 
@@ -124,5 +126,6 @@ def _names(paths: Sequence[Path], root: Path) -> tuple[str, ...]:
 
 
 def _suffixes() -> frozenset[str]:
-    # JSON and XYZ files are read by trimesh too, but a folder's JSON files are seldom meshes.
-    return frozenset(trimesh.available_formats()) - {"json", "dict", "dict64", "xyz", "zip", "tar.gz", "tar.bz2"}
+    # JSON files are read by trimesh too, but a folder's JSON files are seldom meshes.
+    known = frozenset(trimesh.available_formats()) | {suffix.lstrip(".") for suffix in POINT_CLOUDS}
+    return known - {"json", "dict", "dict64", "zip", "tar.gz", "tar.bz2"}

@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps.geometry.mesh import Mesh
-from igps.geometry.surface import area_vectors, unit, vertex_areas
+from igps.geometry.surface import area_vectors, unit
+from igps.geometry.surface_potential import surface_potential
 
 AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
-
-# Numbers of a block of points × vertices: 32 MiB.
-_BLOCK = 2**22
 
 
 def interior_attributes(
@@ -111,7 +109,8 @@ def electrostatic_potential(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[
 
     It is high where much surface is near: deep in thick parts and among folded ones, low in thin limbs and at their
     tips. Rustamov 2010, section 4, names electrostatic potentials as a further dimension; where a body has charges of
-    its own (a protein), pass that potential as an attribute instead.
+    its own (a protein), pass that potential as an attribute instead. It does not depend on how the surface is cut into
+    triangles; on the surface it is finite. See `surface_potential` for the method and its error.
 
     Args:
         mesh: V vertices, F faces.
@@ -120,16 +119,4 @@ def electrostatic_potential(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[
     Returns:
         (P,) dimensionless.
     """
-    # One quadrature point a vertex. The potential at a disc's centre is that of its charge at half its radius.
-    patch = vertex_areas(mesh.vertices, mesh.faces)
-    least = patch / (4 * np.pi)
-    centre = mesh.vertices.mean(axis=0)  # keeps digits in the squared distances
-    vertices = mesh.vertices - centre
-    norms = np.square(vertices).sum(axis=1)
-    size = max(1, _BLOCK // len(vertices))
-    potential = np.empty(len(points))
-    for i in range(0, len(points), size):
-        block = points[i : i + size] - centre
-        squared = np.square(block).sum(axis=1)[:, None] + norms - 2 * block @ vertices.T
-        potential[i : i + size] = (1 / np.sqrt(np.maximum(squared, least))) @ patch
-    return potential / np.sqrt(mesh.area)
+    return surface_potential(mesh.vertices, mesh.faces, points) / np.sqrt(mesh.area)

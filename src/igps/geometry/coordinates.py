@@ -16,6 +16,7 @@ Coordinates are scaled to the mesh: its bounding box gets a half-diagonal of 1.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -24,7 +25,9 @@ import torch
 from numpy.typing import NDArray
 
 from igps.geometry.closed_forms import ListedRule, Surface, Tile, face_blocks
-from igps.geometry.far_field import ClusterMoments, HatMoments, HatTree, in_leaves
+from igps.geometry.far_field import ClusterMoments, HatMoments, HatTree, in_leaves, principal_axes
+
+logger = logging.getLogger(__name__)
 
 __all__ = ["extend", "mean_value_coordinates", "winding_number"]
 
@@ -35,6 +38,10 @@ _CLUSTER_ERROR = 2.2e-3  # of the clusters' moments a radius away from the clust
 _FEW_VERTICES = 2000  # meshes so coarse were up to three times worse, and the closed form takes no time there
 _FLOAT32_ACCURACY = 1e-4  # from here on, single precision is enough for the far field and the product
 _NEAR_SHARE = 0.07  # of hats near a point, above which the dense exact rule is the faster one
+_SAMPLE = 24  # points that are evaluated a second time, to check the approximation
+_SAMPLE_GAIN = 10  # how much more accurately
+_SAMPLE_LINE = (0.11, 0.37, 1.0)  # in principal axes, the longest last; oblique, so that places differ
+_ATTEMPTS = 2  # approximations tried before the closed form
 _GROUP = 128  # points that see the same clusters
 
 
@@ -76,8 +83,10 @@ def extend(
     Vertices (V, 3) and points share one unit; faces (F, 3) are oriented alike, either way. ``accuracy`` None evaluates
     the closed form for all pairs. Otherwise it is the relative error below which 99 % of the interior distances stay
     (Euclidean distances of rows of the result, for points inside a closed surface), and far faces are integrated
-    approximately; neighbouring points share this work, so that a value depends within the accuracy on the points beside
-    it. ``dtype`` is that of the dense weights and of the product with the functions; None takes the cheapest that keeps
+    approximately. Some points of each mesh are evaluated once more and far more accurately; where their distances do
+    not have the accuracy, a finer approximation takes over, or the closed form. Neighbouring points share work, so that
+    a value depends within the accuracy on the points beside it. ``dtype`` is that of the dense weights and of the
+    product with the functions; None takes the cheapest that keeps
     the accuracy. Memory beside arguments and result: at most 256 MiB of weights at a time, and three times the
     functions.
 
@@ -103,8 +112,22 @@ def extend(
     columns = torch.ones(len(order), values.shape[1] + 1, dtype=dtype, device=device)  # the last sums the weights
     columns[:, :-1] = torch.as_tensor(values[order.cpu().numpy()])
     out = np.empty((len(x), values.shape[1]))
-    for rows, sums in _weighted_sums(surface, columns, x, accuracy):
-        out[rows.cpu().numpy()] = _normalised(sums[:, :-1], sums[:, -1:]).cpu().numpy()
+    hats, listed = HatMoments.of(surface), ListedRule.of(surface)
+    setting = _approximation(hats, x, accuracy)
+    for attempt in range(_ATTEMPTS + 1):
+        for rows, sums in _weighted_sums(surface, hats, listed, columns, x, setting):
+            out[rows.cpu().numpy()] = _normalised(sums[:, :-1], sums[:, -1:]).cpu().numpy()
+        if setting is None or accuracy is None:
+            break
+        error = _sampled_error(hats, listed, columns, x, out, accuracy)
+        if error <= accuracy:
+            break
+        finer = None if attempt + 1 == _ATTEMPTS else 0.5 * setting * accuracy / error
+        setting = _approximation(hats, x, finer)
+        logger.info(
+            "mean value coordinates: error %.1e in place of %.1e, evaluated again %s",
+            error, accuracy, "exactly" if setting is None else f"with {setting:.1e}",
+        )  # fmt: skip
     return out
 
 
@@ -189,27 +212,77 @@ def _weight_blocks(
         yield block.points, weights
 
 
+def _approximation(hats: HatMoments, points: torch.Tensor, accuracy: float | None) -> float | None:
+    """The accuracy if approximate sums reach it faster than exact ones do, else None."""
+    n_vertices = len(hats.centres)
+    if accuracy is None or len(points) == 0 or n_vertices < _FEW_VERTICES:
+        return None
+    sample = points[:: len(points) // 64 + 1]
+    n_near = hats.near(sample, _hat_ratio(accuracy)).shape[1]
+    return accuracy if n_near <= _NEAR_SHARE * n_vertices * len(sample) else None
+
+
+def _hat_ratio(accuracy: float) -> float:
+    return max(_EXACT_RATIO, (_HAT_ERROR / accuracy) ** (1 / 3))
+
+
 def _weighted_sums(
-    surface: Surface, columns: torch.Tensor, points: torch.Tensor, accuracy: float | None
+    surface: Surface,
+    hats: HatMoments,
+    listed: ListedRule,
+    columns: torch.Tensor,
+    points: torch.Tensor,
+    accuracy: float | None,
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-    """Columns (V, K) summed with the weights (n, K) of n points at a time, with the indices of those points."""
+    """Columns (V, K) summed with the weights (n, K) of n points at a time, with the indices of those points.
+
+    Exact ones if the accuracy is None, else approximate ones.
+    """
     if len(points) == 0:
         return
-    hats = HatMoments.of(surface)
-    if accuracy is not None and len(columns) >= _FEW_VERTICES:
-        ratio = max(_EXACT_RATIO, (_HAT_ERROR / accuracy) ** (1 / 3))
-        sample = points[:: len(points) // 64 + 1]
-        if hats.near(sample, ratio).shape[1] <= _NEAR_SHARE * len(columns) * len(sample):
-            cluster_ratio = max(ratio, 1 + (_CLUSTER_ERROR / accuracy) ** (1 / 3))
-            yield from _approximate_sums(surface, hats, columns, points, ratio, cluster_ratio)
-            return
-    for block, weights in _weight_blocks(surface, hats, points, columns.dtype):
-        yield block, weights.T @ columns
+    if accuracy is None:
+        for block, weights in _weight_blocks(surface, hats, points, columns.dtype):
+            yield block, weights.T @ columns
+        return
+    ratio = _hat_ratio(accuracy)
+    cluster_ratio = max(ratio, 1 + (_CLUSTER_ERROR / accuracy) ** (1 / 3))
+    yield from _approximate_sums(hats, listed, columns, points, ratio, cluster_ratio)
+
+
+def _sampled_error(
+    hats: HatMoments,
+    listed: ListedRule,
+    columns: torch.Tensor,
+    points: torch.Tensor,
+    values: NDArray[np.float64],
+    accuracy: float,
+) -> float:
+    """The relative error that 99 % of the distances between some of the points keep, of their values (P, K).
+
+    They are compared with those of the hats' moments alone, none in clusters, at an accuracy so much higher that it is
+    exact for this purpose; the closed form would take as long for these few points as all the rest does for all.
+    """
+    # At equal steps along a line that turns with the points: which they are must not depend on their order.
+    along = points @ principal_axes(points) @ points.new_tensor(_SAMPLE_LINE)
+    steps = torch.linspace(0, len(points) - 1, min(_SAMPLE, len(points))).round().long().to(points.device)
+    chosen = along.argsort()[steps]
+    x = points[chosen]
+    rows = torch.arange(len(columns), device=x.device)
+    weights = torch.empty(len(columns), len(x), dtype=torch.float64, device=x.device)
+    hats.fill_weights(x, rows, weights)
+    listed.replace(x, hats.near(x, _hat_ratio(accuracy / _SAMPLE_GAIN)), rows, weights)
+    exact = weights.to(columns.dtype).T @ columns
+    expected = torch.pdist((exact[:, :-1] / exact[:, -1:]).double())
+    found = torch.pdist(torch.as_tensor(values[chosen.cpu().numpy()], device=x.device))
+    if len(expected) == 0:
+        return 0.0
+    errors = (found - expected).abs() / expected.clamp_min(torch.finfo(torch.float64).tiny)
+    return float(errors.quantile(0.99))
 
 
 def _approximate_sums(
-    surface: Surface,
     hats: HatMoments,
+    listed: ListedRule,
     columns: torch.Tensor,
     points: torch.Tensor,
     ratio: float,
@@ -219,7 +292,6 @@ def _approximate_sums(
     smaller one, so that hats near a point are never hidden in a cluster."""
     tree = HatTree.of(hats)
     clusters = ClusterMoments.of(tree, hats, columns)
-    listed = ListedRule.of(surface)
     rows = torch.empty(len(columns), dtype=torch.int64, device=points.device)
     for block in tree.blocks(points, _GROUP, cluster_ratio):
         terms = clusters.rows(block.clusters)

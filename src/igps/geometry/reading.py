@@ -1,4 +1,4 @@
-"""How a mesh is read from a file, and what may be repaired on the way."""
+"""How a mesh is read from a file, and what may be done to it on the way."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from igps.geometry.limits import check_memory
+from igps.geometry.mending import Mending, mend
 from igps.geometry.mesh import Mesh, MeshError, check_arrays
-from igps.geometry.surface import components, diagonal, face_areas
+from igps.geometry.surface import components, face_areas
 
 logger = logging.getLogger(__name__)
 
 Component = Literal["largest"]
 
-# Vertices closer than this share of the bounding box's diagonal are one vertex to `repair`.
-_WELD = 1e-8
+POINT_CLOUDS = frozenset({".xyz"})
+"""Suffixes of files that hold points alone, as lines of three coordinates, or of six with normals."""
 
 
 @dataclass(frozen=True)
@@ -27,57 +29,119 @@ class MeshReading:
     """How a mesh file is read.
 
     Args:
-        repair: weld coincident vertices, drop degenerate, duplicate and unreferenced elements, and orient the faces
-            consistently.
+        mend: "auto" does the least that makes a body of the surface, and leaves a body as it is, see `mend`; "never"
+            refuses what is no body; "always" makes every surface watertight, for collections of mixed quality.
         component: "largest" keeps only the connected component of the largest area.
         allow_open: accept open boundaries; inside and outside are then told apart by the winding number.
 
     Raises:
-        ValueError: unknown component.
+        ValueError: an unknown way to mend, or an unknown component.
     """
 
-    repair: bool = False
+    mend: Mending = "auto"
     component: Component | None = None
     allow_open: bool = False
 
     def __post_init__(self) -> None:
+        if self.mend not in get_args(Mending):
+            raise ValueError(f"mend: expected 'auto', 'never' or 'always', got {self.mend!r}.")
         if self.component is not None and self.component not in get_args(Component):
             raise ValueError(f"component: expected 'largest' or None, got {self.component!r}.")
 
 
-def load_mesh(path: str | Path, reading: MeshReading = MeshReading()) -> Mesh:
-    """Read a mesh file of any format that trimesh reads, and check it.
+def load_mesh(path: str | Path, reading: MeshReading = MeshReading(), *, least_vertices: int = 0) -> Mesh:
+    """Read a mesh file of any format that trimesh reads, or a cloud of points, and make a body of it.
 
-    Polygons are cut into triangles. Vertices keep their order, and are merged by repair alone.
+    Polygons are cut into triangles. The vertices of a body keep their order and are not merged.
 
     Args:
         path: the file.
-        reading: what is done to it; logged, and kept in `Mesh.notes`.
+        reading: what may be done to it; what was done is kept in `Mesh.notes`.
+        least_vertices: a body with fewer is subdivided, unless `reading` mends never.
 
     Raises:
-        MeshError: the file is missing or unreadable, or the mesh is not usable (see `Mesh`).
+        MeshError: the file is missing or unreadable, or the mesh is not usable.
+    """
+    vertices, faces, normals = read_surface(path)
+    if reading.mend == "never" or len(faces):
+        check_arrays(vertices, faces, str(path))
+    notes: tuple[str, ...] = ()
+    if reading.component == "largest" and len(faces):
+        vertices, faces, notes = _largest_component(vertices, faces)
+    if reading.allow_open and reading.mend != "always":
+        try:
+            return Mesh(vertices, faces, name=str(path), allow_open=True, notes=notes)
+        except MeshError:
+            if reading.mend == "never":
+                raise
+    return mend(
+        vertices,
+        faces,
+        how=reading.mend,
+        least_vertices=least_vertices,
+        normals=normals,
+        name=str(path),
+        notes=notes,
+    )
+
+
+def read_surface(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
+    """What a file holds, unchecked.
+
+    Returns:
+        Vertices (V, 3); triangles (F, 3), none of a cloud of points; and the normals (V, 3) of a cloud that has them.
+
+    Raises:
+        MeshError: the file is missing or unreadable.
     """
     path = Path(path)
     if not path.is_file():
         raise MeshError(f"{path}: no such file. Check the path.")
+    check_memory(path)
     try:
-        loaded: Any = trimesh.load(path, process=False, force="mesh", **_loader_options(path))
-        vertices, faces = np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces)
+        return _read(path)
+    except ImportError as error:
+        raise MeshError(
+            f"{path}: the format needs a module that is not installed ({error}). Install it, pip install "
+            '"interior-gps[formats]" has those of trimesh, or convert the file to OFF, OBJ, PLY or STL.'
+        ) from error
+    except MemoryError:
+        raise
     except Exception as error:  # the loaders of some twenty formats raise whatever they like
         raise MeshError(
             f"{path}: not readable as a mesh ({type(error).__name__}: {error}). "
             "Check that the file is complete and in a format that trimesh reads (OFF, OBJ, PLY, STL, GLB, ...)."
         ) from error
-    check_arrays(vertices, faces, str(path))
-    notes: list[str] = []
-    if reading.repair:
-        vertices, faces = _repaired(vertices, faces, notes)
-        check_arrays(vertices, faces, str(path))
-    if reading.component == "largest":
-        vertices, faces = _largest_component(vertices, faces, notes)
-    for note in notes:
-        logger.info("%s: %s", path, note)
-    return Mesh(vertices, faces, name=str(path), allow_open=reading.allow_open, notes=tuple(notes))
+
+
+def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
+    """Vertices (V, 3), faces (F, 3), none of a cloud of points, and the normals (V, 3) of one that has them."""
+    if path.suffix.lower() in POINT_CLOUDS:
+        rows = np.loadtxt(path, ndmin=2, comments=("#", "//"))
+        if rows.shape[1] not in (3, 6):
+            raise ValueError(f"expected lines of 3 numbers, or of 6 with normals, got {rows.shape[1]}")
+        return rows[:, :3], np.zeros((0, 3), dtype=np.int64), rows[:, 3:] if rows.shape[1] == 6 else None
+    scene: Any = trimesh.load(path, process=False, force="scene", **_loader_options(path))
+    parts = list(scene.geometry.values())
+    if parts and all(isinstance(part, trimesh.PointCloud) for part in parts):
+        points = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts])
+        return points, np.zeros((0, 3), dtype=np.int64), _normals(scene, len(points))
+    mesh = scene.to_mesh()
+    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces), None
+
+
+def _normals(cloud: Any, n_points: int) -> NDArray[np.float64] | None:
+    """Those of a PLY file, which trimesh keeps as they were read, (n_points, 3)."""
+    found = [geometry.metadata.get("_ply_raw", {}) for geometry in (cloud, *cloud.geometry.values())]
+    for raw in found:
+        rows = raw.get("vertex", {}).get("data")
+        try:
+            normals = np.column_stack([np.asarray(rows[name], dtype=np.float64) for name in ("nx", "ny", "nz")])
+        except (KeyError, ValueError, IndexError, TypeError):
+            continue
+        if normals.shape == (n_points, 3):
+            return normals
+    return None
 
 
 def _loader_options(path: Path) -> dict[str, Any]:
@@ -85,47 +149,16 @@ def _loader_options(path: Path) -> dict[str, Any]:
     return {"skip_materials": True, "maintain_order": True} if path.suffix.lower() == ".obj" else {}
 
 
-def _repaired(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    # Welding happens on a lattice in units of the bounding box, because trimesh's own tolerance is an absolute length.
-    centre, length = vertices.mean(axis=0), diagonal(vertices)
-    lattice = np.round((vertices - centre) / (_WELD * max(length, np.finfo(float).tiny))).astype(np.int64)
-    _, first, new_index = np.unique(lattice, axis=0, return_index=True, return_inverse=True)
-    kept = np.sort(first)
-    position = np.empty(len(first), dtype=np.int64)
-    position[np.argsort(first)] = np.arange(len(first))
-    if len(kept) < len(vertices):
-        notes.append(f"welded {len(vertices) - len(kept)} coincident vertices")
-    mesh = trimesh.Trimesh(vertices[kept], position[new_index.ravel()[faces]], process=False)
-
-    sharp = (mesh.faces != np.roll(mesh.faces, 1, axis=1)).all(axis=1)
-    for keep, what in ((sharp, "degenerate"), (None, "duplicate")):
-        mask = mesh.unique_faces() if keep is None else keep
-        if not mask.all():
-            notes.append(f"dropped {int((~mask).sum())} {what} faces")
-            mesh.update_faces(mask)
-    unused = len(mesh.vertices) - len(np.unique(mesh.faces))
-    if unused:
-        notes.append(f"dropped {unused} unreferenced vertices")
-        mesh.remove_unreferenced_vertices()
-    before = mesh.faces.copy()
-    trimesh.repair.fix_winding(mesh)
-    turned = int((before != mesh.faces).any(axis=1).sum())
-    if turned:
-        notes.append(f"turned {turned} faces to orient the surface")
-    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-
-
 def _largest_component(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], tuple[str, ...]]:
     count, label = components(faces, len(vertices))
     face_label = label[faces[:, 0]]
     area = np.bincount(face_label, weights=face_areas(vertices, faces), minlength=count)
     keep = face_label == int(np.argmax(area))
     used, new_faces = np.unique(faces[keep], return_inverse=True)
-    n_dropped = len(np.unique(face_label)) - 1
-    if n_dropped:
-        notes.append(f"kept the largest of {n_dropped + 1} components ({len(used)} of {len(vertices)} vertices)")
-    return vertices[used], new_faces.reshape(-1, 3)
+    n_parts = len(np.unique(face_label))
+    if n_parts == 1:
+        return vertices, faces, ()
+    note = f"kept the largest of {n_parts} components ({len(used)} of {len(vertices)} vertices)"
+    return vertices[used], new_faces.reshape(-1, 3), (note,)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,10 +15,14 @@ from igps.geometry.attributes import AttributeName, check_attributes, interior_a
 from igps.geometry.coordinates import extend
 from igps.geometry.laplacian import Backend, laplacian
 from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.ordering import crowding, places, shares_around
 from igps.geometry.sampling import surface_points
 from igps.geometry.simplification import simplify
+from igps.geometry.surface import face_areas
 from igps.geometry.voxels import interior_samples
-from igps.linalg import Spectrum, eigenpairs
+from igps.linalg import ConvergenceError, Spectrum, eigenpairs
+
+logger = logging.getLogger(__name__)
 
 # Largest relative residual of an eigenpair. It is mostly far smaller; on meshes with very thin triangles rounding does
 # not allow much less, and the histograms cannot tell.
@@ -32,7 +38,8 @@ class SignatureConfig:
         resolution: voxels along the longest side of the bounding box.
         min_samples: the grid is refined until at least so many voxels lie inside; 0 keeps `resolution`.
         n_surface_samples: area-weighted random samples of the surface.
-        backend: "cotangent" or "robust", see `laplacian`.
+        backend: "cotangent" or "robust", see `laplacian`. Where the cotangent matrices have no eigenpairs to the
+            tolerance, the others are used, and the Signature's notes say so.
         max_vertices: simplify larger meshes first; None keeps them.
         accuracy: relative error that 99 % of the interior distances may have, which speeds up the mean value
             coordinates; None evaluates them exactly.
@@ -42,7 +49,7 @@ class SignatureConfig:
     """
 
     # Raise it whenever the same mesh and parameters would give another Signature: it is part of every cache key.
-    ALGORITHM_VERSION: ClassVar[int] = 2
+    ALGORITHM_VERSION: ClassVar[int] = 3
 
     n_eigenpairs: int = 250
     resolution: int = 32
@@ -106,12 +113,14 @@ class Signature:
     Args:
         eigenvalues: (K,) float64 ascending, 1/length², without the zero of the constant eigenfunction.
         interior: P voxel centres inside the body, eigenfunctions extended by mean value coordinates.
-        surface: area-weighted random points of the surface, eigenfunctions interpolated linearly.
+        surface: area-weighted random points of the surface, eigenfunctions interpolated linearly. Both in an order that
+            depends on the body's form alone, see `places`.
         area: of the surface, length².
         volume: of the body, length³.
         config: the parameters that made it.
         name: of the mesh.
-        notes: what was done to the mesh before, in words.
+        notes: what was done to the mesh before, and to the computation, in words.
+        residual: the largest of the eigenpairs, relative to the eigenvalue; NaN where it is not known.
     """
 
     eigenvalues: NDArray[np.float64]
@@ -122,6 +131,7 @@ class Signature:
     config: SignatureConfig
     name: str = "mesh"
     notes: tuple[str, ...] = ()
+    residual: float = math.nan
 
     @property
     def barycentroid(self) -> NDArray[np.float64]:
@@ -150,10 +160,7 @@ def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Sign
             f"{config.n_eigenpairs + 2} are needed. Subdivide the mesh or lower n_eigenpairs."
         )
     points = interior_samples(mesh, config.resolution, config.min_samples)
-    stiffness, mass = laplacian(mesh, config.backend)
-    spectrum = eigenpairs(
-        stiffness, mass, config.n_eigenpairs, positions=mesh.vertices, tolerance=_RESIDUAL, seed=config.seed
-    )
+    spectrum, notes = _spectrum(mesh, config)
     interior = _interior(mesh, spectrum, points, config)
     surface = _surface(mesh, spectrum, config)
     for where, samples in (("interior", interior), ("surface", surface)):
@@ -170,16 +177,52 @@ def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Sign
         volume=mesh.volume,
         config=config,
         name=mesh.name,
-        notes=mesh.notes,
+        notes=(*mesh.notes, *notes),
+        residual=spectrum.residual,
     )
 
 
+def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str, ...]]:
+    """The eigenpairs, of the intrinsic-Delaunay matrices where the cotangent ones fail, and a note if they were."""
+
+    def solve(config: SignatureConfig) -> Spectrum:
+        stiffness, mass = laplacian(mesh, config.backend)
+        return eigenpairs(
+            stiffness, mass, config.n_eigenpairs, positions=mesh.vertices, tolerance=_RESIDUAL, seed=config.seed
+        )
+
+    try:
+        return solve(config), ()
+    except (ConvergenceError, ValueError) as failure:  # a ValueError: slivers make entries that no solver can use
+        if config.backend == "robust":
+            raise
+        try:
+            spectrum = solve(replace(config, backend="robust"))
+        except ImportError as missing:
+            raise ConvergenceError(f"{mesh.name}: {failure}. Remesh the body; or else: {missing}") from failure
+        except (ConvergenceError, ValueError) as second:
+            raise ConvergenceError(
+                f"{mesh.name}: the eigenpairs fail with the cotangent matrices ({failure}) and with the "
+                f"intrinsic-Delaunay ones ({second}). The triangles are too ill-shaped: remesh."
+            ) from second
+        note = f"intrinsic-Delaunay matrices were used: the cotangent ones failed ({failure})"
+        logger.warning("%s: %s", mesh.name, note)
+        return spectrum, (note,)
+
+
 def _interior(mesh: Mesh, spectrum: Spectrum, points: NDArray[np.float64], config: SignatureConfig) -> Samples:
-    values = extend(mesh.vertices, mesh.faces, spectrum.eigenfunctions, points, accuracy=config.accuracy)
+    # The accuracy is that of interior distances, which are those between rows of eigenfunctions so weighted.
+    roots = np.sqrt(spectrum.eigenvalues)
+    values = extend(mesh.vertices, mesh.faces, spectrum.eigenfunctions / roots, points, accuracy=config.accuracy)
+    values *= roots
+    order = np.argsort(places(values, spectrum.eigenvalues, mesh.area, crowding(points)), kind="stable")
+    points, values = points[order], values[order]
     return Samples(points, np.asarray(values, dtype=np.float32), interior_attributes(mesh, points, config.attributes))
 
 
 def _surface(mesh: Mesh, spectrum: Spectrum, config: SignatureConfig) -> Samples:
-    points = surface_points(mesh, config.n_surface_samples, config.seed)
+    marks = shares_around(mesh.faces, face_areas(mesh.vertices, mesh.faces))
+    order = places(spectrum.eigenfunctions, spectrum.eigenvalues, mesh.area, marks)
+    points = surface_points(mesh, config.n_surface_samples, config.seed, order)
     values = points.interpolate(spectrum.eigenfunctions).astype(np.float32)
     return Samples(points.positions, values, surface_attributes(mesh, points.face, config.attributes))

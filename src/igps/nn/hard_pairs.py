@@ -7,6 +7,8 @@ from itertools import combinations_with_replacement
 import torch
 from torch import Tensor
 
+from igps.nn.precision import full_precision
+
 # Rows and columns of a block of pairs: its float32 distances fill half of a core's second-level cache.
 _BLOCK = 512
 
@@ -77,7 +79,7 @@ def hard_pair_histogram(points: Tensor, level: Tensor, n_classes: int, n_bins: i
     # Sorted by class, a block of pairs has one class at either end, and needs no class index of its own.
     order = torch.argsort(level, stable=True)
     groups = (points[order] / width).split(torch.bincount(level, minlength=n_classes).tolist())
-    with torch.autocast(points.device.type, enabled=False):
+    with torch.autocast(points.device.type, enabled=False), full_precision():
         rows = [_group_histogram(groups[a], groups[b], a == b, n_bins) for a, b in class_pairs(n_classes)]
     n_points = len(points)
     return (torch.stack(rows) / (n_points * (n_points - 1) / 2)).to(points.dtype)

@@ -146,11 +146,11 @@ class RetrievalLearner(LightningModule):
 
     def validation_step(self, batch: SignatureBatch, batch_index: int) -> None:
         """Collect the descriptions of a batch."""
-        self.scores.update(self(batch), batch.labels)
+        self.scores.update(self(batch), batch.labels, batch.ids)
 
     def test_step(self, batch: SignatureBatch, batch_index: int) -> None:
         """Collect the descriptions of a batch."""
-        self.scores.update(self(batch), batch.labels)
+        self.scores.update(self(batch), batch.labels, batch.ids)
 
     def on_validation_epoch_end(self) -> None:
         """Scores over the validation part."""

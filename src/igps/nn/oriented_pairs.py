@@ -11,6 +11,7 @@ from torch.utils.checkpoint import checkpoint
 
 from igps.nn.centres import position
 from igps.nn.hard_pairs import check_points, class_pairs
+from igps.nn.precision import full_precision
 
 # Pairs that are held at once: each of their many numbers fills a part of a core's second-level cache.
 _BLOCK = 2**16
@@ -42,9 +43,10 @@ def _features(points: Tensor, directions: Tensor, first: int, last: int) -> tupl
     length = torch.cdist(rows, columns, compute_mode="donot_use_mm_for_euclid_dist")
     inverse = torch.where(length > 0, 1 / torch.where(length > 0, length, 1), 0)
     own_row, own_column = (row_directions * rows).sum(dim=1), (column_directions * columns).sum(dim=1)
-    towards_column = (torch.addmm(-own_row[:, None], row_directions, columns.T) * inverse).clamp(-1, 1)
-    towards_row = (torch.addmm(-own_column, rows, column_directions.T) * inverse).clamp(-1, 1)
-    between = row_directions @ column_directions.T
+    with full_precision():
+        towards_column = (torch.addmm(-own_row[:, None], row_directions, columns.T) * inverse).clamp(-1, 1)
+        towards_row = (torch.addmm(-own_column, rows, column_directions.T) * inverse).clamp(-1, 1)
+        between = row_directions @ column_directions.T
     return torch.maximum(towards_column, towards_row), torch.minimum(towards_column, towards_row), between
 
 
@@ -106,7 +108,8 @@ def _sums(
 
     By the cell of the lower centres, and by which of the cells next to it, along the axes, the weight is of.
     """
-    axes = [(torch.cdist(points[first:last], points[first:]), centres) for points, centres in distances]
+    with full_precision():
+        axes = [(torch.cdist(points[first:last], points[first:]), centres) for points, centres in distances]
     for points, directions, towards, between in oriented:
         features = _features(points, directions, first, last)
         axes += zip(features, (towards, towards, between), strict=True)

@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
 from igps.nn.hard_pairs import check_points, class_pairs, single_at_least
+from igps.nn.precision import full_precision
 from igps.parallel import on_threads
 
 Result = TypeVar("Result")
@@ -54,7 +55,7 @@ def soft_pair_histogram(memberships: Tensor, axes: Sequence[tuple[Tensor, Tensor
     dtype = single_at_least(axes[0][0]).dtype
     order = _by_class(memberships.detach())
     ordered = [(points[order].to(dtype), centres.to(dtype)) for points, centres in axes]
-    with torch.autocast(memberships.device.type, enabled=False):
+    with torch.autocast(memberships.device.type, enabled=False), full_precision():
         return _SoftPairHistogram.apply(memberships[order].to(dtype), *(tensor for axis in ordered for tensor in axis))
 
 
@@ -124,7 +125,7 @@ class _SoftPairHistogram(torch.autograd.Function):
         by_memberships = None
         by_points: list[Tensor | None] = [None] * ctx.n_axes
         wanted = [k for k in range(ctx.n_axes) if ctx.needs_input_grad[1 + 2 * k]]
-        with torch.autocast(upstream.device.type, enabled=False):
+        with torch.autocast(upstream.device.type, enabled=False), full_precision():
             if wanted or (ctx.needs_input_grad[0] and not kept):
                 pairs = _BlockedPairs(memberships, axes)
             # Either end of a pair may be the row: hence the factors of 2.
@@ -157,6 +158,10 @@ def _bins(moments: Tensor, centres: Sequence[Tensor]) -> Tensor:
         # The excess was measured from where the centres are; the difference, 0, tells what moving them does.
         moved = (centre.detach() - centre)[:-1].view(over_rest)
         upper = (excess.narrow(k, 1, n_inner) + moved * inner) / centre.diff().view(over_rest)
+        # The two moments are rounded apart: held to a share of the count, so that neither bin becomes negative. What is
+        # added is 0, and has the gradient.
+        share = upper.detach().clamp(min=0).minimum(inner.detach())
+        upper = share + (upper - upper.detach())
         counts = torch.cat([below, upper], dim=k) + torch.cat([inner - upper, beyond], dim=k)
     return counts
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from igps.data.batch import SampleBatch, SignatureBatch
+from igps.nn.precision import full_precision
 
 SampleKind = Literal["interior", "surface"]
 
@@ -108,5 +109,7 @@ def nearest_directions(points: Tensor, targets: Tensor, n_nearest: int = _N_NEAR
     Returns:
         (P, D); zero where the mean is the point itself.
     """
-    nearest = torch.cdist(points.detach(), targets.detach()).topk(min(n_nearest, len(targets)), largest=False).indices
+    with full_precision():
+        distances = torch.cdist(points.detach(), targets.detach())
+    nearest = distances.topk(min(n_nearest, len(targets)), largest=False).indices
     return functional.normalize(targets[nearest].mean(dim=1) - points, dim=1)

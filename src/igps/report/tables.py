@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from igps.geometry.damage import DAMAGES
 from igps.geometry.disturbances import DISTURBANCES
 from igps.retrieval import RetrievalScores
 from igps.studies.comparison import Result
+from igps.studies.damage import DamageResult
+from igps.studies.doctor import Finding
 from igps.studies.robustness import POSE, Movement
 
 TITLES = dict(nn="NN", ft="FT", st="ST", e="E", dcg="DCG", adr="ADR", adr_self="ADR self", map="mAP")  # noqa: C408
@@ -61,3 +64,50 @@ def robustness_table(table: Mapping[str, Mapping[str, Movement]]) -> str:
     if POSE in columns:
         lines.append(f"  {POSE}: from one pose of a body to another, over all pairs")
     return "\n".join(lines + notes)
+
+
+def damage_table(results: Mapping[str, Mapping[str, DamageResult]]) -> str:
+    """One line a damage, of each descriptor the share of meshes described and the loss of NN and FT in points."""
+    names = list(results)
+    damages = list(next(iter(results.values())))
+    width = max(len(name) for name in damages)
+    lines = [" " * width + "".join(f"{name:>24}" for name in names)]
+    lines.append(" " * width + "".join(f"{'used':>10}{'NN':>7}{'FT':>7}" for _ in names))
+    notes = []
+    for way in damages:
+        found = [results[name][way] for name in names]
+        cells = [f"{100 * one.usable:>9.0f}%{100 * one.loss('nn'):>7.1f}{100 * one.loss('ft'):>7.1f}" for one in found]
+        lines.append(f"{way:<{width}}" + "".join(cells))
+        for name, one in zip(names, found, strict=True):
+            if one.notes:
+                first = next(iter(one.notes.values()))
+                notes.append(f"{name}, {way}: {len(one.notes)} of {one.n_given} missing; {first}")
+    lines.append(
+        "used: share of the damaged meshes that could be described; NN, FT: points lost against the clean twins"
+    )
+    lines += [f"  {way}: {DAMAGES[way].description}" for way in damages]
+    return "\n".join(lines + notes)
+
+
+def findings_table(findings: Sequence[Finding]) -> str:
+    """One line a file: what is done to it, vertices, expected time and memory; or why it cannot be used."""
+    width = max(len(finding.id) for finding in findings)
+    lines = [f"{'':<{width}}{'vertices':>10}{'after':>9}{'seconds':>9}{'MB':>7}  what is done"]
+    for finding in findings:
+        if finding.error is not None:
+            lines.append(f"{finding.id:<{width}}  cannot be used: {finding.error}")
+            continue
+        assert finding.seconds is not None  # of every file that can be used
+        assert finding.memory is not None
+        steps = ", ".join(finding.steps) or "nothing"
+        lines.append(
+            f"{finding.id:<{width}}{finding.n_vertices:>10}{finding.n_vertices_after:>9}{finding.seconds:>9.1f}"
+            f"{finding.memory / 1e6:>7.0f}  {steps}"
+        )
+    n_bad = sum(finding.error is not None for finding in findings)
+    n_mended = sum(bool(finding.steps) for finding in findings)
+    total = sum(finding.seconds or 0 for finding in findings)
+    lines.append(
+        f"{len(findings)} files: {n_mended} mended, {n_bad} cannot be used; about {total / 60:.1f} core-minutes"
+    )
+    return "\n".join(lines)

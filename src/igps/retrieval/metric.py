@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torchmetrics import Metric
@@ -18,7 +21,8 @@ class RetrievalScoresMetric(Metric):
 
     `update` takes descriptors (N, ...) and integer labels (N,); `compute` returns the means as a dict of scalar
     tensors, fractions. Call `update` and `compute`, not the metric itself: single batches seldom hold two of a class.
-    A distributed sampler must not pad with repeated shapes, as a repetition is a perfect match.
+    A repeated shape would be a perfect match, and a distributed sampler repeats some to fill its batches: give `ids`,
+    and each shape counts once, whatever the number of processes.
 
     Args:
         distance: the distance function that compares the descriptors.
@@ -30,25 +34,46 @@ class RetrievalScoresMetric(Metric):
 
     descriptors: list[Tensor]
     labels: list[Tensor]
+    ids: list[Tensor]
 
     def __init__(self, distance: Distance = chi_square, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.distance = distance
         self.add_state("descriptors", default=[], dist_reduce_fx="cat")
         self.add_state("labels", default=[], dist_reduce_fx="cat")
+        self.add_state("ids", default=[], dist_reduce_fx="cat")
 
-    def update(self, descriptors: Tensor, labels: Tensor) -> None:
-        """Add descriptors (N, ...) and integer labels (N,); ValueError if they are not aligned."""
+    def update(self, descriptors: Tensor, labels: Tensor, ids: Sequence[str] | None = None) -> None:
+        """Add descriptors (N, ...), integer labels (N,) and names that tell shapes apart.
+
+        Raises:
+            ValueError: they are not aligned, or some updates have names and others none.
+        """
         if labels.ndim != 1 or labels.is_floating_point() or descriptors.ndim < 2 or len(labels) != len(descriptors):
             raise ValueError(
                 f"labels: expected one integer for each of the descriptors (N, ...), got {tuple(labels.shape)} of "
                 f"{labels.dtype} for descriptors {tuple(descriptors.shape)}"
             )
+        if ids is not None and len(ids) != len(labels):
+            raise ValueError(f"ids: expected one name for each of {len(labels)} descriptors, got {len(ids)}")
+        if self.labels and (ids is None) == bool(self.ids):
+            raise ValueError("ids: expected with every update or with none, got them with some")
         self.descriptors.append(descriptors.detach())
         self.labels.append(labels)
+        if ids is not None:
+            self.ids.append(torch.tensor([_number(name) for name in ids], dtype=torch.int64, device=labels.device))
 
     def compute(self) -> dict[str, Tensor]:
         """Mean scores by name; ValueError if no two descriptors share a label."""
         descriptors, labels = dim_zero_cat(self.descriptors), dim_zero_cat(self.labels)
+        if len(self.ids):
+            _, first = np.unique(dim_zero_cat(self.ids).cpu().numpy(), return_index=True)
+            kept = torch.from_numpy(np.sort(first)).to(labels.device)
+            descriptors, labels = descriptors[kept], labels[kept]
         scores = retrieval_scores(self.distance(descriptors, descriptors), labels)
         return {name: torch.tensor(value, device=descriptors.device) for name, value in scores.mean().items()}
+
+
+def _number(name: str) -> int:
+    """64 bits of a name, the same in every process: names cannot be gathered, numbers can."""
+    return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little", signed=True)

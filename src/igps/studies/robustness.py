@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,18 +9,17 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tqdm import tqdm
 
-from igps.data.batch import collate
 from igps.data.dataset import SignatureDataset
 from igps.geometry.disturbances import DISTURBANCES
-from igps.geometry.signature import compute_signature
 from igps.nn.descriptor import Descriptor
-from igps.parallel import Failed, one_thread, run
+from igps.studies.altered import Answer, Way, describe_altered
 from igps.studies.comparison import check_descriptors, compare
 
 POSE = "pose"
 """The column of the movement between poses of one body."""
+
+_AS_IT_IS = "as it is"
 
 
 @dataclass(frozen=True)
@@ -97,9 +95,10 @@ def robustness(
     check_descriptors(descriptors, dataset)
     if gallery is None and len(dataset) < 2:
         raise ValueError("dataset: expected at least two meshes, each its own class, or a gallery. Give one of them.")
-    found = _described(dataset, descriptors, n_workers)
+    ways: dict[str, Way | None] = {_AS_IT_IS: None, **{name: one.apply for name, one in DISTURBANCES.items()}}
+    found = describe_altered(dataset, ways, descriptors, n_workers=n_workers)
     if gallery is None:
-        units = {one.name: _between_meshes(one, [of[None][one.name] for of in found]) for one in descriptors}
+        units = {one.name: _between_meshes(one, [of[_AS_IT_IS][one.name] for of in found]) for one in descriptors}
     else:
         units = _between_classes(gallery, descriptors, n_workers)
     table = {one.name: _movements(one, dataset.files.names, found, units[one.name]) for one in descriptors}
@@ -109,67 +108,10 @@ def robustness(
     return Robustness(table, units)
 
 
-_Description = NDArray[np.float32] | str
-"""What a descriptor says of a body, or why it says nothing."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """One mesh, disturbed or not, for all descriptors."""
-
-    dataset: SignatureDataset
-    disturbance: str | None
-    descriptors: Sequence[Descriptor]
-
-
-def _describe(job: _Job) -> dict[str, _Description]:
-    """The description by every descriptor; what fails of one becomes a note, because it must not stop the others."""
-    mesh = job.dataset.mesh(0)
-    if job.disturbance is None:
-        batch = job.dataset.batch([0], meshes=True)
-    else:
-        mesh = DISTURBANCES[job.disturbance].apply(mesh)
-        batch = collate([compute_signature(mesh, job.dataset.config)], [mesh])
-    descriptions: dict[str, _Description] = {}
-    for descriptor in job.descriptors:
-        try:
-            with one_thread(), torch.inference_mode():
-                description = descriptor(batch)[0].numpy()
-            finite = bool(np.isfinite(description).all())
-            descriptions[descriptor.name] = (
-                description if finite else "the description has entries that are not finite."
-            )
-        except ValueError as error:
-            descriptions[descriptor.name] = str(error)
-        except Exception as error:
-            descriptions[descriptor.name] = f"{type(error).__name__}: {error}"
-    return descriptions
-
-
-def _described(
-    dataset: SignatureDataset, descriptors: Sequence[Descriptor], n_workers: int | None
-) -> list[dict[str | None, dict[str, _Description]]]:
-    """Of each mesh, what all descriptors say of it undisturbed (None) and after each disturbance."""
-    ways: tuple[str | None, ...] = (None, *DISTURBANCES)
-    jobs = [_Job(dataset.subset([i]), way, descriptors) for i in range(len(dataset)) for way in ways]
-    found: list[dict[str | None, dict[str, _Description]]] = [{} for _ in range(len(dataset))]
-    outcomes = run(_describe, jobs, n_workers=n_workers)
-    with tqdm(total=len(jobs), desc="disturbed meshes") as bar, contextlib.closing(outcomes):
-        for number, outcome in outcomes:
-            bar.update()
-            if isinstance(outcome, Failed):
-                found[number // len(ways)][ways[number % len(ways)]] = dict.fromkeys(
-                    (one.name for one in descriptors), outcome.reason
-                )
-            else:
-                found[number // len(ways)][ways[number % len(ways)]] = outcome
-    return found
-
-
 def _movements(
     descriptor: Descriptor,
     names: Sequence[str],
-    found: Sequence[Mapping[str | None, Mapping[str, _Description]]],
+    found: Sequence[Mapping[str, Mapping[str, Answer]]],
     unit: float,
 ) -> dict[str, Movement]:
     """The movement by each disturbance."""
@@ -178,7 +120,7 @@ def _movements(
         distances: dict[str, float] = {}
         notes: dict[str, str] = {}
         for mesh, descriptions in zip(names, found, strict=True):
-            before, after = descriptions[None][descriptor.name], descriptions[way][descriptor.name]
+            before, after = descriptions[_AS_IT_IS][descriptor.name], descriptions[way][descriptor.name]
             if isinstance(before, str) or isinstance(after, str):
                 notes[mesh] = before if isinstance(before, str) else str(after)
             else:
@@ -192,7 +134,7 @@ def _distance(descriptor: Descriptor, one: NDArray[np.float32], other: NDArray[n
         return float(descriptor.distances(torch.from_numpy(one)[None], torch.from_numpy(other)[None]))
 
 
-def _between_meshes(descriptor: Descriptor, descriptions: Sequence[_Description]) -> float:
+def _between_meshes(descriptor: Descriptor, descriptions: Sequence[Answer]) -> float:
     """Median distance between any two of the descriptions that are there; NaN without two."""
     there = [description for description in descriptions if not isinstance(description, str)]
     pairs = [_distance(descriptor, one, other) for i, one in enumerate(there) for other in there[i + 1 :]]

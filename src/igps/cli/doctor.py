@@ -1,0 +1,70 @@
+"""`igps doctor`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from igps.cli.reading import write_rows
+from igps.data.sources import find_meshes
+from igps.geometry.mending import Mending
+from igps.geometry.reading import Component, MeshReading
+from igps.geometry.signature import SignatureConfig
+from igps.parallel import Limits
+from igps.report.tables import findings_table
+from igps.studies.doctor import Finding, examine
+
+_HEADER = (
+    "file", "usable", "fault", "mended_by", "notes", "vertices", "vertices_after", "seconds", "megabytes", "error",
+)  # fmt: skip
+
+
+def doctor(
+    root: Path,
+    out: Path | None = None,
+    signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
+    mend: Mending = "auto",
+    component: Component | None = None,
+    allow_open: bool = False,
+    n_workers: int | None = None,
+    time_limit: float | None = None,
+) -> None:
+    """Tell what is wrong with each mesh file of a folder, what will be done about it, and what that will cost.
+
+    Nothing is computed but the mending. The exit status is 1 if a file cannot be used.
+
+    Args:
+        root: folder of meshes, with or without classes.
+        out: a CSV file for the findings, with all notes.
+        signature: parameters of the signatures to come.
+        mend: auto does the least that makes a body of each mesh, never refuses what is no body, always makes all
+            watertight.
+        component: largest keeps only the largest connected component of each mesh.
+        allow_open: accept surfaces with holes
+        n_workers: processes; all cores if not given.
+        time_limit: seconds that one file may take; no limit if not given.
+    """
+    reading = MeshReading(mend, component, allow_open)
+    found = examine(find_meshes(root), reading, signature, n_workers=n_workers, limits=Limits(time_limit))
+    print(findings_table(found))
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_rows(out, _HEADER, [_row(finding) for finding in found])
+        print(f"written to {out}")
+    if any(finding.error is not None for finding in found):
+        sys.exit(1)
+
+
+def _row(finding: Finding) -> tuple[str, ...]:
+    return (
+        finding.id,
+        "no" if finding.error else "yes",
+        finding.fault or "",
+        " ".join(finding.steps),
+        "; ".join(finding.notes),
+        "" if finding.n_vertices is None else str(finding.n_vertices),
+        "" if finding.n_vertices_after is None else str(finding.n_vertices_after),
+        "" if finding.seconds is None else f"{finding.seconds:.1f}",
+        "" if finding.memory is None else f"{finding.memory / 1e6:.0f}",
+        finding.error or "",
+    )

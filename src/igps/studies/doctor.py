@@ -1,0 +1,121 @@
+"""What is wrong with mesh files, what will be done about it, and what that will cost."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from tqdm import tqdm
+
+from igps.data.sources import MeshFiles
+from igps.geometry.mending import Step, mended_by
+from igps.geometry.mesh import MeshError
+from igps.geometry.reading import MeshReading, load_mesh, read_surface
+from igps.geometry.signature import SignatureConfig
+from igps.parallel import Failed, Limits, run
+
+# Of a signature on one core: seconds and bytes by vertices and eigenpairs, fitted to bodies of 1,000 to 250,000
+# vertices. They tell a minute from an hour, not more.
+_SECONDS, _SECONDS_PER_VERTEX, _SECONDS_PER_ENTRY = 0.15, 2.5e-5, 3e-7
+_BYTES, _BYTES_PER_VERTEX, _BYTES_PER_ENTRY = 300e6, 4000.0, 60.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is known of a file before its signature is computed.
+
+    Args:
+        id: its name.
+        fault: why the surface as it is in the file is no body; None if it is one.
+        steps: what is done to it.
+        notes: the same in words.
+        n_vertices: in the file; None if it cannot be read.
+        n_vertices_after: of the body; None if there is none.
+        seconds: expected processor time from file to signature.
+        memory: expected peak memory, bytes.
+        error: why the file cannot be used; None if it can.
+    """
+
+    id: str
+    fault: str | None = None
+    steps: tuple[Step, ...] = ()
+    notes: tuple[str, ...] = ()
+    n_vertices: int | None = None
+    n_vertices_after: int | None = None
+    seconds: float | None = None
+    memory: float | None = None
+    error: str | None = None
+
+
+def examine(
+    files: MeshFiles,
+    reading: MeshReading | None = None,
+    config: SignatureConfig | None = None,
+    *,
+    n_workers: int | None = None,
+    limits: Limits | None = None,
+    progress: bool = True,
+) -> list[Finding]:
+    """Read and mend every file as for its signature, and say what was found.
+
+    Args:
+        files: to be examined.
+        reading: how they are read; the default if None.
+        config: of the signatures; the default if None.
+        n_workers: processes; all cores if None.
+        limits: time and memory of one file.
+        progress: show a bar.
+    """
+    one = partial(_examine, reading or MeshReading(), config or SignatureConfig())
+    outcomes = run(one, files.paths, n_workers=n_workers, limits=limits)
+    found: dict[int, Finding] = {}
+    with tqdm(total=len(files), desc="files", disable=not progress) as bar, contextlib.closing(outcomes):
+        for i, outcome in outcomes:
+            bar.update()
+            found[i] = Finding(files.paths[i].name, error=outcome.reason) if isinstance(outcome, Failed) else outcome
+    return [replace(found[i], id=files.names[i]) for i in range(len(files))]
+
+
+def expected_cost(n_vertices: int, n_eigenpairs: int) -> tuple[float, float]:
+    """Seconds of one core and bytes of memory that a signature takes, to an order of magnitude."""
+    entries = n_vertices * n_eigenpairs
+    seconds = _SECONDS + _SECONDS_PER_VERTEX * n_vertices + _SECONDS_PER_ENTRY * entries
+    return seconds, _BYTES + _BYTES_PER_VERTEX * n_vertices + _BYTES_PER_ENTRY * entries
+
+
+def _examine(reading: MeshReading, config: SignatureConfig, path: Path) -> Finding:
+    start = time.process_time()
+    try:
+        vertices, _, _ = read_surface(path)
+    except MeshError as error:
+        return Finding(path.name, fault=str(error), error=str(error))
+    fault = None
+    try:
+        load_mesh(path, MeshReading("never", reading.component, reading.allow_open))
+    except MeshError as error:
+        fault = str(error)
+    try:
+        mesh = load_mesh(path, reading, least_vertices=config.n_eigenpairs + 2)
+    except MeshError as error:
+        return Finding(path.name, fault=fault, n_vertices=len(vertices), error=str(error))
+    n_after = min(len(mesh.vertices), config.max_vertices or len(mesh.vertices))
+    seconds, memory = expected_cost(n_after, config.n_eigenpairs)
+    return Finding(
+        id=path.name,
+        fault=fault,
+        steps=mended_by(mesh.notes),
+        notes=mesh.notes,
+        n_vertices=len(vertices),
+        n_vertices_after=len(mesh.vertices),
+        seconds=time.process_time() - start + seconds,
+        memory=memory,
+    )
+
+
+def usable(findings: Sequence[Finding]) -> bool:
+    """Whether every file can be used."""
+    return all(finding.error is None for finding in findings)

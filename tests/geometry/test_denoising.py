@@ -1,0 +1,74 @@
+"""Noise is told from shape, and goes; shape stays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from igps.geometry.denoising import denoised, is_noisy
+from igps.geometry.disturbances import noise
+from igps.geometry.mending import mend, mended_by
+from igps.geometry.mesh import Mesh
+
+
+def bumpy() -> Mesh:
+    """A sphere with 2,562 vertices and bumps of about six edge lengths."""
+    surface = trimesh.creation.icosphere(subdivisions=4)
+    x, y, z = surface.vertices.T
+    bumps = 0.03 * np.sin(12 * x) * np.sin(11 * y + 1) * np.cos(10 * z)
+    return Mesh(np.asarray(surface.vertices) * (1 + bumps)[:, None], np.asarray(surface.faces))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_is_found_and_shape_is_not(sphere: Mesh, seed: int) -> None:
+    assert is_noisy(noise(sphere, 0.004, seed).vertices, sphere.faces)
+    assert not is_noisy(sphere.vertices, sphere.faces)
+    assert not is_noisy(bumpy().vertices, bumpy().faces)
+
+
+def test_rounding_creases_and_odd_triangles_are_no_noise() -> None:
+    box = trimesh.creation.box((1, 2, 3)).subdivide_to_size(0.1)
+    generator = np.random.default_rng(0)
+    flat = np.asarray(box.vertices) + generator.normal(0, 1e-7, box.vertices.shape)
+    assert not is_noisy(flat, np.asarray(box.faces))
+    surface = trimesh.creation.icosphere(subdivisions=4)
+    shifted = np.asarray(surface.vertices) + generator.normal(0, 0.01, surface.vertices.shape)
+    shifted /= np.linalg.norm(shifted, axis=1, keepdims=True)
+    assert not is_noisy(shifted, np.asarray(surface.faces))
+
+
+def test_the_rough_half_of_a_body_stays(sphere: Mesh) -> None:
+    rough = noise(sphere, 0.004, 0).vertices
+    upper = sphere.vertices[:, 2:] > 0.2
+    assert not is_noisy(np.where(upper, rough, sphere.vertices), sphere.faces)
+
+
+def test_area_and_volume_come_back(sphere: Mesh) -> None:
+    noisy = noise(sphere, 0.004, 1)
+    assert noisy.area > 1.05 * sphere.area
+    smooth = Mesh(denoised(noisy.vertices, noisy.faces), noisy.faces)
+    assert smooth.area == pytest.approx(sphere.area, rel=0.01)
+    assert smooth.volume == pytest.approx(sphere.volume, rel=0.01)
+    assert (
+        np.abs(np.linalg.norm(smooth.vertices, axis=1) - 1).std() < 0.6 * np.linalg.norm(noisy.vertices, axis=1).std()
+    )
+
+
+def test_boundaries_stay(sphere: Mesh) -> None:
+    faces = sphere.faces[sphere.vertices[sphere.faces].mean(axis=1)[:, 2] < 0.5]
+    noisy = noise(sphere, 0.004, 1).vertices
+    smooth = denoised(noisy, faces)
+    sides = np.sort(np.stack([faces, np.roll(faces, 1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    edges, count = np.unique(sides, axis=0, return_counts=True)
+    rim = np.unique(edges[count == 1])
+    np.testing.assert_array_equal(smooth[rim], noisy[rim])
+    assert not np.array_equal(smooth, noisy)
+
+
+def test_mending_smooths_noise_only(sphere: Mesh) -> None:
+    noisy = noise(sphere, 0.004, 1)
+    mesh = mend(noisy.vertices, noisy.faces)
+    assert mended_by(mesh.notes) == ("smoothed",)
+    np.testing.assert_array_equal(mesh.faces, sphere.faces)
+    np.testing.assert_array_equal(mesh.vertices, denoised(noisy.vertices, noisy.faces))

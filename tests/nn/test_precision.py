@@ -1,0 +1,129 @@
+"""Settings that allow coarse matrix products change no distance bin, and are as they were afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+from torch import Tensor
+
+from igps.nn.hard_pairs import pair_histogram
+from igps.nn.oriented_pairs import oriented_pair_histogram
+from igps.nn.precision import full_precision
+from igps.nn.soft_pairs import soft_pair_histogram
+from igps.nn.view import nearest_directions
+
+
+def by_backend(name: str, precision: str) -> Callable[[], None]:
+    def change() -> None:
+        backend = getattr(torch.backends, name, None) if name else torch.backends
+        owner = backend.matmul if name else backend  # type: ignore[union-attr]
+        if not hasattr(owner, "fp32_precision"):
+            pytest.skip("this PyTorch has no precision for each backend")
+        owner.fp32_precision = precision  # type: ignore[union-attr]
+
+    return change
+
+
+def allow_tf32() -> None:
+    torch.backends.cuda.matmul.allow_tf32 = True
+
+
+SETTINGS: dict[str, Callable[[], None]] = {
+    "medium": lambda: torch.set_float32_matmul_precision("medium"),
+    "high": lambda: torch.set_float32_matmul_precision("high"),
+    "allow_tf32": allow_tf32,
+    "mkldnn": by_backend("mkldnn", "bf16"),
+    "cuda": by_backend("cuda", "tf32"),
+    "all": by_backend("", "bf16"),
+}
+
+
+def state() -> list[str]:
+    found = []
+    try:
+        found.append(torch.get_float32_matmul_precision())
+    except RuntimeError:
+        found.append("contradiction")
+    for backend in (torch.backends.cuda, torch.backends.mkldnn):
+        found.append(str(getattr(getattr(backend, "matmul", None), "fp32_precision", None)))
+    return [*found, str(getattr(torch.backends, "fp32_precision", None))]
+
+
+@pytest.fixture(params=list(SETTINGS))
+def setting(request: pytest.FixtureRequest) -> Iterator[Callable[[], None]]:
+    yield SETTINGS[request.param]
+    if hasattr(torch.backends, "fp32_precision"):
+        torch.backends.fp32_precision = "none"
+    torch.set_float32_matmul_precision("highest")
+    for backend in (torch.backends.cuda, torch.backends.mkldnn):
+        if hasattr(getattr(backend, "matmul", None), "fp32_precision"):
+            backend.matmul.fp32_precision = "none"
+
+
+def kernels() -> list[Tensor]:
+    """All that counts pairs by their distance."""
+    generator = torch.Generator().manual_seed(0)
+    embedding = torch.randn(300, 64, generator=generator) / 8
+    points = torch.rand(300, 3, generator=generator)
+    directions = torch.nn.functional.normalize(torch.randn(300, 3, generator=generator), dim=1)
+    memberships = torch.rand(300, 2, generator=generator).softmax(dim=1)
+    centres = torch.linspace(0.1, 2.5, 30)
+    leaf = embedding.clone().requires_grad_()
+    joint = soft_pair_histogram(memberships, [(leaf, centres), (points, centres[:10])])
+    cosines = torch.linspace(-0.8, 0.8, 5)
+    oriented = oriented_pair_histogram(
+        torch.ones(300, 1), [(embedding, centres[::5])], [(points, directions, cosines, cosines)]
+    )
+    (gradient,) = torch.autograd.grad(joint.square().sum(), leaf)  # counts all pairs once more
+    return [
+        pair_histogram(embedding, embedding.norm(dim=1)),
+        joint.detach(),
+        oriented,
+        gradient,
+        nearest_directions(embedding, embedding.flip(0) * 1.1, 3),
+    ]
+
+
+def test_no_bin_changes(setting: Callable[[], None]) -> None:
+    expected = kernels()
+    setting()
+    before = state()
+    for result, other in zip(kernels(), expected, strict=True):
+        assert torch.equal(result, other)
+    assert state() == before
+
+
+def test_threads_share_the_settings(setting: Callable[[], None]) -> None:
+    """One that leaves while others are inside must not take the precision from them; the last one restores it."""
+    expected = kernels()
+    setting()
+    before = state()
+    with ThreadPoolExecutor(4) as pool:
+        for results in pool.map(lambda _: kernels(), range(12)):
+            for result, other in zip(results, expected, strict=True):
+                torch.testing.assert_close(result, other, rtol=0, atol=1e-6)
+    assert state() == before
+
+
+def test_an_error_inside_restores_the_settings(setting: Callable[[], None]) -> None:
+    setting()
+    before = state()
+
+    def fail() -> None:
+        with full_precision():
+            assert not {"bf16", "tf32"} & set(state()[1:3])
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert state() == before
+
+
+def test_plain_settings_are_left_alone() -> None:
+    before = state()
+    with full_precision(), full_precision():
+        assert state() == before
+    assert state() == before
