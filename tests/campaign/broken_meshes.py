@@ -1,0 +1,144 @@
+"""Broken mesh files are refused in a sentence that names them, or every number made of them is confirmed.
+
+`python tests/campaign/broken_meshes.py --case 123` repeats one file and keeps it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from mutator import Broken, broken_mesh
+from outcome import Row
+from reference import confirm
+
+from igps import MeshError, MeshReading, SignatureConfig, compute_signature, load_mesh
+from igps.geometry.reading import Component
+from igps.geometry.simplification import simplify
+from igps.linalg.lanczos import ConvergenceError
+from igps.parallel import Failed, Limits, run
+
+SEED = 13
+CONFIG = SignatureConfig(n_eigenpairs=6, resolution=9, min_samples=0, n_surface_samples=40)
+MANY_VERTICES = 1000
+# A case takes a tenth of a second. What takes longer than this hangs, on a machine that does something else beside.
+SECONDS = 60.0
+MEMORY = 4 * 2**30
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a file.
+
+    Args:
+        kind: "refused", "confirmed" or "wrong".
+        reason: what was said of a refused one; what is wrong.
+        checks: how often each number was confirmed, by name.
+    """
+
+    kind: str
+    reason: str = ""
+    checks: tuple[str, ...] = ()
+
+
+def examine(job: tuple[int, int]) -> Verdict:
+    """Read and describe the file of a number, in a folder that is removed."""
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory(prefix="igps-campaign-") as folder:
+        return judge(broken_mesh(*job), Path(folder), number=job[1])
+
+
+def judge(broken: Broken, folder: Path, number: int) -> Verdict:
+    """What becomes of a file, read as half of the users would."""
+    path = folder / broken.name
+    path.write_bytes(broken.content)
+    reading, changed = _reading(number)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of overflow in readers, among others; the numbers are checked
+        try:
+            mesh = load_mesh(path, reading)
+            if len(mesh.vertices) > MANY_VERTICES:  # mending may make many
+                mesh = simplify(mesh, MANY_VERTICES)
+            signature = compute_signature(mesh, CONFIG)
+        except (MeshError, ValueError) as error:
+            if str(path) not in str(error):
+                return Verdict("wrong", f"a {type(error).__name__} does not name the file: {error}")
+            return Verdict("refused", str(error).replace(str(path), "FILE"))
+        except Exception as error:
+            if isinstance(error, ConvergenceError) and str(path) in str(error):
+                return Verdict("refused", str(error).replace(str(path), "FILE"))
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{Path(where.filename).name}:{where.lineno}"
+            return Verdict("wrong", f"a traceback of {type(error).__name__} from {place}: {error}")
+        # Where nothing may be changed, what is read is what was written.
+        wanted = None if changed else broken.arrays
+        try:
+            with np.errstate(all="ignore"):
+                doubts, checks = confirm(mesh, signature, wanted, CONFIG, path.suffix)
+        except MeshError as error:
+            return Verdict("wrong", f"the moved mesh is refused: {error}")
+    return Verdict("wrong", "; ".join(doubts), tuple(checks)) if doubts else Verdict("confirmed", "", tuple(checks))
+
+
+def _reading(number: int) -> tuple[MeshReading, bool]:
+    """How the file of this number is read, and whether that may change the surface."""
+    component: Component | None = "largest" if number % 7 == 1 else None
+    allow_open = number % 3 == 1
+    mend = ("never", "auto", "never", "auto", "never", "auto", "never", "always")[number % 8]
+    return MeshReading(mend=mend, component=component, allow_open=allow_open), mend != "never" or bool(component)  # type: ignore[arg-type]
+
+
+def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
+    """Read and describe so many files."""
+    start = time.monotonic()
+    jobs = [(SEED, number) for number in range(n_cases)]
+    kinds: Counter[str] = Counter()
+    reasons: Counter[str] = Counter()
+    checks: Counter[str] = Counter()
+    missed = []
+    for place, verdict in run(examine, jobs, n_workers=n_workers, limits=Limits(SECONDS, MEMORY)):
+        number = jobs[place][1]
+        if isinstance(verdict, Failed):
+            verdict = Verdict("wrong", verdict.reason)
+        kinds[verdict.kind] += 1
+        checks.update(verdict.checks)
+        if verdict.kind == "refused":
+            reasons[" ".join(word for word in verdict.reason.split() if word.isalpha())[:60]] += 1
+        if verdict.kind == "wrong":
+            missed.append(f"--case {number} ({broken_mesh(SEED, number).story}): {verdict.reason}"[:400])
+    return [
+        Row(
+            "broken meshes",
+            "OFF, OBJ, PLY, STL, GLB and 3MF read and described",
+            n_cases,
+            "no traceback, hang or crash, every number confirmed",
+            f"{kinds['refused']} refused, {kinds['confirmed']} confirmed, {kinds['wrong']} wrong",
+            missed=sorted(missed),
+            details={"kinds": dict(kinds), "confirmations": dict(checks), "refusals": dict(reasons.most_common(30))},
+            seconds=time.monotonic() - start,
+        )
+    ]
+
+
+def main() -> None:
+    """Repeat one case and say what became of it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--case", type=int, required=True, help="number of the file")
+    parser.add_argument("--out", type=Path, default=Path("build/campaign"), help="folder that keeps the file")
+    arguments = parser.parse_args()
+    broken = broken_mesh(SEED, arguments.case)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    print(arguments.out / broken.name, broken.story, sep="\n")
+    print(judge(broken, arguments.out, arguments.case))
+
+
+if __name__ == "__main__":
+    main()

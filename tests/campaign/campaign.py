@@ -1,0 +1,50 @@
+"""The campaign: broken meshes, kills, a machine at fault, properties of every descriptor, deliberate faults.
+
+It prints a table, writes it to a JSON file, and ends with status 1 where a target is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+# Before anything reads it: workers and runs side by side have one thread each.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from outcome import Row, table
+
+PARTS = ("broken_meshes", "kills", "machine_faults", "properties", "mutants")
+# How much of each part: the whole campaign, and the small one of two minutes. None leaves a part out.
+_WHOLE = {"broken_meshes": 10_000, "kills": 200, "machine_faults": 0, "properties": 12, "mutants": 20}
+_SMALL = {"broken_meshes": 300, "kills": 8, "machine_faults": None, "properties": 1, "mutants": None}
+
+
+def main() -> None:
+    """Run the campaign, or parts of it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--small", action="store_true", help="the one of two minutes")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="of the campaign")
+    parser.add_argument("--out", type=Path, default=Path("build/campaign.json"), help="JSON file of the table")
+    arguments = parser.parse_args()
+    amounts = _SMALL if arguments.small else _WHOLE
+    rows: list[Row] = []
+    for part in arguments.parts:
+        amount = amounts[part]
+        if amount is None:
+            continue
+        print(f"{part} ...", flush=True)
+        run: Callable[..., list[Row]] = importlib.import_module(part).campaign
+        rows += run(amount) if amount else run()
+    print(table(rows))
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps([row.as_dict() for row in rows], indent=2) + "\n")
+    sys.exit(not all(row.met for row in rows))
+
+
+if __name__ == "__main__":
+    main()

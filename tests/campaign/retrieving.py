@@ -1,0 +1,164 @@
+"""`igps retrieve` on a few small shapes, as a command that can be killed, and the table that it leaves."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import types
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+
+from igps.shapes.files import off_text
+
+HERE = Path(__file__).parent
+SHAPES_A_CLASS = 4
+
+
+def write_shapes(folder: Path) -> None:
+    """Three classes of four closed surfaces of some two hundred vertices, with a folder each."""
+    made = {
+        "ball": trimesh.creation.icosphere(subdivisions=2),
+        "ring": trimesh.creation.torus(1.0, 0.35, major_sections=20, minor_sections=10),
+        "rod": trimesh.creation.capsule(height=2.0, radius=0.5, count=[14, 14]),
+    }
+    generator = np.random.default_rng(0)
+    for label, mesh in made.items():
+        (folder / label).mkdir(parents=True)
+        for number in range(SHAPES_A_CLASS):
+            x, y, z = np.asarray(mesh.vertices).T
+            a, b, c = generator.uniform(0.05, 0.3, 3)
+            vertices = np.stack([x * (1 + a), y + b * x * x, z + c * np.sin(2 * x)], axis=1)
+            (folder / label / f"{number}.off").write_text(off_text(vertices, np.asarray(mesh.faces)))
+
+
+def arguments(shapes: Path, cache: Path, out: Path, n_workers: int) -> list[str]:
+    """Of the command, without its name."""
+    signature = {"n_eigenpairs": 6, "resolution": 10, "min_samples": 0, "n_surface_samples": 20}
+    return [
+        *("retrieve", str(shapes), "--descriptor", "cheap_descriptor:cheap", "--n_workers", str(n_workers)),
+        *("--cache_dir", str(cache), "--out", str(out)),
+        *(word for name, value in signature.items() for word in (f"--signature.{name}", str(value))),
+    ]
+
+
+def environment(fault: str = "") -> dict[str, str]:
+    """Of a command: the descriptor can be imported, and a fault of the machine is in force."""
+    paths = [str(HERE), *([str(HERE / "shims")] if fault else []), *sys.path]
+    path = os.pathsep.join(dict.fromkeys(path for path in paths if path))
+    return {**os.environ, "PYTHONPATH": path, "IGPS_CAMPAIGN_FAULT": fault, "OMP_NUM_THREADS": "1"}
+
+
+def retrieve(
+    shapes: Path, cache: Path, out: Path, n_workers: int = 1, fault: str = "", under: Sequence[str] = ()
+) -> subprocess.CompletedProcess[str]:
+    """The command, run to its end, with a fault of the machine, or under another command."""
+    command = [*under, sys.executable, "-m", "igps.cli", *arguments(shapes, cache, out, n_workers)]
+    return subprocess.run(command, env=environment(fault), capture_output=True, text=True, timeout=300, check=False)
+
+
+class Command:
+    """The command in a process forked from this one, which has imported all that it needs: it starts at once."""
+
+    def __init__(self, shapes: Path, cache: Path, out: Path, n_workers: int) -> None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        self.log = out.with_suffix(".log")
+        words = ["igps", *arguments(shapes, cache, out, n_workers)]
+        sys.stdout.flush()
+        sys.stderr.flush()
+        self.pid = os.fork()
+        if self.pid == 0:
+            _become(words, self.log)
+        self._status: int | None = None
+
+    def children(self) -> list[int]:
+        """Processes of its workers."""
+        return children(self.pid)
+
+    def status(self) -> int | None:
+        """Exit status; minus the signal that ended it; None while it runs."""
+        if self._status is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            self._status = os.waitstatus_to_exitcode(status) if pid else None
+        return self._status
+
+    def wait(self) -> int:
+        """Exit status, at its end."""
+        if self._status is None:
+            self._status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        return self._status
+
+
+def _become(words: list[str], log: Path) -> None:
+    status = 70
+    try:
+        os.setsid()
+        handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        for stream in (1, 2):
+            os.dup2(handle, stream)
+        sys.argv = words
+        # Workers import the main module, which is to be none of the campaign's.
+        sys.modules["__main__"] = types.ModuleType("__main__")
+        os.environ.update(environment())
+        sys.path.insert(0, str(HERE))
+        torch.set_num_threads(1)
+        main = _command()
+        main()
+        status = 0
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else 1
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def _command() -> Callable[[], None]:
+    from igps.cli import main
+
+    return main
+
+
+def children(pid: int) -> list[int]:
+    """Processes whose parent this one is."""
+    try:
+        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+
+
+def is_python_worker(pid: int) -> bool:
+    """Whether a process is a worker, and not the helper of multiprocessing that looks after semaphores."""
+    try:
+        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return False
+
+
+def table(out: Path) -> Mapping[str, Any] | None:
+    """All that a run leaves, to the bit; None where it is not whole."""
+    try:
+        scores = json.loads((out / "scores.json").read_text())
+        with (out / "ranking.csv").open(newline="") as file:
+            ranking = list(csv.reader(file))
+        with np.load(out / "distances.npz") as archive:
+            arrays = {name: (archive[name].dtype.str, archive[name].tobytes()) for name in archive.files}
+    except (OSError, ValueError, KeyError, EOFError):
+        return None
+    return {"scores": scores, "ranking": ranking, "arrays": arrays, "failures": (out / "failures.csv").exists()}
+
+
+def partials(cache: Path) -> list[Path]:
+    """Files that somebody began to write."""
+    return [path for path in cache.rglob("*") if path.is_file() and path.suffix != ".safetensors"]

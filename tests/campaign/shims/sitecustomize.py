@@ -1,0 +1,68 @@
+"""Faults of a machine, put into every Python process that has this folder on its path and names one of them.
+
+FAULT is one of
+    full N     the disk is full: the files of the cache hold no more than N bytes in all;
+    rename     a file cannot be renamed over another one, as where somebody else holds that one open;
+    clock S    the clock is S seconds behind.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+
+_NAME, _, _VALUE = os.environ.get("IGPS_CAMPAIGN_FAULT", "").partition(" ")
+
+
+def _no_rename() -> None:
+    replace, rename = os.replace, os.rename
+
+    def refusing(move):  # type: ignore[no-untyped-def]
+        def moved(source, target, **options):  # type: ignore[no-untyped-def]
+            if os.path.exists(target) and str(target).endswith(".safetensors"):
+                raise PermissionError(13, "The process cannot access the file because it is used by another", target)
+            return move(source, target, **options)
+
+        return moved
+
+    os.replace, os.rename = refusing(replace), refusing(rename)
+
+
+def _no_space(limit: int) -> None:
+    """A write to a file of the cache fails once the files there hold so many bytes."""
+    import builtins
+    import errno
+    import io
+
+    ordinary = builtins.open
+
+    def opened(file, mode="r", *arguments, **options):  # type: ignore[no-untyped-def]
+        stream = ordinary(file, mode, *arguments, **options)
+        if (".safetensors" not in str(file) and ".partial" not in str(file)) or not set(mode) & set("wax"):
+            return stream
+        root = os.path.dirname(os.path.dirname(os.path.abspath(file)))
+
+        class Full(io.BufferedWriter):
+            def write(self, data):  # type: ignore[no-untyped-def, override]
+                used = sum(os.path.getsize(os.path.join(at, name)) for at, _, names in os.walk(root) for name in names)
+                if used + len(data) > limit:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file))
+                return super().write(data)
+
+        return Full(stream.detach())
+
+    builtins.open = opened
+
+
+def _earlier(seconds: float) -> None:
+    now, now_ns = time.time, time.time_ns
+    time.time = lambda: now() - seconds
+    time.time_ns = lambda: now_ns() - int(seconds * 1e9)
+
+
+if _NAME == "rename":
+    _no_rename()
+elif _NAME == "full":
+    _no_space(int(_VALUE))
+elif _NAME == "clock":
+    _earlier(float(_VALUE))
