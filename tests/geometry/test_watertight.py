@@ -234,3 +234,8 @@ def test_what_is_no_surface_is_refused() -> None:
         watertight(np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
     with pytest.raises(ValueError, match="resolution"):
         watertight(*arrays(ball()), resolution=2)
+
+
+def test_a_body_between_the_points_of_the_grid_is_refused_by_name() -> None:
+    with pytest.raises(MeshError, match=r"wire\.off: no point of the grid lies in the body"):
+        module._marched(np.ones((4, 4, 4), dtype=np.float32), "wire.off")

@@ -503,6 +503,11 @@ def _marched(field: NDArray[np.float32], name: str) -> tuple[NDArray[np.float64]
     except ImportError as error:
         raise ImportError('watertight needs scikit-image: pip install "interior-gps[shapes]".') from error
     for _ in range(20):
+        if not (field.min() < 0 < field.max()):
+            raise MeshError(
+                f"{name}: no point of the grid lies in the body, which is too thin everywhere for its length. "
+                "Give it some thickness."
+            )
         vertices, faces, _, _ = marching_cubes(field, 0.0, allow_degenerate=True)
         # Downward gradients point outward here.
         faces = faces.astype(np.int64)
