@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from igps.geometry import disturbances
 from igps.geometry.mesh import Mesh, MeshError
-from igps.geometry.surface import area_vectors
+from igps.geometry.surface import area_vectors, diagonal
 from igps.geometry.voxels import interior_samples
 
 Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
@@ -102,7 +102,7 @@ def halves(mesh: Mesh, seed: int = 0, overlap: float = 0.02) -> Triangles:
     body = manifold3d.Manifold(manifold3d.Mesh64(np.ascontiguousarray(points), mesh.faces.astype(np.uint64)))
     if body.status() != manifold3d.Error.NoError:
         raise MeshError(f"{mesh.name}: manifold3d does not accept the surface ({body.status()}), so it was not cut.")
-    reach = overlap / 2 * _diagonal(mesh.vertices)
+    reach = overlap / 2 * diagonal(mesh.vertices)
     pieces = [body.trim_by_plane(sign * axis, -reach).to_mesh64() for sign in (1, -1)]
     vertices = [np.asarray(piece.vert_properties)[:, :3] + centre for piece in pieces]
     faces = [np.asarray(piece.tri_verts, dtype=np.int64) for piece in pieces]
@@ -194,7 +194,7 @@ def _with_fins(
     a, b = faces[face, corner], faces[face, (corner + 1) % 3]
     normals = area_vectors(vertices, faces)[face]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
-    tips = (vertices[a] + vertices[b]) / 2 + 0.01 * _diagonal(vertices) * normals
+    tips = (vertices[a] + vertices[b]) / 2 + 0.01 * diagonal(vertices) * normals
     stands = np.stack([a, b, len(vertices) + np.arange(n_fins)], axis=1)
     twice = faces[generator.permutation(len(faces))[: max(round(doubled * len(faces)), 1)]]
     return np.vstack([vertices, tips]), np.vstack([faces, stands, twice])
@@ -235,7 +235,3 @@ def _ball() -> Triangles:
 
     ball = trimesh.creation.icosphere(subdivisions=2)
     return np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int64)
-
-
-def _diagonal(vertices: NDArray[np.float64]) -> float:
-    return float(np.linalg.norm(np.ptp(vertices, axis=0)))
