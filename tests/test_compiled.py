@@ -1,0 +1,39 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from igps.compiled import compiled, is_available
+
+
+@compiled()
+def cumulative(values: np.ndarray) -> np.ndarray:
+    total = 0.0
+    sums = np.empty_like(values)
+    for i in range(len(values)):
+        total += values[i]
+        sums[i] = total
+    return sums
+
+
+@pytest.mark.skipif(not is_available(), reason="needs numba, the extra [fast]")
+def test_a_compiled_loop_is_the_function_that_it_was_made_of():
+    values = np.random.default_rng(0).random(1000)
+    np.testing.assert_allclose(cumulative(values), np.cumsum(values), rtol=1e-12)
+    assert cumulative.__name__ == "cumulative"
+
+
+def test_importing_a_compiled_loop_imports_no_compiler():
+    code = "import sys, igps, igps.compiled; igps.compiled.compiled()(lambda x: x); sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+@pytest.mark.parametrize(("value", "expected"), [("1", False), ("0", None)])
+def test_numbas_own_switch_turns_it_off(value, expected, monkeypatch):
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", value)
+    is_available.cache_clear()
+    try:
+        assert is_available() is (pytest.importorskip("numba") is not None if expected is None else expected)
+    finally:
+        is_available.cache_clear()
