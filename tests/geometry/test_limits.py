@@ -41,22 +41,45 @@ def test_headers_with_comments_and_lies(tmp_path: Path) -> None:
     assert expected_faces(file) == 0
 
 
-def test_ten_million_triangles_in_two_gibibytes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("limit", ["RLIMIT_AS", "RLIMIT_DATA"])
+def test_ten_million_triangles_in_two_gibibytes(tmp_path: Path, limit: str) -> None:
     file = tmp_path / "huge.stl"
     with file.open("wb") as stream:  # a sparse file: only its head is on the disk
         stream.write(bytes(80) + (10_000_000).to_bytes(4, "little"))
         stream.truncate(84 + 50 * 10_000_000)
     program = (
         "import resource, sys; from pathlib import Path; from igps.geometry.limits import check_memory\n"
-        "resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))\n"
+        "resource.setrlimit(getattr(resource, sys.argv[2]), (2 << 30, 2 << 30))\n"
         "check_memory(Path(sys.argv[1]))"
     )
     pytest.importorskip("resource")
-    done = subprocess.run([sys.executable, "-c", program, str(file)], capture_output=True, text=True, timeout=120)
+    words = [sys.executable, "-c", program, str(file), limit]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
     message = done.stderr.strip().splitlines()[-1]
     assert "huge.stl: about 10,000,000 triangles need 10.0 GB" in message
     assert "Simplify" in message
+
+
+@pytest.mark.parametrize(
+    ("limit", "used", "cached"),
+    [("memory.max", "memory.current", "inactive_file"),
+     ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")],
+)  # fmt: skip
+def test_files_that_a_group_has_read_are_free_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, used: str, cached: str
+) -> None:
+    monkeypatch.setattr(limits, "_GROUPS", ((tmp_path, limit, used, cached),))
+    monkeypatch.setattr(limits, "_of_limits", lambda: None)
+    monkeypatch.setattr(limits, "_of_machine", lambda: None)
+    (tmp_path / used).write_text("900\n")
+    assert available_memory() is None
+    (tmp_path / limit).write_text("max\n")
+    assert available_memory() is None
+    (tmp_path / limit).write_text("1000\n")
+    assert available_memory() == 100
+    (tmp_path / "memory.stat").write_text(f"anon 50\nfile 800\nsome_{cached} 3\n{cached} 700\nslab 9\n")
+    assert available_memory() == 800
 
 
 def test_what_fits_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

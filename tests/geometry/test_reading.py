@@ -23,10 +23,17 @@ def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
 def test_missing_and_unreadable_files(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match=r"nowhere\.off: no such file"):
         load_mesh(tmp_path / "nowhere.off")
-    for name, text in (("empty.off", ""), ("words.off", "hello"), ("cut.ply", "ply\nformat ascii 1.0\n")):
+    for name, text in (("blank.off", "\n"), ("words.off", "hello"), ("cut.ply", "ply\nformat ascii 1.0\n")):
         (tmp_path / name).write_text(text)
         with pytest.raises(MeshError, match=rf"{name}: not readable"):
             load_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl", "glb", "xyz", "3mf"])
+def test_an_empty_file_is_called_empty(tmp_path: Path, suffix: str) -> None:
+    (tmp_path / f"none.{suffix}").write_bytes(b"")
+    with pytest.raises(MeshError, match=rf"none\.{suffix}: the file is empty \(0 bytes\)\. Export it again"):
+        load_mesh(tmp_path / f"none.{suffix}")
 
 
 @pytest.mark.parametrize("suffix", ["off", "obj", "ply", "glb"])

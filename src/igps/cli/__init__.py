@@ -1,4 +1,4 @@
-"""The command line: `igps retrieve`, `extract`, `query`, `demo`, `compare`, `figure` and `robustness`, by functions."""
+"""The command line: what follows `igps` is a function by name."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def compare(
     if n_failed:
         print(f"{n_failed} meshes could not be used or described.")
     if out is not None:
-        write_notes(out, dataset)
+        write_notes(out / "notes.csv", dataset)
         _write_figure(out, results)
         print(f"written to {out}")
 

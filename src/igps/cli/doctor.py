@@ -12,7 +12,7 @@ from igps.geometry.reading import Component, MeshReading
 from igps.geometry.signature import SignatureConfig
 from igps.parallel import Limits
 from igps.report.tables import findings_table
-from igps.studies.doctor import Finding, examine
+from igps.studies.doctor import Finding, examine, usable
 
 _HEADER = (
     "file", "usable", "fault", "mended_by", "notes", "vertices", "vertices_after", "seconds", "megabytes", "error",
@@ -28,6 +28,7 @@ def doctor(
     allow_open: bool = False,
     n_workers: int | None = None,
     time_limit: float | None = None,
+    memory_limit: float | None = None,
 ) -> None:
     """Tell what is wrong with each mesh file of a folder, what will be done about it, and what that will cost.
 
@@ -43,15 +44,17 @@ def doctor(
         allow_open: accept surfaces with holes
         n_workers: processes; all cores if not given.
         time_limit: seconds that one file may take; no limit if not given.
+        memory_limit: gigabytes of memory that one file may take; no limit if not given.
     """
     reading = MeshReading(mend, component, allow_open)
-    found = examine(find_meshes(root), reading, signature, n_workers=n_workers, limits=Limits(time_limit))
+    limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
+    found = examine(find_meshes(root), reading, signature, n_workers=n_workers, limits=limits)
     print(findings_table(found))
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_rows(out, _HEADER, [_row(finding) for finding in found])
         print(f"written to {out}")
-    if any(finding.error is not None for finding in found):
+    if not usable(found):
         sys.exit(1)
 
 

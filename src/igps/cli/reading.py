@@ -87,10 +87,10 @@ def mending_summary(dataset: SignatureDataset, n_given: int) -> str:
     return f"{n_mended} of {n_given} meshes were mended: {told}"
 
 
-def write_notes(out: Path, dataset: SignatureDataset) -> None:
-    """Write notes.csv, what was done to which mesh; or remove that of an earlier run where nothing was done."""
+def write_notes(path: Path, dataset: SignatureDataset) -> None:
+    """Write a table of what was done to which mesh; or remove that of an earlier run where nothing was done."""
     notes = ((name, dataset.notes(i)) for i, name in enumerate(dataset.files.names))
-    write_rows(out / "notes.csv", ("file", "note"), [(name, note) for name, told in notes for note in told])
+    write_rows(path, ("file", "note"), [(name, note) for name, told in notes for note in told])
 
 
 def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -69,7 +69,8 @@ def extract(
 
     Args:
         meshes: mesh files, or one folder.
-        out: the archive, a file ending in .npz.
+        out: the archive, a file ending in .npz; what was done to meshes that were mended is written beside it, in a
+            file of the same name ending in .notes.csv.
         descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
     """
     source = meshes[0] if len(meshes) == 1 else meshes
@@ -81,6 +82,7 @@ def extract(
     out.parent.mkdir(parents=True, exist_ok=True)
     with out.open("wb") as file:  # given a name, NumPy would append .npz to it
         np.savez_compressed(file, **arrays)
+    write_notes(out.with_suffix(".notes.csv"), dataset)
     print(
         f"{len(features)} descriptions of shape {features.shape[1:]} written to {out}; {len(failures)} meshes skipped"
     )
@@ -160,4 +162,4 @@ def _write_retrieval(
                 writer.writerow(row)
     rows = [(failure.id, failure.error) for failure in failures]
     write_rows(out / "failures.csv", ("file", "error"), rows)
-    write_notes(out, dataset)
+    write_notes(out / "notes.csv", dataset)

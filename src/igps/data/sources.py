@@ -9,7 +9,7 @@ from pathlib import Path
 
 import trimesh
 
-from igps.geometry.reading import POINT_CLOUDS
+from igps.geometry.reading import NEED_MODULES, POINT_CLOUDS
 
 LABELS_FILE = "labels.csv"
 
@@ -127,5 +127,5 @@ def _names(paths: Sequence[Path], root: Path) -> tuple[str, ...]:
 
 def _suffixes() -> frozenset[str]:
     # JSON files are read by trimesh too, but a folder's JSON files are seldom meshes.
-    known = frozenset(trimesh.available_formats()) | {suffix.lstrip(".") for suffix in POINT_CLOUDS}
+    known = frozenset(trimesh.available_formats()) | {suffix.lstrip(".") for suffix in POINT_CLOUDS | NEED_MODULES}
     return known - {"json", "dict", "dict64", "zip", "tar.gz", "tar.bz2"}

@@ -13,6 +13,12 @@ _BYTES_PER_FACE = 1000
 _OBJ_BYTES, _TEXT_STL_BYTES = 35, 200
 # A file so small is not looked at.
 _SMALL = 1 << 20
+# Of a control group: the folder, its limit, what it uses, and in memory.stat what of that is files that were read and
+# may be forgotten at any time.
+_GROUPS = (
+    (Path("/sys/fs/cgroup"), "memory.max", "memory.current", "inactive_file"),
+    (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+)
 
 
 def check_memory(path: Path) -> None:
@@ -67,34 +73,41 @@ def _of_limits() -> int | None:
         import resource
     except ImportError:  # there are none on Windows
         return None
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    used = _first_number(Path("/proc/self/statm"))
-    if limit == resource.RLIM_INFINITY or used is None:
-        return None
-    return limit - used * resource.getpagesize()
+    left = []
+    # Address space, and of that what can be written, which a memory limit of `igps.parallel` bounds.
+    for kind, column in ((resource.RLIMIT_AS, 0), (resource.RLIMIT_DATA, 5)):
+        limit, _ = resource.getrlimit(kind)
+        pages = _number(Path("/proc/self/statm"), column)
+        if limit != resource.RLIM_INFINITY and pages is not None:
+            left.append(limit - pages * resource.getpagesize())
+    return min(left, default=None)
 
 
 def _of_group() -> int | None:
-    for limit, used in (
-        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-        ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-    ):
-        most, current = _first_number(Path(limit)), _first_number(Path(used))
+    for folder, limit, used, cached in _GROUPS:
+        most, current = _number(folder / limit), _number(folder / used)
         if most is not None and current is not None:
-            return most - current
+            return most - current + (_named_number(folder / "memory.stat", cached) or 0)
     return None
 
 
 def _of_machine() -> int | None:
-    try:
-        line = re.search(r"MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text())
-    except OSError:
-        return None
-    return int(line[1]) * 1024 if line else None
+    kilobytes = _named_number(Path("/proc/meminfo"), "MemAvailable:")
+    return None if kilobytes is None else kilobytes * 1024
 
 
-def _first_number(path: Path) -> int | None:
+def _number(path: Path, column: int = 0) -> int | None:
+    """A number of the first line of a file; None if there is none."""
     try:
-        return int(path.read_text().split()[0])
+        return int(path.read_text().split()[column])
     except (OSError, ValueError, IndexError):
         return None
+
+
+def _named_number(path: Path, name: str) -> int | None:
+    """The number after a name at the start of a line; None if there is none."""
+    try:
+        line = re.search(rf"^{re.escape(name)}\s+(\d+)", path.read_text(), re.MULTILINE)
+    except OSError:
+        return None
+    return int(line[1]) if line else None

@@ -23,6 +23,10 @@ Component = Literal["largest"]
 POINT_CLOUDS = frozenset({".xyz"})
 """Suffixes of files that hold points alone, as lines of three coordinates, or of six with normals."""
 
+NEED_MODULES = frozenset({".3mf", ".3dxml", ".dae", ".zae", ".xaml", ".step", ".stp"})
+"""Suffixes of files that trimesh reads by further modules. They are meshes where these are missing, too: a file that
+cannot be read is to be named, not passed over."""
+
 
 @dataclass(frozen=True)
 class MeshReading:
@@ -97,6 +101,8 @@ def read_surface(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int6
     path = Path(path)
     if not path.is_file():
         raise MeshError(f"{path}: no such file. Check the path.")
+    if path.stat().st_size == 0:
+        raise MeshError(f"{path}: the file is empty (0 bytes). Export it again.")
     check_memory(path)
     try:
         return _read(path)

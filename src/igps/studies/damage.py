@@ -29,6 +29,7 @@ class DamageResult:
     Args:
         n_given: meshes that were damaged.
         scores: means over the damaged meshes that could be described, each as a query of the clean others; fractions.
+            None where no two of them are of one class.
         clean: the same of their clean twins.
         notes: why others could not be described, by name.
     """
@@ -123,7 +124,8 @@ def _result(
         if isinstance(one, str) or isinstance(other, str)
     }
     kept = [i for i, name in enumerate(dataset.files.names) if name not in notes]
-    if not kept:
+    if len({labels[i] for i in kept}) == len(kept):
+        # Nothing is left, or nothing that could be found.
         return DamageResult(len(dataset), {}, {}, notes)
     gallery, queries = (torch.from_numpy(np.stack([answers[i] for i in kept])) for answers in (before, after))
     scores = []

@@ -1,0 +1,95 @@
+"""`igps doctor`: its table, its file, and its exit status."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import pytest
+
+from damaged_files import N_FACES, N_VERTICES, without_lxml, write_box, write_clean, write_soup, write_unusable
+from igps.cli import main
+
+FEW = ["--signature.n_eigenpairs", "20", "--n_workers", "1"]
+
+
+def igps(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
+    main()
+
+
+def test_table_and_file_of_a_folder_that_can_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, out = tmp_path / "meshes", tmp_path / "deep" / "doctor.csv"
+    write_clean(root / "a" / "clean.off")
+    write_soup(root / "a" / "soup.off")
+    write_box(root / "b" / "box.off")
+    igps(monkeypatch, "doctor", root, "--out", out, *FEW)  # no status: nothing is raised
+    header, *lines, total, written = capsys.readouterr().out.splitlines()
+    assert header.split() == ["vertices", "after", "seconds", "MB", "what", "is", "done"]
+    cells = {line.split()[0]: line.split()[1:] for line in lines}
+    assert cells["a/clean.off"][:2] + cells["a/clean.off"][4:] == [str(N_VERTICES), str(N_VERTICES), "nothing"]
+    assert cells["a/soup.off"][:2] + cells["a/soup.off"][4:] == [str(3 * N_FACES), str(N_VERTICES), "welded"]
+    assert cells["b/box.off"][0] == "8"
+    assert cells["b/box.off"][4:] == ["subdivided"]
+    assert total.startswith("3 files: 2 mended, 0 cannot be used; about ")
+    assert written == f"written to {out}"
+
+    rows = {row["file"]: row for row in csv.DictReader(out.open(newline=""))}
+    assert list(rows) == ["a/clean.off", "a/soup.off", "b/box.off"]
+    for name, row in rows.items():
+        assert [row["vertices"], row["vertices_after"], row["seconds"], row["megabytes"]] == cells[name][:4]
+        assert (row["usable"], row["error"]) == ("yes", "")
+        assert float(row["seconds"]) > 0
+        assert float(row["megabytes"]) > 0
+    assert (rows["a/clean.off"]["fault"], rows["a/clean.off"]["mended_by"], rows["a/clean.off"]["notes"]) == ("",) * 3
+    assert "boundary edges" in rows["a/soup.off"]["fault"]
+    assert rows["a/soup.off"]["mended_by"] == "welded"
+    assert rows["a/soup.off"]["notes"] == f"welded {3 * N_FACES - N_VERTICES} coincident vertices"
+
+
+def test_status_is_1_if_a_file_cannot_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    without_lxml(monkeypatch)
+    root, out = tmp_path / "meshes", tmp_path / "doctor.csv"
+    write_clean(root / "clean.off")
+    sentences = write_unusable(root)
+    with pytest.raises(SystemExit) as stopped:
+        igps(monkeypatch, "doctor", root, "--out", out, *FEW)
+    assert stopped.value.code == 1
+    printed = capsys.readouterr()
+    lines = printed.out.splitlines()
+    for name, sentence in sentences.items():
+        (line,) = [line for line in lines if line.startswith(f"{name} ")]
+        assert line.endswith(f"cannot be used: {root / name}: {sentence}")
+    assert any(
+        line.startswith(f"{1 + len(sentences)} files: 0 mended, {len(sentences)} cannot be used") for line in lines
+    )
+    assert "Traceback" not in printed.out + printed.err
+    rows = {row["file"]: row for row in csv.DictReader(out.open(newline=""))}
+    assert {name: row["usable"] for name, row in rows.items()} == {"clean.off": "yes", **dict.fromkeys(sentences, "no")}
+    assert all(rows[name]["error"] == f"{root / name}: {sentence}" for name, sentence in sentences.items())
+
+
+def test_options_choose_the_mending(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_soup(tmp_path / "soup.off")
+    with pytest.raises(SystemExit, match="1"):
+        igps(monkeypatch, "doctor", tmp_path, "--mend", "never", *FEW)
+    assert "cannot be used" in capsys.readouterr().out
+    pytest.importorskip("igl")
+    pytest.importorskip("skimage")
+    igps(monkeypatch, "doctor", tmp_path, "--mend", "always", *FEW)
+    assert capsys.readouterr().out.splitlines()[1].split()[-1] == "watertight"
+
+
+def test_a_folder_without_meshes_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="1"):
+        igps(monkeypatch, "doctor", tmp_path, *FEW)
+    assert f"igps: {tmp_path}: no mesh found" in capsys.readouterr().err

@@ -1,0 +1,186 @@
+"""What commands say and write of the meshes that they mended, and of those of which nothing could be made."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from damaged_files import (
+    N_FACES,
+    N_VERTICES,
+    without_lxml,
+    write_box,
+    write_clean,
+    write_holed,
+    write_soup,
+    write_unusable,
+)
+from igps.cli import COMMANDS, main
+from own_descriptors import SMALL
+
+ONE = ["--descriptor", "own_descriptors:small_interior", *SMALL]
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Three balls, two of them damaged, and three eggs, one of them damaged; and two boxes."""
+    folder = tmp_path / "meshes"
+    for label, height in (("ball", 1.0), ("egg", 2.0)):
+        write_clean(folder / label / "clean.off", 1.1, height)
+        write_soup(folder / label / "soup.off", 1.2, height)
+    write_holed(folder / "ball" / "holed.off", 1.05, 1.0)
+    write_clean(folder / "egg" / "whole.off", 1.05, 2.0)
+    write_box(folder / "box" / "1.off")
+    write_box(folder / "box" / "2.off").write_text((folder / "box" / "1.off").read_text() + "\n")
+    return folder
+
+
+WELDED = f"welded {3 * N_FACES - N_VERTICES} coincident vertices"
+SUMMARY = "5 of 8 meshes were mended: 2 welded, 2 subdivided, 1 filled"
+
+
+def igps(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
+    main()
+
+
+def notes(path: Path) -> list[tuple[str, str]]:
+    return [(row["file"], row["note"]) for row in csv.DictReader(path.open(newline=""))]
+
+
+def check_notes(path: Path) -> None:
+    """Each mended file, by what was done to it by hand, and no other."""
+    found = dict(notes(path))
+    assert len(found) == len(notes(path))
+    assert set(found) == {"ball/soup.off", "egg/soup.off", "ball/holed.off", "box/1.off", "box/2.off"}
+    assert found["ball/soup.off"] == found["egg/soup.off"] == WELDED
+    assert found["ball/holed.off"] == "filled 1 small holes"
+    assert all(found[f"box/{i}.off"].startswith("subdivided from 8 to ") for i in (1, 2))
+
+
+def test_retrieve_says_what_was_mended_from_the_cache_too(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    for _ in range(2):
+        igps(monkeypatch, "retrieve", root, "--out", out, "--cache_dir", tmp_path / "cache", *ONE)
+        assert capsys.readouterr().out.splitlines()[0] == SUMMARY
+        check_notes(out / "notes.csv")
+        (out / "notes.csv").unlink()
+    # Where nothing is mended nothing is said, and the notes of an earlier run are gone.
+    (out / "notes.csv").write_text("of an earlier run")
+    clean = tmp_path / "clean"
+    for label, height in (("ball", 1.0), ("egg", 2.0)):
+        for i in range(2):
+            write_clean(clean / label / f"{i}.off", 1 + 0.1 * i, height)
+    igps(monkeypatch, "retrieve", clean, "--out", out, "--cache_dir", tmp_path / "cache", *ONE)
+    assert "mended" not in capsys.readouterr().out
+    assert not (out / "notes.csv").exists()
+
+
+def test_extract_and_compare_write_the_same_notes(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cache = ["--cache_dir", tmp_path / "cache"]
+    igps(monkeypatch, "extract", root, "--out", tmp_path / "deep" / "all.npz", *cache, *ONE)
+    assert capsys.readouterr().out.splitlines()[0] == SUMMARY
+    check_notes(tmp_path / "deep" / "all.notes.csv")
+    igps(monkeypatch, "compare", root, "--descriptors", "d2", "--out", tmp_path / "out", *cache, *SMALL)
+    assert SUMMARY in capsys.readouterr().out.splitlines()
+    check_notes(tmp_path / "out" / "notes.csv")
+
+
+def test_never_and_always(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logging.disable(logging.WARNING)
+    out = ["--out", tmp_path / "out", "--cache_dir", tmp_path / "cache"]
+    try:
+        igps(monkeypatch, "retrieve", root, "--mend", "never", *out, *ONE)
+        printed = capsys.readouterr().out
+        assert "5 of 8 meshes could not be used." in printed
+        assert "mended" not in printed
+        refused = {row["file"]: row["error"] for row in csv.DictReader((tmp_path / "out" / "failures.csv").open())}
+        assert set(refused) == {"ball/soup.off", "egg/soup.off", "ball/holed.off", "box/1.off", "box/2.off"}
+        assert "6 boundary edges" in refused["ball/holed.off"]
+        assert "too few for 20 eigenpairs" in refused["box/1.off"]
+        assert all(error.startswith(str(root)) for error in refused.values())
+    finally:
+        logging.disable(logging.NOTSET)
+    pytest.importorskip("igl")
+    pytest.importorskip("skimage")
+    igps(monkeypatch, "retrieve", root, "--mend", "always", *out, *ONE)
+    assert capsys.readouterr().out.splitlines()[0] == "8 of 8 meshes were mended: 8 made watertight"
+    assert {name for name, note in notes(tmp_path / "out" / "notes.csv") if "watertight" in note} == {
+        path.relative_to(root).as_posix() for path in root.rglob("*.off")
+    }
+
+
+def test_an_unknown_way_to_mend_is_refused_by_the_command(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        igps(monkeypatch, "retrieve", root, "--mend", "perhaps", *ONE)
+    error = capsys.readouterr().err
+    assert "mend" in error
+    assert all(word in error for word in ("auto", "never", "always"))
+
+
+def leaves(commands: Any, before: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    found = []
+    for name, command in commands.items():
+        found += [(*before, name)] if callable(command) else leaves(command, (*before, name))
+    return found
+
+
+@pytest.mark.parametrize("command", [c for c in leaves(COMMANDS) if c != ("demo",)], ids=" ".join)
+def test_every_command_that_reads_meshes_has_the_choice(
+    command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        igps(monkeypatch, *command, "--help")
+    text = capsys.readouterr().out
+    assert "--mend {auto,never,always}" in text
+    assert "auto does the least that makes a body of" in " ".join(text.split())
+
+
+@pytest.mark.parametrize("command", ["retrieve", "extract"])
+def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    without_lxml(monkeypatch)
+    root, out = tmp_path / "meshes", tmp_path / "out"
+    for label, height in (("ball", 1.0), ("egg", 2.0)):
+        for i in range(2):
+            write_clean(root / label / f"{i}.off", 1 + 0.1 * i, height)
+
+    def features(place: Path) -> tuple[list[str], np.ndarray]:
+        target = place if command == "retrieve" else place / "all.npz"
+        igps(monkeypatch, command, root, "--out", target, "--cache_dir", place / "cache", *ONE)
+        with np.load(place / ("distances.npz" if command == "retrieve" else "all.npz")) as archive:
+            return archive["names"].tolist(), archive["distances" if command == "retrieve" else "features"]
+
+    names, values = features(tmp_path / "clean")
+    sentences = write_unusable(root / "egg")
+    capsys.readouterr()
+    with caplog.at_level(logging.WARNING):
+        names_beside, values_beside = features(out)
+    assert names_beside == names == ["ball/0.off", "ball/1.off", "egg/0.off", "egg/1.off"]
+    np.testing.assert_array_equal(values_beside, values)
+    said = {record.getMessage() for record in caplog.records if "skipped" in record.getMessage()}
+    assert said == {f"skipped: {root / 'egg' / name}: {sentence}" for name, sentence in sentences.items()}
+    printed = capsys.readouterr()
+    assert "Traceback" not in printed.out + printed.err
+    if command == "retrieve":
+        rows = {row["file"]: row["error"] for row in csv.DictReader((out / "failures.csv").open(newline=""))}
+        assert rows == {f"egg/{name}": f"{root / 'egg' / name}: {sentence}" for name, sentence in sentences.items()}
+        assert f"{len(sentences)} of {4 + len(sentences)} meshes could not be used." in printed.out
+    else:
+        assert f"{len(sentences)} meshes skipped" in printed.out

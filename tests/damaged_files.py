@@ -1,0 +1,97 @@
+"""Files that are damaged by hand, one fault each, whose counts are known without the code that mends them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+N_VERTICES, N_FACES = 162, 320
+"""Of the ball that most of the files hold."""
+
+
+def ball(width: float = 1.0, height: float = 1.0) -> trimesh.Trimesh:
+    """A stretched ball."""
+    body = trimesh.creation.icosphere(subdivisions=2)
+    assert (len(body.vertices), len(body.faces)) == (N_VERTICES, N_FACES)
+    body.vertices *= [1.0, width, height]
+    return body
+
+
+def write_clean(path: Path, width: float = 1.0, height: float = 1.0) -> Path:
+    """A body."""
+    return _written(path, ball(width, height))
+
+
+def write_soup(path: Path, width: float = 1.0, height: float = 1.0) -> Path:
+    """Every triangle with its own corners, as STL files have them."""
+    body = ball(width, height)
+    return _written(path, trimesh.Trimesh(body.vertices[body.faces.ravel()], np.arange(3 * N_FACES).reshape(-1, 3),
+                                          process=False))  # fmt: skip
+
+
+def write_holed(path: Path, width: float = 1.0, height: float = 1.0) -> Path:
+    """Without a vertex and the faces around it: a hole of six edges."""
+    body = ball(width, height)
+    inner = next(i for i in range(N_VERTICES) if (body.faces == i).sum() == 6)
+    body.update_faces((body.faces != inner).all(axis=1))
+    body.remove_unreferenced_vertices()
+    return _written(path, body)
+
+
+def write_box(path: Path) -> Path:
+    """A body of eight vertices."""
+    return _written(path, trimesh.creation.box((1, 2, 3)))
+
+
+def write_crossing(path: Path) -> Path:
+    """Two unit cubes of twelve triangles that go through each other by half."""
+    boxes = [trimesh.creation.box(), trimesh.creation.box()]
+    boxes[1].apply_translation([0.5, 0, 0])
+    return _written(path, trimesh.util.concatenate(boxes))
+
+
+def write_unusable(folder: Path) -> dict[str, str]:
+    """Files of which nothing can be made; what is said of each, by its name."""
+    folder.mkdir(parents=True, exist_ok=True)
+    texts = {
+        "empty.off": "",
+        "empty.stl": "",
+        "nothing.off": "OFF\n0 0 0\n",
+        "triangle.off": "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
+        "line.obj": "v 0 0 0\nv 1 2 3\nv 2 4 6\nv 3 6 9\nf 1 2 3\nf 2 3 4\n",
+        "five.xyz": "0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 1 1\n",
+        "part.3mf": "PK",
+    }
+    for name, text in texts.items():
+        (folder / name).write_text(text)
+    return {
+        "empty.off": "the file is empty (0 bytes). Export it again.",
+        "empty.stl": "the file is empty (0 bytes). Export it again.",
+        "nothing.off": "the file is empty: no vertices and no faces. Export it again.",
+        "triangle.off": "a single triangle is no body. Check that the export is complete.",
+        "line.obj": "no triangle has an area; a surface was expected. If the file holds lines, give them thickness.",
+        "five.xyz": "a cloud of 5 points; at least 10 are needed for a surface. "
+        "Check that the file holds faces, or scan more points.",
+        "part.3mf": "the format needs a module that is not installed (No module named 'lxml'). Install it, "
+        'pip install "interior-gps[formats]" has those of trimesh, or convert the file to OFF, OBJ, PLY or STL.',
+    }
+
+
+def without_lxml(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """What trimesh knows of 3MF files where lxml is not installed, wherever these tests run."""
+    error = ModuleNotFoundError("No module named 'lxml'")
+    monkeypatch.setitem(trimesh.exchange.load.mesh_loaders, "3mf", trimesh.exceptions.ExceptionWrapper(error))
+
+
+def free_edges(path: Path) -> int:
+    """Edges of one face only, as trimesh counts them."""
+    surface = trimesh.load(path, process=False)
+    return len(trimesh.grouping.group_rows(surface.edges_sorted, require_count=1))
+
+
+def _written(path: Path, surface: trimesh.Trimesh) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    surface.export(path)
+    return path
