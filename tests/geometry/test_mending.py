@@ -9,9 +9,11 @@ import pytest
 import trimesh
 
 from igps.geometry.damage import DAMAGES, halves, holes
-from igps.geometry.mending import mend, mended_by, subdivided, welded
+from igps.geometry.mending import mend, mended_by
 from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.subdivision import subdivided
 from igps.geometry.surface import area_vectors
+from igps.geometry.tidying import welded
 
 pytest.importorskip("igl")
 pytest.importorskip("skimage")

@@ -55,3 +55,22 @@ def test_genus_counts_handles(n_handles: int) -> None:
     voxels = trimesh.voxel.ops.matrix_to_marching_cubes(cells)
     mesh = as_mesh(voxels)
     assert surface.genus(mesh.faces, len(mesh.vertices)) == mesh.genus == n_handles
+
+
+def test_parts_of_faces_and_their_areas() -> None:
+    pieces = [trimesh.creation.icosphere(subdivisions=k, radius=radius) for k, radius in ((2, 1.0), (1, 3.0), (0, 2.0))]
+    whole = trimesh.util.concatenate(pieces)
+    # A vertex of no face in between is no part.
+    vertices = np.insert(np.asarray(whole.vertices), 162, [9, 9, 9], axis=0)
+    faces = np.where(whole.faces >= 162, whole.faces + 1, whole.faces)
+    shuffled = np.random.default_rng(0).permutation(len(faces))
+    part, areas = surface.face_parts(vertices, faces[shuffled])
+    np.testing.assert_array_equal(part, np.repeat([0, 1, 2], [len(piece.faces) for piece in pieces])[shuffled])
+    np.testing.assert_allclose(areas, [piece.area for piece in pieces], rtol=1e-12)
+
+
+def test_compact_keeps_the_triangles_and_the_order(blob: Mesh) -> None:
+    some = blob.faces[100:140]
+    vertices, faces = surface.compact(blob.vertices, some)
+    np.testing.assert_array_equal(vertices[faces], blob.vertices[some])
+    np.testing.assert_array_equal(vertices, blob.vertices[sorted({int(i) for i in some.ravel()})])

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from igps.geometry import watertight as module
 from igps.geometry.coordinates import winding_number
+from igps.geometry.isosurface import marched
 from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.outside import OrientedSurface
 from igps.geometry.watertight import watertight
 
 pytest.importorskip("igl")
@@ -127,7 +129,7 @@ def test_parts_are_turned_outward_by_their_winding_numbers(turned: tuple[bool, b
     vertices, faces = arrays(*rings)
     # A fortieth of the faces is missing from one place.
     away = np.linalg.norm(vertices[faces].mean(axis=1) - [10, 0, 0], axis=1)
-    surface = module._Oriented.of(vertices, faces[np.argsort(away)[len(faces) // 40 :]])
+    surface = OrientedSurface.of(vertices, faces[np.argsort(away)[len(faces) // 40 :]])
     assert surface.is_nearly_closed
     places = np.array([[-10, 0, 0], [0, 10, 0], [0, 10 * np.cos(1.2), 10 * np.sin(1.2)], [0, 0, 0], [0, 0, 9]])
     np.testing.assert_allclose(surface.winding(places), [2, 1, 1, 0, 0], atol=0.05)
@@ -238,4 +240,4 @@ def test_what_is_no_surface_is_refused() -> None:
 
 def test_a_body_between_the_points_of_the_grid_is_refused_by_name() -> None:
     with pytest.raises(MeshError, match=r"wire\.off: no point of the grid lies in the body"):
-        module._marched(np.ones((4, 4, 4), dtype=np.float32), "wire.off")
+        marched(np.ones((4, 4, 4), dtype=np.float32), "wire.off")

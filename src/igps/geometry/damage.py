@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from igps.geometry import disturbances
 from igps.geometry.mesh import Mesh, MeshError
-from igps.geometry.surface import area_vectors, diagonal
+from igps.geometry.surface import area_vectors, compact, diagonal, face_areas, undirected_edges, unit
 from igps.geometry.voxels import interior_samples
 
 Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
@@ -154,10 +154,9 @@ def _with_holes(
 ) -> Triangles:
     if not 0 < share < 1:
         raise ValueError(f"share: expected a number between 0 and 1, got {share}.")
-    area = np.linalg.norm(area_vectors(vertices, faces), axis=1)
+    area = face_areas(vertices, faces)
     per_patch = share / n_patches * area.sum()
-    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    pairs = np.unique(np.sort(np.stack([start, end], axis=1), axis=1), axis=0)
+    pairs, _ = undirected_edges(faces, len(vertices))
     length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
     graph = sparse.csr_array((np.maximum(length, 1e-300), tuple(pairs.T)), shape=(len(vertices),) * 2)
     left = np.ones(len(faces), dtype=bool)
@@ -166,8 +165,7 @@ def _with_holes(
         away = dijkstra(graph, directed=False, indices=faces[middle]).mean(axis=0)[faces].mean(axis=1)
         order = np.argsort(np.where(left, away, np.inf), kind="stable")
         left[order[: max(int((np.cumsum(area[order]) <= per_patch).sum()), 1)]] = False
-    used, kept = np.unique(faces[left], return_inverse=True)
-    return vertices[used], kept.reshape(-1, 3)
+    return compact(vertices, faces[left])
 
 
 def _as_soup(vertices: NDArray[np.float64], faces: NDArray[np.int64], generator: np.random.Generator) -> Triangles:
@@ -192,8 +190,7 @@ def _with_fins(
     face = generator.integers(len(faces), size=n_fins)
     corner = generator.integers(3, size=n_fins)
     a, b = faces[face, corner], faces[face, (corner + 1) % 3]
-    normals = area_vectors(vertices, faces)[face]
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+    normals = unit(area_vectors(vertices, faces)[face])
     tips = (vertices[a] + vertices[b]) / 2 + 0.01 * diagonal(vertices) * normals
     stands = np.stack([a, b, len(vertices) + np.arange(n_fins)], axis=1)
     twice = faces[generator.permutation(len(faces))[: max(round(doubled * len(faces)), 1)]]
@@ -211,8 +208,7 @@ def _with_parts(
     centre, radius = inner
     direction = generator.standard_normal(3)
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    diagonal = float(np.linalg.norm(high - low))
-    place = (low + high) / 2 + 0.6 * diagonal * direction / np.linalg.norm(direction)
+    place = (low + high) / 2 + 0.6 * diagonal(mesh.vertices) * direction / np.linalg.norm(direction)
     speck = np.sqrt(1e-3 * mesh.area / (4 * np.pi))
     n = len(vertices)
     return (

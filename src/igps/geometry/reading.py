@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from igps.geometry.limits import check_memory
 from igps.geometry.mending import Mending, mend
 from igps.geometry.mesh import Mesh, MeshError, check_arrays
-from igps.geometry.surface import components, face_areas
+from igps.geometry.surface import compact, face_parts
 
 logger = logging.getLogger(__name__)
 
@@ -158,13 +158,9 @@ def _loader_options(path: Path) -> dict[str, Any]:
 def _largest_component(
     vertices: NDArray[np.float64], faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], tuple[str, ...]]:
-    count, label = components(faces, len(vertices))
-    face_label = label[faces[:, 0]]
-    area = np.bincount(face_label, weights=face_areas(vertices, faces), minlength=count)
-    keep = face_label == int(np.argmax(area))
-    used, new_faces = np.unique(faces[keep], return_inverse=True)
-    n_parts = len(np.unique(face_label))
-    if n_parts == 1:
+    part, areas = face_parts(vertices, faces)
+    if len(areas) == 1:
         return vertices, faces, ()
-    note = f"kept the largest of {n_parts} components ({len(used)} of {len(vertices)} vertices)"
-    return vertices[used], new_faces.reshape(-1, 3), (note,)
+    kept, new_faces = compact(vertices, faces[part == int(np.argmax(areas))])
+    note = f"kept the largest of {len(areas)} components ({len(kept)} of {len(vertices)} vertices)"
+    return kept, new_faces, (note,)

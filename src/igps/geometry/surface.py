@@ -62,6 +62,22 @@ def components(faces: NDArray[np.int64], n_vertices: int) -> tuple[int, NDArray[
     return int(count), label
 
 
+def face_parts(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The connected part of each face, (F,) counted from zero, and the areas of the parts, length²."""
+    _, label = components(faces, len(vertices))
+    _, part = np.unique(label[faces[:, 0]], return_inverse=True)
+    area = np.bincount(part, weights=face_areas(vertices, faces))
+    return part.astype(np.int64), area.astype(np.float64)
+
+
+def compact(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The vertices that faces use, in their order, and the faces that use them."""
+    used, index = np.unique(faces, return_inverse=True)
+    return vertices[used], index.reshape(-1, 3)
+
+
 def genus(faces: NDArray[np.int64], n_vertices: int) -> int:
     """Handles of a closed connected surface, by Euler's formula V − E + F = 2 − 2 genus with 2E = 3F."""
     return (2 - (n_vertices - len(faces) // 2)) // 2
