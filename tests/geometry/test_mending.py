@@ -71,9 +71,16 @@ def test_holes_are_filled_where_the_surface_was(sphere: Mesh) -> None:
     assert length.max() < 3 * np.median(length)
 
 
-def test_halves_need_a_watertight_surface(blob: Mesh) -> None:
+def test_halves_that_overlap_are_the_body_again(blob: Mesh) -> None:
     mesh = mend(*halves(blob))
-    assert "watertight" in mended_by(mesh.notes)
+    assert mended_by(mesh.notes) == ("united",)
+    assert mesh.volume == pytest.approx(blob.volume, rel=1e-9)
+    assert mesh.area == pytest.approx(blob.area, rel=1e-9)
+
+
+def test_halves_that_overlap_and_are_always_made_watertight_come_near_it(blob: Mesh) -> None:
+    mesh = mend(*halves(blob), how="always")
+    assert mended_by(mesh.notes) == ("watertight",)
     assert mesh.volume == pytest.approx(blob.volume, rel=0.01)
     assert mesh.area == pytest.approx(blob.area, rel=0.01)
 
@@ -97,8 +104,8 @@ def test_a_part_that_sticks_out_is_not_hidden() -> None:
     knob.apply_translation([1, 0, 0])
     whole = trimesh.util.concatenate([surface, knob])
     mesh = mend(np.asarray(whole.vertices), np.asarray(whole.faces))
-    assert mended_by(mesh.notes) == ("watertight",)
-    assert mesh.vertices[:, 0].max() == pytest.approx(1.3, abs=0.02)
+    assert mended_by(mesh.notes) == ("united",)
+    assert mesh.vertices[:, 0].max() == pytest.approx(1.3, abs=1e-9)
 
 
 def test_too_few_vertices_are_more_on_the_same_surface() -> None:

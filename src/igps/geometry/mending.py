@@ -1,4 +1,4 @@
-"""The least that makes a body of a surface: as it is, welded, filled, smoothed, subdivided, or watertight.
+"""The least that makes a body of a surface: as it is, welded, filled, united, smoothed, subdivided, or watertight.
 
 A mesh that is a body already and not noisy is left as it is, bit for bit. Every step says in the mesh's notes what it
 did, and `mended_by` tells from the notes which steps were needed.
@@ -19,12 +19,13 @@ from igps.geometry.hole_filling import with_small_holes_filled
 from igps.geometry.mesh import Mesh, MeshError, check_arrays
 from igps.geometry.subdivision import subdivided
 from igps.geometry.tidying import tidied, welded, without_hidden
+from igps.geometry.union import united, without_walls
 from igps.geometry.watertight import watertight
 
 logger = logging.getLogger(__name__)
 
 Mending = Literal["auto", "never", "always"]
-Step = Literal["welded", "filled", "smoothed", "subdivided", "watertight"]
+Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertight"]
 
 # The first words of the notes of each step.
 _WORDS: dict[str, Step] = {
@@ -32,6 +33,7 @@ _WORDS: dict[str, Step] = {
     "dropped": "welded",
     "turned": "welded",
     "filled": "filled",
+    "united": "united",
     "smoothed": "smoothed",
     "subdivided": "subdivided",
     "made watertight": "watertight",
@@ -54,7 +56,8 @@ def mend(
     """A body from a surface in any state, by the least that helps.
 
     In this order, and no further than needed: the surface as it is; coincident vertices welded, degenerate and doubled
-    faces, fins, specks and closed parts inside the body dropped, faces turned; small holes filled; `watertight`. What
+    faces, fins, specks and closed parts inside the body dropped, faces turned; small holes filled; walls inside dropped
+    or closed parts that overlap united (see `union`), where that makes a body; `watertight`. What
     is rough with a scanner's noise all over is smoothed, because noise adds area (see `denoising`). What then has fewer
     than `least_vertices` is subdivided, longest edges first, which leaves the surface where it is.
 
@@ -98,17 +101,28 @@ def mended_by(notes: Iterable[str]) -> tuple[Step, ...]:
 
 def _mended(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> Mesh:
     notes: list[str] = []
+    given = vertices, faces
     for step in (None, welded, tidied, with_small_holes_filled, without_hidden):
         if step is not None and len(faces):
             vertices, faces = step(vertices, faces, notes)
-        try:
-            mesh = Mesh(vertices, faces, name=name, notes=tuple(notes))
-        except MeshError:
-            continue
-        smooth = _smoothed(mesh.vertices, mesh.faces, notes)
-        return mesh if smooth is mesh.vertices else Mesh(smooth, mesh.faces, name=name, notes=tuple(notes))
+        if body := _body(vertices, faces, notes, name):
+            return body
+    # What may go wrong with a heap of parts is tried, and left behind where it makes no body.
+    for attempt, surface, done in ((without_walls, (vertices, faces), list(notes)), (united, given, [])):
+        if len(surface[1]) and (body := _body(*attempt(*surface, done), done, name)):
+            return body
     body = watertight(_smoothed(vertices, faces, notes), faces, name=name)
     return replace(body, notes=(*notes, *body.notes))
+
+
+def _body(vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str], name: str) -> Mesh | None:
+    """The body that these are, smoothed if it is noisy; None if they are none."""
+    try:
+        mesh = Mesh(vertices, faces, name=name, notes=tuple(notes))
+    except MeshError:
+        return None
+    smooth = _smoothed(mesh.vertices, mesh.faces, notes)
+    return mesh if smooth is mesh.vertices else Mesh(smooth, mesh.faces, name=name, notes=tuple(notes))
 
 
 def _remade(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> Mesh:

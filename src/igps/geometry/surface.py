@@ -72,6 +72,30 @@ def face_parts(
     return part.astype(np.int64), area.astype(np.float64)
 
 
+def face_patches(faces: NDArray[np.int64], n_vertices: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The patch of each face, and which patches end only where at least two other faces meet.
+
+    Faces are of one patch that share an edge with each other alone.
+
+    Returns:
+        (F,) counted from zero, and (patches,).
+    """
+    _, edge_of_side = undirected_edges(faces, n_vertices)
+    by_edge = np.argsort(edge_of_side, kind="stable")
+    count = np.bincount(edge_of_side)
+    at = (np.cumsum(count) - count)[count == 2]
+    one, two = by_edge[at] // 3, by_edge[at + 1] // 3
+    graph = sparse.coo_array((np.ones(len(one), dtype=np.int8), (one, two)), shape=(len(faces), len(faces)))
+    n_patches, patch = connected_components(graph, directed=False)
+    sides_of = np.repeat(patch, 3)
+    # An edge where the patch itself has more than one face is no end of it that others could take over.
+    ends, n_own = np.unique(np.stack([sides_of, edge_of_side]), axis=1, return_counts=True)
+    patch_at, edge_at = ends
+    free = (count[edge_at] - n_own < 2) & (count[edge_at] != 2)
+    shared = np.bincount(patch_at, weights=(count[edge_at] > 2), minlength=n_patches) > 0
+    return patch.astype(np.int64), (np.bincount(patch_at, weights=free, minlength=n_patches) == 0) & shared
+
+
 def compact(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """The vertices that faces use, in their order, and the faces that use them."""
     used, index = np.unique(faces, return_inverse=True)

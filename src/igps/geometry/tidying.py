@@ -14,7 +14,7 @@ from igps.geometry.surface import compact, diagonal, face_areas, face_parts, und
 # Vertices closer than this share of the bounding box's diagonal are one.
 _WELD = 1e-8
 # Parts of less than this share of the area are specks, unless all of them together have ten times as much.
-_SPECK = 2e-3
+SPECK = 2e-3
 # Fins may have this share of the area.
 _FINS = 0.05
 
@@ -44,10 +44,10 @@ def welded(
     if unused:
         notes.append(f"dropped {unused} unreferenced vertices")
     vertices, faces = compact(vertices, faces)
-    return vertices, _turned(faces, notes)
+    return vertices, oriented(faces, notes)
 
 
-def _turned(faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.int64]:
+def oriented(faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.int64]:
     """The faces turned so that neighbours agree, as far as the surface can be oriented.
 
     From the first face of each part in the order of a breadth-first search; the smaller side is turned.
@@ -76,7 +76,8 @@ def _turned(faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.int64]:
     before[n] = n
     flip = np.zeros(n + 1, dtype=bool)
     child = np.nonzero(before[:n] != n)[0]
-    flip[child] = np.asarray(graph[child, before[child]]).ravel() == 2
+    if len(child):  # of none SciPy makes a matrix
+        flip[child] = np.asarray(graph[child, before[child]]).ravel() == 2
     # Parity along the way to the root, by doubling.
     while (before != n).any():
         flip ^= flip[before]
@@ -99,13 +100,13 @@ def tidied(
         notes.append(f"dropped {len(faces) - len(kept)} faces of fins")
         faces = kept
     part, areas = face_parts(vertices, faces)
-    specks = areas < _SPECK * areas.sum()
-    if specks.any() and areas[specks].sum() < 10 * _SPECK * areas.sum():
+    specks = areas < SPECK * areas.sum()
+    if specks.any() and areas[specks].sum() < 10 * SPECK * areas.sum():
         notes.append(f"dropped {int(specks.sum())} specks")
         faces = faces[~specks[part]]
     # Only now is it plain which faces are neighbours.
     vertices, faces = compact(vertices, faces)
-    return vertices, _turned(faces, notes)
+    return vertices, oriented(faces, notes)
 
 
 def _without_fins(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
