@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 
 from igps.geometry import watertight as module
 from igps.geometry.coordinates import winding_number
+from igps.geometry.damage import DAMAGES
 from igps.geometry.isosurface import marched
+from igps.geometry.mending import mend
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.outside import OrientedSurface
 from igps.geometry.watertight import watertight
+from igps.shapes import ArticulatedShapes
 
 pytest.importorskip("igl")
 pytest.importorskip("skimage")
@@ -133,6 +136,33 @@ def test_parts_are_turned_outward_by_their_winding_numbers(turned: tuple[bool, b
     assert surface.is_nearly_closed
     places = np.array([[-10, 0, 0], [0, 10, 0], [0, 10 * np.cos(1.2), 10 * np.sin(1.2)], [0, 0, 0], [0, 0, 9]])
     np.testing.assert_allclose(surface.winding(places), [2, 1, 1, 0, 0], atol=0.05)
+
+
+def test_faces_between_solids_are_left_out_of_the_winding_numbers() -> None:
+    outer, core = ball(subdivisions=4), ball(0.3)
+    wall = trimesh.creation.box((1.2, 1.2, 0.02))
+    vertices, faces = arrays(outer, core, wall)
+    bare = OrientedSurface(20 * vertices, faces, False)._without_hidden()
+    np.testing.assert_array_equal(bare.faces, faces[: len(outer.faces)])
+    assert bare.is_nearly_closed
+    np.testing.assert_allclose(bare.winding(20 * np.array([[0, 0, 0.005], [0, 0.1, 0], [0, 0, 0.9], [0, 0, 1.1]])),
+                               [1, 1, 1, 0], atol=5e-3)  # fmt: skip
+    # An open cup hides nothing: it is asked with all of its faces.
+    cup_vertices, cup_faces = cut_ball(0.3)
+    cup = OrientedSurface(20 * cup_vertices, cup_faces, False)._without_hidden()
+    np.testing.assert_array_equal(cup.faces, cup_faces)
+    assert not cup.is_nearly_closed
+
+
+@pytest.mark.parametrize("number", [6, 11])
+def test_a_thin_body_of_overlapping_halves_with_holes_is_solid(number: int) -> None:
+    pytest.importorskip("manifold3d")
+    shape = ArticulatedShapes(number + 1, 1, seed=11, n_vertices=3500)[number]
+    body = Mesh(shape.vertices, shape.faces)
+    mended = mend(*DAMAGES["everything"].apply(body, 0))
+    assert_closed(mended)
+    assert mended.volume == pytest.approx(body.volume, rel=0.03)
+    assert mended.area == pytest.approx(body.area, rel=0.03)
 
 
 def test_parts_that_share_an_edge_are_one() -> None:

@@ -1,17 +1,18 @@
 """Which points of a grid lie outside a surface that may have holes; lengths are in cells.
 
-**A hole, or a cup?** Where a surface is nearly closed, which its own faces tell by their winding numbers (their mean
-distance to whole numbers is below 1/20: bodies with 2 % missing have 0.01 to 0.03, a cup as deep as wide has 0.10), the
-winding number says what is inside (Jacobson et al. 2013). Anywhere else an opening is a hole, and what lies behind it
-inside, if a ball that passes through it has less than half the radius of the largest ball behind it. Anything wider is
-the mouth of a cup, a trouser leg or a bell, and stays open, with about a cell of wall. A wall with two sides, as of a
-vase that was modelled as a solid, stays open whatever the width of its mouth, since the winding number behind is near
-zero. Openings narrower than a cell are always closed.
+**A hole, or a cup?** Where a surface is nearly closed, which its own faces tell by their winding numbers, the winding
+number says what is inside (Jacobson et al. 2013). It is if their mean distance to whole numbers is below 1/20: bodies
+with 2 % missing have 0.01 to 0.03, a cup as deep as wide has 0.10. Where a body was put together of overlapping solids,
+the faces hidden between them are left out first, or thin bodies would have up to 0.10, too. Anywhere else an opening is
+a hole, and what lies behind it inside, if a ball that passes through it has less than half the radius of the largest
+ball behind it. Anything wider is the mouth of a cup, a trouser leg or a bell, and stays open, with about a cell of
+wall. A wall with two sides, as of a vase that was modelled as a solid, stays open whatever the width of its mouth,
+since the winding number behind is near zero. Openings narrower than a cell are always closed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from scipy import ndimage
 
 from igps.geometry.distance_grid import MARGIN
 from igps.geometry.extras import libigl
-from igps.geometry.surface import area_vectors, face_areas
+from igps.geometry.surface import area_vectors, face_areas, unit
 
 # Grid points so close to a triangle are its wall, through which the flood does not pass: a grid line that crosses a
 # triangle has a point at most half a cell from it on either side.
@@ -33,6 +34,9 @@ _TWO_SIDED = 0.25
 _NEARLY_CLOSED, _PROBES = 0.05, 1500
 # So many parts of at least this share of the area may be turned to find the best orientation.
 _TURNED, _SMALL_PART = 8, 0.01
+# Faces with the inside on both sides are looked for where there are more than this share, if there are not too many
+# faces to ask each.
+_HIDDEN, _MANY_FACES = 0.02, 200_000
 
 
 @dataclass(frozen=True)
@@ -73,12 +77,33 @@ class OrientedSurface:
         centred = vertices - vertices.mean(axis=0)
         if np.einsum("ij,ij->", centred[faces[:, 0]], area_vectors(centred, faces)) < 0:
             faces = np.ascontiguousarray(faces[:, ::-1])
-        return cls(vertices, faces, _defect(total) < _NEARLY_CLOSED)
+        surface = cls(vertices, faces, _defect(total) < _NEARLY_CLOSED)
+        hidden = total.reshape(2, -1).min(axis=0) > 0.5
+        if surface.is_nearly_closed or hidden.mean() < _HIDDEN or len(faces) > _MANY_FACES:
+            return surface
+        bare = surface._without_hidden()
+        return bare if bare.is_nearly_closed else surface
 
     def winding(self, points: NDArray[Any]) -> NDArray[np.float64]:
         if not len(points) or not len(self.faces):
             return np.zeros(len(points))
         return np.asarray(libigl().fast_winding_number(self.vertices, self.faces, points.astype(np.float64)))
+
+    def _without_hidden(self) -> OrientedSurface:
+        """Without the faces that have the inside on both sides, such as walls between solids put together.
+
+        Where these share some of their outer surface, which has lost its doubles, each alone is open there, which
+        spoils the winding numbers around.
+        """
+        normals, middle = unit(area_vectors(self.vertices, self.faces)), self.vertices[self.faces].mean(axis=1)
+        least = np.minimum(*(self.winding(middle + side * normals) for side in (0.25, -0.25)))
+        faces = self.faces[least <= 0.5]
+        if not len(faces):
+            return self
+        middle, normals = _probes(self.vertices, faces)
+        bare = OrientedSurface(self.vertices, faces, False)
+        points = np.concatenate([middle + 0.25 * normals, middle - 0.25 * normals])
+        return replace(bare, is_nearly_closed=_defect(bare.winding(points)) < _NEARLY_CLOSED)
 
 
 def _probes(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
