@@ -72,6 +72,13 @@ def face_parts(
     return part.astype(np.int64), area.astype(np.float64)
 
 
+def signed_volume(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
+    """What a closed surface encloses, length³, negative if it is inside out (of an open one: of its cone over the
+    centre of its vertices)."""
+    centred = vertices - vertices.mean(axis=0)
+    return float(np.einsum("ij,ij->", centred[faces[:, 0]], area_vectors(centred, faces)) / 3)
+
+
 def compact(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """The vertices that faces use, in their order, and the faces that use them."""
     used, index = np.unique(faces, return_inverse=True)
