@@ -74,3 +74,10 @@ def test_compact_keeps_the_triangles_and_the_order(blob: Mesh) -> None:
     vertices, faces = surface.compact(blob.vertices, some)
     np.testing.assert_array_equal(vertices[faces], blob.vertices[some])
     np.testing.assert_array_equal(vertices, blob.vertices[sorted({int(i) for i in some.ravel()})])
+
+
+def test_signed_volume(blob: Mesh) -> None:
+    expected = as_trimesh(blob).volume
+    far = blob.vertices + np.array([100.0, -50, 20])
+    assert surface.signed_volume(far, blob.faces) == pytest.approx(expected, rel=1e-10)
+    assert surface.signed_volume(far, blob.faces[:, ::-1]) == pytest.approx(-expected, rel=1e-10)

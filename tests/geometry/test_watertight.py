@@ -77,6 +77,21 @@ def test_ball_of_loose_turned_triangles() -> None:
     assert len(body.vertices) <= 5000
 
 
+@pytest.mark.parametrize(
+    "solid",
+    [trimesh.creation.box((1, 0.9, 0.8)), trimesh.creation.box((1, 1, 0.1)), trimesh.creation.box((1, 1, 0.05)),
+     trimesh.creation.cylinder(0.05, 1, sections=64)],
+    ids=["block", "plate", "thin plate", "rod"],
+)  # fmt: skip
+def test_the_volume_is_kept_by_the_grid_and_by_the_simplification(solid: trimesh.Trimesh) -> None:
+    body = watertight(*arrays(solid))
+    assert len(body.vertices) <= 5000
+    assert body.volume == pytest.approx(solid.volume, rel=3.5e-3)
+    # Edges and corners are rounded.
+    assert body.area == pytest.approx(solid.area, rel=0.02)
+    assert np.abs(np.ptp(body.vertices, axis=0) - solid.extents).max() < solid.extents.max() / 96
+
+
 def test_a_hole_is_closed_and_a_cup_stays_open() -> None:
     holed = watertight(*cut_ball(0.9))
     assert holed.volume == pytest.approx(BALL, rel=0.02)

@@ -8,7 +8,15 @@ from numpy.typing import NDArray
 from igps.geometry.extras import libigl
 from igps.geometry.level_set import LEAST, without_bubbles
 from igps.geometry.mesh import MeshError
-from igps.geometry.surface import area_vectors, compact, components, directed_edges
+from igps.geometry.surface import (
+    area_vectors,
+    compact,
+    components,
+    directed_edges,
+    face_areas,
+    signed_volume,
+    vertex_normals,
+)
 
 # Least cosine between the normals of triangles in a flat place.
 _FLAT = 0.95
@@ -63,7 +71,24 @@ def simplified(
     if len(triangles) == 0 or len(_bad_edges(triangles, len(points))) or not np.isfinite(points).all():
         return vertices, faces
     points, triangles = _largest(points * scale, triangles)
-    return points, _flipped(points, triangles)
+    triangles = _flipped(points, triangles)
+    return _with_volume(points, triangles, signed_volume(vertices, faces)), triangles
+
+
+def _with_volume(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], volume: float, most: float = 0.25
+) -> NDArray[np.float64]:
+    """The vertices moved along their normals, all by the same length of at most `most`, to give the volume.
+
+    Collapsed edges cut corners, which takes some percent of the volume of thin limbs.
+    """
+    left = most
+    for _ in range(3):
+        step = (volume - signed_volume(vertices, faces)) / face_areas(vertices, faces).sum()
+        step = float(np.clip(step, -left, left))
+        vertices = vertices + step * vertex_normals(vertices, faces)
+        left -= abs(step)
+    return vertices
 
 
 def _bad_edges(faces: NDArray[np.int64], n_vertices: int) -> NDArray[np.int64]:

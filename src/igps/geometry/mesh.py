@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from igps.geometry.surface import (
-    area_vectors,
     components,
     diagonal,
     directed_edges,
     face_areas,
     genus,
+    signed_volume,
     undirected_edges,
 )
 
@@ -66,7 +66,7 @@ class Mesh:
         faces = np.ascontiguousarray(faces, dtype=np.int64)
         _check_topology(faces, len(vertices), self.name, self.allow_open)
         _check_size(vertices, self.name)
-        volume = _signed_volume(vertices, faces)
+        volume = signed_volume(vertices, faces)
         if abs(volume) <= _FLAT * diagonal(vertices) ** 3:
             raise MeshError(
                 f"{self.name}: the surface encloses no volume ({volume:.3g} for a bounding box diagonal of "
@@ -88,7 +88,7 @@ class Mesh:
     @property
     def volume(self) -> float:
         """Enclosed volume, length³ (of an open mesh: of its cone over the centre of its vertices)."""
-        return _signed_volume(self.vertices, self.faces)
+        return signed_volume(self.vertices, self.faces)
 
     @property
     def diagonal(self) -> float:
@@ -186,8 +186,3 @@ def _check_topology(faces: NDArray[np.int64], n_vertices: int, name: str, allow_
             "file with MeshReading(component='largest'), on the command line --component largest, to keep one; with "
             f"{_REPAIR} if coincident vertices are merely not welded; or join them."
         )
-
-
-def _signed_volume(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
-    centred = vertices - vertices.mean(axis=0)
-    return float(np.einsum("ij,ij->", centred[faces[:, 0]], area_vectors(centred, faces)) / 3)

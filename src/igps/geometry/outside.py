@@ -21,7 +21,7 @@ from scipy import ndimage
 
 from igps.geometry.distance_grid import MARGIN
 from igps.geometry.extras import libigl
-from igps.geometry.surface import area_vectors, face_areas, unit
+from igps.geometry.surface import area_vectors, face_areas, signed_volume, unit
 
 # Grid points so close to a triangle are its wall, through which the flood does not pass: a grid line that crosses a
 # triangle has a point at most half a cell from it on either side.
@@ -74,8 +74,7 @@ class OrientedSurface:
                 break
             total, shares[best] = turned[best], -shares[best]
             faces = np.where((part == large[best])[:, None], faces[:, ::-1], faces)
-        centred = vertices - vertices.mean(axis=0)
-        if np.einsum("ij,ij->", centred[faces[:, 0]], area_vectors(centred, faces)) < 0:
+        if signed_volume(vertices, faces) < 0:
             faces = np.ascontiguousarray(faces[:, ::-1])
         surface = cls(vertices, faces, _defect(total) < _NEARLY_CLOSED)
         hidden = total.reshape(2, -1).min(axis=0) > 0.5

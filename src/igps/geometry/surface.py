@@ -96,6 +96,13 @@ def face_patches(faces: NDArray[np.int64], n_vertices: int) -> tuple[NDArray[np.
     return patch.astype(np.int64), (np.bincount(patch_at, weights=free, minlength=n_patches) == 0) & shared
 
 
+def signed_volume(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
+    """What a closed surface encloses, length³, negative if it is inside out (of an open one: of its cone over the
+    centre of its vertices)."""
+    centred = vertices - vertices.mean(axis=0)
+    return float(np.einsum("ij,ij->", centred[faces[:, 0]], area_vectors(centred, faces)) / 3)
+
+
 def compact(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """The vertices that faces use, in their order, and the faces that use them."""
     used, index = np.unique(faces, return_inverse=True)
