@@ -23,7 +23,7 @@ from outcome import Row, table
 PARTS = ("broken_meshes", "kills", "machine_faults", "properties", "mutants")
 # How much of each part: the whole campaign, and the small one of two minutes. None leaves a part out.
 _WHOLE = {"broken_meshes": 10_000, "kills": 200, "machine_faults": 0, "properties": 12, "mutants": 20}
-_SMALL = {"broken_meshes": 300, "kills": 8, "machine_faults": None, "properties": 1, "mutants": None}
+_SMALL = {"broken_meshes": 200, "kills": 8, "machine_faults": None, "properties": 1, "mutants": None}
 
 
 def _run(part: str, amount: int) -> list[Row]:
