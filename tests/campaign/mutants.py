@@ -195,7 +195,9 @@ def is_noticed(mutant: Mutant, copy: Path, calls: Calls) -> bool:
 def called(room: str, copy: Path, folder: Path) -> tuple[Calls, list[str]]:
     """What the tests of a room do, and which of them fail on the sound code."""
     report = folder / f"{room}.json"
-    _run([f"tests/{room}"], copy, _HOUR, ("-p", "called"), report)
+    status = _run([f"tests/{room}"], copy, _HOUR, ("-p", "called"), report)
+    if status not in (0, 1):
+        raise RuntimeError(f"tests/{room}: pytest ends with status {status} on the sound code, expected 0 or 1.")
     found = json.loads(report.read_text())
     tests = {name: (test["seconds"], frozenset(test["functions"])) for name, test in found["tests"].items()}
     return Calls(tests, frozenset(found["shared"])), found["failed"]
