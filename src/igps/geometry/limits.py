@@ -1,4 +1,4 @@
-"""Whether a file fits into memory, told from its first lines before it is read."""
+"""Whether a file, or a grid in a body, fits into memory, told before it takes any."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from igps.geometry.mesh import MeshError
 _BYTES_PER_FACE = 1000
 # What a triangle takes in a file whose first lines do not tell the number: OBJ, and text STL.
 _OBJ_BYTES, _TEXT_STL_BYTES = 35, 200
-# A file so small is not looked at.
-_SMALL = 1 << 20
+# What a cell of a grid takes while it is told whether it is inside.
+_BYTES_PER_CELL = 40
+# A file so small is not looked at, nor a grid that takes so little.
+_SMALL, _SMALL_GRID = 1 << 20, 1 << 26
 
 
 def check_memory(path: Path) -> None:
@@ -30,6 +32,23 @@ def check_memory(path: Path) -> None:
             f"{path}: about {n_faces:,} triangles need {needed / 1e9:.1f} GB of memory, and "
             f"{max(free, 0) / 1e9:.1f} GB are free. "
             "Simplify the mesh in a program that streams it, or give the process more memory."
+        )
+
+
+def check_grid(n_cells: int, name: str) -> None:
+    """Refuse a grid whose cells need more memory than the process may still have.
+
+    Raises:
+        MeshError: names the mesh, the number of cells, both amounts, and the remedy.
+    """
+    needed = n_cells * _BYTES_PER_CELL
+    if needed < _SMALL_GRID:
+        return
+    free = available_memory()
+    if free is not None and needed > free:
+        raise MeshError(
+            f"{name}: a grid of {n_cells:,} cells needs {needed / 1e9:.1f} GB of memory, and {max(free, 0) / 1e9:.1f} "
+            "GB are free. Lower the resolution or min_samples, use fewer workers, or give the process more memory."
         )
 
 
@@ -67,22 +86,43 @@ def _of_limits() -> int | None:
         import resource
     except ImportError:  # there are none on Windows
         return None
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    used = _first_number(Path("/proc/self/statm"))
-    if limit == resource.RLIM_INFINITY or used is None:
+    try:
+        pages = [int(word) for word in Path("/proc/self/statm").read_text().split()]
+    except (OSError, ValueError):
         return None
-    return limit - used * resource.getpagesize()
+    # Of the address space, and of data alone, which is what `igps.parallel` bounds.
+    of_kinds = ((resource.RLIMIT_AS, pages[0]), (resource.RLIMIT_DATA, pages[5]))
+    limits = ((resource.getrlimit(kind)[0], used * resource.getpagesize()) for kind, used in of_kinds)
+    return min((limit - used for limit, used in limits if limit != resource.RLIM_INFINITY), default=None)
 
 
-def _of_group() -> int | None:
-    for limit, used in (
-        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-        ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+def _of_group(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> int | None:
+    """The least of the process's control group and those around it, of either version of the kernel's interface."""
+    try:
+        lines = [line.split(":", 2) for line in own.read_text().splitlines()]
+    except OSError:
+        lines = []
+    found = []
+    for mount, limit, usage, cache, controller in (
+        (root, "memory.max", "memory.current", "inactive_file", ""),
+        (root / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file", "memory"),
     ):
-        most, current = _first_number(Path(limit)), _first_number(Path(used))
-        if most is not None and current is not None:
-            return most - current
-    return None
+        paths = [line[2].strip("/") for line in lines if len(line) == 3 and controller in line[1].split(",")]
+        # A container may see its own group as the root, whatever the path says.
+        for folder in {place for path in ["", *paths] for place in (mount / path, *(mount / path).parents)}:
+            most, current = _first_number(folder / limit), _first_number(folder / usage)
+            if most is not None and current is not None:
+                found.append(most - current + _reclaimable(folder / "memory.stat", cache))
+    return min(found, default=None)
+
+
+def _reclaimable(statistics: Path, name: str) -> int:
+    """Bytes of files that the kernel keeps in memory as long as nobody else wants it."""
+    try:
+        lines = statistics.read_text().splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) for line in lines if line.startswith(f"{name} ")), 0)
 
 
 def _of_machine() -> int | None:
