@@ -32,22 +32,21 @@ SEED = 13
 EXACT = 0.1  # nothing but rounding: what single precision and the ties of a histogram leave
 DISCRETE = 10.0  # the same body on another grid or mesh: small beside the distance between bodies
 _PROMISES = {
-    "motion": "any motion, but for the grid and the samples of the surface",
+    "motion": "nothing but rounding, but for the grid and the rays of a reflection",
     "turned grid": "a turn that takes the axes of the grid to each other: nothing but rounding",
     "scale": "nothing but rounding",
     "renumbering of vertices": "nothing but rounding",
-    "renumbering of faces": "nothing but rounding, but for the random samples of the surface",
+    "renumbering of faces": "nothing but rounding",
     "subdivision": "the same surface with four times the faces: another operator",
     "signs and bases": "signs, and a basis inside each multiplet: nothing but rounding",
     "padding": "nothing at all",
     "batch size": "nothing at all",
     "threads": "nothing at all",
 }
-# What a description is made of decides which changes are exact for it. Random points of the surface are drawn by the
-# order of faces and of their corners, which a reflection exchanges.
-_RANDOM_SURFACE = {"gps", "multiscale", "rich", "pretrained", "d2", "local_diameter_centricity", "spectral_gw"}
-# Farthest points of the surface, from a first one that is found from the first vertex.
-_FARTHEST = {"inner_distance", "canonical_form", "geodesic_spectral"}
+# A motion moves the body within the grid of its samples, and a reflection exchanges the corners of faces, by which rays
+# are laid out.
+_GRID = {"interior", "multiscale", "rich", "pretrained", "inner_distance", "volume_shape_dna"}
+_RAYS = {"local_diameter_centricity"}
 
 
 @dataclass(frozen=True)
@@ -63,35 +62,14 @@ class Bound:
     known: str = ""
 
 
-# Where today's code moves a description farther than promised, and why.
-KNOWN: dict[tuple[str, str], str] = {
-    ("turned grid", "inner_distance"): "its paths start from a subset of the samples that depends on their order",
-    ("renumbering of vertices", "canonical_form"): "its farthest points start from the first vertex",
-    ("motion", "spectral_gw"): "its points are 500 random ones of the surface",
-    ("renumbering of faces", "spectral_gw"): "its points are 500 random ones of the surface",
-    # Seen on a body with nearly equal distances: another set of points, and so another form.
-    ("scale", "canonical_form"): "rounding decides between farthest points that are equally far",
-    ("scale", "geodesic_spectral"): "rounding decides between farthest points that are equally far",
-}
-_SUBSETS = "subsets of the samples depend on their order"
+# Where today's code moves a description farther than promised, and why. Nothing is known.
+KNOWN: dict[tuple[str, str], str] = {}
 
 
 def bound(prop: str, name: str) -> Bound:
     """Of a property and a descriptor."""
-    if prop in ("scale", "signs and bases", "padding", "batch size", "threads"):
-        exact = True
-    elif prop == "motion":
-        exact = name == "shape_dna"
-    elif prop == "turned grid":
-        exact = True
-    elif prop == "renumbering of vertices":
-        exact = name not in _FARTHEST | {"local_diameter_centricity"}
-    elif prop == "renumbering of faces":
-        exact = name not in _RANDOM_SURFACE
-    else:
-        exact = False
-    subsets = name in ("multiscale", "rich", "pretrained") and prop.startswith(("turned", "renumbering"))
-    return Bound(EXACT if exact else DISCRETE, KNOWN.get((prop, name), _SUBSETS if subsets else ""))
+    exact = prop != "subdivision" and not (prop == "motion" and name in _GRID | _RAYS)
+    return Bound(EXACT if exact else DISCRETE, KNOWN.get((prop, name), ""))
 
 
 # As many samples of the surface as by default, which random ones need to tell the same of a body twice.

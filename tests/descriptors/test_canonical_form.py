@@ -179,3 +179,12 @@ def test_parameters_are_checked(blob: Mesh) -> None:
             CanonicalForm(n_samples=n_samples)
     with pytest.raises(ValueError, match="642"):
         CanonicalForm(n_samples=700).describe_body(of_mesh(blob))
+
+
+def test_the_numbers_of_vertices_do_not_matter(blob: Mesh) -> None:
+    # Simplified too, which is where ties could be broken by numbers.
+    descriptor = CanonicalForm(max_vertices=400)
+    order = np.random.default_rng(3).permutation(len(blob.vertices))
+    renumbered = Mesh(blob.vertices[order], np.argsort(order)[blob.faces][::-1])
+    expected = descriptor.describe_body(of_mesh(blob))
+    np.testing.assert_allclose(descriptor.describe_body(of_mesh(renumbered)), expected, rtol=1e-4, atol=1e-6)

@@ -115,3 +115,11 @@ def test_parameters_are_checked(blob: Mesh) -> None:
             GeodesicSpectral(n_samples=n_samples)
     with pytest.raises(ValueError, match="642"):
         GeodesicSpectral(n_samples=700).describe_body(of_mesh(blob))
+
+
+def test_the_numbers_of_vertices_do_not_matter(blob: Mesh) -> None:
+    descriptor = GeodesicSpectral(max_vertices=400)
+    order = np.random.default_rng(3).permutation(len(blob.vertices))
+    renumbered = Mesh(blob.vertices[order], np.argsort(order)[blob.faces][::-1])
+    expected = descriptor.describe_body(of_mesh(blob))
+    np.testing.assert_allclose(descriptor.describe_body(of_mesh(renumbered)), expected, rtol=1e-5)

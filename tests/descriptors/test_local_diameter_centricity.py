@@ -188,3 +188,13 @@ def test_bending_matters_less_than_thickness() -> None:
 def test_bad_parameters_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
         LocalDiameterCentricity(**{name: value})  # type: ignore[arg-type]
+
+
+def test_numbers_of_vertices_and_faces_do_not_matter(blob: Mesh) -> None:
+    generator = np.random.default_rng(4)
+    order = generator.permutation(len(blob.vertices))
+    faces = np.argsort(order)[blob.faces][generator.permutation(len(blob.faces))]
+    descriptor = LocalDiameterCentricity(n_samples=300)
+    expected = descriptor.describe_body(of_mesh(blob))
+    found = descriptor.describe_body(of_mesh(Mesh(blob.vertices[order], np.roll(faces, 1, axis=1))))
+    np.testing.assert_allclose(found, expected, atol=1e-6)

@@ -224,3 +224,15 @@ def test_parameters_are_checked(blob_signature: Signature) -> None:
             SpectralGromovWasserstein(**parameters)
     with pytest.raises(ValueError, match="times"):
         heat_kernels(blob_signature, "surface", (-1.0,), 10)
+
+
+def test_some_samples_stand_for_all(blob_signature: Signature) -> None:
+    # Steps along the order of form: whatever the first one, no part of the body is left out or taken twice.
+    few = [SpectralGromovWasserstein(n_samples=100, n_quantiles=20, seed=seed) for seed in range(4)]
+    of_all = SpectralGromovWasserstein(n_samples=400, n_quantiles=20).describe_body(of_signature(blob_signature))
+    for descriptor in few:
+        described = descriptor.describe_body(of_signature(blob_signature))
+        assert np.abs(described - of_all).max() < 0.05 * np.abs(of_all).max()
+    kernels = [heat_kernels(blob_signature, "surface", (1.0,), n, seed=s)[0] for n, s in ((400, 0), (400, 1), (300, 1))]
+    np.testing.assert_array_equal(kernels[0], kernels[1])
+    assert len(np.unique(np.diag(kernels[2]))) == 300

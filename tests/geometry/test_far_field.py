@@ -297,8 +297,15 @@ def test_the_sampled_error_is_that_of_the_distances() -> None:
     columns = torch.cat([torch.as_tensor(functions), torch.ones(len(functions), 1)], 1).double()
     exact = extend(*mesh, functions, points)
     assert coordinates._sampled_error(hats, listed, columns, x, exact, 1e-3) < 1e-4
-    wrong = exact.mean(axis=0) + 1.01 * (exact - exact.mean(axis=0))
-    assert coordinates._sampled_error(hats, listed, columns, x, wrong, 1e-3) == pytest.approx(0.01, rel=0.02)
+    generator = np.random.default_rng(1)
+    for size in (1e-3, 1e-2):
+        wrong = exact + size * generator.normal(size=exact.shape)
+        expected = np.quantile(np.abs(pdist(wrong) / pdist(exact) - 1), 0.99)
+        found = coordinates._sampled_error(hats, listed, columns, x, wrong, 1e-3)
+        assert 0.6 * expected < found < 1.7 * expected
+    # Errors that go together, here by the same share of every distance, are never taken for less than they are.
+    larger = exact.mean(axis=0) + 1.01 * (exact - exact.mean(axis=0))
+    assert coordinates._sampled_error(hats, listed, columns, x, larger, 1e-3) > 0.01
     order = np.random.default_rng(0).permutation(len(points))
     half = exact.copy()
     half[:50] *= 1.003

@@ -11,7 +11,8 @@ import trimesh
 
 from igps.geometry import limits
 from igps.geometry.limits import available_memory, check_memory, expected_faces
-from igps.geometry.mesh import MeshError
+from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.voxels import interior_samples
 
 
 @pytest.mark.parametrize("kind", ["off", "ply", "stl"])
@@ -61,27 +62,6 @@ def test_ten_million_triangles_in_two_gibibytes(tmp_path: Path, limit: str) -> N
     assert "Simplify" in message
 
 
-@pytest.mark.parametrize(
-    ("limit", "used", "cached"),
-    [("memory.max", "memory.current", "inactive_file"),
-     ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")],
-)  # fmt: skip
-def test_files_that_a_group_has_read_are_free_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, used: str, cached: str
-) -> None:
-    monkeypatch.setattr(limits, "_GROUPS", ((tmp_path, limit, used, cached),))
-    monkeypatch.setattr(limits, "_of_limits", lambda: None)
-    monkeypatch.setattr(limits, "_of_machine", lambda: None)
-    (tmp_path / used).write_text("900\n")
-    assert available_memory() is None
-    (tmp_path / limit).write_text("max\n")
-    assert available_memory() is None
-    (tmp_path / limit).write_text("1000\n")
-    assert available_memory() == 100
-    (tmp_path / "memory.stat").write_text(f"anon 50\nfile 800\nsome_{cached} 3\n{cached} 700\nslab 9\n")
-    assert available_memory() == 800
-
-
 def test_what_fits_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "ball.off"
     trimesh.creation.icosphere(subdivisions=6).export(file)
@@ -98,3 +78,65 @@ def test_some_memory_is_available() -> None:
     free = available_memory()
     assert free is not None
     assert 0 < free < 1 << 50
+
+
+def group(folder: Path, version: int, most: object, used: int, cached: int) -> None:
+    """Files of a control group."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = ("memory.max", "memory.current") if version == 2 else ("memory.limit_in_bytes", "memory.usage_in_bytes")
+    for name, value in zip(names, (most, used), strict=True):
+        (folder / name).write_text(f"{value}\n")
+    cache = "inactive_file" if version == 2 else "total_inactive_file"
+    (folder / "memory.stat").write_text(f"active_file 7\nsome_{cache} 3\n{cache} {cached}\n")
+
+
+def test_the_groups_around_a_process_bound_its_memory(tmp_path: Path) -> None:
+    own, root = tmp_path / "own", tmp_path / "groups"
+    own.write_text("0::/job/step\n")
+    assert limits._of_group(root, own) is None
+    group(root / "job" / "step", 2, "max", 300, 0)
+    assert limits._of_group(root, own) is None
+    group(root / "job", 2, 1000, 400, 150)  # of all steps together; files that were read can go
+    assert limits._of_group(root, own) == 1000 - 400 + 150
+    group(root / "job" / "step", 2, 500, 300, 0)
+    assert limits._of_group(root, own) == 200
+
+
+def test_a_container_has_its_group_as_the_root(tmp_path: Path) -> None:
+    own, root = tmp_path / "own", tmp_path / "groups"
+    own.write_text("9:name=systemd:/\n4:cpu,memory:/docker/0815\n")
+    group(root / "memory", 1, 2000, 1500, 100)
+    assert limits._of_group(root, own) == 600
+    group(root / "memory" / "docker" / "0815", 1, 1000, 900, 0)
+    assert limits._of_group(root, own) == 100
+    assert limits._of_group(tmp_path / "nowhere", tmp_path / "nothing") is None
+
+
+@pytest.mark.parametrize("kind", ["RLIMIT_AS", "RLIMIT_DATA"])
+def test_the_limits_of_the_process_bound_its_memory(kind: str) -> None:
+    pytest.importorskip("resource")
+    program = (
+        "import resource\nfrom igps.geometry.limits import available_memory\nbefore = available_memory()\n"
+        f"resource.setrlimit(resource.{kind}, (1 << 33, 1 << 33))\n"
+        "assert before is None or 0 < available_memory() <= min(before, 1 << 33) + (1 << 26)\n"
+        "block = bytearray(1 << 29)\n"
+        f"assert available_memory() < (1 << 33) - (1 << 29)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
+def test_a_grid_that_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    mesh = Mesh(ball.vertices, ball.faces, name="ball")
+    free = 100 * 2**20
+    monkeypatch.setattr(limits, "available_memory", lambda: free)
+    assert len(interior_samples(mesh, 100)) > 100_000  # 40 MB
+    with pytest.raises(
+        MeshError, match=r"ball: a grid of 8,000,000 cells needs 0\.3 GB of memory, and 0\.1 GB are free"
+    ):
+        interior_samples(mesh, 200)
+    # Nor is a grid refined into what does not fit.
+    with pytest.raises(MeshError, match="use fewer workers"):
+        interior_samples(mesh, 60, min_samples=3_000_000)
+    free = 10**10
+    assert len(interior_samples(mesh, 150)) > 10**6

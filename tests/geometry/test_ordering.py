@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from conftest import as_mesh
 from igps.data.batch import SampleBatch, collate
 from igps.geometry.mesh import Mesh
-from igps.geometry.ordering import crowding, one_in_each_share, places, shares_around
+from igps.geometry.ordering import crowding, in_order_of_form, one_in_each_share, places, shares_around
 from igps.geometry.signature import SignatureConfig, compute_signature
 from igps.nn.axes import EuclideanDistance, InteriorDistance, Potential
 from igps.nn.histogram import PairHistogram
@@ -149,3 +152,31 @@ def test_subsets_take_equal_steps() -> None:
     starts = {tuple(batch.subset(4, seed=seed).attributes["depth"][0].tolist()) for seed in range(20)}
     assert len(starts) > 1
     assert set().union(*starts) == set(range(10))  # none is left out by every start
+
+
+def test_the_order_of_form_takes_out_every_numbering(blob: Mesh) -> None:
+    expected = in_order_of_form(blob)
+    for seed in range(3):
+        found = in_order_of_form(renumbered(blob, seed))
+        np.testing.assert_array_equal(found.vertices, expected.vertices)
+        np.testing.assert_array_equal(found.faces, expected.faces)
+
+
+def test_the_order_of_form_keeps_the_surface(blob: Mesh) -> None:
+    found = in_order_of_form(blob)
+
+    def corners(mesh: Mesh) -> set[bytes]:
+        """Every face by its corners' places, from each of the three on, so that orientation counts."""
+        places = mesh.vertices[mesh.faces]
+        return {np.roll(face, k, axis=0).tobytes() for face in places for k in range(3)}
+
+    assert corners(found) == corners(blob)
+    assert len(found.faces) == len(blob.faces)
+
+
+def test_the_order_of_form_does_not_depend_on_place_and_scale(blob: Mesh) -> None:
+    turn = Rotation.from_rotvec([0.3, 1.1, -0.7]).as_matrix()
+    moved = replace(blob, vertices=2.5 * blob.vertices @ turn.T + [3, -1, 2])
+    expected, found = in_order_of_form(blob), in_order_of_form(moved)
+    np.testing.assert_array_equal(found.faces, expected.faces)
+    np.testing.assert_allclose(found.vertices, 2.5 * expected.vertices @ turn.T + [3, -1, 2], atol=1e-12)

@@ -43,7 +43,7 @@ class SignatureDataModule(LightningDataModule):
         n_validation: how many of those validate.
         n_test: classes to test ("unseen" only); all others if None.
         split_seed: of the split.
-        classes_per_batch, shapes_per_class: P and K of a training batch.
+        classes_per_batch, shapes_per_class: P and K of a training batch, in each process.
         n_samples_in_memory: interior and surface samples of each training shape, a fixed random subset, that are kept
             in memory from step to step; None reads whole signatures from the cache at each step.
         config: of the signatures.
@@ -101,8 +101,13 @@ class SignatureDataModule(LightningDataModule):
             raise ImportError('training needs pytorch-metric-learning: pip install "interior-gps[metric]".') from error
         part = self.dataset.subset(self.split.train)
         n_batch = min(self.classes_per_batch, len(part.labels.unique())) * self.shapes_per_class
+        # Lightning deals what is drawn out to its processes one by one: each of them is to get so many of a class.
+        n_processes = self.trainer.world_size if self.trainer is not None else 1
         sampler = MPerClassSampler(
-            part.labels, self.shapes_per_class, batch_size=n_batch, length_before_new_iter=max(len(part), n_batch)
+            part.labels,
+            self.shapes_per_class * n_processes,
+            batch_size=n_batch * n_processes,
+            length_before_new_iter=max(len(part), n_batch * n_processes),
         )
         if self.n_samples_in_memory is None:
             return DataLoader(part, batch_size=n_batch, sampler=sampler, collate_fn=collate)

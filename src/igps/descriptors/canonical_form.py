@@ -13,6 +13,7 @@ from torch import Tensor
 
 from igps.data.batch import Body
 from igps.geometry.geodesics import farthest_points
+from igps.geometry.ordering import in_order_of_form
 from igps.geometry.simplification import simplify
 from igps.nn.descriptor import BodyDescriptor
 from igps.nn.needs import Needs
@@ -74,7 +75,7 @@ class CanonicalForm(BodyDescriptor):
             ValueError: the mesh has fewer than `n_samples` vertices.
             MeshError: it cannot be simplified.
         """
-        samples = farthest_points(simplify(body.mesh, self.max_vertices), self.n_samples)
+        samples = farthest_points(simplify(in_order_of_form(body.mesh), self.max_vertices), self.n_samples)
         distances = samples.mutual / np.sqrt(body.mesh.area)
         form = classical_scaling(distances)
         if self.scaling == "least squares":

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from igps.data.batch import Body
 from igps.geometry.geodesics import farthest_points
+from igps.geometry.ordering import in_order_of_form
 from igps.geometry.simplification import simplify
 from igps.nn.descriptor import BodyDescriptor
 from igps.nn.needs import Needs
@@ -56,7 +57,7 @@ class GeodesicSpectral(BodyDescriptor):
             ValueError: the mesh has fewer than `n_samples` vertices.
             MeshError: it cannot be simplified.
         """
-        samples = farthest_points(simplify(body.mesh, self.max_vertices), self.n_samples)
+        samples = farthest_points(simplify(in_order_of_form(body.mesh), self.max_vertices), self.n_samples)
         values = affinity_eigenvalues(samples.mutual, self.n_eigenvalues)
         return np.sqrt(np.abs(values)).astype(np.float32)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from igps.data.batch import Body
 from igps.geometry.geodesics import farthest_points
 from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.ordering import in_order_of_form
 from igps.geometry.sampling import surface_points
 from igps.geometry.surface import area_vectors, unit, vertex_areas
 from igps.nn.descriptor import BodyDescriptor
@@ -79,7 +80,7 @@ class LocalDiameterCentricity(BodyDescriptor):
             ImportError: libigl is not installed.
             MeshError: no ray meets the far side of the surface.
         """
-        mesh = body.mesh
+        mesh = in_order_of_form(body.mesh)
         points = surface_points(mesh, self.n_samples, self.seed)
         diameter = local_diameters(mesh, points.face, points.weights, self.n_rays, self.opening_angle)
         central = points.interpolate(centricity(mesh, self.n_sources)[:, None])[:, 0]

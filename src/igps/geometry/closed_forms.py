@@ -135,7 +135,8 @@ class ListedRule:
             values, barycentric, on_face = self.weights(face, points.index_select(0, column).T.contiguous())
             values.masked_fill_(~is_near.index_select(1, keep), 0)
             flat_weights.index_add_(0, cells.index_select(1, keep).flatten(), values.flatten().to(weights.dtype))
-            touching.append((column[on_face], self.faces[face[on_face]], barycentric.T[on_face]))
+            if bool(on_face.any()):
+                touching.append((column[on_face], self.faces[face[on_face]], barycentric.T[on_face]))
         if touching:
             column, corner, values = (torch.cat(parts) for parts in zip(*touching, strict=True))
             first = np.unique(column.cpu().numpy(), return_index=True)[1]

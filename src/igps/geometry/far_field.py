@@ -93,10 +93,15 @@ class HatMoments:
     def fill_weights(self, points: torch.Tensor, hats: torch.Tensor, weights: torch.Tensor) -> None:
         """Fill the weights (h, n) of some hats; those of hats near a point are unusable."""
         dtype, n_points = weights.dtype, len(points)
-        centre = points.mean(0)
-        coefficients = (self.polynomials[hats].view(-1, 10) @ _shift(centre)).to(dtype)
-        monomials = _monomials(points - centre).to(dtype)
-        size = Tile.of(points.device).hats
+        coefficients = self.polynomials[hats].view(-1, 10)
+        if dtype == torch.float64:
+            monomials = _monomials(points)
+        else:  # about a centre near the points, where single precision is enough
+            centre = points.mean(0)
+            coefficients = (coefficients @ _shift(centre)).to(dtype)
+            monomials = _monomials(points - centre).to(dtype)
+        tile = Tile.of(points.device)
+        size = tile.hats * max(1, tile.points // max(n_points, 1))  # few points leave room for more hats
         buffer = torch.empty(4 * size, n_points, dtype=dtype, device=points.device)
         for part, out in zip(coefficients.split(4 * size), weights.split(size), strict=True):
             values = torch.mm(part, monomials, out=buffer[: len(part)])

@@ -16,8 +16,11 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
 from igps.geometry.mesh import Mesh
+from igps.geometry.ordering import places_in_space
 from igps.geometry.surface import undirected_edges
 
+# Distances that differ by less than this share are equal but for rounding.
+_TIE = 1e-9
 # Sources to one call of the shortest-path solver, which returns the points on the edges too.
 _BLOCK = 64
 
@@ -77,7 +80,9 @@ def geodesic_distances(mesh: Mesh, sources: ArrayLike, points_per_edge: int = 2)
 def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> FarthestPoints:
     """Vertices each of which is the farthest from all taken before it (Eldar, Lindenbaum, Porat and Zeevi 1997).
 
-    The first one is the farthest from the farthest from vertex 0, an end of a long geodesic.
+    The first one is the farthest from the farthest from the one that sticks out most, an end of a long geodesic. Of
+    equally far ones the one nearest to all taken before is taken, and of equal ones still that which comes last in
+    `places_in_space`: which they are does not depend on how the vertices are numbered.
 
     Args:
         mesh: the surface.
@@ -98,13 +103,25 @@ def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> Far
     def from_vertex(vertex: int) -> NDArray[np.float64]:
         return dijkstra(graph, indices=vertex)[:n_vertices]
 
-    taken = [int(np.argmax(from_vertex(int(np.argmax(from_vertex(0))))))]
+    def farthest(distance: NDArray[np.float64], total: NDArray[np.float64]) -> int:
+        equal = np.flatnonzero(distance >= (1 - _TIE) * distance.max())
+        equal = equal[total[equal] <= (1 + _TIE) * total[equal].min()]
+        return int(equal[np.argmax(places[equal])])
+
+    places = places_in_space(mesh)
+    first = int(np.argmax(places))
+    for _ in range(2):
+        distance = from_vertex(first)
+        first = farthest(distance, distance)
+    taken = [first]
     distances = np.empty((n_samples, n_vertices))
-    distances[0] = nearest = from_vertex(taken[0])
+    distances[0] = from_vertex(first)
+    nearest, total = distances[0].copy(), distances[0].copy()
     for i in range(1, n_samples):
-        taken.append(int(np.argmax(nearest)))
+        taken.append(farthest(nearest, total))
         distances[i] = from_vertex(taken[i])
         nearest = np.minimum(nearest, distances[i])
+        total += distances[i]
     return FarthestPoints(np.array(taken, dtype=np.int64), distances)
 
 

@@ -1,4 +1,4 @@
-"""Whether a file fits into memory, told from its first lines before it is read."""
+"""Whether a file, or a grid in a body, fits into memory, told before it takes any."""
 
 from __future__ import annotations
 
@@ -11,14 +11,10 @@ from igps.geometry.mesh import MeshError
 _BYTES_PER_FACE = 1000
 # What a triangle takes in a file whose first lines do not tell the number: OBJ, and text STL.
 _OBJ_BYTES, _TEXT_STL_BYTES = 35, 200
-# A file so small is not looked at.
-_SMALL = 1 << 20
-# Of a control group: the folder, its limit, what it uses, and in memory.stat what of that is files that were read and
-# may be forgotten at any time.
-_GROUPS = (
-    (Path("/sys/fs/cgroup"), "memory.max", "memory.current", "inactive_file"),
-    (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
-)
+# What a cell of a grid takes while it is told whether it is inside.
+_BYTES_PER_CELL = 40
+# A file so small is not looked at, nor a grid that takes so little.
+_SMALL, _SMALL_GRID = 1 << 20, 1 << 26
 
 
 def check_memory(path: Path) -> None:
@@ -36,6 +32,23 @@ def check_memory(path: Path) -> None:
             f"{path}: about {n_faces:,} triangles need {needed / 1e9:.1f} GB of memory, and "
             f"{max(free, 0) / 1e9:.1f} GB are free. "
             "Simplify the mesh in a program that streams it, or give the process more memory."
+        )
+
+
+def check_grid(n_cells: int, name: str) -> None:
+    """Refuse a grid whose cells need more memory than the process may still have.
+
+    Raises:
+        MeshError: names the mesh, the number of cells, both amounts, and the remedy.
+    """
+    needed = n_cells * _BYTES_PER_CELL
+    if needed < _SMALL_GRID:
+        return
+    free = available_memory()
+    if free is not None and needed > free:
+        raise MeshError(
+            f"{name}: a grid of {n_cells:,} cells needs {needed / 1e9:.1f} GB of memory, and {max(free, 0) / 1e9:.1f} "
+            "GB are free. Lower the resolution or min_samples, use fewer workers, or give the process more memory."
         )
 
 
@@ -74,7 +87,7 @@ def _of_limits() -> int | None:
     except ImportError:  # there are none on Windows
         return None
     left = []
-    # Address space, and of that what can be written, which a memory limit of `igps.parallel` bounds.
+    # Of the address space, and of data alone, which is what `igps.parallel` bounds.
     for kind, column in ((resource.RLIMIT_AS, 0), (resource.RLIMIT_DATA, 5)):
         limit, _ = resource.getrlimit(kind)
         pages = _number(Path("/proc/self/statm"), column)
@@ -83,12 +96,25 @@ def _of_limits() -> int | None:
     return min(left, default=None)
 
 
-def _of_group() -> int | None:
-    for folder, limit, used, cached in _GROUPS:
-        most, current = _number(folder / limit), _number(folder / used)
-        if most is not None and current is not None:
-            return most - current + (_named_number(folder / "memory.stat", cached) or 0)
-    return None
+def _of_group(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> int | None:
+    """The least of the process's control group and those around it, of either version of the kernel's interface."""
+    try:
+        lines = [line.split(":", 2) for line in own.read_text().splitlines()]
+    except OSError:
+        lines = []
+    found = []
+    for mount, limit, usage, cache, controller in (
+        (root, "memory.max", "memory.current", "inactive_file", ""),
+        (root / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file", "memory"),
+    ):
+        paths = [line[2].strip("/") for line in lines if len(line) == 3 and controller in line[1].split(",")]
+        # A container may see its own group as the root, whatever the path says.
+        for folder in {place for path in ["", *paths] for place in (mount / path, *(mount / path).parents)}:
+            most, current = _number(folder / limit), _number(folder / usage)
+            if most is not None and current is not None:
+                # Files that were read stay in memory as long as nobody else wants it.
+                found.append(most - current + (_named_number(folder / "memory.stat", cache) or 0))
+    return min(found, default=None)
 
 
 def _of_machine() -> int | None:

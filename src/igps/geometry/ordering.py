@@ -2,16 +2,21 @@
 
 Samples come in the order of a grid, faces and vertices in that of a file. What is chosen by such an order changes when
 the body is turned or its mesh numbered anew. Here points are ordered by one number each, which consists of distances in
-a spectral embedding and so does not depend on place, numbering, or sign and basis of eigenfunctions.
+a spectral embedding, or in space, and so does not depend on place, numbering, or sign and basis of eigenfunctions.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-__all__ = ["crowding", "one_in_each_share", "places", "shares_around"]
+from igps.geometry.mesh import Mesh
+from igps.geometry.surface import face_areas
+
+__all__ = ["crowding", "in_order_of_form", "one_in_each_share", "places", "places_in_space", "shares_around"]
 
 # λ·area at which the embedding's weights have fallen to 1/e of the commute time's: the eigenfunctions from the 60th on
 # count for nothing, and it does not matter whether the last ones are all of a multiplet.
@@ -50,7 +55,34 @@ def places(
     scaled = eigenvalues * area
     weights = np.sqrt(area / scaled) * np.exp(-scaled / _CUTOFF)
     kept = weights > _LEAST_WEIGHT * weights[0]
-    embedding = eigenfunctions[:, kept].astype(np.float64) * weights[kept]
+    return _by_anchors(eigenfunctions[:, kept].astype(np.float64) * weights[kept], marks)
+
+
+def places_in_space(mesh: Mesh) -> NDArray[np.float64]:
+    """(V,) the same for the vertices of a mesh, by straight distances from the surface's centroid and from anchors.
+
+    This needs no eigenfunctions, but changes with pose.
+    """
+    areas = face_areas(mesh.vertices, mesh.faces)
+    centres = mesh.vertices[mesh.faces].mean(axis=1)
+    embedding = mesh.vertices - areas @ centres / areas.sum()
+    embedding /= np.linalg.norm(embedding, axis=1).max()
+    return _by_anchors(embedding, shares_around(mesh.faces, areas))
+
+
+def in_order_of_form(mesh: Mesh) -> Mesh:
+    """The mesh with vertices, faces and the first corner of each in an order that its numbering does not change."""
+    found = places_in_space(mesh)
+    order = np.argsort(found, kind="stable")
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    corners = rank[mesh.faces]
+    first = corners.argmin(axis=1)[:, None]
+    corners = np.take_along_axis(corners, (first + np.arange(3)) % 3, axis=1)
+    return replace(mesh, vertices=mesh.vertices[order], faces=corners[np.lexsort(corners.T[::-1])])
+
+
+def _by_anchors(embedding: NDArray[np.float64], marks: NDArray[np.float64] | None) -> NDArray[np.float64]:
     found = np.linalg.norm(embedding, axis=1)
     if marks is not None:
         found += _MARK_SHARE * marks

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps.geometry.coordinates import winding_number
+from igps.geometry.limits import check_grid
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.surface import directed_edges
 
@@ -46,6 +47,7 @@ def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> 
         )
     while True:
         axes = grid_axes(mesh, resolution)
+        check_grid(len(axes[0]) * len(axes[1]) * len(axes[2]), mesh.name)
         inside = inside_grid(mesh, axes)
         count = int(inside.sum())
         if count >= max(min_samples, 1):
