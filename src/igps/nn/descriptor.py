@@ -31,13 +31,13 @@ class Descriptor(nn.Module, ABC):
         source: author, year.
         invariant_to: which of "motion" (rotation, translation, reflection), "scale" and "pose" (isometric bending)
             leave its descriptions as they are, but for discretisation.
-        needs: of a body.
+        needs: of a body; all eigenpairs, unless redefined.
     """
 
     name: str = "descriptor"
     source: str = ""
     invariant_to: tuple[str, ...] = ()
-    needs: Needs = Needs()
+    needs: Needs = Needs(whole_spectrum=True)
 
     @abstractmethod
     def describe(self, batch: SignatureBatch) -> Tensor:
