@@ -21,6 +21,7 @@ from igps.geometry.simplification import simplify
 from igps.geometry.surface import face_areas
 from igps.geometry.voxels import interior_samples
 from igps.linalg import ConvergenceError, Spectrum, eigenpairs
+from igps.threads import one_thread
 
 logger = logging.getLogger(__name__)
 
@@ -206,7 +207,9 @@ class Signature:
         """The Signature of a configuration of which this one's is one of the larger, see `SignatureConfig.larger`."""
 
         def cut(samples: Samples) -> Samples:
-            kept = {name: values for name, values in samples.attributes.items() if name in config.attributes}
+            kept: dict[str, NDArray[np.float32]] = {
+                name: values for name, values in samples.attributes.items() if name in config.attributes
+            }
             return replace(
                 samples,
                 eigenfunctions=np.ascontiguousarray(samples.eigenfunctions[:, : config.n_kept]),
@@ -222,6 +225,7 @@ class Signature:
         )
 
 
+@one_thread()
 def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Signature:
     """Sample the eigenfunctions of a mesh in its interior and on its surface (Rustamov 2010, section 3).
 

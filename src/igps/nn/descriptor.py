@@ -18,6 +18,7 @@ from igps.nn.histogram import PairHistogram
 from igps.nn.needs import Needs
 from igps.nn.view import Views
 from igps.retrieval import chi_square, cosine
+from igps.threads import one_thread
 
 
 class Descriptor(nn.Module, ABC):
@@ -50,7 +51,8 @@ class Descriptor(nn.Module, ABC):
             ValueError: the batch lacks what the descriptor needs.
         """
         self.needs.check(batch)
-        return self.describe(batch)
+        with one_thread():
+            return self.describe(batch)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, ...) and (G, ...) descriptions to (Q, G) distances ≥ 0, smaller is closer; χ² unless redefined."""
