@@ -3,8 +3,6 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-# Threads that spin while they wait slow each other down many times where another process takes a core.
-export OMP_WAIT_POLICY ?= passive
 
 .PHONY: demo test lint campaign shrec07 bench clean
 

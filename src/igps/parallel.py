@@ -26,9 +26,23 @@ from concurrent.futures import (
     wait,
 )
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, TypeVar
 
-import torch
+from igps.threads import n_cores, one_thread, stay_on_one_thread
+from igps.threads import n_threads as available_threads
+
+__all__ = [
+    "Failed",
+    "Limits",
+    "MachineError",
+    "is_machines",
+    "machines_words",
+    "n_cores",
+    "on_threads",
+    "one_thread",
+    "run",
+]
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -113,29 +127,26 @@ def run(
         yield number, _attempt(lambda job=job: function(job), limits)  # type: ignore[misc]
 
 
-def on_threads(function: Callable[[Job], Result], jobs: Sequence[Job], n_threads: int) -> Iterator[Result]:
+def on_threads(
+    function: Callable[[Job], Result], jobs: Sequence[Job], n_threads: int | None = None
+) -> Iterator[Result]:
     """The result of every job in order, each job on one thread of its own, as PyTorch lets many compute at once.
 
     Splitting each small product over all cores instead makes every one of them wait for the slowest core, which on a
     machine with other work to do costs many times the product itself.
+
+    Args:
+        function: may run beside itself.
+        jobs: by which it is called.
+        n_threads: as many as `igps.threads.n_threads` if None.
     """
-    with one_thread():
-        if n_threads == 1:
-            yield from map(function, jobs)
-            return
-        with ThreadPoolExecutor(n_threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            yield from pool.map(function, jobs)
-
-
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Torch on one thread, and afterwards on as many as before."""
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(n_threads)
+    n_threads = min(available_threads() if n_threads is None else n_threads, len(jobs))
+    alone = partial(_alone, function)
+    if n_threads <= 1:
+        yield from map(alone, jobs)
+        return
+    with ThreadPoolExecutor(n_threads, initializer=stay_on_one_thread) as pool:
+        yield from pool.map(alone, jobs)
 
 
 def is_machines(error: OSError) -> bool:
@@ -149,9 +160,9 @@ def machines_words(error: OSError) -> str:
     return f"{error}. {remedy} and run again: what is done is kept."
 
 
-def n_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _alone(function: Callable[[Job], Result], job: Job) -> Result:
+    with one_thread():
+        return function(job)
 
 
 def _attempt(result: Callable[[], Result], limits: Limits) -> Result | Failed:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from safetensors import safe_open
 
 from igps import cli
 from igps.cli import main
@@ -106,6 +107,39 @@ def test_gps_is_another_descriptor_on_the_same_cache(
     archives = [np.load(tmp_path / name / "distances.npz")["distances"] for name in ("interior", "gps")]
     assert np.abs(archives[0] - archives[1]).max() > 1e-3
     assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 6
+
+
+def test_only_the_eigenpairs_that_are_needed_are_computed(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless a number is given, and unless a cache has more."""
+    options = [option for option in SMALL if option not in ("--signature.n_eigenpairs", "20")]
+
+    def run(cache: str, *more: str) -> tuple[int, np.ndarray]:
+        out = tmp_path / "out"
+        igps(monkeypatch, "retrieve", root, "--out", out, "--cache_dir", tmp_path / cache, *options, *more)
+        with np.load(out / "distances.npz") as archive:
+            return json.loads((out / "scores.json").read_text())["config"]["n_eigenpairs"], archive["distances"]
+
+    def computed(cache: str) -> set[int]:
+        found = set()
+        for file in (tmp_path / cache).rglob("*.safetensors"):
+            with safe_open(file, framework="numpy") as opened:
+                found.add(len(opened.get_tensor("eigenvalues")))
+        return found
+
+    n_eigenpairs, few = run("cache", "--descriptor", "shape_dna")
+    assert n_eigenpairs == 64
+    assert computed("cache") == {64}
+    run("cache", "--descriptor", "interior")
+    assert computed("cache") == {64, 250}
+    run("of interior", "--descriptor", "interior")
+    n_eigenpairs, same = run("of interior", "--descriptor", "shape_dna")
+    assert n_eigenpairs == 64
+    assert computed("of interior") == {250}
+    np.testing.assert_allclose(same, few, atol=1e-6)
+    run("explicit", "--descriptor", "shape_dna", "--signature.n_eigenpairs", "70")
+    assert computed("explicit") == {70}
 
 
 def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(

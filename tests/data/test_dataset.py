@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import logging
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +82,7 @@ def test_computed_once_then_read(dataset: SignatureDataset, counted: list[str]) 
 @pytest.mark.parametrize(
     "change",
     [{"n_eigenpairs": 21}, {"resolution": 11}, {"min_samples": 300}, {"n_surface_samples": 51}, {"backend": "robust"},
-     {"max_vertices": 100}, {"accuracy": None}, {"attributes": ("depth",)}, {"seed": 1}],
+     {"max_vertices": 100}, {"accuracy": None}, {"attributes": ("depth",)}, {"seed": 1}, {"least_vertices": 200}],
 )  # fmt: skip
 def test_key_covers_every_parameter(root: Path, tmp_path: Path, counted: list[str], change: dict[str, object]) -> None:
     SignatureDataset(root, CONFIG, tmp_path / "cache")[0]
@@ -94,6 +94,7 @@ def test_parametrisation_above_is_complete() -> None:
     changed = {"n_eigenpairs", "resolution", "min_samples", "n_surface_samples", "backend", "max_vertices", "accuracy",
                "attributes", "seed"}  # fmt: skip
     assert set(CONFIG.as_dict()) == changed | {"algorithm_version"}
+    assert {field.name for field in fields(CONFIG)} == changed | {"least_vertices"}
 
 
 @pytest.mark.parametrize("option", [{"mend": "always"}, {"component": "largest"}, {"allow_open": True}])

@@ -4,16 +4,19 @@ import pickle
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
+import trimesh
 from bodies_on_disk import write_body
 
 import igps.data.recipe as recipe_module
 from igps.data.recipe import Recipe
-from igps.geometry.mesh import MeshError
+from igps.geometry.attributes import AttributeName
+from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.reading import MeshReading
-from igps.geometry.signature import SignatureConfig, compute_signature
+from igps.geometry.signature import Signature, SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface_samples=20)
 
@@ -86,6 +89,78 @@ def test_keys_are_those_of_the_caches_that_exist(recipe: Recipe, tmp_path: Path)
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
     assert SignatureConfig.ALGORITHM_VERSION == 3
     assert recipe.key(tmp_path / "frozen.off") == "f3de6688b1db864db53947e7043284b6dae4394c17e8a65a0ef5a8e84af8b84f"
+
+
+USUAL = replace(CONFIG, n_eigenpairs=None)
+NEEDED = USUAL.needing(50)
+
+
+@pytest.fixture
+def computed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The numbers of eigenpairs of the signatures that are computed, not read."""
+    numbers: list[int] = []
+
+    def counting(mesh: Mesh, config: SignatureConfig) -> Signature:
+        numbers.append(config.n_kept)
+        return compute_signature(mesh, config)
+
+    monkeypatch.setattr(recipe_module, "compute_signature", counting)
+    return numbers
+
+
+@pytest.mark.parametrize("subdivisions", [2, 3])
+def test_a_larger_signature_serves(tmp_path: Path, computed: list[int], subdivisions: int) -> None:
+    """Of 642 vertices, and of 162, which are too few for the usual number: both are subdivided alike."""
+    body = trimesh.creation.icosphere(subdivisions=subdivisions)
+    body.vertices *= [1.0, 1.3, 1.9]
+    path = tmp_path / "egg.off"
+    body.export(path)
+    full = Recipe(replace(USUAL, attributes=get_args(AttributeName)), MeshReading(), tmp_path / "cache")
+    full.signature(path)
+    needed = replace(full, config=replace(NEEDED, attributes=("surface_direction",)))
+    assert needed.is_cached(path)
+    found = needed.signature(path)
+    assert computed == [250]
+    assert needed.notes(path) == full.notes(path)
+    assert bool(full.notes(path)) == (subdivisions == 2)
+    expected = compute_signature(needed.mesh(path), needed.config)
+    assert found.config == expected.config
+    np.testing.assert_allclose(found.eigenvalues, expected.eigenvalues, rtol=1e-9)
+    for one, other in ((found.interior, expected.interior), (found.surface, expected.surface)):
+        np.testing.assert_allclose(one.points, other.points, atol=1e-12)
+        np.testing.assert_allclose(np.abs(one.eigenfunctions), np.abs(other.eigenfunctions), atol=1e-3)
+        assert set(one.attributes) == set(other.attributes) == {"surface_direction"}
+    # And never the other way round.
+    replace(needed, cache_dir=tmp_path / "other").signature(path)
+    assert not replace(full, cache_dir=tmp_path / "other").is_cached(path)
+    assert computed == [250, 64]
+
+
+def test_a_signature_of_another_mesh_or_with_other_samples_does_not_serve(
+    recipe: Recipe, path: Path, computed: list[int]
+) -> None:
+    """The file has 162 vertices: enough for 64 eigenpairs, and subdivided for 250."""
+    replace(recipe, config=USUAL).signature(path)
+    replace(recipe, config=NEEDED).signature(path)
+    assert computed == [250]
+    replace(recipe, config=replace(CONFIG, n_eigenpairs=64)).signature(path)
+    replace(recipe, config=replace(CONFIG, n_eigenpairs=20)).signature(path)
+    replace(recipe, config=replace(NEEDED, seed=1)).signature(path)
+    assert computed == [250, 64, 20, 64]
+
+
+def test_a_damaged_larger_signature_is_passed_over(path: Path, tmp_path: Path, computed: list[int]) -> None:
+    recipe = Recipe(USUAL, MeshReading(), tmp_path / "cache")
+    recipe.signature(path)
+    (file,) = (tmp_path / "cache").rglob("*.safetensors")
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1  # of an eigenfunction: the header does not tell
+    file.write_bytes(content)
+    needed = replace(recipe, config=NEEDED)
+    assert len(needed.signature(path).eigenvalues) == 64
+    assert computed == [250, 64]
+    assert len(needed.signature(path).eigenvalues) == 64
+    assert computed == [250, 64]
 
 
 def test_a_missing_file_is_named(recipe: Recipe, tmp_path: Path) -> None:

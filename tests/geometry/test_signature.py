@@ -201,6 +201,57 @@ def test_bad_configuration_is_named(field: dict[str, object]) -> None:
         SignatureConfig(**field)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("n_eigenpairs", [64, 100])
+def test_a_signature_is_the_beginning_of_one_with_more(blob: Mesh, n_eigenpairs: int) -> None:
+    """Samples, their order and the eigenvalues; the eigenfunctions but for the sign, which a single one has free."""
+    exact = replace(CONFIG, n_eigenpairs=n_eigenpairs)
+    more = replace(exact, n_eigenpairs=250, attributes=("electrostatic_potential", "surface_direction"))
+    alone, whole = compute_signature(blob, exact), compute_signature(blob, more)
+    found = whole.beginning(exact)
+    assert (found.config, found.interior.attributes, found.surface.attributes) == (exact, {}, {})
+    assert (found.area, found.volume, found.notes) == (alone.area, alone.volume, alone.notes)
+    np.testing.assert_allclose(found.eigenvalues, alone.eigenvalues, rtol=1e-9)
+    for one, other in ((found.interior, alone.interior), (found.surface, alone.surface)):
+        np.testing.assert_allclose(one.points, other.points, atol=1e-12)
+        assert one.eigenfunctions.shape == other.eigenfunctions.shape
+        assert one.eigenfunctions.flags.c_contiguous
+        signs = np.sign((one.eigenfunctions * other.eigenfunctions).sum(axis=0))
+        np.testing.assert_allclose(one.eigenfunctions * signs, other.eigenfunctions, atol=1e-4)
+    attributed = whole.beginning(replace(exact, attributes=("surface_direction",)))
+    assert set(attributed.interior.attributes) == set(attributed.surface.attributes) == {"surface_direction"}
+    np.testing.assert_allclose(histogram(found), histogram(alone), atol=1e-6)
+    with pytest.raises(AssertionError):  # the number does matter
+        np.testing.assert_allclose(histogram(whole), histogram(alone), atol=1e-4)
+
+
+def test_no_number_of_eigenpairs_is_the_usual_one(blob: Mesh) -> None:
+    config = SignatureConfig(resolution=6, min_samples=0, n_surface_samples=20)
+    assert config.as_dict() == replace(config, n_eigenpairs=250).as_dict() == config.resolved().as_dict()
+    assert config.as_dict()["n_eigenpairs"] == 250
+    assert "least_vertices" not in config.as_dict()
+    assert config.needing(50).as_dict() == {**config.as_dict(), "n_eigenpairs": 64, "least_vertices": 252}
+    signature = compute_signature(blob, config)
+    assert len(signature.eigenvalues) == signature.config.n_eigenpairs == 250
+
+
+def test_larger_configurations_have_all_and_more() -> None:
+    small = SignatureConfig(resolution=17, attributes=("depth",)).needing(50)
+    larger = list(small.larger())
+    assert {one.n_eigenpairs for one in larger} == {64, 100, 250}
+    assert [one.n_kept for one in larger] == sorted(one.n_kept for one in larger)
+    for one in larger:
+        assert set(one.attributes) >= {"depth"}
+        same = replace(one, n_eigenpairs=64, attributes=("depth",))
+        assert same == small
+    # What a plain dataset, and what one for `rich`, has in its cache.
+    plain = SignatureConfig(resolution=17).as_dict()
+    assert plain in [one.as_dict() for one in SignatureConfig(resolution=17).needing(0).larger()]
+    rich = ("depth", "electrostatic_potential", "surface_direction")
+    assert {**plain, "attributes": rich} in [one.as_dict() for one in SignatureConfig(resolution=17).larger()]
+    assert {one.n_kept for one in SignatureConfig(n_eigenpairs=40).larger()} == {40}  # other samples
+    assert {one.n_kept for one in SignatureConfig(n_eigenpairs=64, max_vertices=120).larger()} == {64, 100}
+
+
 def test_paper_is_the_paper() -> None:
     paper = SignatureConfig.paper()
     assert (paper.n_eigenpairs, paper.resolution, paper.min_samples, paper.backend) == (250, 32, 0, "cotangent")

@@ -2,12 +2,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from batches import batch_of, two_bodies
+from numpy.typing import NDArray
 from torch import nn
 
+from igps.data.batch import Body
+from igps.descriptors import NAMES, descriptor
 from igps.geometry.signature import SignatureConfig
+from igps.nn.descriptor import BodyDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.needs import Needs, needs_of_embedding
 
@@ -61,4 +66,43 @@ def test_a_batch_that_lacks_something_is_refused() -> None:
 
 def test_needs_of_an_embedding_are_its_eigenpairs() -> None:
     assert needs_of_embedding(SpectralEmbedding(n_eigenpairs=6)) == Needs(6)
-    assert needs_of_embedding(SpectralEmbedding()) == needs_of_embedding(nn.Identity()) == Needs()
+    assert needs_of_embedding(SpectralEmbedding()) == Needs(whole_spectrum=True)
+    assert needs_of_embedding(nn.Identity()) == Needs(whole_spectrum=True)
+
+
+@pytest.mark.parametrize(
+    ("needs", "n_eigenpairs"),
+    [(Needs(), 64), (Needs(50), 64), (Needs(100), 100), (Needs(100) | Needs(250), 250), (Needs(300), 300),
+     (Needs(whole_spectrum=True), 250), (Needs(50) | Needs(whole_spectrum=True), 250),
+     (Needs(300, whole_spectrum=True), 300)],
+)  # fmt: skip
+def test_as_many_eigenpairs_as_needed_where_no_number_is_given(needs: Needs, n_eigenpairs: int) -> None:
+    """64 or more, on which the order of the samples depends; a mesh has room for 250 in any case."""
+    completed = needs.completed(SignatureConfig(resolution=17))
+    assert (completed.n_eigenpairs, completed.resolution) == (n_eigenpairs, 17)
+    assert completed.n_vertices_read == max(252, n_eigenpairs + 2)
+    needs.check_config(completed)
+    explicit = SignatureConfig(n_eigenpairs=311)
+    assert needs.completed(explicit) == explicit
+    paper = SignatureConfig.paper()
+    if n_eigenpairs <= 250:
+        assert needs.completed(paper) == paper
+    else:
+        with pytest.raises(ValueError, match="at least 300, got 250"):
+            needs.completed(paper)
+    assert needs.completed(SignatureConfig(least_vertices=2000)).n_vertices_read == 2000
+
+
+def test_what_a_descriptor_does_not_say_is_all() -> None:
+    class Own(BodyDescriptor):
+        def describe_body(self, body: Body) -> NDArray[np.float32]:
+            return body.eigenvalues.astype(np.float32)
+
+    assert Own().needs.completed(SignatureConfig()).n_eigenpairs == 250
+
+
+def test_what_the_descriptors_need_is_what_a_cache_is_searched_for() -> None:
+    for name in NAMES:
+        needs = descriptor(name).needs
+        assert needs.completed(SignatureConfig()).n_eigenpairs in SignatureConfig.SIZES, name
+        assert needs.whole_spectrum is False, name

@@ -20,6 +20,7 @@ from igps.cli.reading import FLAGS
 from igps.cli.retrieval import extract, query, retrieve
 from igps.cli.robustness import robustness
 from igps.parallel import MachineError, is_machines, machines_words
+from igps.threads import one_thread
 
 Command = Callable[..., None]
 Commands = Mapping[str, "Command | Commands"]
@@ -45,7 +46,8 @@ def main() -> None:
     _add_commands(parser, COMMANDS)
     command, options = _chosen(parser.instantiate(parser.parse_args()), COMMANDS)
     try:
-        command(**options)
+        with one_thread():
+            command(**options)
     except MachineError as error:
         print(f"igps: {error}", file=sys.stderr)
         sys.exit(2)

@@ -63,7 +63,8 @@ def signatures(
     if paper and signature != SignatureConfig():
         raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
     config = SignatureConfig.paper() if paper else signature
-    config = reduce(or_, (one.needs for one in descriptors), Needs()).completed(config)
+    if descriptors:
+        config = reduce(or_, (one.needs for one in descriptors), Needs()).completed(config)
     dataset = SignatureDataset(source, config, cache_dir, reading=MeshReading(mend, component, allow_open))
     limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
     failures = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits)

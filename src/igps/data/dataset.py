@@ -44,9 +44,11 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     Args:
         root_or_paths: a folder (see `find_meshes`), mesh files, or a `MeshFiles`.
-        config: parameters of the Signatures; `SignatureConfig()` if None.
+        config: parameters of the Signatures; `SignatureConfig()` if None, with 250 eigenpairs. For one descriptor
+            alone, `descriptor.needs.completed(SignatureConfig())` has as many as it needs.
         cache_dir: where Signatures are kept; the user's cache directory if None. The key of a file covers the mesh
-            file's content, how it is read, every parameter, and the algorithm's version.
+            file's content, how it is read, every parameter, and the algorithm's version. A Signature with more
+            eigenpairs or attributes serves too.
         labels: classes of the given paths, by name.
         reading: how mesh files are read.
         point_functions: attributes of your own of the interior samples, by name: functions of their points, (P, 3) in
@@ -75,7 +77,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         else:
             self.files = mesh_files(root_or_paths, labels)
         self._recipe = Recipe(
-            config or SignatureConfig(), reading or MeshReading(), Path(cache_dir or default_cache_dir())
+            (config or SignatureConfig()).resolved(), reading or MeshReading(), Path(cache_dir or default_cache_dir())
         )
         self._point_functions = dict(point_functions or {})
         self.classes: tuple[str, ...] = tuple(sorted(set(self.files.labels or ())))

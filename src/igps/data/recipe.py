@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from igps.data.cache import SignatureCache
+from igps.geometry.mending import mended_by
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.reading import MeshReading, load_mesh
 from igps.geometry.signature import Signature, SignatureConfig, compute_signature
@@ -33,15 +35,17 @@ class Recipe:
         Raises:
             MeshError: it cannot be used.
         """
-        return load_mesh(path, self.reading, least_vertices=self.config.n_eigenpairs + 2)
+        return load_mesh(path, self.reading, least_vertices=self.config.n_vertices_read)
 
     def signature(self, path: Path) -> Signature:
-        """The Signature of a file, from the cache where it is there, and there afterwards."""
-        cache, key = SignatureCache(self.cache_dir), self.key(path)
-        signature = cache.get(key)
-        if signature is None:
-            signature = compute_signature(self.mesh(path), self.config)
-            cache.put(key, signature)
+        """The Signature of a file, from the cache where it or a larger one is there, and there afterwards."""
+        cache = SignatureCache(self.cache_dir)
+        for key in self._cached(path):
+            signature = cache.get(key)
+            if signature is not None:
+                return signature.beginning(self.config)
+        signature = compute_signature(self.mesh(path), self.config)
+        cache.put(self.key(path), signature)
         return signature
 
     def fill(self, path: Path) -> None:
@@ -50,12 +54,13 @@ class Recipe:
 
     def notes(self, path: Path) -> tuple[str, ...]:
         """What was done to the mesh of a cached Signature, in words."""
-        return SignatureCache(self.cache_dir).notes(self.key(path))
+        key = next(self._cached(path), None)
+        return () if key is None else SignatureCache(self.cache_dir).notes(key)
 
     def is_cached(self, path: Path) -> bool:
         """Whether the Signature of a file can be read; false for a file that cannot."""
         try:
-            return self.key(path) in SignatureCache(self.cache_dir)
+            return next(self._cached(path), None) is not None
         except MeshError:
             return False
 
@@ -65,11 +70,29 @@ class Recipe:
         Raises:
             MeshError: the file cannot be read.
         """
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise MeshError(f"{path}: cannot be read ({error.strerror}). Check the path.") from error
+        return self._key(path, _content(path), self.config)
+
+    def _cached(self, path: Path) -> Iterator[str]:
+        """The keys that the cache has of the Signature of a file and of larger ones, which begin with it."""
+        cache, content = SignatureCache(self.cache_dir), _content(path)
+        for config in (self.config, *self.config.larger()):
+            key = self._key(path, content, config)
+            if key not in cache:
+                continue
+            # A mesh that was subdivided for more vertices is another one.
+            read_alike = config.n_vertices_read == self.config.n_vertices_read
+            if read_alike or "subdivided" not in mended_by(cache.notes(key)):
+                yield key
+
+    def _key(self, path: Path, content: bytes, config: SignatureConfig) -> str:
         # The suffix chooses the reader, so the same bytes under another suffix are another mesh.
         reading = [path.suffix.lower(), asdict(self.reading)]
-        parameters = json.dumps([reading, self.config.as_dict()], sort_keys=True)
+        parameters = json.dumps([reading, config.as_dict()], sort_keys=True)
         return hashlib.sha256(parameters.encode() + b"\0" + content).hexdigest()
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise MeshError(f"{path}: cannot be read ({error.strerror}). Check the path.") from error

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from igps.data.batch import Body
 from igps.nn.descriptor import BodyDescriptor
+from igps.nn.needs import Needs
 
 ShapeFunction = Literal["d2", "a3", "d1"]
 
@@ -43,6 +44,7 @@ class D2(BodyDescriptor):
     name = "d2"
     source = "Osada, Funkhouser, Chazelle and Dobkin 2002"
     invariant_to = ("motion", "scale")
+    needs = Needs()
 
     function: ShapeFunction = "d2"
     n_bins: int = 64

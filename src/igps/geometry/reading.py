@@ -15,6 +15,7 @@ from igps.geometry.limits import check_memory
 from igps.geometry.mending import Mending, mend
 from igps.geometry.mesh import Mesh, MeshError, check_arrays
 from igps.geometry.surface import compact, face_parts
+from igps.threads import one_thread
 
 logger = logging.getLogger(__name__)
 
@@ -53,6 +54,7 @@ class MeshReading:
             raise ValueError(f"component: expected 'largest' or None, got {self.component!r}.")
 
 
+@one_thread()
 def load_mesh(path: str | Path, reading: MeshReading = MeshReading(), *, least_vertices: int = 0) -> Mesh:
     """Read a mesh file of any format that trimesh reads, or a cloud of points, and make a body of it.
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from igps.geometry.simplification import simplify
 from igps.geometry.surface import face_areas
 from igps.geometry.voxels import interior_samples
 from igps.linalg import ConvergenceError, Spectrum, eigenpairs
+from igps.threads import one_thread
 
 logger = logging.getLogger(__name__)
 
@@ -28,13 +29,22 @@ logger = logging.getLogger(__name__)
 # not allow much less, and the histograms cannot tell.
 _RESIDUAL = 1e-6
 
+# The order of the samples, see `places`, depends on about so many eigenpairs. With as many or more of one body the same
+# samples come in the same order, to rounding.
+_ORDERED_BY = 64
+
 
 @dataclass(frozen=True)
 class SignatureConfig:
     """Every parameter that a Signature depends on.
 
+    The samples of a Signature and their first eigenfunctions do not depend on how many there are, if at least 64. So
+    each is the beginning of those with more, see `larger` and `Signature.beginning`; but for that their meshes must be
+    the same, and one with fewer vertices than `least_vertices` is subdivided.
+
     Args:
-        n_eigenpairs: eigenpairs kept, without the constant one.
+        n_eigenpairs: eigenpairs kept, without the constant one; None for as many as the descriptor needs that the
+            Signature is for (see `Needs.completed`), 250 where there is none.
         resolution: voxels along the longest side of the bounding box.
         min_samples: the grid is refined until at least so many voxels lie inside; 0 keeps `resolution`.
         n_surface_samples: area-weighted random samples of the surface.
@@ -46,12 +56,18 @@ class SignatureConfig:
         attributes: of the samples: "depth" and "electrostatic_potential" of the interior ones, "surface_direction" of
             all, see `interior_attributes` and `surface_attributes`.
         seed: of the surface samples and of the eigensolver's start.
+        least_vertices: meshes with fewer are subdivided when they are read, unless they are mended never; None for the
+            two more than the eigenpairs without which these cannot be computed.
     """
 
     # Raise it whenever the same mesh and parameters would give another Signature: it is part of every cache key.
     ALGORITHM_VERSION: ClassVar[int] = 3
 
-    n_eigenpairs: int = 250
+    DEFAULT_EIGENPAIRS: ClassVar[int] = 250
+    # What the library's descriptors ask for: known to be in caches.
+    SIZES: ClassVar[tuple[int, ...]] = (64, 100, 250)
+
+    n_eigenpairs: int | None = None
     resolution: int = 32
     min_samples: int = 1000
     n_surface_samples: int = 2000
@@ -60,17 +76,19 @@ class SignatureConfig:
     accuracy: float | None = 1e-3
     attributes: tuple[AttributeName, ...] = ()
     seed: int = 0
+    least_vertices: int | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("n_eigenpairs", 1), ("resolution", 1), ("min_samples", 0), ("n_surface_samples", 1)):
+        smallest = {"n_eigenpairs": 1, "resolution": 1, "min_samples": 0, "n_surface_samples": 1, "least_vertices": 0}
+        for name, least in smallest.items():
             value = getattr(self, name)
-            if value < least:
+            if value is not None and value < least:
                 raise ValueError(f"{name}: expected at least {least}, got {value}.")
         if self.backend not in ("cotangent", "robust"):
             raise ValueError(f"backend: expected 'cotangent' or 'robust', got {self.backend!r}.")
-        if self.max_vertices is not None and self.max_vertices <= self.n_eigenpairs + 1:
+        if self.max_vertices is not None and self.max_vertices <= self.n_kept + 1:
             raise ValueError(
-                f"max_vertices: expected more than n_eigenpairs + 1 = {self.n_eigenpairs + 1}, got {self.max_vertices}."
+                f"max_vertices: expected more than n_eigenpairs + 1 = {self.n_kept + 1}, got {self.max_vertices}."
             )
         if self.accuracy is not None and not 0 < self.accuracy < 1:
             raise ValueError(f"accuracy: expected None or a number between 0 and 1, got {self.accuracy}.")
@@ -79,11 +97,57 @@ class SignatureConfig:
     @classmethod
     def paper(cls) -> SignatureConfig:
         """Rustamov 2010: 250 eigenpairs and a 32-voxel grid that is never refined."""
-        return cls(min_samples=0)
+        return cls(n_eigenpairs=250, min_samples=0)
+
+    @property
+    def n_kept(self) -> int:
+        """`n_eigenpairs`, or how many there are where it is None."""
+        return self.DEFAULT_EIGENPAIRS if self.n_eigenpairs is None else self.n_eigenpairs
+
+    @property
+    def n_vertices_read(self) -> int:
+        """`least_vertices`, or what the eigenpairs need where it is None."""
+        return self.n_kept + 2 if self.least_vertices is None else self.least_vertices
+
+    def resolved(self) -> SignatureConfig:
+        """The same with a number of eigenpairs."""
+        return replace(self, n_eigenpairs=self.n_kept)
+
+    def needing(self, n_eigenpairs: int) -> SignatureConfig:
+        """The same where only the first so many eigenpairs are needed, unless a number of them is given already.
+
+        Meshes are subdivided as for the default number, so that this is the beginning of that Signature.
+        """
+        if self.n_eigenpairs is not None:
+            return self
+        n_computed = max(n_eigenpairs, _ORDERED_BY)
+        if n_computed >= self.DEFAULT_EIGENPAIRS:
+            return replace(self, n_eigenpairs=n_computed)
+        return replace(self, n_eigenpairs=n_computed, least_vertices=self.n_vertices_read)
+
+    def larger(self) -> Iterator[SignatureConfig]:
+        """Those whose Signature of a body begins with this one's, smallest first, as far as a cache may well have them.
+
+        For a mesh that is subdivided that holds only of those with as many `n_vertices_read`.
+        """
+        everything: tuple[AttributeName, ...] = get_args(AttributeName)
+        sizes, n_vertices = [self.n_kept], self.n_vertices_read
+        if self.n_kept >= _ORDERED_BY:
+            most = math.inf if self.max_vertices is None else self.max_vertices - 2
+            sizes += [size for size in self.SIZES if self.n_kept < size <= most]
+            n_vertices = max(n_vertices, self.DEFAULT_EIGENPAIRS + 2)
+        for n_eigenpairs in sizes:
+            for attributes in dict.fromkeys((self.attributes, everything)):
+                one = replace(self, n_eigenpairs=n_eigenpairs, attributes=attributes, least_vertices=n_vertices)
+                if one.as_dict() != self.as_dict():
+                    yield one
 
     def as_dict(self) -> dict[str, Any]:
-        """The parameters by name, with the algorithm version."""
-        return {**asdict(self), "algorithm_version": self.ALGORITHM_VERSION}
+        """The parameters by name and the algorithm's version; `least_vertices` only where the others do not tell."""
+        found = {**asdict(self), "n_eigenpairs": self.n_kept, "algorithm_version": self.ALGORITHM_VERSION}
+        if self.n_vertices_read == self.n_kept + 2:
+            del found["least_vertices"]
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +203,29 @@ class Signature:
         potential = np.square(self.interior.eigenfunctions, dtype=np.float64) @ (1 / self.eigenvalues)
         return self.interior.points[int(np.argmin(potential))]
 
+    def beginning(self, config: SignatureConfig) -> Signature:
+        """The Signature of a configuration of which this one's is one of the larger, see `SignatureConfig.larger`."""
 
+        def cut(samples: Samples) -> Samples:
+            kept: dict[str, NDArray[np.float32]] = {
+                name: values for name, values in samples.attributes.items() if name in config.attributes
+            }
+            return replace(
+                samples,
+                eigenfunctions=np.ascontiguousarray(samples.eigenfunctions[:, : config.n_kept]),
+                attributes=kept,
+            )
+
+        return replace(
+            self,
+            eigenvalues=self.eigenvalues[: config.n_kept].copy(),
+            interior=cut(self.interior),
+            surface=cut(self.surface),
+            config=config,
+        )
+
+
+@one_thread()
 def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Signature:
     """Sample the eigenfunctions of a mesh in its interior and on its surface (Rustamov 2010, section 3).
 
@@ -151,13 +237,13 @@ def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Sign
         MeshError: too few vertices for the eigenpairs asked, or no interior sample.
         ConvergenceError: the eigensolver failed.
     """
-    config = config or SignatureConfig()
+    config = (config or SignatureConfig()).resolved()
     if config.max_vertices is not None:
         mesh = simplify(mesh, config.max_vertices)
-    if len(mesh.vertices) < config.n_eigenpairs + 2:
+    if len(mesh.vertices) < config.n_kept + 2:
         raise MeshError(
-            f"{mesh.name}: {len(mesh.vertices)} vertices are too few for {config.n_eigenpairs} eigenpairs; at least "
-            f"{config.n_eigenpairs + 2} are needed. Subdivide the mesh or lower n_eigenpairs."
+            f"{mesh.name}: {len(mesh.vertices)} vertices are too few for {config.n_kept} eigenpairs; at least "
+            f"{config.n_kept + 2} are needed. Subdivide the mesh or lower n_eigenpairs."
         )
     points = interior_samples(mesh, config.resolution, config.min_samples)
     spectrum, notes = _spectrum(mesh, config)
@@ -188,7 +274,7 @@ def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str,
     def solve(config: SignatureConfig) -> Spectrum:
         stiffness, mass = laplacian(mesh, config.backend)
         return eigenpairs(
-            stiffness, mass, config.n_eigenpairs, positions=mesh.vertices, tolerance=_RESIDUAL, seed=config.seed
+            stiffness, mass, config.n_kept, positions=mesh.vertices, tolerance=_RESIDUAL, seed=config.seed
         )
 
     try:

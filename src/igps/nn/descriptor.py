@@ -18,6 +18,7 @@ from igps.nn.histogram import PairHistogram
 from igps.nn.needs import Needs
 from igps.nn.view import Views
 from igps.retrieval import chi_square, cosine
+from igps.threads import one_thread
 
 
 class Descriptor(nn.Module, ABC):
@@ -31,13 +32,13 @@ class Descriptor(nn.Module, ABC):
         source: author, year.
         invariant_to: which of "motion" (rotation, translation, reflection), "scale" and "pose" (isometric bending)
             leave its descriptions as they are, but for discretisation.
-        needs: of a body.
+        needs: of a body; all eigenpairs, unless redefined.
     """
 
     name: str = "descriptor"
     source: str = ""
     invariant_to: tuple[str, ...] = ()
-    needs: Needs = Needs()
+    needs: Needs = Needs(whole_spectrum=True)
 
     @abstractmethod
     def describe(self, batch: SignatureBatch) -> Tensor:
@@ -50,7 +51,8 @@ class Descriptor(nn.Module, ABC):
             ValueError: the batch lacks what the descriptor needs.
         """
         self.needs.check(batch)
-        return self.describe(batch)
+        with one_thread():
+            return self.describe(batch)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, ...) and (G, ...) descriptions to (Q, G) distances ≥ 0, smaller is closer; χ² unless redefined."""

@@ -19,6 +19,7 @@ from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.heads import Head
 from igps.nn.metric import CorrectedDistance
 from igps.retrieval.metric import RetrievalScoresMetric
+from igps.threads import one_thread
 
 # Packages whose classes a checkpoint may name without an explicit word.
 _TRUSTED = ("igps", "torch", "pytorch_lightning", "pytorch_metric_learning")
@@ -135,6 +136,7 @@ class RetrievalLearner(LightningModule):
         if not self.trainer.sanity_checking and self.trainer.state.fn == "fit":
             self._fit()
 
+    @one_thread()
     def training_step(self, batch: SignatureBatch, batch_index: int) -> Tensor:
         """Loss of one P×K batch."""
         assert self.distance.head is not None  # setup() has made sure
@@ -144,10 +146,22 @@ class RetrievalLearner(LightningModule):
         self.log("train_loss", loss, batch_size=len(batch), prog_bar=True)
         return loss
 
+    @one_thread()
+    def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
+        """Gradients of the loss, on as few threads as the loss itself."""
+        super().backward(loss, *args, **kwargs)
+
+    @one_thread()
+    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
+        """A whole step: Lightning computes the loss and its gradients from inside of it."""
+        super().optimizer_step(*args, **kwargs)
+
+    @one_thread()
     def validation_step(self, batch: SignatureBatch, batch_index: int) -> None:
         """Collect the descriptions of a batch."""
         self.scores.update(self(batch), batch.labels, batch.ids)
 
+    @one_thread()
     def test_step(self, batch: SignatureBatch, batch_index: int) -> None:
         """Collect the descriptions of a batch."""
         self.scores.update(self(batch), batch.labels, batch.ids)
@@ -170,11 +184,13 @@ class RetrievalLearner(LightningModule):
         epochs = max(self.trainer.max_epochs or 1, 1)
         return {"optimizer": optimizer, "lr_scheduler": torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs)}
 
+    @one_thread()
     def _log_scores(self, part: str) -> None:
         if not self.trainer.sanity_checking:
             self.log_dict({f"{part}_{name}": value for name, value in self.scores.compute().items()})
         self.scores.reset()
 
+    @one_thread()
     def _fit(self, calibrate: bool = True) -> None:
         """Fit the head and the scale to the training shapes as they are described now, in evaluation mode.
 

@@ -21,11 +21,13 @@ class Needs:
         n_eigenpairs: at least so many; with fewer it would be another descriptor.
         attributes: of the samples, see `SignatureConfig`.
         mesh: whether the surface itself.
+        whole_spectrum: whether it takes all eigenpairs that there are: with more it would be another descriptor.
     """
 
     n_eigenpairs: int = 0
     attributes: tuple[AttributeName, ...] = ()
     mesh: bool = False
+    whole_spectrum: bool = False
 
     def __or__(self, other: Needs) -> Needs:
         """What both need."""
@@ -33,20 +35,25 @@ class Needs:
             max(self.n_eigenpairs, other.n_eigenpairs),
             tuple(dict.fromkeys((*self.attributes, *other.attributes))),
             self.mesh or other.mesh,
+            self.whole_spectrum or other.whole_spectrum,
         )
 
     def completed(self, config: SignatureConfig) -> SignatureConfig:
-        """The configuration with the attributes that are needed.
+        """The configuration with the attributes that are needed, and as many eigenpairs if it names no number.
+
+        A descriptor of the whole spectrum gets the usual number, if that is enough.
 
         Raises:
             ValueError: too few eigenpairs.
         """
-        self._check_eigenpairs(config.n_eigenpairs)
+        usual = SignatureConfig.DEFAULT_EIGENPAIRS if self.whole_spectrum else 0
+        config = config.needing(max(usual, self.n_eigenpairs))
+        self._check_eigenpairs(config.n_kept)
         return replace(config, attributes=tuple(dict.fromkeys((*config.attributes, *self.attributes))))
 
     def check_config(self, config: SignatureConfig) -> None:
         """Raise a ValueError that names what Signatures of this configuration lack, if they lack anything."""
-        self._check_eigenpairs(config.n_eigenpairs)
+        self._check_eigenpairs(config.n_kept)
         self._check_attributes(config.attributes)
 
     def check(self, batch: SignatureBatch) -> None:
@@ -76,6 +83,6 @@ class Needs:
 
 
 def needs_of_embedding(embedding: nn.Module) -> Needs:
-    """What an embedding needs: the eigenpairs that it says it uses."""
+    """What an embedding needs: the eigenpairs that it says it uses, or all."""
     n_eigenpairs = getattr(embedding, "n_eigenpairs", None)
-    return Needs(n_eigenpairs=n_eigenpairs if isinstance(n_eigenpairs, int) else 0)
+    return Needs(n_eigenpairs) if isinstance(n_eigenpairs, int) else Needs(whole_spectrum=True)

@@ -14,6 +14,7 @@ from torch.nn.functional import pad
 from igps.nn.hard_pairs import check_points, class_pairs, single_at_least
 from igps.nn.precision import full_precision
 from igps.parallel import on_threads
+from igps.threads import n_threads as available_threads
 
 Result = TypeVar("Result")
 
@@ -248,7 +249,7 @@ class _BlockedPairs:
     def over_rows(self, task: Callable[[slice], Result]) -> list[Result]:
         """Results of a task for blocks of rows, worked on by as many cores as this thread may use."""
         n_points = len(self.memberships)
-        n_threads = torch.get_num_threads() if self.memberships.device.type == "cpu" else 1
+        n_threads = available_threads() if self.memberships.device.type == "cpu" else 1
         most = min(_BLOCK, max(1, _BLOCK_COUNTS // self.n_cells))
         size = -(-n_points // (-(-n_points // (most * n_threads)) * n_threads))
         blocks = [slice(i, min(i + size, n_points)) for i in range(0, n_points, size)]

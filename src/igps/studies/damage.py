@@ -89,7 +89,7 @@ def damage(
     names = list(damages or DAMAGES)
     if unknown := [name for name in names if name not in DAMAGES]:
         raise ValueError(f"damages: expected some of {', '.join(DAMAGES)}, got {unknown[0]!r}.")
-    least = dataset.config.n_eigenpairs + 2
+    least = dataset.config.n_vertices_read
     ways: dict[str, Way | None] = {name: partial(damaged, name, seed, mending, least) for name in names}
     found = describe_altered(dataset, {_CLEAN: None, **ways}, descriptors, n_workers=n_workers)
     clean = [of[_CLEAN] for of in found]

@@ -99,11 +99,11 @@ def _examine(reading: MeshReading, config: SignatureConfig, path: Path) -> Findi
     except MeshError as error:
         fault = str(error)
     try:
-        mesh = load_mesh(path, reading, least_vertices=config.n_eigenpairs + 2)
+        mesh = load_mesh(path, reading, least_vertices=config.n_vertices_read)
     except MeshError as error:
         return Finding(path.name, fault=fault, n_vertices=len(vertices), error=str(error))
     n_after = min(len(mesh.vertices), config.max_vertices or len(mesh.vertices))
-    seconds, memory = expected_cost(n_after, config.n_eigenpairs)
+    seconds, memory = expected_cost(n_after, config.n_kept)
     return Finding(
         id=path.name,
         fault=fault,

@@ -24,6 +24,7 @@ from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histogram import PairHistogram
 from igps.retrieval import chi_square
+from igps.threads import one_thread
 
 # Cells along the longest side of a slice: finer than a picture can show.
 _SLICE_RESOLUTION = 300
@@ -86,6 +87,7 @@ class WeldChange:
     eigenvalues: tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
+@one_thread()
 def weld_change(
     body: Mesh, ends: tuple[int, int] | None = None, n_eigenpairs: int = 250, resolution: int = 32
 ) -> WeldChange:
@@ -133,6 +135,7 @@ class PotentialSlice:
     n_samples: int
 
 
+@one_thread()
 def potential_slice(body: Mesh, n_eigenpairs: int = 250, resolution: int = 32) -> PotentialSlice:
     """The potential on the horizontal plane through the barycentroid of a body.
 

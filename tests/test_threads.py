@@ -1,0 +1,356 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from pytorch_lightning import Trainer
+from threadpoolctl import threadpool_info
+from torch.utils.data import DataLoader
+
+import igps
+import igps.threads as threads_module
+from igps.cli import main
+from igps.data.batch import LabelledSignature
+from igps.geometry.mesh import Mesh
+from igps.geometry.signature import SignatureConfig
+from igps.nn.metric import CorrectedDistance, MetricHead
+from igps.parallel import on_threads
+from igps.threads import cpu_quota, n_cores, n_threads, one_thread
+
+CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
+needs_affinity = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs an affinity to set")
+
+
+def blas() -> list[int]:
+    """Threads of NumPy's and SciPy's products."""
+    return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+
+
+def in_new_thread(function: Callable[[], Any]) -> Any:
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(function).result()
+
+
+def settings() -> tuple[int, int, list[int]]:
+    """Of this thread, of new threads, and of the process."""
+    return torch.get_num_threads(), in_new_thread(torch.get_num_threads), blas()
+
+
+@pytest.fixture(autouse=True)
+def three_threads() -> Iterator[None]:
+    """An unusual number, so that what restores another is seen."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def many_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads_module, "n_cores", lambda: 8)
+
+
+class Container:
+    """The files by which a process learns of its control groups, below a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.proc, self.mounted = folder / "proc", folder / "sys fs"
+        self.proc.mkdir()
+        self.mountinfo = "22 1 8:1 / / rw,relatime shared:1 - ext4 /dev/root rw\nnonsense\n"
+
+    def mount(self, kind: str, name: str, root: str = "/", options: str = "rw") -> Path:
+        folder = self.mounted / name
+        folder.mkdir(parents=True, exist_ok=True)
+        escaped = str(folder).replace(" ", "\\040")
+        self.mountinfo += f"35 23 0:31 {root} {escaped} rw,nosuid shared:9 - {kind} {kind} {options}\n"
+        return folder
+
+    def quota(self, *memberships: str) -> float | None:
+        (self.proc / "cgroup").write_text("".join(f"{line}\n" for line in memberships))
+        (self.proc / "mountinfo").write_text(self.mountinfo)
+        return cpu_quota(self.proc)
+
+
+@pytest.fixture
+def container(tmp_path: Path) -> Container:
+    return Container(tmp_path)
+
+
+def write_unified(folder: Path, text: str) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cpu.max").write_text(text + "\n")
+
+
+def write_legacy(folder: Path, quota: int, period: int = 100_000) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cpu.cfs_quota_us").write_text(f"{quota}\n")
+    (folder / "cpu.cfs_period_us").write_text(f"{period}\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "cores"),
+    [("max 100000", None), ("200000 100000", 2.0), ("50000 100000", 0.5), ("150000 50000", 3.0), ("25000 100000", 0.25),
+     ("0 100000", None), ("100000 0", None), ("100000", None), ("", None), ("a b", None)],
+)  # fmt: skip
+def test_quota_of_version_2(container: Container, text: str, cores: float | None) -> None:
+    write_unified(container.mount("cgroup2", "cgroup"), text)
+    assert container.quota("0::/") == cores
+
+
+@pytest.mark.parametrize(
+    ("quota", "period", "cores"), [(-1, 100_000, None), (200_000, 100_000, 2.0), (25_000, 50_000, 0.5)]
+)
+def test_quota_of_version_1(container: Container, quota: int, period: int, cores: float | None) -> None:
+    write_legacy(container.mount("cgroup", "cpu,cpuacct", options="rw,cpu,cpuacct") / "docker/ab", quota, period)
+    write_legacy(container.mount("cgroup", "cpuset", options="rw,cpuset") / "docker/ab", 10_000)
+    assert container.quota("9:cpuset:/docker/ab", "4:cpu,cpuacct:/docker/ab", "1:name=systemd:/", "0::/") == cores
+
+
+def test_a_group_has_no_more_than_those_around_it(container: Container) -> None:
+    folder = container.mount("cgroup2", "cgroup")
+    write_unified(folder / "a/b/c", "400000 100000")
+    write_unified(folder / "a/b", "max 100000")
+    write_unified(folder / "a", "150000 100000")
+    write_unified(folder / "other", "10000 100000")
+    write_unified(folder.parent, "10000 100000")  # not a group
+    assert container.quota("0::/a/b/c") == 1.5
+    write_unified(folder / "a/b/c", "30000 100000")
+    assert container.quota("0::/a/b/c") == 0.3
+    assert container.quota("0::/") is None
+
+
+def test_both_versions_at_once(container: Container) -> None:
+    write_unified(container.mount("cgroup2", "unified") / "a", "300000 100000")
+    write_legacy(container.mount("cgroup", "cpu", options="rw,cpu") / "a", 200_000)
+    assert container.quota("1:cpu:/a", "0::/a") == 2.0
+    assert container.quota("1:cpu:/b", "0::/a") == 3.0
+
+
+@pytest.mark.parametrize("group", ["/docker/ab", "/", "/../other"])
+def test_a_group_that_is_mounted_as_the_root(container: Container, group: str) -> None:
+    """In a container only its own group is mounted, whatever its name is inside or outside."""
+    write_legacy(container.mount("cgroup", "cpu", root="/docker/ab", options="rw,cpu"), 200_000)
+    assert container.quota(f"1:cpu:{group}") == 2.0
+
+
+def test_what_cannot_be_read_is_no_limit(container: Container, tmp_path: Path) -> None:
+    assert cpu_quota(tmp_path / "no such process") is None
+    folder = container.mount("cgroup2", "cgroup")
+    assert container.quota("0::/", "nonsense", "") is None
+    (folder / "cpu.max").mkdir()
+    assert container.quota("0::/") is None
+    (folder / "cpu.max").rmdir()
+    (folder / "cpu.max").write_bytes(b"\xff\xfe")
+    assert container.quota("0::/") is None
+
+
+@pytest.mark.parametrize(
+    ("quota", "seen", "cores"), [(0.5, 64, 1), (1.5, 64, 2), (2.0, 64, 2), (9.0, 4, 4), (None, 4, 4)]
+)
+def test_cores_are_those_granted_and_seen(
+    monkeypatch: pytest.MonkeyPatch, quota: float | None, seen: int, cores: int
+) -> None:
+    monkeypatch.setattr(threads_module, "cpu_quota", lambda: quota)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(seen)), raising=False)
+    assert n_cores() == cores
+
+
+@needs_affinity
+def test_on_one_core_a_body_is_computed_on_one_thread() -> None:
+    """A process of its own, as the affinity is that of all threads."""
+    program = (
+        "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "import igps, torch, trimesh; from igps.threads import n_cores, n_threads\n"
+        "ball = trimesh.creation.icosphere(subdivisions=3)\n"
+        "config = igps.SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)\n"
+        "signature = igps.compute_signature(igps.Mesh(ball.vertices, ball.faces), config)\n"
+        "print(n_cores(), n_threads(), round(float(signature.eigenvalues[0]), 1))"
+    )
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    output = subprocess.run(
+        [sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environment
+    ).stdout
+    assert output.split() == ["1", "1", "2.0"]
+
+
+def test_settings_are_one_inside_and_as_before_outside(many_cores: None) -> None:
+    before = settings()
+    assert before[:2] == (3, 3)
+    environment = dict(os.environ)
+    with one_thread():
+        assert settings() == (1, 3, [1] * len(before[2]))
+        with one_thread():
+            assert (torch.get_num_threads(), n_threads()) == (1, 3)
+        assert settings() == (1, 3, [1] * len(before[2]))
+    assert settings() == before
+    assert os.environ == environment
+
+
+def test_settings_are_restored_after_an_exception() -> None:
+    before = settings()
+    with pytest.raises(KeyError), one_thread():
+        raise KeyError
+    assert settings() == before
+
+
+def test_threads_that_overlap_leave_each_other_as_they_were() -> None:
+    """Each begins within the one before and ends after it, which is where settings of the process get lost."""
+    before = settings()
+    entered = [threading.Event() for _ in range(4)]
+    found: list[tuple[int, int, int]] = []
+
+    def one(i: int) -> None:
+        torch.set_num_threads(4 + i)
+        outside = torch.get_num_threads()
+        with one_thread():
+            inside = torch.get_num_threads()
+            entered[i].set()
+            if i + 1 < len(entered):
+                assert entered[i + 1].wait(60)
+            assert set(blas()) == {1}
+        found.append((outside, inside, torch.get_num_threads()))
+
+    def run(i: int) -> None:
+        if i:
+            assert entered[i - 1].wait(60)
+        one(i)
+
+    workers = [threading.Thread(target=run, args=(i,)) for i in range(4)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert sorted(found) == [(4, 1, 4), (5, 1, 5), (6, 1, 6), (7, 1, 7)]
+    assert (torch.get_num_threads(), blas()) == (before[0], before[2])
+
+
+def test_a_thread_that_starts_inside_gets_what_it_would_have_got() -> None:
+    with one_thread():
+        assert in_new_thread(torch.get_num_threads) == 3
+
+
+def test_no_more_threads_than_torch_had_or_there_are_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    for cores, expected in ((8, 3), (2, 2), (1, 1)):
+        monkeypatch.setattr(threads_module, "n_cores", lambda cores=cores: cores)
+        assert n_threads() == expected
+        with one_thread():
+            assert n_threads() == expected
+    torch.set_num_threads(1)
+    monkeypatch.setattr(threads_module, "n_cores", lambda: 8)
+    assert n_threads() == 1
+
+
+def test_jobs_on_threads_have_one_thread_each_and_start_no_more(many_cores: None) -> None:
+    before = settings()
+
+    def job(i: int) -> tuple[int, int, int, int]:
+        return i, torch.get_num_threads(), n_threads(), sum(on_threads(lambda x: x, [i, i]))
+
+    assert list(on_threads(job, range(7))) == [(i, 1, 1, 2 * i) for i in range(7)]
+    assert list(on_threads(job, range(2), 1)) == [(i, 1, 3, 2 * i) for i in range(2)]
+    assert list(on_threads(job, [])) == []
+    assert settings() == before
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_jobs_that_fail_or_are_left_undone_leave_no_setting(many_cores: None, n: int) -> None:
+    before = settings()
+    with pytest.raises(ZeroDivisionError):
+        list(on_threads(lambda i: 1 / i, [1, 0, 2], n))
+    assert settings() == before
+    results = on_threads(lambda i: i, [1, 2, 3], n)
+    assert next(results) == 1
+    assert torch.get_num_threads() == 3  # the caller's own work in between is its own
+    del results
+    assert settings() == before
+
+
+def test_calls_on_a_body_leave_the_settings(blob: Mesh) -> None:
+    before = settings()
+    signature = igps.compute_signature(blob, CONFIG)
+    igps.descriptor("d2")(igps.collate([signature]))
+    with pytest.raises(ValueError, match="too few"):
+        igps.compute_signature(blob, SignatureConfig(n_eigenpairs=10_000))
+    with ThreadPoolExecutor(3) as pool:
+        others = list(pool.map(lambda _: igps.compute_signature(blob, CONFIG), range(3)))
+        assert set(pool.map(lambda _: torch.get_num_threads(), range(9))) == {3}
+    for other in others:
+        np.testing.assert_array_equal(other.interior.eigenfunctions, signature.interior.eigenfunctions)
+    assert settings() == before
+
+
+def test_a_body_is_computed_on_one_thread(blob: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[int, set[int]]] = []
+    original = igps.geometry.signature.eigenpairs
+
+    def watched(*arguments: Any, **options: Any) -> Any:
+        seen.append((torch.get_num_threads(), set(blas())))
+        return original(*arguments, **options)
+
+    monkeypatch.setattr("igps.geometry.signature.eigenpairs", watched)
+    igps.compute_signature(blob, CONFIG)
+    assert seen == [(1, {1})]
+
+
+def test_one_thread_gives_the_numbers_of_many(blob: Mesh) -> None:
+    many = igps.compute_signature(blob, CONFIG)
+    torch.set_num_threads(1)
+    one = igps.compute_signature(blob, CONFIG)
+    for first, second in ((many.interior, one.interior), (many.surface, one.surface)):
+        np.testing.assert_array_equal(first.eigenfunctions, second.eigenfunctions)
+        np.testing.assert_array_equal(first.points, second.points)
+
+
+class Watched(torch.nn.Module):
+    """A description with a parameter, which notes on how many threads its value and its gradient are computed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = torch.nn.Parameter(torch.ones(()))
+        self.seen: list[tuple[str, int]] = []
+        self.scale.register_hook(lambda _: self.seen.append(("gradient", torch.get_num_threads())))
+
+    def forward(self, batch: igps.SignatureBatch) -> torch.Tensor:
+        self.seen.append(("value", torch.get_num_threads()))
+        return self.scale * batch.interior.eigenfunctions.abs().mean(dim=1).softmax(dim=1)
+
+
+def test_a_training_step_is_computed_on_one_thread(blob: Mesh) -> None:
+    before = settings()
+    signature = igps.compute_signature(blob, CONFIG)
+    items = [LabelledSignature(signature, i // 2, str(i)) for i in range(4)]
+    described = Watched()
+    learner = igps.RetrievalLearner(described, CorrectedDistance(MetricHead(width=4, n_hidden=8)))
+    options = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    trainer = Trainer(max_epochs=1, accumulate_grad_batches=2, enable_model_summary=False, **options)  # type: ignore[arg-type]
+    with pytest.warns(UserWarning, match="val_dataloader"):
+        trainer.fit(learner, DataLoader(items, batch_size=2, collate_fn=igps.collate))  # type: ignore[arg-type]
+    assert described.seen.count(("gradient", 1)) == 2
+    assert set(described.seen) == {("value", 1), ("gradient", 1)}
+    assert settings() == before
+
+
+def test_a_command_leaves_the_settings(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    before = settings()
+    seen: list[int] = []
+
+    def watched(_: Path) -> Any:
+        seen.append(torch.get_num_threads())
+        raise ValueError("no meshes")
+
+    monkeypatch.setattr("igps.cli.retrieval.labelled_meshes", watched)
+    monkeypatch.setattr(sys, "argv", ["igps", "retrieve", "nowhere"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "no meshes" in capsys.readouterr().err
+    assert seen == [1]
+    assert settings() == before
