@@ -10,6 +10,7 @@ import pytest
 import torch
 import trimesh
 
+from igps.compiled import is_available
 from igps.geometry import coordinates
 from igps.geometry.mesh import Mesh
 from igps.geometry.reading import load_mesh
@@ -22,6 +23,14 @@ SHARED = Path(__file__).parents[2] / "shared"
 
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+
+
+@pytest.fixture(params=[True, False], ids=["compiled", "by torch"])
+def with_or_without_compiler(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loops are compiled, and then as if Numba were not there."""
+    if request.param and not is_available():
+        pytest.skip("needs numba, the extra [fast]")
+    monkeypatch.setattr("igps.nn.counted_pairs.is_available", lambda: request.param)
 
 
 def as_mesh(surface: trimesh.Trimesh, name: str = "mesh") -> Mesh:

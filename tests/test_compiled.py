@@ -17,6 +17,20 @@ def cumulative(values: np.ndarray) -> np.ndarray:
     return sums
 
 
+@compiled()
+def largest_sum(rows: np.ndarray) -> float:
+    largest = -np.inf
+    for row in rows:
+        largest = max(largest, cumulative(row)[-1])
+    return largest
+
+
+@pytest.mark.skipif(not is_available(), reason="needs numba, the extra [fast]")
+def test_a_compiled_loop_may_call_another():
+    rows = np.random.default_rng(1).random((7, 40))
+    assert largest_sum(rows) == pytest.approx(rows.sum(axis=1).max())
+
+
 @pytest.mark.skipif(not is_available(), reason="needs numba, the extra [fast]")
 def test_a_compiled_loop_is_the_function_that_it_was_made_of():
     values = np.random.default_rng(0).random(1000)

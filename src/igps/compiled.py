@@ -11,12 +11,13 @@ import os
 import threading
 from collections.abc import Callable
 from functools import cache, update_wrapper
+from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-_compiling = threading.Lock()
+_compiling = threading.RLock()  # one that compiles what it calls
 
 
 @cache
@@ -30,7 +31,7 @@ class Compiled(Generic[Arguments, Result]):
     """A function of arrays and numbers that is compiled when it is first called; importing it costs nothing.
 
     Args:
-        function: what `numba.njit` can compile.
+        function: what `numba.njit` can compile; it may call other such functions of its module by their names.
         **options: of `numba.njit`.
     """
 
@@ -45,7 +46,7 @@ class Compiled(Generic[Arguments, Result]):
 
     @property
     def dispatcher(self) -> Callable[..., Any]:
-        """What Numba makes of the function; other compiled functions may call this one.
+        """What Numba makes of the function, and of those that it calls.
 
         Raises:
             ImportError: Numba is not installed.
@@ -55,8 +56,21 @@ class Compiled(Generic[Arguments, Result]):
                 if self._compiled is None:
                     import numba
 
-                    self._compiled = numba.njit(cache=True, nogil=True, **self._options)(self._function)
+                    self._compiled = numba.njit(cache=True, nogil=True, **self._options)(self._linked())
         return self._compiled
+
+    def _linked(self) -> Callable[..., Any]:
+        """The function, in whose globals the compiled functions that it calls are what Numba makes of them."""
+        function = self._function
+        if not isinstance(function, FunctionType):
+            return function
+        known = {name: function.__globals__.get(name) for name in function.__code__.co_names}
+        called = {name: value.dispatcher for name, value in known.items() if isinstance(value, Compiled)}
+        if not called:
+            return function
+        return FunctionType(
+            function.__code__, {**function.__globals__, **called}, function.__name__, function.__defaults__
+        )
 
 
 def compiled(**options: Any) -> Callable[[Callable[Arguments, Result]], Compiled[Arguments, Result]]:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-__all__ = ["FaceBlock", "ListedRule", "Surface", "Tile", "spatial_order", "squared_distances"]
+__all__ = ["FaceBlock", "ListedRule", "Surface", "Tile", "has_area", "spatial_order", "squared_distances"]
 
 _ROOT_EPS = 2.0**-26  # flatter faces (height / length) are left out
 _ON_SURFACE = 2e-9  # half-diagonals: closer points take the surface value, and coplanar faces count as exactly so
@@ -51,14 +51,21 @@ class Surface:
     @staticmethod
     def of(vertices: torch.Tensor, faces: torch.Tensor) -> Surface:
         corners = vertices[faces]
+        keep = has_area(corners)
         sides = corners.roll(-2, dims=1) - corners.roll(-1, dims=1)
         area_vectors = torch.linalg.cross(sides[:, 0], sides[:, 1])
         double_areas = area_vectors.norm(dim=1)
         squared_sides = sides.square().sum(-1)
-        keep = double_areas > _ROOT_EPS * squared_sides.amax(1)
         normals = area_vectors[keep] / double_areas[keep, None]
         inward = torch.linalg.cross(normals[:, None].expand(-1, 3, -1), sides[keep])
         return Surface(vertices, faces[keep], normals, double_areas[keep], inward, squared_sides[keep])
+
+
+def has_area(corners: torch.Tensor) -> torch.Tensor:
+    """(F,) whether a triangle (F, 3, 3) is one to rounding; coordinates of the order of 1."""
+    a, b, c = corners.unbind(1)
+    longest = torch.stack([(one - two).square().sum(1) for one, two in ((b, c), (c, a), (a, b))]).amax(0)
+    return torch.linalg.cross(c - b, a - c).norm(dim=1) > _ROOT_EPS * longest
 
 
 def squared_distances(one: torch.Tensor, two: torch.Tensor) -> torch.Tensor:

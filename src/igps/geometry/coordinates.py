@@ -19,12 +19,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from igps.geometry.closed_forms import ListedRule, Surface, Tile, face_blocks
+from igps.geometry.closed_forms import ListedRule, Surface, Tile, face_blocks, has_area
 from igps.geometry.far_field import ClusterMoments, HatMoments, HatTree, in_leaves, principal_axes
 
 logger = logging.getLogger(__name__)
@@ -45,6 +46,7 @@ _AXES_STEP = 32  # of the hats, by which the body's axes are told
 _SAMPLE_LINE = (0.11, 0.37, 1.0)  # in principal axes, the longest last; oblique, so that places differ
 _ATTEMPTS = 2  # approximations tried before the closed form
 _GROUP = 128  # points that see the same clusters
+_TREE_ERROR = 0.01  # of libigl's fast winding numbers; twice the largest found
 
 
 def mean_value_coordinates(
@@ -138,6 +140,7 @@ def winding_number(
     faces: NDArray[np.integer],
     points: NDArray[np.floating],
     *,
+    accuracy: float | None = None,
     device: torch.device | str = "cpu",
 ) -> NDArray[np.float64]:
     """Winding number (P,) of a mesh about points (P, 3): the solid angles of its faces over 4π.
@@ -145,22 +148,52 @@ def winding_number(
     1 inside and 0 outside a closed, outward oriented surface; fractions for an open one. Solid angles by
     Van Oosterom and Strackee 1983, equation 8. On the surface itself the value is one of those beside it, or between.
 
+    On the CPU libigl's trees take over where it is installed: that of Jacobson, Kavan and Sorkine-Hornung 2013, exact
+    to rounding; and where ``accuracy``, the error allowed, is at least 0.01, that of Barill, Dickson, Schmidt, Levin
+    and Jacobson 2018, which is several times faster again. Its error is not proved: the largest found was 0.0044, at
+    12,000 points in and around soups, open and closed surfaces.
+
     Raises:
         ValueError: a shape, an index or a value of an argument is invalid.
     """
-    surface, x = _prepare(vertices, faces, points, device)
-    tile = Tile.of(x.device)
+    if accuracy is not None and not accuracy > 0:
+        raise ValueError(f"accuracy: expected None (exact) or a positive error, got {accuracy}")
+    scaled, indices, x = _scaled(vertices, faces, points)
+    if torch.device(device).type == "cpu" and len(x) and (igl := _igl()) is not None:
+        tree = igl.winding_number if accuracy is None or accuracy < _TREE_ERROR else igl.fast_winding_number
+        # Flat faces add nothing there. That not all are flat, the first tell as a rule.
+        if not has_area(torch.from_numpy(scaled[indices[:_SAMPLE]])).any():
+            _with_area(torch.from_numpy(scaled), torch.from_numpy(indices))
+        return np.asarray(tree(scaled, indices, x))
+    surface, points_there = _on_device(scaled, indices, x, device)
+    tile = Tile.of(points_there.device)
     blocks = face_blocks(surface, tile.faces)
-    out = [x.new_zeros(0)]
-    for part in x.split(tile.points):
+    out = [points_there.new_zeros(0)]
+    for part in points_there.split(tile.points):
         out.append(sum((block.solid_angles(part) for block in blocks), start=part.new_zeros(len(part))))
     return torch.cat(out).cpu().numpy() / (4 * np.pi)
+
+
+def _igl() -> Any:
+    """libigl; None where it is not installed."""
+    try:
+        import igl
+    except ImportError:
+        return None
+    return igl
 
 
 def _prepare(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating], device: torch.device | str
 ) -> tuple[Surface, torch.Tensor]:
     """Check the arguments; the scaled surface and the points on its scale."""
+    return _on_device(*_scaled(vertices, faces, points), device)
+
+
+def _scaled(
+    vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """Check the arguments; vertices and points on the mesh's scale, and the faces."""
     vertices, faces, points = np.asarray(vertices, np.float64), np.asarray(faces), np.asarray(points, np.float64)
     for name, array in (("vertices", vertices), ("faces", faces), ("points", points)):
         if array.ndim != 2 or array.shape[1] != 3:
@@ -176,11 +209,30 @@ def _prepare(
     centre, scale = (low + high) / 2, np.linalg.norm(high - low) / 2
     if not scale > 0:
         raise ValueError("vertices: expected distinct vertices, got one place for all; check the mesh")
-    scaled = torch.as_tensor((vertices - centre) / scale, device=device)
-    surface = Surface.of(scaled, torch.as_tensor(faces.astype(np.int64), device=device))
-    if len(surface.faces) == 0:
+    return (vertices - centre) / scale, np.array(faces, np.int64, order="C"), (points - centre) / scale
+
+
+def _with_area(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
+    """The faces (F', 3) that have an area.
+
+    Raises:
+        ValueError: there are none.
+    """
+    kept = faces[has_area(vertices[faces])]
+    if len(kept) == 0:
         raise ValueError("faces: expected at least one face with an area, got flat ones only; check the mesh")
-    return surface, torch.as_tensor((points - centre) / scale, device=device)
+    return kept
+
+
+def _on_device(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    points: NDArray[np.float64],
+    device: torch.device | str,
+) -> tuple[Surface, torch.Tensor]:
+    scaled = torch.as_tensor(vertices, device=device)
+    kept = _with_area(scaled, torch.as_tensor(faces, device=device))
+    return Surface.of(scaled, kept), torch.as_tensor(points, device=device)
 
 
 def _renumbered(surface: Surface) -> tuple[Surface, torch.Tensor]:

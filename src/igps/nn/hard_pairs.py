@@ -6,7 +6,9 @@ from itertools import combinations_with_replacement
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
+from igps.nn.counted_pairs import can_count, count_pairs
 from igps.nn.precision import full_precision
 
 # Rows and columns of a block of pairs: its float32 distances fill half of a core's second-level cache.
@@ -76,6 +78,10 @@ def hard_pair_histogram(points: Tensor, level: Tensor, n_classes: int, n_bins: i
     """
     check_points(points)
     points = single_at_least(points.detach())
+    if can_count(points):
+        centres = (torch.arange(n_bins, dtype=points.dtype) + 0.5) * width
+        memberships = one_hot(level, n_classes)
+        return count_pairs(memberships, [(points, centres)]).to(points.dtype)
     # Sorted by class, a block of pairs has one class at either end, and needs no class index of its own.
     order = torch.argsort(level, stable=True)
     groups = (points[order] / width).split(torch.bincount(level, minlength=n_classes).tolist())

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from igps.nn.centres import position
+from igps.nn.counted_pairs import can_count, count_pairs
 from igps.nn.hard_pairs import check_points, class_pairs
 from igps.nn.precision import full_precision
 
@@ -74,6 +75,8 @@ def oriented_pair_histogram(
     """
     _check(memberships, distances, oriented)
     dtype = torch.promote_types(oriented[0][0].dtype, torch.float32)
+    if can_count(memberships, *(tensor for axis in (*distances, *oriented) for tensor in axis)):
+        return count_pairs(memberships, distances, oriented).to(dtype)
     memberships = memberships.to(dtype)
     distances = [(points.to(dtype), centres) for points, centres in distances]
     oriented = [(p.to(dtype), n.to(dtype), towards, between) for p, n, towards, between in oriented]

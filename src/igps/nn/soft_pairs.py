@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
+from igps.nn.counted_pairs import can_count, count_pairs
 from igps.nn.hard_pairs import check_points, class_pairs, single_at_least
 from igps.nn.precision import full_precision
 from igps.parallel import on_threads
@@ -54,6 +55,8 @@ def soft_pair_histogram(memberships: Tensor, axes: Sequence[tuple[Tensor, Tensor
     """
     _check(memberships, axes)
     dtype = single_at_least(axes[0][0]).dtype
+    if can_count(memberships, *(tensor for axis in axes for tensor in axis)):
+        return count_pairs(memberships, axes).to(dtype)
     order = _by_class(memberships.detach())
     ordered = [(points[order].to(dtype), centres.to(dtype)) for points, centres in axes]
     with torch.autocast(memberships.device.type, enabled=False), full_precision():

@@ -1,0 +1,110 @@
+"""Histograms of pairs by compiled loops: in one pass for all axes, on one thread, without gradient."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from igps.compiled import is_available
+from igps.nn.pair_loops import add_features, add_pairs
+from igps.nn.precision import full_precision
+
+# Values of all axes that are held at once: they stay in a core's second-level cache.
+_BLOCK = 2**18
+_MOST_COLUMNS = 2048
+_TYPES = (torch.float32, torch.float64)
+
+
+def can_count(*tensors: Tensor) -> bool:
+    """Whether `count_pairs` serves these: loops can be compiled, all is on the CPU, and no gradient is asked for."""
+    return (
+        is_available()
+        and all(tensor.device.type == "cpu" and tensor.dtype in _TYPES for tensor in tensors)
+        and not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors))
+    )
+
+
+def count_pairs(
+    memberships: Tensor,
+    distances: Sequence[tuple[Tensor, Tensor]],
+    oriented: Sequence[tuple[Tensor, Tensor, Tensor, Tensor]] = (),
+) -> Tensor:
+    """`oriented_pair_histogram`, or `soft_pair_histogram` where nothing is oriented, of arguments that were checked.
+
+    Args:
+        memberships: (P, C).
+        distances: of each dimension the points (P, D) and the centres (B,), two at least.
+        oriented: of each three dimensions the points (P, D), their directions, and the centres of the features.
+
+    Returns:
+        (C(C+1)/2, B, ..., A, A, A, ...) float64 of sum 1.
+
+    Raises:
+        ValueError: a single centre, or points so far out that their distances cannot be told.
+    """
+    dtype = torch.promote_types((distances[0] if distances else oriented[0])[0].dtype, torch.float32)
+    layout = [centres for _, centres in distances]
+    for *_, towards, between in oriented:
+        layout += [towards, towards, between]
+    shape = [len(centres) for centres in layout]
+    if min(shape) < 2:
+        raise ValueError(f"centres: expected at least two along each dimension, got {shape}.")
+    centres = torch.zeros(len(layout), max(shape), dtype=dtype)
+    for k, along in enumerate(layout):
+        centres[k, : len(along)] = along.detach()
+    order, classes, weights = _members(memberships.detach())
+    located = [_centred(points[order].to(dtype)) for points, _ in distances]
+    norms = torch.stack([points.square().sum(dim=1) for points in located]) if located else torch.zeros(0, 0).to(dtype)
+    if not bool((norms < torch.finfo(dtype).max / 8).all()):
+        raise ValueError("points: expected distances that can be squared, got larger ones; choose a larger unit.")
+    turned = [[each[order].to(dtype).T.contiguous().numpy() for each in (p, n)] for p, n, *_ in oriented]
+    n_points, n_classes = memberships.shape
+    total = torch.zeros(n_classes * (n_classes + 1) // 2, math.prod(shape), 2 ** len(shape), dtype=torch.float64)
+    of_axes = norms.numpy(), centres.numpy(), np.array(shape)
+    of_points = classes.numpy(), weights.numpy(), total.numpy()
+    n_columns = min(n_points, _MOST_COLUMNS)
+    n_rows = min(max(1, _BLOCK // (n_columns * len(shape))), n_columns)
+    with torch.autocast("cpu", enabled=False), full_precision():
+        for row in range(0, n_points, n_rows):
+            for column in range(row, n_points, n_columns):
+                rows, columns = slice(row, row + n_rows), slice(column, column + n_columns)
+                n_kept = (min(n_rows, n_points - row), min(n_columns, n_points - column))
+                block = torch.empty(len(shape), *n_kept, dtype=dtype)
+                for k, points in enumerate(located):
+                    torch.mm(points[rows], points[columns].T, out=block[k])
+                values = block.numpy()
+                for k, (places, directions) in enumerate(turned):
+                    first = len(located) + 3 * k
+                    add_features(places, directions, row, column, values[first : first + 3])
+                add_pairs(values, *of_axes, row, column, *of_points)
+    return _folded(total, shape) / (n_points * (n_points - 1) / 2)
+
+
+def _members(memberships: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(P,) an order that has points of the same classes side by side; these classes (M, P), and the weights."""
+    n_members = max(1, int((memberships > 0).sum(dim=1).max()))
+    weights, classes = memberships.double().topk(n_members, dim=1)
+    leading = torch.where(weights > 0, classes, 0)
+    key = torch.zeros(len(leading), dtype=torch.int64)
+    for column in leading.T:
+        key = key * memberships.shape[1] + column
+    order = torch.argsort(key, stable=True)
+    return order, classes[order].int().T.contiguous(), weights[order].T.contiguous()
+
+
+def _centred(points: Tensor) -> Tensor:
+    return points - points.mean(dim=0)  # keeps digits in the squared distances
+
+
+def _folded(total: Tensor, shape: Sequence[int]) -> Tensor:
+    """(rows, B, ...) counts from (rows, cells, 2^K), by the cell below and the corner of it."""
+    counts = total.view(-1, *shape, *(2,) * len(shape))
+    for axis in range(len(shape)):
+        own, beyond = counts.unbind(1 + len(shape))
+        # Beyond the last cell there is nothing to give, so that nothing is rolled over the end.
+        counts = own + beyond.roll(1, dims=1 + axis)
+    return counts
