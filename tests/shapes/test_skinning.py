@@ -8,10 +8,12 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from igps.shapes.grammar import FAMILIES
 from igps.shapes.rods import Binding, Rig, Rod, at_rest, bend, bind, carry, limbs
 from igps.shapes.skeleton import Part, Skeleton, limb
 from igps.shapes.skinning import Motions, after, motion, moved, normalized, product, same_side, turn_about
 from igps.shapes.solids import Blob, Solid
+from igps.shapes.templates import TEMPLATES
 
 Array = NDArray[np.float64]
 g = np.random.default_rng(0)
@@ -160,3 +162,15 @@ def test_weights_are_shares_and_follow_the_nearest_rod() -> None:
     levels = np.unique(z)
     mean = np.array([weights[z == level, 2].mean() for level in levels])
     assert np.abs(np.diff(mean)).max() < 0.15
+
+
+def test_trunks_bend_and_frames_do_not() -> None:
+    """A wheel without limbs has no joint at all; the trunk of a four-legged animal is a rod, its legs too."""
+    wheel = FAMILIES["wheel"].build(np.random.default_rng(0), 4, 3, "none", "plain")
+    assert all(len(rod.along) == 1 for rod in limbs(at_rest(wheel, {})).rods)
+    rods = limbs(at_rest(TEMPLATES["quadruped"](), {})).rods
+    assert len(rods[0].joints) == 1  # the spine
+    knees = [rod for rod in rods if len(rod.joints) == 2 and not rod.joints[1].is_root]
+    assert len(knees) >= 4
+    for rod in knees:
+        assert np.degrees(rod.joints[1].high - rod.joints[1].low).max() > 90.0

@@ -25,7 +25,7 @@ LOOK_ALIKE_TEMPLATES = {
     "octopus": "octopus",
     "spider": "ant",
     "hand": "hand",
-    "snake": "fish",
+    "snake": "none closely",
     "plier": "plier",
     "mug": "cup",
     "glasses": "glasses",
@@ -33,7 +33,7 @@ LOOK_ALIKE_TEMPLATES = {
     "fish": "fish",
     "bird": "bird, airplane",
 }
-"""The named templates, and the classes of SHREC'07 that each resembles (the snake none closely)."""
+"""The named templates, and the classes of SHREC'07 that each resembles."""
 
 LOOK_ALIKE_FAMILIES = {
     "star": "octopus",

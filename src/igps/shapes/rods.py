@@ -414,7 +414,7 @@ def _centre_line(chain: Sequence[Bone], is_root: bool) -> tuple[Array, Array, Ar
         side = high - low
         longest = int(np.argmax(side))
         across = np.delete(np.arange(3), longest)
-        if side[longest] < 1.7 * side[across].mean():
+        if side[longest] < 1.6 * side[across].max():
             return root.placed.offset[None], np.array([0.5 * side.mean()]), root.frame[None], [0]
         reach = 0.42 * side[longest] * root.frame[:, longest]
         line = np.stack([root.placed.offset - reach, root.placed.offset + reach])
