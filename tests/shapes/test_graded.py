@@ -167,6 +167,9 @@ def test_write_makes_folders_of_classes_and_bodies(tmp_path: Path) -> None:
     read = trimesh.load(files.paths[3], process=False)
     np.testing.assert_array_equal(read.vertices, shapes[3].vertices)
 
+    GradedShapes(1, 1, 1, seed=4, n_vertices=(1600, 2000)).write(tmp_path)  # fewer of the same forget nothing
+    assert len((tmp_path / "bodies.csv").read_text().splitlines()) == 5
+
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files.paths}
     files.paths[1].write_bytes(before[files.paths[1]][0][:4000])  # as a full disk would leave it
     shapes.write(tmp_path)

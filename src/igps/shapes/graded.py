@@ -216,7 +216,7 @@ class GradedShapes:
             folder.mkdir(parents=True, exist_ok=True)
             write_whole(manifest, settings)
         names = self.names
-        write_whole(folder / BODIES_FILE, "file,label\n" + "".join(f"{n}.off,{body_of(n)}\n" for n in names))
+        _record_bodies(folder / BODIES_FILE, names)
         missing = [i for i, name in enumerate(names) if not is_whole_off(folder / f"{name}.off")]
         # A body at a time, so that it is drawn once for all its poses.
         jobs: dict[int, list[int]] = {}
@@ -262,6 +262,13 @@ _ARGUMENTS = ("n_classes", "n_bodies", "n_poses", "seed", "n_vertices", "look_al
 def body_of(name: str) -> str:
     """The body of a shape by its name or its file's, ``class/body/pose``."""
     return name.rsplit("/", 1)[0]
+
+
+def _record_bodies(path: Path, names: list[str]) -> None:
+    """Name the body of each file, beside those that are named there already."""
+    before = path.read_text(encoding="utf-8").splitlines()[1:] if path.exists() else []
+    rows = dict.fromkeys([*before, *(f"{name}.off,{body_of(name)}" for name in names)])
+    write_whole(path, "\n".join(["file,label", *rows]) + "\n")
 
 
 def _write(shapes: GradedShapes, folder: Path, indices: list[int]) -> None:

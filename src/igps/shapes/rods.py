@@ -38,6 +38,8 @@ _INNER_FACTOR, _INNER_LIMIT = 4.5, 135.0
 _SPINE_LIMIT = 30.0
 _TWIST_LIMIT = 55.0
 _CURL_LIMIT = 320.0
+# A spring's wire is bent by so much a turn, radians, as it opens.
+_OPENING = 0.7
 # From so many radii on, a limb of three parts or more curls.
 _SLENDER = 6.0
 _MOST_ELEMENTS = 48
@@ -359,11 +361,9 @@ def _successors(bones: Sequence[Bone]) -> list[int | None]:
 
 
 def _rod(chain: Sequence[Bone], bones: Sequence[Bone], parent: int, held: float, hinged: bool) -> Rod:
-    first = chain[0]
-    is_root = parent < 0
-    line, radii, frames, starts = _centre_line(chain, is_root)
-    stiff = len(line) == 1 or (not is_root and not any(any(bone.part.bend) for bone in chain))
-    if stiff:
+    """The rod of a chain of bones, which has one element where nothing in it can bend."""
+    line, radii, frames, starts = _centre_line(chain, parent < 0)
+    if len(line) == 1 or (parent >= 0 and not any(any(bone.part.bend) for bone in chain)):
         return Rod(parent, held, line[:1], np.zeros(1), radii[:1], radii[:1], frames[:1, :, :2])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     length, radius = float(along[-1]), float(radii.mean())
@@ -371,31 +371,39 @@ def _rod(chain: Sequence[Bone], bones: Sequence[Bone], parent: int, held: float,
     even = np.linspace(0.0, length, n)
     points = np.stack([np.interp(even, along, line[:, i]) for i in range(3)], axis=1)
     which = np.clip(np.searchsorted(along, even, side="right") - 1, 0, len(frames) - 1)
-    joints = []
-    for bone, before, start in zip(chain, (None, *chain), starts, strict=False):
-        at = along[start]
-        if bone is first and is_root:
-            if length > 2.0 * radius and not hinged and not isinstance(bone.solid, Helix):
-                spine = np.radians([_SPINE_LIMIT, _SPINE_LIMIT])
-                joints.append(Joint(0.5 * min(length, float(np.linalg.norm(bone.tip - bone.origin))),
-                                    bone.frame[:, :2], -spine, spine, False))  # fmt: skip
-            continue
-        if not any(bone.part.bend):
-            continue
-        low, high = _limits(bone, before, hinged)
-        if bone is first and not hinged:
-            holder = bones[bone.parent].placed
-            outside = holder.distance(*points.T) > -0.2 * radius
-            at = even[int(np.argmax(outside))] if outside.any() else 0.0
-        joints.append(Joint(float(at), bone.frame[:, :2], low, high, bone is first))
-    slender = length / radius
-    if isinstance(first.solid, Helix):
-        return Rod(parent, held, points, even, radii, radii, frames[:, :, :2], (), 0.7 * first.solid.turns)
-    curl = min(np.radians(_CURL_LIMIT), 0.5 * slender) if len(chain) >= 3 and slender > _SLENDER else 0.06 * slender
-    twist = min(np.radians(_TWIST_LIMIT), _SHEAR * slender)
     even_radii = np.interp(even, along, radii)
-    return Rod(parent, held, points, even, even_radii, even_radii, frames[which][:, :, :2], tuple(joints),
-               0.0 if hinged else float(curl), 0.0 if hinged else float(twist), hinged)  # fmt: skip
+    rod = Rod(parent, held, points, even, even_radii, even_radii, frames[which][:, :, :2], is_hinge=hinged)
+    spring = chain[0].solid
+    if isinstance(spring, Helix):
+        return replace(rod, curl=_OPENING * spring.turns)
+    rod = replace(rod, joints=_joints(chain, [float(along[start]) for start in starts], rod, bones))
+    if hinged:
+        return rod
+    slender = length / radius
+    curl = min(np.radians(_CURL_LIMIT), 0.5 * slender) if len(chain) >= 3 and slender > _SLENDER else 0.06 * slender
+    return replace(rod, curl=float(curl), twist=float(min(np.radians(_TWIST_LIMIT), _SHEAR * slender)))
+
+
+def _joints(chain: Sequence[Bone], starts: Sequence[float], rod: Rod, bones: Sequence[Bone]) -> tuple[Joint, ...]:
+    """The joints of a rod, of which ``starts`` are the arc lengths where its bones begin."""
+    joints = []
+    radius = float(rod.radii.mean())
+    for bone, before, at in zip(chain, (None, *chain), starts, strict=False):
+        axes = bone.frame[:, :2]
+        if before is None and rod.parent < 0:
+            # The first bone of all: its joint is the spine's, in its middle.
+            if rod.length > 2.0 * radius and not rod.is_hinge:
+                spine = np.radians([_SPINE_LIMIT, _SPINE_LIMIT])
+                middle = 0.5 * min(rod.length, float(np.linalg.norm(bone.tip - bone.origin)))
+                joints.append(Joint(middle, axes, -spine, spine, False))
+        elif any(bone.part.bend):
+            low, high = _limits(bone, before, rod.is_hinge)
+            if before is None and not rod.is_hinge:
+                # A limb bends from where it comes out of the body that holds it.
+                outside = bones[bone.parent].placed.distance(*rod.points.T) > -0.2 * radius
+                at = float(rod.along[int(np.argmax(outside))]) if outside.any() else 0.0
+            joints.append(Joint(at, axes, low, high, before is None))
+    return tuple(joints)
 
 
 def _centre_line(chain: Sequence[Bone], is_root: bool) -> tuple[Array, Array, Array, list[int]]:
