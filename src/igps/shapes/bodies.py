@@ -21,6 +21,8 @@ _MAX_POSES = 60
 _TRIAL_VERTICES = 2400
 _MAX_GRIDS = 6
 _MIN_ANGLE = 1.0  # degrees, before the surface is bent
+# How far bodies lie from their skeleton, as a share of the widest: some are nearly as alike as two people.
+_SPREAD = (0.3, 1.0)
 # How far a sheet is rolled, degrees.
 _ROLL = 230.0
 # Of a body's limbs, some poses are chosen from so many for those that nearly touch.
@@ -99,8 +101,13 @@ class Pose:
     gap: float
 
 
-def draw_body(body_class: BodyClass, seed: Sequence[int]) -> Body:
+def draw_body(body_class: BodyClass, kin: Sequence[int], seed: Sequence[int]) -> Body:
     """Draw a body: what its class leaves open, proportions, thickness, warp and relief.
+
+    Args:
+        body_class: its class.
+        kin: seed of the skeleton, which bodies may have in common.
+        seed: of all else.
 
     Raises:
         ValueError: no draw gave a sound surface.
@@ -109,7 +116,8 @@ def draw_body(body_class: BodyClass, seed: Sequence[int]) -> Body:
     for draw in range(_MAX_DRAWS):
         # Later draws are nearer to the class: most failures are parts that meet, or are too thin for the grid.
         rng = np.random.default_rng([*seed, draw])
-        body = _drawn(body_class, rng, 1.0 - 0.7 * draw / _MAX_DRAWS)
+        spread = rng.uniform(*_SPREAD) * (1.0 - 0.7 * draw / _MAX_DRAWS)
+        body = _drawn(body_class, np.random.default_rng([*kin, draw]), rng, spread)
         for rotation in (np.eye(3), _random_rotation(rng)):
             vertices, faces = body.surface(_TRIAL_VERTICES, rotation)
             found = _fault(body.warp(vertices), faces, body.genus, _TRIAL_VERTICES)
@@ -163,8 +171,8 @@ def draw_pose(body: Body, rng: np.random.Generator, target: int) -> Pose:
     return found
 
 
-def _drawn(body_class: BodyClass, rng: np.random.Generator, spread: float) -> Body:
-    skeleton, motion = body_class.draw(rng)
+def _drawn(body_class: BodyClass, kin: np.random.Generator, rng: np.random.Generator, spread: float) -> Body:
+    skeleton, motion = body_class.draw(kin)
     groups = sorted({part.group for part in skeleton.root.walk()})
     thickness = rng.uniform(-0.1, 0.22)
     changes = rng.uniform(-1.0, 1.0, (len(groups), 2)) * (0.16, 0.24)

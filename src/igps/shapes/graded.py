@@ -25,7 +25,8 @@ from igps.shapes.solids import Array
 
 _VERSION = 1  # raised whenever the same arguments would give other meshes
 _MAX_ATTEMPTS = 6
-_BODY, _POSE = 11, 12  # what a random stream is for: keeps the streams of one seed apart
+_KIN, _BODY, _POSE = 10, 11, 12  # what a random stream is for: keeps the streams of one seed apart
+_SIBLINGS = 2  # bodies in a row with one skeleton, whose likeness makes bodies hard to tell apart
 BODIES_FILE = "bodies.csv"
 
 _log = logging.getLogger(__name__)
@@ -57,9 +58,10 @@ class GradedShapes:
     """A deterministic benchmark of two levels: classes of bodies, and bodies in poses.
 
     A class is a kind of body; its bodies differ in proportions, thickness, details and whatever else the class leaves
-    open; the poses of a body bend one surface, nearly isometrically, as far as animals and tools bend. Things that do
-    not bend are the same in every pose. Every pose has triangles of its own, and some are simplified, noisy, mirrored
-    or made watertight.
+    open, but every second is a sibling of the one before it, with the same skeleton in other proportions. The poses of
+    a body bend one surface, nearly isometrically, as far as animals and tools bend. Things that do not bend are the
+    same in every pose. Every pose has triangles of its own, and some are simplified, noisy, mirrored or made
+    watertight.
 
     A shape depends on its class, body, pose, ``seed``, ``n_vertices`` and ``look_alikes`` alone, so that shapes may be
     made in any order and by many processes, and more of them later.
@@ -245,7 +247,8 @@ class GradedShapes:
 
     def _body(self, body_class: int, number: int) -> Body:
         if self._last is None or self._last[0] != (body_class, number):
-            drawn = draw_body(self._classes[body_class], [self.seed, _BODY, body_class, number])
+            kin = [self.seed, _KIN, body_class, number // _SIBLINGS]
+            drawn = draw_body(self._classes[body_class], kin, [self.seed, _BODY, body_class, number])
             self._last = (body_class, number), drawn
         return self._last[1]
 
