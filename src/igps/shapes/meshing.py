@@ -52,8 +52,8 @@ def roughen(vertices: Array, faces: Faces, amplitude: float, wavelength: float, 
     return vertices + surface.vertex_normals(vertices, faces) * (amplitude * noise / np.sqrt(6.0))[:, None]
 
 
-def defect(vertices: Array, faces: Faces, genus: int, n_vertices: int) -> str | None:
-    """What keeps a mesh out of the benchmark, in words, or None."""
+def defect(vertices: Array, faces: Faces, genus: int, n_vertices: int, min_angle: float = _MIN_ANGLE) -> str | None:
+    """What keeps a mesh out of the benchmark, in words, or None; ``min_angle`` in degrees."""
     count = len(vertices)
     if abs(count / n_vertices - 1.0) > _VERTEX_TOLERANCE:
         return f"{count} vertices"
@@ -70,7 +70,7 @@ def defect(vertices: Array, faces: Faces, genus: int, n_vertices: int) -> str | 
     if np.linalg.det(vertices[faces]).sum() <= 0.0:
         return "inside out"
     angle = _smallest_angle(vertices, faces)
-    if angle < _MIN_ANGLE:
+    if angle < min_angle:
         return f"a triangle with an angle of {angle:.2g} degrees"
     return None
 
