@@ -12,6 +12,7 @@ import igps
 PACKAGE = Path(igps.__file__).parent
 # From the ground up. A room imports only from the floors below its own, and itself; a new room is one more name here.
 FLOORS = (
+    ("compiled",),
     ("linalg", "retrieval", "parallel"),
     ("geometry",),
     ("shapes",),
@@ -23,7 +24,7 @@ FLOORS = (
     ("cli", "sklearn"),
 )
 # Rooms that are one file.
-FILES = ("parallel", "sklearn")
+FILES = ("compiled", "parallel", "sklearn")
 
 
 def imported_rooms(path: Path) -> set[str]:
