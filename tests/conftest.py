@@ -14,6 +14,8 @@ from igps.compiled import is_available
 from igps.geometry import coordinates
 from igps.geometry.mesh import Mesh
 from igps.geometry.reading import load_mesh
+from igps.linalg import direct, eigensolver, ordering
+from igps.nn import counted_pairs
 
 # The meshes are small: on two threads they are hardly faster, and many times slower where another process takes a core.
 torch.set_num_threads(1)
@@ -25,12 +27,14 @@ TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
 
-@pytest.fixture(params=[True, False], ids=["compiled", "by torch"])
-def with_or_without_compiler(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Loops are compiled, and then as if Numba were not there."""
-    if request.param and not is_available():
+@pytest.fixture(params=["compiled", "plain"])
+def both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The test runs with loops compiled, where they can be, and without."""
+    if request.param == "plain":
+        for module in (direct, eigensolver, ordering, counted_pairs):
+            monkeypatch.setattr(module, "is_available", lambda: False)
+    elif not is_available():
         pytest.skip("needs numba, the extra [fast]")
-    monkeypatch.setattr("igps.nn.counted_pairs.is_available", lambda: request.param)
 
 
 def as_mesh(surface: trimesh.Trimesh, name: str = "mesh") -> Mesh:

@@ -19,8 +19,9 @@ from scipy.linalg import eigh
 from igps.geometry.laplacian import laplacian
 from igps.geometry.mesh import Mesh
 from igps.linalg import ConvergenceError, Spectrum, eigenpairs, eigensolver, krylov, lanczos
-from igps.linalg.factorization import factorize
-from igps.linalg.symbolic import dissect
+from igps.linalg.direct import analyse
+
+pytestmark = pytest.mark.usefixtures("both_ways")
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +113,7 @@ def test_krylov_basis_keeps_its_promises(torus_problem: Problem) -> None:
     """Orthonormal rows, a projection that is the operator's, residuals that are the vectors'; also when widened."""
     stiffness, mass, positions = torus_problem
     matrix = sparse.csr_array(stiffness * mass.sum() / np.sqrt(mass)[:, None] / np.sqrt(mass))
-    factors = factorize(dissect(matrix, positions), matrix, 300.0)
+    factors = analyse(matrix, positions).factorize(matrix, 300.0)
     space = krylov.Krylov(factors, np.sqrt(mass / mass.sum()), 40, np.random.default_rng(0))
     for widen in (False, False, True, False, False):
         space.expand()

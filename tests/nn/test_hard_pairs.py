@@ -8,7 +8,7 @@ import torch
 
 from igps.nn.hard_pairs import class_pairs, pair_histogram
 
-pytestmark = pytest.mark.usefixtures("with_or_without_compiler")
+pytestmark = pytest.mark.usefixtures("both_ways")
 
 
 def by_loops(embedding: np.ndarray, potential: np.ndarray, d_max: float, u_max: float, c: int, b: int) -> np.ndarray:

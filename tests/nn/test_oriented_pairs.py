@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from igps.nn.centres import middles
 from igps.nn.oriented_pairs import oriented_pair_histogram, point_pair_features
 
-pytestmark = pytest.mark.usefixtures("with_or_without_compiler")
+pytestmark = pytest.mark.usefixtures("both_ways")
 
 BINS, ANGLES = middles(6, 3.0, "bins").double(), middles(5, 2.0, "bins").double() - 1
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from igps.nn.hard_pairs import class_pairs
 from igps.nn.soft_pairs import soft_pair_histogram
 
-pytestmark = pytest.mark.usefixtures("with_or_without_compiler")
+pytestmark = pytest.mark.usefixtures("both_ways")
 
 CENTRES = torch.tensor([0.4, 0.9, 1.0, 1.6, 2.7], dtype=torch.float64)
 EUCLIDEAN_CENTRES = torch.tensor([0.2, 0.35, 0.8], dtype=torch.float64)

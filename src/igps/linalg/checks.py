@@ -19,6 +19,12 @@ def canonical(matrix: sparse.csr_array) -> sparse.csr_array:
     return matrix
 
 
+def check_entries(matrix: sparse.csr_array, indptr: np.ndarray, indices: np.ndarray) -> None:
+    """Whether a matrix stores the entries of the one whose structure is known."""
+    if not (np.array_equal(matrix.indptr, indptr) and np.array_equal(matrix.indices, indices)):
+        raise ValueError("matrix must store the same entries as the one that was dissected: dissect it anew")
+
+
 def checked_mass(mass: np.ndarray | sparse.sparray | sparse.spmatrix) -> np.ndarray:
     """The mass as a new float64 vector, (V,) where a vector or a diagonal sparse matrix is given."""
     if not sparse.issparse(mass):

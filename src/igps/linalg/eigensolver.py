@@ -35,10 +35,11 @@ from scipy import sparse
 from scipy.linalg import eigh
 from scipy.sparse.linalg import ArpackError, eigsh
 
+from igps.compiled import is_available
 from igps.linalg.checks import ROUNDING, checked_mass, checked_stiffness
-from igps.linalg.factorization import SingularMatrixError, factorize
+from igps.linalg.direct import analyse
+from igps.linalg.factorization import SingularMatrixError
 from igps.linalg.lanczos import ConvergenceError, gap_behind, lanczos
-from igps.linalg.symbolic import dissect
 
 logger = logging.getLogger(__name__)
 
@@ -186,7 +187,7 @@ def _prove_complete(
     gap = gap_behind(torch.from_numpy(eigenvalues), n_eigenpairs)
     if gap is None:
         raise ConvergenceError(f"no gap behind eigenvalue {n_eigenpairs} to count at: ask for more or fewer eigenpairs")
-    n_present = factorize(dissect(matrix, positions), matrix, gap[1]).n_negative - 1
+    n_present = analyse(matrix, positions).inertia(matrix, gap[1]) - 1
     if n_present != gap[0]:
         raise ConvergenceError(f"found {gap[0]} of {n_present} eigenvalues below {gap[1]:.6g} / area")
 
@@ -198,13 +199,14 @@ def _residual(matrix: sparse.csr_array, eigenvalues: np.ndarray, vectors: np.nda
         ConvergenceError: one is above the tolerance though rounding allows a smaller one, or above RESIDUAL_LIMIT.
     """
     largest = 0.0
-    for start in range(0, len(eigenvalues), 64):  # in pieces, to keep the memory small
+    defects = _defects(matrix, eigenvalues, vectors)
+    for start in range(0, len(eigenvalues), 64):
         part = slice(start, start + 64)
-        values, y = eigenvalues[part], np.ascontiguousarray(vectors[:, part])
-        residuals = np.linalg.norm(matrix @ y - y * values, axis=0) / np.abs(values)
+        values = eigenvalues[part]
+        residuals = defects[part] / np.abs(values)
         largest = max(largest, float(residuals.max()))
         if not (residuals <= tolerance).all():
-            rounding = ROUNDING * np.linalg.norm(abs(matrix) @ np.abs(y), axis=0) / np.abs(values)
+            rounding = np.linalg.norm(abs(matrix) @ np.abs(vectors[:, part]), axis=0) * ROUNDING / np.abs(values)
             allowed = np.maximum(tolerance, np.minimum(tolerance + rounding, RESIDUAL_LIMIT))
             bad = ~(residuals <= allowed)
             if bad.any():
@@ -214,3 +216,17 @@ def _residual(matrix: sparse.csr_array, eigenvalues: np.ndarray, vectors: np.nda
                     "repair the bad triangles"
                 )
     return largest
+
+
+def _defects(matrix: sparse.csr_array, eigenvalues: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """(K,) lengths ‖A y − λ y‖."""
+    if is_available():
+        from igps.linalg import loops
+
+        return loops.defects(matrix.data, matrix.indptr, matrix.indices, eigenvalues, np.ascontiguousarray(vectors))
+    pieces = [slice(start, start + 64) for start in range(0, len(eigenvalues), 64)]
+    defects = []
+    for piece in pieces:  # to keep the memory small
+        y = np.ascontiguousarray(vectors[:, piece])
+        defects.append(np.linalg.norm(matrix @ y - y * eigenvalues[piece], axis=0))
+    return np.concatenate(defects)

@@ -32,11 +32,12 @@ import numpy as np
 import torch
 from scipy import sparse
 
-from igps.linalg.checks import canonical
+from igps.linalg.checks import canonical, check_entries
 from igps.linalg.symbolic import Batch, Dissection
 
 # Fronts are added to their parents in chunks of so many matrix entries, to bound the memory for their indices.
 CHUNK_ENTRIES = 2**22
+SINGULAR = "a pivot block of the shifted matrix is singular: use a slightly different shift"
 
 
 class SingularMatrixError(ValueError):
@@ -107,8 +108,7 @@ def factorize(dissection: Dissection, matrix: sparse.csr_array, shift: float = 0
         SingularMatrixError: a pivot block is singular.
     """
     matrix = canonical(matrix)
-    if not (np.array_equal(matrix.indptr, dissection.indptr) and np.array_equal(matrix.indices, dissection.indices)):
-        raise ValueError("matrix must store the same entries as the one that was dissected: dissect it anew")
+    check_entries(matrix, dissection.indptr, dissection.indices)
     values = torch.from_numpy(matrix.data.astype(np.float64)).to(dissection.device)
     all_blocks = []
     n_negative = 0
@@ -125,7 +125,7 @@ def factorize(dissection: Dissection, matrix: sparse.csr_array, shift: float = 0
             n_fronts, n_own, n_boundary = batch.shape
             width = n_own + n_boundary
             front = fronts[batch.offset : batch.offset + n_fronts * width**2].view(n_fronts, width, width)
-            inverse, n_negative_pivots = _invert(front[:, :n_own, :n_own])
+            inverse, n_negative_pivots = invert(front[:, :n_own, :n_own])
             coupling = front[:, :n_own, n_own:]
             elimination = -torch.bmm(inverse, coupling)
             blocks.append(torch.cat([inverse, elimination], 2))
@@ -145,7 +145,7 @@ def _extend_add(fronts: torch.Tensor, batch: Batch, update: torch.Tensor) -> Non
         fronts.index_add_(0, (starts[:, :, None] + columns[:, None, :]).flatten(), values.flatten())
 
 
-def _invert(pivots: torch.Tensor) -> tuple[torch.Tensor, int]:
+def invert(pivots: torch.Tensor) -> tuple[torch.Tensor, int]:
     """Inverses of symmetric blocks (N, S, S), and how many negative eigenvalues the blocks have together."""
     factors, failed = torch.linalg.cholesky_ex(pivots)
     indefinite = failed > 0
@@ -155,7 +155,7 @@ def _invert(pivots: torch.Tensor) -> tuple[torch.Tensor, int]:
     inverses[~indefinite] = torch.cholesky_inverse(factors[~indefinite])
     factors, order, failed = torch.linalg.ldl_factor_ex(pivots[indefinite])
     if failed.any():
-        raise SingularMatrixError("a pivot block of the shifted matrix is singular: use a slightly different shift")
+        raise SingularMatrixError(SINGULAR)
     identity = torch.eye(pivots.shape[-1], dtype=pivots.dtype, device=pivots.device).expand_as(factors)
     inverse = torch.linalg.ldl_solve(factors, order, identity)
     inverses[indefinite] = (inverse + inverse.mT) / 2

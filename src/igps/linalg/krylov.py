@@ -10,11 +10,17 @@ import torch
 from scipy.linalg import qr
 
 from igps.linalg.checks import ROUNDING
-from igps.linalg.factorization import Factorization
+from igps.linalg.direct import Factors
 
 BLOCK_SIZE = 16
 # Below this, relative to what it came from, a pivot makes a Cholesky factor inaccurate
 CHOLESKY_QR_PIVOT = 1e-6
+# Below this, dividing by a pivot makes too much of what rounding left of the basis to wait for the next sweep
+QUICK_PIVOT = 1e-4
+# So many blocks go by between two sweeps, or one where a sweep has found a larger loss of orthogonality
+SWEEP_EVERY, SWEEP_LOSS = 2, 1e-8
+# Of a larger basis there is no copy in single precision, to save memory: 1 GiB
+MOST_SINGLE_ENTRIES = 2**28
 
 
 @dataclass(frozen=True)
@@ -51,20 +57,25 @@ class Krylov:
     the others stay orthogonal to it, and the projected problem leaves it out.
     """
 
-    def __init__(
-        self, factors: Factorization, zero_mode: np.ndarray, capacity: int, generator: np.random.Generator
-    ) -> None:
+    def __init__(self, factors: Factors, zero_mode: np.ndarray, capacity: int, generator: np.random.Generator) -> None:
         self._factors = factors
         self._generator = generator
         n_vertices = len(zero_mode)
         self._basis = torch.empty(capacity + 1, n_vertices, dtype=torch.float64)
         self._basis[0] = torch.from_numpy(zero_mode)
+        # a copy in single precision, to be read in half the time
+        self._single: torch.Tensor | None = None
+        if self._basis.numel() <= MOST_SINGLE_ENTRIES:
+            self._single = torch.empty(capacity + 1, n_vertices, dtype=torch.float32)
+            self._single[0] = self._basis[0]
         self._projected = torch.zeros(capacity + 1, capacity + 1, dtype=torch.float64)
-        # rows previous:current and current:stop of the basis are the last two blocks, the last not yet multiplied
-        self._previous = self._current = self._stop = 1
+        # rows previous:current and current:stop of the basis are the last two blocks, the last not yet multiplied; rows
+        # before swept are orthogonal to all before them, those behind it to their neighbours
+        self._previous = self._current = self._stop = self._swept = 1
+        self._every = SWEEP_EVERY
         self._coupling = torch.empty(0, 0, dtype=torch.float64)
         # a random vector is mostly high frequencies: one application leaves what matters
-        self._append(self._orthonormal(self._apply(self._random(BLOCK_SIZE)), near=1)[0])
+        self._append(self._orthonormal(self._apply(self._random(BLOCK_SIZE)).T.contiguous(), near=1)[0], swept=True)
 
     @property
     def size(self) -> int:
@@ -75,23 +86,33 @@ class Krylov:
         """Multiply the last block, and append what is new in the product as the next block."""
         last = slice(self._current, self._stop)
         product = self._apply(self._basis[last])
-        projection = self._basis[last] @ product.T
-        block, coupling = self._orthonormal(product, near=self._previous)
-        self._projected[last, last] = (projection + projection.T) / 2
+        near = self._basis[self._previous : self._stop]
+        projection = near @ product
+        diagonal = projection[self._current - self._previous :]
+        product = product.T.contiguous()
+        quick = self._factor_quickly(torch.addmm(product, projection.T, near, alpha=-1), _longest(product))
+        if quick is None:
+            self._sweep()
+        block, coupling = quick or self._orthonormal(product, near=self._previous)
+        self._projected[last, last] = (diagonal + diagonal.T) / 2
         self._previous, self._current = self._current, self._stop
-        self._append(block)
+        self._append(block, swept=quick is None)
         new = slice(self._current, self._stop)
         self._projected[new, last] = coupling
         self._projected[last, new] = coupling.T
         self._coupling = coupling
+        if self._stop - self._swept >= self._every * len(block) and self._sweep() > SWEEP_LOSS:
+            self._every = 1
 
     def widen(self) -> None:
         """Enlarge the last block, and those that follow, by random vectors: they see what the start block did not."""
+        self._sweep()
         block, _ = self._orthonormal(self._random(BLOCK_SIZE), near=self._previous)
-        self._append(block)
+        self._append(block, swept=True)
         self._coupling = torch.cat([self._coupling, self._coupling.new_zeros(len(block), self._coupling.shape[1])])
 
     def ritz_pairs(self, shift: float) -> RitzPairs:
+        self._sweep()
         inside = slice(1, self._current)
         theta, coefficients = torch.linalg.eigh(self._projected[inside, inside])
         outside = self._coupling @ coefficients[-self._coupling.shape[1] :]
@@ -114,19 +135,52 @@ class Krylov:
         return torch.from_numpy(self._generator.standard_normal((n_rows, self._basis.shape[1])))
 
     def _apply(self, block: torch.Tensor) -> torch.Tensor:
-        return self._factors.solve(block.T).T.contiguous()
+        """The products (V, b) of the operator with b rows."""
+        return self._factors.solve(block.T)
 
-    def _append(self, block: torch.Tensor) -> None:
+    def _append(self, block: torch.Tensor, *, swept: bool) -> None:
         stop = self._stop + len(block)
         if stop > len(self._basis):
             capacity = len(self._basis) * 3 // 2 + len(block)
             basis, projected = self._basis, self._projected
             self._basis = basis.new_empty(capacity, basis.shape[1])
             self._basis[: self._stop] = basis[: self._stop]
+            if self._single is not None:
+                single, self._single = self._single, self._single.new_empty(capacity, basis.shape[1])
+                self._single[: self._swept] = single[: self._swept]
             self._projected = projected.new_zeros(capacity, capacity)
             self._projected[: self._stop, : self._stop] = projected[: self._stop, : self._stop]
         self._basis[self._stop : stop] = block
         self._stop = stop
+        if swept:
+            self._mark_swept()
+
+    def _mark_swept(self) -> None:
+        if self._single is not None:
+            self._single[self._swept : self._stop] = self._basis[self._swept : self._stop]
+        self._swept = self._stop
+
+    def _sweep(self) -> float:
+        """Make the rows since the last sweep orthogonal to all before them, and orthonormal; how far they were from it.
+
+        The recurrence leaves of older rows what rounding left in the last two blocks, times the ratio of the largest θ
+        to the spread of the others: with each block some hundred times as much. Two blocks go by before it is swept
+        out, in both at once, as products of the basis with twice as many columns take less than twice the time. The
+        projection is then wrong by the square of what was lost (Simon 1984), which is below rounding. Single precision
+        takes out exactly enough of what is that small.
+        """
+        old, new = self._basis[: self._swept], self._basis[self._swept : self._stop]
+        if not len(new):
+            return 0.0
+        lost = old @ new.T.contiguous()
+        largest = float(lost.abs().max())
+        if self._single is None or largest > SWEEP_LOSS:
+            new.addmm_(lost.T, old, alpha=-1)
+        else:
+            new.sub_(lost.T.float() @ self._single[: self._swept])
+        new.copy_(_inverse(torch.linalg.cholesky(new @ new.T)) @ new)
+        self._mark_swept()
+        return largest
 
     def _orthonormal(self, block: torch.Tensor, near: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Rows Q orthonormal and orthogonal to the basis, and R with block = Qᵀ R + what the basis spans, by columns.
@@ -134,7 +188,7 @@ class Krylov:
         The recurrence says that only the basis from row ``near`` on contributes, the full pass after it sweeps out
         what rounding has left. Together that costs one product with the basis and one back.
         """
-        scale = float(torch.linalg.norm(block, dim=1).max())
+        scale = _longest(block)
         first: torch.Tensor | None = None
         for rows in (self._basis[near : self._stop], self._basis[: self._stop]):
             block = torch.addmm(block, (rows @ block.T).T, rows, alpha=-1)
@@ -146,10 +200,8 @@ class Krylov:
     def _factor_rows(self, block: torch.Tensor, scale: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Orthonormal rows Q and R with blockᵀ = Qᵀ R; for a direction lost in rounding a random row and no R."""
         factor, failed = torch.linalg.cholesky_ex(block @ block.T)
-        pivots = torch.diagonal(factor)
-        if not failed and pivots.min() > CHOLESKY_QR_PIVOT * scale:
-            identity = torch.eye(len(factor), dtype=factor.dtype)
-            return torch.linalg.solve_triangular(factor, identity, upper=False) @ block, factor.T
+        if not failed and torch.diagonal(factor).min() > CHOLESKY_QR_PIVOT * scale:
+            return _inverse(factor) @ block, factor.T
         q, r, order = qr(block.T.numpy(), mode="economic", pivoting=True)
         lost = np.abs(np.diag(r)) <= ROUNDING * scale
         r[lost] = 0
@@ -157,3 +209,22 @@ class Krylov:
         if lost.any():
             rows[torch.from_numpy(lost)] = self._random(int(lost.sum())) / math.sqrt(block.shape[1])
         return rows, torch.from_numpy(r[:, np.argsort(order)])
+
+    @staticmethod
+    def _factor_quickly(block: torch.Tensor, scale: float) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """As `_factor_rows` without a pass over the basis between two factorizations; None if a pivot is small."""
+        first, failed = torch.linalg.cholesky_ex(block @ block.T)
+        if failed or not torch.diagonal(first).min() > QUICK_PIVOT * scale:
+            return None
+        block = _inverse(first) @ block
+        second = torch.linalg.cholesky(block @ block.T)
+        return _inverse(second) @ block, second.T @ first.T
+
+
+def _inverse(factor: torch.Tensor) -> torch.Tensor:
+    """Of a lower triangular matrix."""
+    return torch.linalg.solve_triangular(factor, torch.eye(len(factor), dtype=factor.dtype), upper=False)
+
+
+def _longest(rows: torch.Tensor) -> float:
+    return float(torch.linalg.norm(rows, dim=1).max())

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from scipy import sparse
 
-from igps.linalg.factorization import Factorization, factorize
+from igps.linalg.checks import ROUNDING
+from igps.linalg.direct import Factors, Structure, analyse
 from igps.linalg.krylov import BLOCK_SIZE, Krylov
-from igps.linalg.symbolic import Dissection, dissect
 
 logger = logging.getLogger(__name__)
 
@@ -19,8 +19,10 @@ logger = logging.getLogger(__name__)
 SHIFT_RANK = 0.55
 # The shift of the second try, in units of 1/area
 SHIFT_BELOW = -1.0
-# Basis size at which all pairs have converged, as measured: so many vectors a pair, and so many blocks besides
-BASIS_PER_EIGENPAIR, BASIS_PER_EIGENPAIR_BELOW, BASIS_BLOCKS = 1.55, 2.55, 11
+# Basis size at which all pairs have mostly converged, as measured on bodies of 10,000 vertices: so many vectors a pair
+# and, besides, so many blocks, more for each factor of ten in the number of pairs and for each digit beyond seven
+BASIS_PER_EIGENPAIR, BASIS_PER_EIGENPAIR_BELOW = 1.35, 2.35
+BASIS_BLOCKS, BASIS_BLOCKS_PER_DECADE, BASIS_BLOCKS_PER_DIGIT = 1.4, 4.8, 1.0
 # The basis gives up at this multiple of that size
 BASIS_LIMIT = 3
 # How accurate the factorization must be, relative to the tolerance: the lowest modes see its error some 1000 times
@@ -46,13 +48,15 @@ def lanczos(
 
     With the shift inside the spectrum it is fast. With the shift below, A − σI is definite: its factors are accurate.
     """
-    dissection = dissect(matrix, positions)
+    structure = analyse(matrix, positions)
     if inside:
-        shift, factors = _factorize_inside(dissection, matrix, zero_mode, n_eigenpairs, tolerance)
+        shift, factors = _factorize_inside(structure, matrix, zero_mode, n_eigenpairs, tolerance)
     else:
-        shift, factors = SHIFT_BELOW, factorize(dissection, matrix, SHIFT_BELOW)
+        shift, factors = SHIFT_BELOW, structure.factorize(matrix, SHIFT_BELOW)
     per_eigenpair = BASIS_PER_EIGENPAIR if inside else BASIS_PER_EIGENPAIR_BELOW
-    first_look = math.ceil(per_eigenpair * n_eigenpairs) + BASIS_BLOCKS * BLOCK_SIZE
+    digits = -math.log10(max(tolerance, ROUNDING)) - 7
+    n_blocks = BASIS_BLOCKS + BASIS_BLOCKS_PER_DECADE * math.log10(n_eigenpairs) + BASIS_BLOCKS_PER_DIGIT * digits
+    first_look = math.ceil(per_eigenpair * n_eigenpairs + max(n_blocks, 1) * BLOCK_SIZE)
     n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
     krylov = Krylov(factors, zero_mode, first_look + 4 * BLOCK_SIZE, np.random.default_rng(seed))
     limit = min(BASIS_LIMIT * first_look, len(zero_mode) - 2 * BLOCK_SIZE)
@@ -65,7 +69,7 @@ def lanczos(
         missing = False
         if gap is not None:
             n_found, bound = gap
-            n_present = factorize(dissection, matrix, bound).n_negative - 1
+            n_present = structure.inertia(matrix, bound) - 1
             if n_present == n_found:
                 return krylov.eigenvectors(ritz, found[:n_eigenpairs])
             if n_present < n_found:
@@ -83,8 +87,8 @@ def lanczos(
 
 
 def _factorize_inside(
-    dissection: Dissection, matrix: sparse.csr_array, zero_mode: np.ndarray, n_eigenpairs: int, tolerance: float
-) -> tuple[float, Factorization]:
+    structure: Structure, matrix: sparse.csr_array, zero_mode: np.ndarray, n_eigenpairs: int, tolerance: float
+) -> tuple[float, Factors]:
     """A shift with about SHIFT_RANK of the wanted eigenvalues below it, at which the factorization is accurate.
 
     The known zero mode tells the accuracy: as A − σI is indefinite, a pivot block is close to singular now and then.
@@ -92,9 +96,9 @@ def _factorize_inside(
     target = max(1.5, SHIFT_RANK * n_eigenpairs)
     shift = 4 * math.pi * target
     mode = torch.from_numpy(zero_mode)[:, None]
-    best: tuple[float, float, float, Factorization] | None = None
+    best: tuple[float, float, float, Factors] | None = None
     for _ in range(6):
-        factors = factorize(dissection, matrix, shift)
+        factors = structure.factorize(matrix, shift)
         rank = factors.n_negative
         off_target = max(0.0, abs(rank - target) - 0.2 * target - 1)
         defect = float(torch.linalg.norm(shift * factors.solve(mode) + mode))

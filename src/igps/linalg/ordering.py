@@ -9,6 +9,9 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
+from igps.compiled import is_available
+from igps.linalg.checks import canonical
+
 # Of the part's vertices, how far from the middle a cut may lie. Wider windows find smaller separators, but the lopsided
 # trees that follow cost more than they save.
 CUT_WINDOW = 0.05
@@ -28,6 +31,27 @@ def hop_coordinates(graph: sparse.csr_array, n_landmarks: int = 3) -> np.ndarray
     return np.stack(columns, axis=1)
 
 
+def checked_graph(matrix: sparse.csr_array, coordinates: np.ndarray | None) -> tuple[sparse.csr_array, np.ndarray]:
+    """The matrix with sorted entries, and coordinates for its vertices; the arguments are those of `symbolic.dissect`.
+
+    Raises:
+        ValueError: the pattern is not symmetric or lacks diagonal entries, or coordinates do not fit it.
+    """
+    matrix = canonical(matrix)
+    n_vertices = matrix.shape[0]
+    transpose = matrix.tocsc()
+    if not (np.array_equal(transpose.indptr, matrix.indptr) and np.array_equal(transpose.indices, matrix.indices)):
+        raise ValueError(f"matrix must store entry (j, i) where it stores (i, j), shape is {matrix.shape}")
+    rows = np.repeat(np.arange(n_vertices), np.diff(matrix.indptr))
+    if np.count_nonzero(rows == matrix.indices) != n_vertices:
+        raise ValueError("matrix must store every diagonal entry: store zeros explicitly")
+    if coordinates is None:
+        coordinates = hop_coordinates(matrix)
+    if coordinates.ndim != 2 or len(coordinates) != n_vertices:
+        raise ValueError(f"coordinates must be ({n_vertices}, d) for this matrix, got {coordinates.shape}")
+    return matrix, coordinates
+
+
 def nested_dissection(graph: sparse.csr_array, coordinates: np.ndarray, leaf_size: int) -> tuple[np.ndarray, int]:
     """The tree node of each vertex, numbered as in a heap (root 0, children 2i+1 and 2i+2), and the number of levels.
 
@@ -39,6 +63,11 @@ def nested_dissection(graph: sparse.csr_array, coordinates: np.ndarray, leaf_siz
     n_vertices = graph.shape[0]
     depth = max(0, int(np.ceil(np.log2(n_vertices / leaf_size))))
     orders = [np.argsort(column, kind="stable") for column in coordinates.T]
+    if is_available():
+        from igps.linalg import loops
+
+        indptr, indices = (array.astype(np.int32, copy=False) for array in (graph.indptr, graph.indices))
+        return loops.dissect(np.stack(orders), indptr, indices, depth, CUT_WINDOW), depth + 1
     node = np.full(n_vertices, -1)
     part = np.zeros(n_vertices, dtype=np.int32)
     rows = np.repeat(np.arange(n_vertices), np.diff(graph.indptr))

@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from scipy import sparse
 
-from igps.linalg.checks import canonical
-from igps.linalg.ordering import hop_coordinates, nested_dissection
+from igps.linalg.ordering import checked_graph, nested_dissection
 
 # Largest ratio of front sizes within a batch: many small batches lose time between them, few large ones in padding.
 BATCH_SPREAD = 1.2
@@ -146,20 +145,10 @@ def dissect(
     Raises:
         ValueError: the pattern is not symmetric or lacks diagonal entries, or coordinates do not fit it.
     """
-    matrix = canonical(matrix)
+    matrix, coordinates = checked_graph(matrix, coordinates)
     n_vertices = matrix.shape[0]
     rows = np.repeat(np.arange(n_vertices), np.diff(matrix.indptr))
     columns = matrix.indices.astype(np.int64)
-    transpose = matrix.tocsc()
-    if not (np.array_equal(transpose.indptr, matrix.indptr) and np.array_equal(transpose.indices, matrix.indices)):
-        raise ValueError(f"matrix must store entry (j, i) where it stores (i, j), shape is {matrix.shape}")
-    if np.count_nonzero(rows == columns) != n_vertices:
-        raise ValueError("matrix must store every diagonal entry: store zeros explicitly")
-    if coordinates is None:
-        coordinates = hop_coordinates(matrix)
-    if coordinates.ndim != 2 or len(coordinates) != n_vertices:
-        raise ValueError(f"coordinates must be ({n_vertices}, d) for this matrix, got {coordinates.shape}")
-
     node, n_levels = nested_dissection(matrix, coordinates, leaf_size)
     tree, number = _elimination_tree(node, n_levels, rows, columns)
     layout = _batch_fronts(tree)

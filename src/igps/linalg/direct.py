@@ -1,0 +1,56 @@
+"""Factorizations: by compiled loops where there is a compiler, by PyTorch's batches of products where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from scipy import sparse
+
+from igps.compiled import is_available
+from igps.linalg import multifrontal
+from igps.linalg.factorization import factorize
+from igps.linalg.symbolic import Dissection, dissect
+
+
+class Factors(Protocol):
+    """The factors of a symmetric matrix."""
+
+    @property
+    def n_negative(self) -> int:
+        """Its number of negative eigenvalues."""
+
+    def solve(self, right_hand_sides: torch.Tensor) -> torch.Tensor:
+        """The solutions (V, b) for right-hand sides (V, b), float64."""
+
+
+class Structure(Protocol):
+    """Elimination order and block structure for one sparsity pattern; serves any number of values and shifts."""
+
+    def factorize(self, matrix: sparse.csr_array, shift: float = 0.0) -> Factors:
+        """The factors of ``matrix − shift · I``."""
+
+    def inertia(self, matrix: sparse.csr_array, shift: float = 0.0) -> int:
+        """The number of negative eigenvalues of ``matrix − shift · I``."""
+
+
+@dataclass(frozen=True)
+class Batched:
+    """The structure of a factorization by batches."""
+
+    dissection: Dissection
+
+    def factorize(self, matrix: sparse.csr_array, shift: float = 0.0) -> Factors:
+        return factorize(self.dissection, matrix, shift)
+
+    def inertia(self, matrix: sparse.csr_array, shift: float = 0.0) -> int:
+        return factorize(self.dissection, matrix, shift).n_negative
+
+
+def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = 32) -> Structure:
+    """The structure for all matrices with one symmetric pattern; arguments and errors are those of `dissect`."""
+    if is_available():
+        return multifrontal.analyse(matrix, coordinates, leaf_size=leaf_size)
+    return Batched(dissect(matrix, coordinates, leaf_size=leaf_size))

@@ -1,0 +1,170 @@
+"""The factorization of `factorization` by compiled loops: node by node, depth first, without padding.
+
+A node's Schur complement is added to its parent's front soon after it was made, while the processor's cache still holds
+it, and only the complements along one branch are kept. Pivot blocks of more than LARGE unknowns go to PyTorch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from scipy import sparse
+
+from igps.linalg.checks import canonical, check_entries
+from igps.linalg.factorization import SINGULAR, SingularMatrixError, invert
+from igps.linalg.ordering import checked_graph, nested_dissection
+
+# Own unknowns of a node above which its dense algebra is PyTorch's. OpenBLAS starts threads for LAPACK from 64 on.
+LARGE = 63
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Elimination order and fronts for one sparsity pattern. Nodes and unknowns are numbered depth first.
+
+    Attributes:
+        indptr, indices: (V + 1,), (E,) int32, of the csr matrix.
+        order, number: (V,) the vertex of each number, the number of each vertex.
+        first: (N + 1,) where each node's own numbers start.
+        children: (N, 2) nodes, or -1.
+        start, boundary: (N + 1,) where each node's boundary starts among all boundaries, sorted numbers each.
+        parent_row: the row of each vertex of a boundary in the front of the node's parent.
+        block_start: (N + 1,) where each node's block [D E] starts among all blocks.
+        update_start: (N,) where its complement starts among those that wait to be added.
+        n_updates: entries of all complements that wait at the same time, at most.
+    """
+
+    indptr: np.ndarray
+    indices: np.ndarray
+    order: np.ndarray
+    number: np.ndarray
+    first: np.ndarray
+    children: np.ndarray
+    start: np.ndarray
+    boundary: np.ndarray
+    parent_row: np.ndarray
+    block_start: np.ndarray
+    update_start: np.ndarray
+    n_updates: int
+
+    def factorize(self, matrix: sparse.csr_array, shift: float = 0.0) -> Factors:
+        """Factorize ``matrix − shift · I``; arguments and errors are those of `factorization.factorize`."""
+        blocks = np.empty(self.block_start[-1])
+        return Factors(self, blocks, self._eliminate(matrix, shift, blocks, self.block_start))
+
+    def inertia(self, matrix: sparse.csr_array, shift: float = 0.0) -> int:
+        """The number of negative eigenvalues of ``matrix − shift · I``."""
+        one_block = np.empty(int(np.diff(self.block_start).max()))
+        return self._eliminate(matrix, shift, one_block, np.zeros_like(self.block_start))
+
+    def _eliminate(self, matrix: sparse.csr_array, shift: float, blocks: np.ndarray, block_start: np.ndarray) -> int:
+        """Write the blocks; the number of negative eigenvalues."""
+        from igps.linalg import loops
+
+        matrix = canonical(matrix)
+        check_entries(matrix, self.indptr, self.indices)
+        n_own, n_boundary = np.diff(self.first), np.diff(self.start)
+        updates, front = np.empty(self.n_updates), np.empty(int((n_own + n_boundary).max()) ** 2)
+        problem = (
+            matrix.data.astype(np.float64, copy=False), float(shift), self.indptr, self.indices, self.order,
+            self.number, self.first, self.children, self.start, self.boundary, self.parent_row, updates,
+            self.update_start, np.empty(len(self.order), dtype=np.int64), front,
+        )  # fmt: skip
+        workspace = np.empty(LARGE**2), np.empty(LARGE**2), np.empty(LARGE, dtype=np.int32), _blas_and_lapack()
+        n_negative = begin = 0
+        for node in [*np.flatnonzero(n_own > LARGE).tolist(), len(n_own)]:
+            n_negative_small = loops.eliminate((begin, node), *problem, blocks, block_start, *workspace)
+            if n_negative_small < 0:
+                raise SingularMatrixError(SINGULAR)
+            n_negative += n_negative_small
+            begin = node + 1
+            if node < len(n_own):
+                loops.assemble(node, *problem)
+                size, n_bound = int(n_own[node]), int(n_boundary[node])
+                n_negative += _eliminate_large(
+                    torch.from_numpy(front[: (size + n_bound) ** 2].reshape(size + n_bound, size + n_bound)),
+                    torch.from_numpy(blocks[block_start[node] :][: size * (size + n_bound)].reshape(size, -1)),
+                    torch.from_numpy(updates[self.update_start[node] :][: n_bound**2].reshape(n_bound, n_bound)),
+                )
+        return n_negative
+
+
+@dataclass(frozen=True)
+class Factors:
+    """The factors of one matrix: solves with it, and its number of negative eigenvalues.
+
+    Attributes:
+        tree: the structure they were made with.
+        blocks: each node's (S, S + B) block [D E], end to end.
+        n_negative: number of negative eigenvalues of the matrix.
+    """
+
+    tree: Tree
+    blocks: np.ndarray
+    n_negative: int
+
+    def solve(self, right_hand_sides: torch.Tensor) -> torch.Tensor:
+        """The solutions (V, b) for right-hand sides (V, b), float64."""
+        from igps.linalg import loops
+
+        tree, gemm = self.tree, int(_blas_and_lapack()[0])
+        right = np.ascontiguousarray(right_hand_sides.numpy())
+        return torch.from_numpy(
+            loops.solve(right, tree.order, tree.first, tree.start, tree.boundary, self.blocks, tree.block_start, gemm)
+        )
+
+
+def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = 32) -> Tree:
+    """Elimination order and fronts; arguments and errors are those of `symbolic.dissect`."""
+    from igps.linalg import loops
+
+    matrix, coordinates = checked_graph(matrix, coordinates)
+    node, n_levels = nested_dissection(matrix, coordinates, leaf_size)
+    indptr, indices = (array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices))
+    order, number, first, children, start, boundary, parent_row = loops.tree(node, 2**n_levels - 1, indptr, indices)
+    n_own, n_boundary = np.diff(first), np.diff(start)
+    # when a node is eliminated, its children's complements are the last two that wait: its own takes their place
+    update_start = [0] * len(n_own)
+    top = n_updates = 0
+    for n, (child, size) in enumerate(zip(children[:, 0].tolist(), n_boundary.tolist(), strict=True)):
+        update_start[n] = top if child < 0 else update_start[child]
+        top = update_start[n] + size**2
+        n_updates = max(n_updates, top)
+    return Tree(
+        indptr=indptr,
+        indices=indices,
+        order=order,
+        number=number,
+        first=first,
+        children=children,
+        start=start,
+        boundary=boundary,
+        parent_row=parent_row,
+        block_start=np.append(0, np.cumsum(n_own * (n_own + n_boundary))),
+        update_start=np.array(update_start, dtype=np.int64),
+        n_updates=n_updates,
+    )
+
+
+def _eliminate_large(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor) -> int:
+    """Write D, E and the complement of a front, of which the upper triangle is known; its negative pivots."""
+    n_own = len(block)
+    pivot, coupling = front[:n_own, :n_own].triu(), front[:n_own, n_own:]
+    inverse, n_negative = invert((pivot + pivot.triu(1).T)[None])
+    block[:, :n_own] = inverse[0]
+    block[:, n_own:] = -(inverse[0] @ coupling)
+    torch.addmm(front[n_own:, n_own:], coupling.T, block[:, n_own:], out=update)
+    return n_negative
+
+
+@cache
+def _blas_and_lapack() -> np.ndarray:
+    """Addresses of the functions that the loops call."""
+    from numba.extending import get_cython_function_address
+
+    blas, lapack = "scipy.linalg.cython_blas", "scipy.linalg.cython_lapack"
+    names = (blas, "dgemm"), (lapack, "dpotrf"), (lapack, "dpotri"), (lapack, "dsytrf"), (lapack, "dsytrs")
+    return np.array([get_cython_function_address(*name) for name in names])
