@@ -97,7 +97,10 @@ def _members(memberships: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _centred(points: Tensor) -> Tensor:
-    return points - points.mean(dim=0)  # keeps digits in the squared distances
+    # Coordinates that padding left at 0 would only change how products are rounded. The centre keeps digits in the
+    # squared distances.
+    points = points[:, (points != 0).any(dim=0)]
+    return points - points.mean(dim=0)
 
 
 def _folded(total: Tensor, shape: Sequence[int]) -> Tensor:
