@@ -87,7 +87,7 @@ def report(rows: list[dict[str, float]]) -> None:
             left_out[own] = columns[own] @ fitted(columns[~own], values[~own])
         print(f"  bodies left out: {accuracy(left_out, values)}")
         now = np.array([expected_cost(int(v), int(k)) for v, k in zip(vertices, eigenpairs, strict=True)])
-        print(f"  constants as they are: {accuracy(now[:, key == 'bytes'], values)}", flush=True)
+        print(f"  constants as they are: {accuracy(now[:, int(key == 'bytes')], values)}", flush=True)
 
 
 def main() -> None:

@@ -8,7 +8,11 @@ Heckbert 1997).
 What is a hole and what the mouth of a cup is told in `outside`.
 
 **Several pieces** become one body: those of less than a five-hundredth of the volume are dropped, the others joined by
-straight bars of about a cell's radius, each where the gap is narrowest (a minimum spanning tree of the gaps).
+straight bars of about a cell's radius, each where the gap is narrowest (a minimum spanning tree of the gaps). Joined
+pieces retrieve as the whole body does: of 28 generated bodies of seven classes, each cut into two to seven pieces in
+places of its own, the first tier of `interior` is 92.9 % and that of `rich` 97.6 % (uncut 94.0 and 98.8). The spectra
+of all pieces side by side, without the zero of each, give 36.9 and 70.2 %, since they tell how a body was cut; the
+largest piece alone gives 40.5 and 50.0 %.
 """
 
 from __future__ import annotations
