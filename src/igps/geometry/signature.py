@@ -61,7 +61,7 @@ class SignatureConfig:
     """
 
     # Raise it whenever the same mesh and parameters would give another Signature: it is part of every cache key.
-    ALGORITHM_VERSION: ClassVar[int] = 3
+    ALGORITHM_VERSION: ClassVar[int] = 4
 
     DEFAULT_EIGENPAIRS: ClassVar[int] = 250
     # What the library's descriptors ask for: known to be in caches.
