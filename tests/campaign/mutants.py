@@ -187,7 +187,11 @@ def is_noticed(mutant: Mutant, copy: Path, calls: Calls) -> bool:
     whole = target.read_text()
     target.write_text(mutated(mutant))
     try:
-        return any(_run(some, copy, calls.seconds(some)) not in (0, 5) for some in calls.of(mutant))
+        for some in calls.of(mutant):
+            run = _run(some, copy, calls.seconds(some))
+            if run is None or run.returncode not in (0, 5):
+                return True
+        return False
     finally:
         target.write_text(whole)
 
@@ -195,9 +199,10 @@ def is_noticed(mutant: Mutant, copy: Path, calls: Calls) -> bool:
 def called(room: str, copy: Path, folder: Path) -> tuple[Calls, list[str]]:
     """What the tests of a room do, and which of them fail on the sound code."""
     report = folder / f"{room}.json"
-    status = _run([f"tests/{room}"], copy, _HOUR, ("-p", "called"), report)
-    if status not in (0, 1):
-        raise RuntimeError(f"tests/{room}: pytest ends with status {status} on the sound code, expected 0 or 1.")
+    run = _run([f"tests/{room}"], copy, _HOUR, ("-p", "called"), report)
+    if run is None or run.returncode not in (0, 1):
+        said = "nothing" if run is None else f"{run.stdout[-500:]}{run.stderr[-500:]}"
+        raise RuntimeError(f"tests/{room}: pytest does not come to its end on the sound code; it says {said}")
     found = json.loads(report.read_text())
     tests = {name: (test["seconds"], frozenset(test["functions"])) for name, test in found["tests"].items()}
     return Calls(tests, frozenset(found["shared"])), found["failed"]
@@ -205,8 +210,8 @@ def called(room: str, copy: Path, folder: Path) -> tuple[Calls, list[str]]:
 
 def _run(
     tests: Sequence[str], copy: Path, seconds: float, plugins: Sequence[str] = ("-x",), report: Path | None = None
-) -> int:
-    """Exit status of pytest on the copy of the tree, in the order given; minus a signal where it took too long."""
+) -> subprocess.CompletedProcess[str] | None:
+    """pytest on the copy of the tree, the tests in the order given; None, or ended by a signal, if it took too long."""
     # The copy comes first on the path, so that it is what the tests import.
     path = os.pathsep.join([str(copy / "src"), str(Path(__file__).parent), *(one for one in sys.path if one)])
     environment = {**os.environ, "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
@@ -219,12 +224,13 @@ def _run(
             cwd=copy,
             env=environment,
             capture_output=True,
+            text=True,
             timeout=_HOUR + seconds,
             check=False,
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (limit, limit)),
-        ).returncode
+        )
     except subprocess.TimeoutExpired:
-        return -1
+        return None
 
 
 def campaign(number: int, rooms: Sequence[str] = ROOMS) -> list[Row]:
