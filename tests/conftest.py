@@ -30,7 +30,8 @@ def with_or_without_compiler(request: pytest.FixtureRequest, monkeypatch: pytest
     """Loops are compiled, and then as if Numba were not there."""
     if request.param and not is_available():
         pytest.skip("needs numba, the extra [fast]")
-    monkeypatch.setattr("igps.nn.counted_pairs.is_available", lambda: request.param)
+    for module in ("igps.geometry.surface_potential", "igps.nn.counted_pairs"):
+        monkeypatch.setattr(f"{module}.is_available", lambda: request.param)
 
 
 def as_mesh(surface: trimesh.Trimesh, name: str = "mesh") -> Mesh:
