@@ -87,8 +87,8 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
 def test_keys_are_those_of_the_caches_that_exist(recipe: Recipe, tmp_path: Path) -> None:
     """Frozen: another key leaves all caches useless. It changes with ALGORITHM_VERSION alone."""
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
-    assert SignatureConfig.ALGORITHM_VERSION == 3
-    assert recipe.key(tmp_path / "frozen.off") == "f3de6688b1db864db53947e7043284b6dae4394c17e8a65a0ef5a8e84af8b84f"
+    assert SignatureConfig.ALGORITHM_VERSION == 4
+    assert recipe.key(tmp_path / "frozen.off") == "a75ab4e79d95e15f56ca4e5e68e03c5b743a43fc7a5f05b9f19fbd1a5e9140c7"
 
 
 USUAL = replace(CONFIG, n_eigenpairs=None)

@@ -10,6 +10,8 @@ import trimesh
 from igps.geometry import surface_potential as module
 from igps.geometry.surface_potential import surface_potential
 
+pytestmark = pytest.mark.usefixtures("both_ways")
+
 
 def by_quadrature(triangle: np.ndarray, point: np.ndarray) -> float:
     """∫ dS/r in polar coordinates about the point's projection, where nothing is singular."""

@@ -12,12 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from igps.compiled import is_available
 from igps.geometry.closed_forms import spatial_order, squared_distances
+from igps.geometry.potential_loops import fill_potentials
 
 __all__ = ["surface_potential"]
 
@@ -54,8 +57,12 @@ def surface_potential(
     out = torch.zeros(len(x), dtype=torch.float64)
     if len(corners) and len(x):
         tree = _Tree.of(corners[spatial_order(corners.mean(1), _FACES)], accuracy)
-        for members in spatial_order(x, _POINTS).split(_POINTS * _BLOCKS):
-            out[members] = tree.potentials(x[members])
+        order = spatial_order(x, _POINTS)
+        if is_available():
+            out[order] = tree.compiled_potentials(x[order])
+        else:
+            for members in order.split(_POINTS * _BLOCKS):
+                out[members] = tree.potentials(x[members])
     return out.numpy() * scale
 
 
@@ -67,10 +74,10 @@ class _Tree:
     form takes over.
     """
 
+    corners: torch.Tensor  # (F, 3, 3)
     levels: list[_Patches]
     reaches: list[torch.Tensor]  # (n,) of the patches of each level
-    first: list[int]  # row of the table at which the patches of each level begin
-    table: torch.Tensor  # (4 F + …, 15): the series of the quarters, four a face, and of all levels
+    first: list[int]  # patch at which each level begins if they are numbered through, and the number of all
     limits: torch.Tensor  # (F,): squared distance from a face's centroid from which on its quarters' series serve
     near: _Near
 
@@ -80,13 +87,19 @@ class _Tree:
         levels = [_Patches.of(corners)]
         while len(levels[-1].areas) > 2 * _FACES:
             levels.append(levels[-1].merged(_FACES))
-        quarters = _Patches.of(_quarters(corners).flatten(0, 1))
-        arms = (quarters.centres.view(-1, 4, 3) - levels[0].centres[:, None]).norm(dim=2)
-        limits = (quarters.reaches(accuracy).view(-1, 4) + arms).amax(1).square()
-        table = torch.cat([patches.series for patches in (quarters, *levels)])
-        first = np.cumsum([len(quarters.areas), *(len(level.areas) for level in levels)]).tolist()
+        faces = levels[0]
+        quarters = _Patches(faces.areas / 4, faces.centres, faces.spreads / 4, faces.radii / 2)
+        # Their centroids are that of the face and those half-way to its corners.
+        limits = (quarters.reaches(accuracy) + faces.radii / 2).square()
+        first = [0, *np.cumsum([len(level.areas) for level in levels]).tolist()]
         reaches = [level.reaches(accuracy) for level in levels]
-        return _Tree(levels, reaches, first, table, limits, _Near.of(corners))
+        return _Tree(corners, levels, reaches, first, limits, _Near.of(corners))
+
+    @cached_property
+    def table(self) -> torch.Tensor:
+        """(4 F + …, 15) the series of the quarters, four a face, and of the patches of all levels."""
+        quarters = _Patches.of(_quarters(self.corners).flatten(0, 1))
+        return torch.cat([patches.series for patches in (quarters, *self.levels)])
 
     def potentials(self, points: torch.Tensor) -> torch.Tensor:
         """(n,) at points (n, 3), close ones together."""
@@ -103,6 +116,24 @@ class _Tree:
             values.append(value.index_add_(0, column, self.near(faces[face], block[column])))
         return torch.cat(values)
 
+    def compiled_potentials(self, points: torch.Tensor) -> torch.Tensor:
+        """`potentials` by loops that Numba compiles."""
+        patches = torch.cat([torch.cat([p.centres, p.areas[:, None], _entries(p.form)], 1) for p in self.levels])
+        reaches = torch.cat(self.reaches)
+        out = np.empty(len(points))
+        fill_potentials(
+            points.numpy(),
+            _POINTS,
+            patches.numpy(),
+            reaches.numpy(),
+            np.array(self.first),
+            _FACES,
+            self.limits.numpy(),
+            self.near.table.numpy(),
+            out,
+        )
+        return torch.from_numpy(out)
+
     def _seen(self, blocks: Sequence[torch.Tensor]) -> tuple[Sequence[torch.Tensor], Sequence[torch.Tensor]]:
         """For each block of points: which rows of the table are far from all of it, and which faces are opened."""
         low = torch.stack([block.amin(0) for block in blocks])
@@ -114,7 +145,7 @@ class _Tree:
         for k in reversed(range(len(self.levels))):
             is_far = _gap(self.levels[k].centres[patch], low[block], high[block]) >= self.reaches[k][patch]
             far_blocks.append(block[is_far])
-            far_rows.append(self.first[k] + patch[is_far])
+            far_rows.append(4 * len(self.corners) + self.first[k] + patch[is_far])
             block, patch = block[~is_far], patch[~is_far]
             if k:
                 patch = (_FACES * patch[:, None] + children).flatten()
@@ -181,17 +212,26 @@ class _Patches:
         return torch.maximum(least, 1.5 * self.radii) + self.radii / 2
 
     @property
-    def series(self) -> torch.Tensor:
-        """(n, 15): centroid, r² = |c − x|² − |x|² and A·(3/2 dᵀCd − ½ tr C r²) as polynomials, see `_far_sum`; area."""
+    def form(self) -> torch.Tensor:
+        """(n, 3, 3): A·(3/2 C − ½ tr C·1)."""
         trace = self.spreads.diagonal(dim1=1, dim2=2).sum(1)
         form = 1.5 * self.spreads - 0.5 * trace[:, None, None] * torch.eye(3, dtype=torch.float64)
-        form = self.areas[:, None, None] * form
+        return self.areas[:, None, None] * form
+
+    @property
+    def series(self) -> torch.Tensor:
+        """(n, 15): centroid, r² = |c − x|² − |x|² and A·(3/2 dᵀCd − ½ tr C r²) as polynomials, see `_far_sum`; area."""
+        form = self.form
         product = (form @ self.centres[:, :, None])[..., 0]
         constant = (self.centres * product).sum(1, keepdim=True)
-        mixed = 2 * form[:, (0, 0, 1), (1, 2, 2)]
-        quadratic = [constant, -2 * product, form.diagonal(dim1=1, dim2=2), mixed]
+        quadratic = [constant, -2 * product, _entries(form)]
         squares = self.centres.square().sum(1, keepdim=True)
         return torch.cat([squares, -2 * self.centres, self.areas[:, None], *quadratic], 1)
+
+
+def _entries(form: torch.Tensor) -> torch.Tensor:
+    """(n, 6) coefficients of xx, yy, zz, xy, xz, yz of quadratic forms (n, 3, 3)."""
+    return torch.cat([form.diagonal(dim1=1, dim2=2), 2 * form[:, (0, 0, 1), (1, 2, 2)]], 1)
 
 
 def _far_sum(series: torch.Tensor, points: torch.Tensor, without: torch.Tensor | None = None) -> torch.Tensor:
