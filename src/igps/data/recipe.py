@@ -88,7 +88,9 @@ class Recipe:
         # The suffix chooses the reader, so the same bytes under another suffix are another mesh.
         reading = [path.suffix.lower(), asdict(self.reading)]
         parameters = json.dumps([reading, config.as_dict()], sort_keys=True)
-        return hashlib.sha256(parameters.encode() + b"\0" + content).hexdigest()
+        key = hashlib.sha256(parameters.encode() + b"\0")
+        key.update(content)  # not joined with them: the file may be large
+        return key.hexdigest()
 
 
 def _content(path: Path) -> bytes:
