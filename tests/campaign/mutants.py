@@ -146,7 +146,7 @@ def mutated(mutant: Mutant) -> str:
 
 
 def _is_fault(mutant: Mutant) -> bool:
-    """Whether it changes what is computed: not an annotation or a message alone, and it is Python still."""
+    """Whether it changes what is computed, not an annotation, a message or a marker alone, and is Python still."""
     try:
         return _running(mutated(mutant)) != _running((ROOT / mutant.path).read_text())
     except SyntaxError:
@@ -160,6 +160,10 @@ def _running(source: str) -> str:
             node.returns = None
         elif isinstance(node, ast.arg):
             node.annotation = None
+        elif isinstance(node, ast.arguments):  # whether by place or by name is no matter of what is computed
+            node.args = [*node.posonlyargs, *node.args, *node.kwonlyargs]
+            node.defaults = [*node.defaults, *(default for default in node.kw_defaults if default is not None)]
+            node.posonlyargs, node.kwonlyargs, node.kw_defaults = [], [], []
         elif isinstance(node, ast.AnnAssign):
             node.annotation = ast.Constant(None)
         elif isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):

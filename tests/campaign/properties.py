@@ -62,8 +62,11 @@ class Bound:
     known: str = ""
 
 
-# Where today's code moves a description farther than promised, and why. Nothing is known.
-KNOWN: dict[tuple[str, str], str] = {}
+# Where a description moves farther than promised, and why.
+KNOWN: dict[tuple[str, str], str] = {
+    # The worst body moves by 14 % from one subdivision to two, and by 2 % from two to three.
+    ("subdivision", "gps"): "one subdivision has too few vertices for the last of its 250 eigenpairs",
+}
 
 
 def bound(prop: str, name: str) -> Bound:
