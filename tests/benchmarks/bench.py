@@ -25,6 +25,7 @@ from statistics import median
 import numpy as np
 import torch
 import trimesh
+from describing import save as save_signature
 from scipy import sparse
 
 import igps
@@ -231,10 +232,25 @@ def winding_25k(data: Path | None) -> Figure:
     points = interior_samples(mesh)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     return against(
+        "libigl fast_winding_number",
+        lambda: winding_number(mesh.vertices, mesh.faces, points, accuracy=0.01),
+        lambda: igl.fast_winding_number(vertices, faces, points),
+        repeat=7,
+        note=f"to 0.01, at {len(points)} scattered points",
+    )
+
+
+def winding_25k_exact(data: Path | None) -> Figure:
+    import igl
+
+    mesh = model(data, 25_273)
+    points = interior_samples(mesh)
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    return against(
         "libigl winding number",
         lambda: winding_number(mesh.vertices, mesh.faces, points),
         lambda: igl.winding_number(vertices, faces, points),
-        note=f"exact, at {len(points)} scattered points",
+        note=f"to rounding, at {len(points)} scattered points",
     )
 
 
@@ -245,6 +261,7 @@ def histogram_pairs(data: Path | None) -> Figure:
     def plain() -> torch.Tensor:
         return torch.histc(torch.pdist(embedding), 64, 0, 4)
 
+    pair_histogram(embedding, potential)  # compiled at the first call
     seconds, reference = timed(lambda: pair_histogram(embedding, potential), plain, 5)
     pairs = len(embedding) * (len(embedding) - 1) / 2e6
     note = "baseline: distances alone and one hard histogram, no classes"
@@ -297,10 +314,49 @@ def oriented_pairs(data: Path | None) -> Figure:
         features = np.stack([distance, np.maximum(a, b), np.minimum(a, b), (n[i] * n[j]).sum(axis=1)], axis=1)
         np.histogramdd(features, (6, 5, 5, 5), [(0, 1), (-1, 1), (-1, 1), (-1, 1)])
 
+    ours()  # compiled at the first call
     seconds, reference = timed(ours, by_numpy, 5)
     pairs = len(i) / 1e6
-    note = "four linear kernels, differentiable; baseline: nearest bins"
+    note = "four linear kernels; baseline: nearest bins"
     return Figure(pairs / seconds, "M pairs/s", pairs / reference, "numpy histogramdd", reference / seconds, note)
+
+
+def describe_before(data: Path | None) -> dict[str, Figure]:
+    """A body from its signature, one thread, over commit 8140bb3 in turn; seconds of the processor."""
+    mesh = model(data, 10_000)
+    needs = igps.descriptor("multiscale").needs | igps.descriptor("rich").needs
+    signature = igps.compute_signature(mesh, needs.completed(igps.SignatureConfig()))
+    script = Path(__file__).with_name("describing.py")
+    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    figures = {}
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        path = Path(folder) / "signature.npz"
+        save_signature(signature, path)
+        project = Path(__file__).parents[2]
+        archive = subprocess.run(
+            ["git", "archive", "8140bb3", "src"], check=True, capture_output=True, cwd=project
+        ).stdout
+        subprocess.run(["tar", "x", "-C", folder], check=True, input=archive)
+        ask = []
+        for source in (project / "src", Path(folder) / "src"):
+            process = subprocess.Popen(
+                [sys.executable, str(script), str(path)], text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                env={**os.environ, **one, "PYTHONPATH": str(source)},
+            )  # fmt: skip
+            stack.enter_context(process)
+            ask.append(process)
+        for name in ("rich", "pretrained", "multiscale", "interior", "gps"):
+            seconds: tuple[list[float], list[float]] = ([], [])
+            for _ in range(7):
+                for of, process in zip(seconds, ask, strict=True):
+                    print(name, file=process.stdin, flush=True)
+                    of.append(float(process.stdout.readline()))  # type: ignore[union-attr]
+            ours, before = (float(np.median(of)) for of in seconds)
+            note = f"{len(signature.interior)} and {len(signature.surface)} samples"
+            figures[f"describe_{name}"] = Figure(ours, "s", before, "commit 8140bb3", before / ours, note)
+        for process in ask:
+            process.stdin.close()  # type: ignore[union-attr]
+    return figures
 
 
 def descriptor_15k(data: Path | None) -> Figure:
@@ -479,10 +535,12 @@ FIGURES: dict[str, Callable[[Path | None], Figure | dict[str, Figure]]] = {
     "eigen_11k_robust": eigen_against_robust,
     "coordinates_25k": coordinates_25k,
     "winding_25k": winding_25k,
+    "winding_25k_exact": winding_25k_exact,
     "voxels_128": voxels_128,
     "histogram_pairs": histogram_pairs,
     "histogram_backward": histogram_backward,
     "oriented_pairs": oriented_pairs,
+    "describe_rich": describe_before,
     "descriptor_15k": descriptor_15k,
     "mesh_10k": mesh_10k,
     "mesh_250k": mesh_250k,
