@@ -91,9 +91,12 @@ def test_half_precision_is_counted_in_single(cloud: tuple[torch.Tensor, torch.Te
     torch.testing.assert_close(result, pair_histogram(embedding.float(), potential))
 
 
-def test_bad_layout_is_refused(cloud: tuple[torch.Tensor, torch.Tensor]) -> None:
-    with pytest.raises(ValueError, match="n_bins=1"):
-        pair_histogram(*cloud, n_bins=1)
+@pytest.mark.parametrize(
+    ("name", "value"), [("n_bins", 1), ("n_classes", 0), ("distance_range", 0.0), ("potential_range", -1.0)]
+)
+def test_bad_layout_is_refused(cloud: tuple[torch.Tensor, torch.Tensor], name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name}={value}"):
+        pair_histogram(*cloud, **{name: value})
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
