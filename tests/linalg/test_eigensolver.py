@@ -114,7 +114,7 @@ def test_krylov_basis_keeps_its_promises(torus_problem: Problem) -> None:
     stiffness, mass, positions = torus_problem
     matrix = sparse.csr_array(stiffness * mass.sum() / np.sqrt(mass)[:, None] / np.sqrt(mass))
     factors = analyse(matrix, positions).factorize(matrix, 300.0)
-    space = krylov.Krylov(factors, np.sqrt(mass / mass.sum()), 40, np.random.default_rng(0))
+    space = krylov.Krylov(factors, np.sqrt(mass / mass.sum()), 16, 40, np.random.default_rng(0))
     for widen in (False, False, True, False, False):
         space.expand()
         if widen:
@@ -122,7 +122,7 @@ def test_krylov_basis_keeps_its_promises(torus_problem: Problem) -> None:
     basis = space._basis[: space._stop]
     torch.testing.assert_close(basis @ basis.T, torch.eye(len(basis), dtype=torch.float64), atol=1e-12, rtol=0)
     inside = basis[1 : space.size + 1]
-    assert len(inside) == 3 * krylov.BLOCK_SIZE + 2 * 2 * krylov.BLOCK_SIZE
+    assert len(inside) == 3 * 16 + 2 * 2 * 16
     projected = inside @ factors.solve(inside.T.contiguous())
     torch.testing.assert_close(space._projected[1 : space.size + 1, 1 : space.size + 1], projected, atol=1e-12, rtol=0)
     ritz = space.ritz_pairs(300.0)
@@ -133,6 +133,30 @@ def test_krylov_basis_keeps_its_promises(torus_problem: Problem) -> None:
     estimated = ritz.residuals[largest].numpy()
     assert estimated.max() > 1e-3
     np.testing.assert_allclose(estimated, actual, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("distance", [1e-3, 1e-6, 1e-9])
+def test_a_shift_beside_an_eigenvalue_costs_no_orthogonality(
+    distance: float, torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """There the operator magnifies most what rounding leaves of older vectors, from block to block."""
+    stiffness, mass, positions = torus_problem
+    area = mass.sum()
+    matrix = sparse.csr_array(stiffness * area / np.sqrt(mass)[:, None] / np.sqrt(mass))
+    shift = torus_oracle[0][30] * area * (1 + distance)
+    factors = analyse(matrix, positions).factorize(matrix, shift)
+    space = krylov.Krylov(factors, np.sqrt(mass / area), 8, 300, np.random.default_rng(0))
+    for _ in range(30):
+        space.expand()
+    ritz = space.ritz_pairs(shift)
+    basis = space._basis[: space._stop]
+    torch.testing.assert_close(basis @ basis.T, torch.eye(len(basis), dtype=torch.float64), atol=1e-10, rtol=0)
+    exact, values = torus_oracle[0] * area, ritz.eigenvalues.numpy()
+    exact = np.sort(exact[np.abs(exact - shift).argsort()[:20]])
+    values = np.sort(values[np.abs(values - shift).argsort()[:20]])
+    # what a relative error of rounding in the operator makes of θ = 1 / (λ − σ)
+    rounding = np.finfo(float).eps * (exact - shift) ** 2 / (shift * distance)
+    assert np.all(np.abs(values - exact) <= 1e-9 * exact + 10 * rounding)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])

@@ -12,13 +12,15 @@ from scipy.linalg import qr
 from igps.linalg.checks import ROUNDING
 from igps.linalg.direct import Factors
 
-BLOCK_SIZE = 16
 # Below this, relative to what it came from, a pivot makes a Cholesky factor inaccurate
 CHOLESKY_QR_PIVOT = 1e-6
 # Below this, dividing by a pivot makes too much of what rounding left of the basis to wait for the next sweep
 QUICK_PIVOT = 1e-4
-# So many blocks go by between two sweeps, or one where a sweep has found a larger loss of orthogonality
-SWEEP_EVERY, SWEEP_LOSS = 2, 1e-8
+# Above this, relative to the largest pivot, a Cholesky factor makes rows orthonormal but for rounding
+ROUND_PIVOT = 0.1
+# So many blocks go by between two sweeps, or one where a sweep has found a larger loss of orthogonality; a smaller one
+# may be taken out in single precision
+SWEEP_EVERY, SWEEP_LOSS, SINGLE_LOSS = 2, 1e-7, 1e-8
 # Of a larger basis there is no copy in single precision, to save memory: 1 GiB
 MOST_SINGLE_ENTRIES = 2**28
 
@@ -57,9 +59,17 @@ class Krylov:
     the others stay orthogonal to it, and the projected problem leaves it out.
     """
 
-    def __init__(self, factors: Factors, zero_mode: np.ndarray, capacity: int, generator: np.random.Generator) -> None:
+    def __init__(
+        self,
+        factors: Factors,
+        zero_mode: np.ndarray,
+        block_size: int,
+        capacity: int,
+        generator: np.random.Generator,
+    ) -> None:
         self._factors = factors
         self._generator = generator
+        self._block_size = block_size
         n_vertices = len(zero_mode)
         self._basis = torch.empty(capacity + 1, n_vertices, dtype=torch.float64)
         self._basis[0] = torch.from_numpy(zero_mode)
@@ -75,7 +85,7 @@ class Krylov:
         self._every = SWEEP_EVERY
         self._coupling = torch.empty(0, 0, dtype=torch.float64)
         # a random vector is mostly high frequencies: one application leaves what matters
-        self._append(self._orthonormal(self._apply(self._random(BLOCK_SIZE)).T.contiguous(), near=1)[0], swept=True)
+        self._append(self._orthonormal(self._apply(self._random(block_size)).T.contiguous(), near=1)[0], swept=True)
 
     @property
     def size(self) -> int:
@@ -107,7 +117,7 @@ class Krylov:
     def widen(self) -> None:
         """Enlarge the last block, and those that follow, by random vectors: they see what the start block did not."""
         self._sweep()
-        block, _ = self._orthonormal(self._random(BLOCK_SIZE), near=self._previous)
+        block, _ = self._orthonormal(self._random(self._block_size), near=self._previous)
         self._append(block, swept=True)
         self._coupling = torch.cat([self._coupling, self._coupling.new_zeros(len(block), self._coupling.shape[1])])
 
@@ -174,7 +184,7 @@ class Krylov:
             return 0.0
         lost = old @ new.T.contiguous()
         largest = float(lost.abs().max())
-        if self._single is None or largest > SWEEP_LOSS:
+        if self._single is None or largest > SINGLE_LOSS:
             new.addmm_(lost.T, old, alpha=-1)
         else:
             new.sub_(lost.T.float() @ self._single[: self._swept])
@@ -212,11 +222,14 @@ class Krylov:
 
     @staticmethod
     def _factor_quickly(block: torch.Tensor, scale: float) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """As `_factor_rows` without a pass over the basis between two factorizations; None if a pivot is small."""
+        """As `_factor_rows`, once more where rounding asks for it; None if a pivot is small."""
         first, failed = torch.linalg.cholesky_ex(block @ block.T)
-        if failed or not torch.diagonal(first).min() > QUICK_PIVOT * scale:
+        smallest, largest = torch.aminmax(torch.diagonal(first))
+        if failed or not smallest > QUICK_PIVOT * scale:
             return None
         block = _inverse(first) @ block
+        if smallest > ROUND_PIVOT * largest:
+            return block, first.T
         second = torch.linalg.cholesky(block @ block.T)
         return _inverse(second) @ block, second.T @ first.T
 

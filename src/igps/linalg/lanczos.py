@@ -11,7 +11,7 @@ from scipy import sparse
 
 from igps.linalg.checks import ROUNDING
 from igps.linalg.direct import Factors, Structure, analyse
-from igps.linalg.krylov import BLOCK_SIZE, Krylov
+from igps.linalg.krylov import Krylov
 
 logger = logging.getLogger(__name__)
 
@@ -19,12 +19,14 @@ logger = logging.getLogger(__name__)
 SHIFT_RANK = 0.55
 # The shift of the second try, in units of 1/area
 SHIFT_BELOW = -1.0
-# Basis size at which all pairs have mostly converged, as measured on bodies of 10,000 vertices: so many vectors a pair
+# Vectors in a block: few make a small basis, many make fast products. Up to so many pairs, few are better.
+SMALL_BLOCK, LARGE_BLOCK, FEW_EIGENPAIRS = 8, 16, 128
+# Basis size at which mostly all pairs have converged, as measured on bodies of 11,000 vertices: so many vectors a pair
 # and, besides, so many blocks, more for each factor of ten in the number of pairs and for each digit beyond seven
 BASIS_PER_EIGENPAIR, BASIS_PER_EIGENPAIR_BELOW = 1.35, 2.35
-BASIS_BLOCKS, BASIS_BLOCKS_PER_DECADE, BASIS_BLOCKS_PER_DIGIT = 1.4, 4.8, 1.0
-# The basis gives up at this multiple of that size
-BASIS_LIMIT = 3
+BASIS_BLOCKS, BASIS_BLOCKS_PER_DECADE, BASIS_BLOCKS_PER_DIGIT = {SMALL_BLOCK: 3.4, LARGE_BLOCK: 1.4}, 4.8, 1.0
+# The basis gives up at this multiple of what the pairs need, and so many vectors more
+BASIS_LIMIT, BASIS_LIMIT_BESIDES = 3, 600
 # How accurate the factorization must be, relative to the tolerance: the lowest modes see its error some 1000 times
 DEFECT = 2e-4
 # A gap this wide, relative to the eigenvalue, is taken at once; a multiplet has none, and the next gap is looked for
@@ -53,13 +55,17 @@ def lanczos(
         shift, factors = _factorize_inside(structure, matrix, zero_mode, n_eigenpairs, tolerance)
     else:
         shift, factors = SHIFT_BELOW, structure.factorize(matrix, SHIFT_BELOW)
+    block_size = SMALL_BLOCK if n_eigenpairs <= FEW_EIGENPAIRS else LARGE_BLOCK
     per_eigenpair = BASIS_PER_EIGENPAIR if inside else BASIS_PER_EIGENPAIR_BELOW
     digits = -math.log10(max(tolerance, ROUNDING)) - 7
-    n_blocks = BASIS_BLOCKS + BASIS_BLOCKS_PER_DECADE * math.log10(n_eigenpairs) + BASIS_BLOCKS_PER_DIGIT * digits
-    first_look = math.ceil(per_eigenpair * n_eigenpairs + max(n_blocks, 1) * BLOCK_SIZE)
+    n_blocks = BASIS_BLOCKS[block_size] + BASIS_BLOCKS_PER_DECADE * math.log10(n_eigenpairs)
+    n_blocks = max(1, n_blocks + BASIS_BLOCKS_PER_DIGIT * digits)
+    first_look = math.ceil(per_eigenpair * n_eigenpairs + n_blocks * block_size)
+    limit = math.ceil(BASIS_LIMIT * per_eigenpair * n_eigenpairs) + BASIS_LIMIT_BESIDES
+    limit = min(limit, len(zero_mode) - 2 * block_size)
     n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
-    krylov = Krylov(factors, zero_mode, first_look + 4 * BLOCK_SIZE, np.random.default_rng(seed))
-    limit = min(BASIS_LIMIT * first_look, len(zero_mode) - 2 * BLOCK_SIZE)
+    generator = np.random.default_rng(seed)
+    krylov = Krylov(factors, zero_mode, block_size, first_look + 4 * block_size, generator)
     while krylov.size < first_look:
         krylov.expand()
     while True:

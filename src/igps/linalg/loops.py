@@ -449,7 +449,7 @@ def _solve(
     flat = x.ravel()
     largest = 1
     for n in range(n_nodes):
-        largest = max(largest, start[n + 1] - start[n], first[n + 1] - first[n])
+        largest = max(largest, start[n + 1] - start[n] + first[n + 1] - first[n])
     carried = np.empty((largest, b))
     flat_carried = carried.ravel()
     tile = (max(1, min(b, 16)), SOLVE_TILE, SOLVE_TILE)
@@ -457,16 +457,15 @@ def _solve(
         n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
         if n_own == 0:
             continue
-        width, block, own = n_own + n_boundary, blocks[block_start[n] :], flat[first[n] * b :]
-        if n_boundary:
-            shape = (b, n_boundary, n_own)
-            product(gemm, TRANSPOSED, shape, 1.0, own, b, block[n_own:], width, 0.0, flat_carried, b, tile)
-            for k in range(n_boundary):
-                j = boundary[start[n] + k]
-                for c in range(b):
-                    x[j, c] += carried[k, c]
-        product(gemm, NO, (b, n_own, n_own), 1.0, own, b, block, width, 0.0, flat_carried, b, tile)
+        width, own = n_own + n_boundary, flat[first[n] * b :]
+        # D is symmetric: one product with the transposed block gives D x and Eᵀ x
+        shape = (b, width, n_own)
+        product(gemm, TRANSPOSED, shape, 1.0, own, b, blocks[block_start[n] :], width, 0.0, flat_carried, b, tile)
         own[: n_own * b] = flat_carried[: n_own * b]
+        for k in range(n_boundary):
+            j = boundary[start[n] + k]
+            for c in range(b):
+                x[j, c] += carried[n_own + k, c]
     for n in range(n_nodes - 1, -1, -1):
         n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
         if n_own == 0 or n_boundary == 0:
