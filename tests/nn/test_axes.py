@@ -99,7 +99,9 @@ def test_needs() -> None:
     assert Potential().needs(fine) == Needs(n_eigenpairs=9)
     assert InteriorDistance().needs(fine) == Needs(n_eigenpairs=9)
     assert InteriorDistance(embedding=coarse).needs(fine) == Needs(n_eigenpairs=2)
-    assert InteriorDistance().needs(SpectralEmbedding()) == InteriorDistance().needs(nn.Identity()) == Needs()
+    # What has no number of its own takes all there are.
+    assert InteriorDistance().needs(SpectralEmbedding()) == Needs(whole_spectrum=True)
+    assert InteriorDistance().needs(nn.Identity()) == Needs(whole_spectrum=True)
     assert EuclideanDistance().needs(fine) == Needs()
     assert PairCosines().needs(fine) == Needs(attributes=("surface_direction",))
     assert EmbeddedPairCosines().needs(fine) == Needs(n_eigenpairs=9)
