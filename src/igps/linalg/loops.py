@@ -10,10 +10,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
 from igps.compiled import compiled
 
@@ -23,27 +19,35 @@ SOLVE_TILE = 128
 NO, TRANSPOSED, LOWER = np.uint8(ord("N")), np.uint8(ord("T")), np.uint8(ord("L"))
 
 
-def _fortran(context: Any, address: Any, arguments: Any) -> Any:
-    """Call the Fortran subroutine at an address: numbers go by reference, integers as 32 bits, arrays as they lie."""
+def _intrinsic() -> Any:
+    from llvmlite import ir
+    from numba import types
+    from numba.core import cgutils
+    from numba.extending import intrinsic
 
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        pointers = []
-        for i, kind in enumerate(arguments.types):
-            value = builder.extract_value(values[1], i)
-            if isinstance(kind, types.Array):
-                pointers.append(context.make_array(kind)(context, builder, value).data)
-                continue
-            if isinstance(kind, types.Integer) and kind != types.uint8:
-                value = context.cast(builder, value, kind, types.int32)
-            pointers.append(cgutils.alloca_once_value(builder, value))
-        function = ir.FunctionType(ir.VoidType(), [pointer.type for pointer in pointers])
-        builder.call(builder.inttoptr(values[0], function.as_pointer()), pointers)
-        return context.get_dummy_value()
+    def fortran(context: Any, address: Any, arguments: Any) -> Any:
+        """Call the subroutine at an address: numbers go by reference, integers as 32 bits, arrays as they lie."""
 
-    return types.void(address, arguments), generate
+        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            pointers = []
+            for i, kind in enumerate(arguments.types):
+                value = builder.extract_value(values[1], i)
+                if isinstance(kind, types.Array):
+                    pointers.append(context.make_array(kind)(context, builder, value).data)
+                    continue
+                if isinstance(kind, types.Integer) and kind != types.uint8:
+                    value = context.cast(builder, value, kind, types.int32)
+                pointers.append(cgutils.alloca_once_value(builder, value))
+            function = ir.FunctionType(ir.VoidType(), [pointer.type for pointer in pointers])
+            builder.call(builder.inttoptr(values[0], function.as_pointer()), pointers)
+            return context.get_dummy_value()
+
+        return types.void(address, arguments), generate
+
+    return intrinsic(fortran)
 
 
-fortran: Any = intrinsic(_fortran)
+fortran = _intrinsic()
 
 
 @compiled()
