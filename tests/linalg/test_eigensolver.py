@@ -159,6 +159,17 @@ def test_a_shift_beside_an_eigenvalue_costs_no_orthogonality(
     assert np.all(np.abs(values - exact) <= 1e-9 * exact + 10 * rounding)
 
 
+def test_a_large_basis_gives_its_place_to_the_eigenvectors(
+    torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stiffness, mass, positions = torus_problem
+    monkeypatch.setattr(krylov, "MOST_SINGLE_ENTRIES", 1000)
+    monkeypatch.setattr(krylov, "COLUMNS_AT_ONCE", 100)
+    spectrum = eigenpairs(stiffness, mass, 130, positions=positions)
+    np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1:131], rtol=1e-10)
+    assert_pairs(spectrum, torus_problem)
+
+
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_scale_of_the_coordinates(scale: float, torus_problem: Problem) -> None:
     stiffness, mass, positions = torus_problem

@@ -6,12 +6,12 @@ Lewis & Simon 1994):
 1. With y = M^½ φ the problem is A y = λ y, A = M^-½ L M^-½, and orthogonality is Euclidean. Lengths are measured in
    units of √area, so that nothing depends on the scale of the coordinates.
 2. Weyl's law N(λ) ≈ λ · area / 4π places a shift σ where about SHIFT_RANK of the wanted eigenvalues lie below it.
-   (A − σI)⁻¹ is applied by `factorization`. It maps λ to θ = 1/(λ − σ), so that the wanted eigenvalues lie at both ends
+   (A − σI)⁻¹ is applied by `direct`. It maps λ to θ = 1/(λ − σ), so that the wanted eigenvalues lie at both ends
    of the spectrum, and those below σ have nothing unwanted on their side. The basis that is needed is a third smaller
    than with a shift below the spectrum. Bands with a shift each (manifold harmonics, Vallet & Lévy 2008) would shrink
    it further, but cost a factorization each and leave vectors of neighbouring bands to be made orthogonal.
-3. The block Krylov basis Q follows the three-term recurrence, with one full reorthogonalisation a step. With
-   T = Qᵀ (A − σI)⁻¹ Q and its eigenpairs (θ, s), the Ritz vectors are Q s.
+3. The block Krylov basis Q follows the three-term recurrence, with one full reorthogonalisation of every two blocks at
+   once. With T = Qᵀ (A − σI)⁻¹ Q and its eigenpairs (θ, s), the Ritz vectors are Q s.
 4. One more application of (A − σI)⁻¹ to a Ritz vector takes only the block R that couples the basis to the next one. It
    removes the high frequencies, which A would amplify, and leaves a residual that is known before any vector is formed:
    ‖A y − λ y‖ = ‖R s_last‖ / θ², with s_last the rows of s that belong to the last block.

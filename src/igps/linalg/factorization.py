@@ -21,6 +21,9 @@ inertia). For A − σI that is the number of eigenvalues of A below σ, and pro
 
 No pivot moves from one block to another. That is stable for a positive definite matrix. For an indefinite A − σI it is
 so unless σ lies close to an eigenvalue of a leading block, which is rare but does happen: check a residual.
+
+`multifrontal` does the same by compiled loops, in a quarter of the time. This is for where there is no compiler, and
+for other devices.
 """
 
 from __future__ import annotations

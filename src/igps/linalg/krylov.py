@@ -23,6 +23,8 @@ ROUND_PIVOT = 0.1
 SWEEP_EVERY, SWEEP_LOSS, SINGLE_LOSS = 2, 1e-7, 1e-8
 # Of a larger basis there is no copy in single precision, to save memory: 1 GiB
 MOST_SINGLE_ENTRIES = 2**28
+# Columns of a large basis that are turned into eigenvectors at once
+COLUMNS_AT_ONCE = 8192
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ class Krylov:
         self._generator = generator
         self._block_size = block_size
         n_vertices = len(zero_mode)
-        self._basis = torch.empty(capacity + 1, n_vertices, dtype=torch.float64)
+        self._memory = np.empty((capacity + 1, n_vertices))
+        self._basis = torch.from_numpy(self._memory)
         self._basis[0] = torch.from_numpy(zero_mode)
         # a copy in single precision, to be read in half the time
         self._single: torch.Tensor | None = None
@@ -136,10 +139,27 @@ class Krylov:
         )
 
     def eigenvectors(self, ritz: RitzPairs, index: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """Eigenvalues (K,) and eigenvectors (V, K) of the Ritz pairs with these indices."""
+        """Eigenvalues (K,) and eigenvectors (V, K) of the Ritz pairs with these indices; a large basis is lost."""
         coefficients = ritz.coefficients[:, index]
         coefficients /= torch.linalg.norm(coefficients, dim=0)
+        if self._single is None:
+            return ritz.eigenvalues[index].numpy(), self._combine_in_place(coefficients)
         return ritz.eigenvalues[index].numpy(), (self._basis[1 : self._stop].T @ coefficients).numpy()
+
+    def _combine_in_place(self, coefficients: torch.Tensor) -> np.ndarray:
+        """The basis times coefficients (m + b, K), as (V, K): never in memory beside the basis."""
+        n_vertices, n_vectors = self._basis.shape[1], coefficients.shape[1]
+        pieces = [slice(start, start + COLUMNS_AT_ONCE) for start in range(0, n_vertices, COLUMNS_AT_ONCE)]
+        for piece in pieces:
+            self._basis[:n_vectors, piece] = coefficients.T @ self._basis[1 : self._stop, piece]
+        rows = self._memory
+        self._basis, self._memory = self._basis.new_empty(0, n_vertices), np.empty((0, n_vertices))
+        # gives back what lies behind; no other array looks into it any more
+        rows.resize((n_vectors, n_vertices), refcheck=False)
+        vectors = np.empty((n_vertices, n_vectors))
+        for piece in pieces:
+            vectors[piece] = rows[:, piece].T
+        return vectors
 
     def _random(self, n_rows: int) -> torch.Tensor:
         return torch.from_numpy(self._generator.standard_normal((n_rows, self._basis.shape[1])))
@@ -153,7 +173,8 @@ class Krylov:
         if stop > len(self._basis):
             capacity = len(self._basis) * 3 // 2 + len(block)
             basis, projected = self._basis, self._projected
-            self._basis = basis.new_empty(capacity, basis.shape[1])
+            self._memory = np.empty((capacity, basis.shape[1]))
+            self._basis = torch.from_numpy(self._memory)
             self._basis[: self._stop] = basis[: self._stop]
             if self._single is not None:
                 single, self._single = self._single, self._single.new_empty(capacity, basis.shape[1])

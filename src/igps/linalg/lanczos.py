@@ -20,7 +20,8 @@ SHIFT_RANK = 0.55
 # The shift of the second try, in units of 1/area
 SHIFT_BELOW = -1.0
 # Vectors in a block: few make a small basis, many make fast products. Up to so many pairs, few are better.
-SMALL_BLOCK, LARGE_BLOCK, FEW_EIGENPAIRS = 8, 16, 128
+# So they are where a basis takes gigabytes.
+SMALL_BLOCK, LARGE_BLOCK, FEW_EIGENPAIRS, LARGE_RESULT = 8, 16, 128, 2**27
 # Basis size at which mostly all pairs have converged, as measured on bodies of 11,000 vertices: so many vectors a pair
 # and, besides, so many blocks, more for each factor of ten in the number of pairs and for each digit beyond seven
 BASIS_PER_EIGENPAIR, BASIS_PER_EIGENPAIR_BELOW = 1.35, 2.35
@@ -55,7 +56,8 @@ def lanczos(
         shift, factors = _factorize_inside(structure, matrix, zero_mode, n_eigenpairs, tolerance)
     else:
         shift, factors = SHIFT_BELOW, structure.factorize(matrix, SHIFT_BELOW)
-    block_size = SMALL_BLOCK if n_eigenpairs <= FEW_EIGENPAIRS else LARGE_BLOCK
+    few = n_eigenpairs <= FEW_EIGENPAIRS or n_eigenpairs * len(zero_mode) > LARGE_RESULT
+    block_size = SMALL_BLOCK if few else LARGE_BLOCK
     per_eigenpair = BASIS_PER_EIGENPAIR if inside else BASIS_PER_EIGENPAIR_BELOW
     digits = -math.log10(max(tolerance, ROUNDING)) - 7
     n_blocks = BASIS_BLOCKS[block_size] + BASIS_BLOCKS_PER_DECADE * math.log10(n_eigenpairs)
@@ -65,7 +67,7 @@ def lanczos(
     limit = min(limit, len(zero_mode) - 2 * block_size)
     n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
     generator = np.random.default_rng(seed)
-    krylov = Krylov(factors, zero_mode, block_size, first_look + 4 * block_size, generator)
+    krylov = Krylov(factors, zero_mode, block_size, first_look + 3 * block_size, generator)
     while krylov.size < first_look:
         krylov.expand()
     while True:
