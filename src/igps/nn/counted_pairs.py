@@ -63,7 +63,7 @@ def count_pairs(
         raise ValueError("points: expected distances that can be squared, got larger ones; choose a larger unit.")
     turned = [[each[order].to(dtype).T.contiguous().numpy() for each in (p, n)] for p, n, *_ in oriented]
     n_points, n_classes = memberships.shape
-    total = torch.zeros(n_classes * (n_classes + 1) // 2, math.prod(shape), 2 ** len(shape), dtype=torch.float64)
+    total = torch.zeros(n_classes * (n_classes + 1) // 2, math.prod(shape) * 2 ** len(shape), dtype=torch.float64)
     of_axes = norms.numpy(), centres.numpy(), np.array(shape)
     of_points = classes.numpy(), weights.numpy(), total.numpy()
     n_columns = min(n_points, _MOST_COLUMNS)
@@ -104,7 +104,7 @@ def _centred(points: Tensor) -> Tensor:
 
 
 def _folded(total: Tensor, shape: Sequence[int]) -> Tensor:
-    """(rows, B, ...) counts from (rows, cells, 2^K), by the cell below and the corner of it."""
+    """(rows, B, ...) counts from (rows, cells·2^K), by the cell below and the corner of it."""
     counts = total.view(-1, *shape, *(2,) * len(shape))
     for axis in range(len(shape)):
         own, beyond = counts.unbind(1 + len(shape))

@@ -80,15 +80,17 @@ def add_pairs(
         row, column: see above.
         classes: (M, P) that each point belongs to.
         weights: (M, P) of them, descending; 0 where a point belongs to fewer.
-        total: (C(C+1)/2, cells, 2^K) to add to; of the corners the last axis alternates fastest.
+        total: (C(C+1)/2, cells·2^K) to add to; of the corners the last axis alternates fastest.
     """
     n_axes, n_rows, n_columns = values.shape
-    n_cells, n_corners = total.shape[1:]
+    n_corners = 1 << n_axes
+    n_cells = total.shape[1] // n_corners
     n_classes = int(np.sqrt(2.0 * len(total)))
     n_members = len(classes)
     inverse, below, per_length, most = tables(centres, n_centres)
     # Of the row, or of rows in the same classes: by the class of the other end.
     sums = np.zeros((n_classes * n_cells, n_corners))
+    by_class = sums.reshape((n_classes, n_cells * n_corners))
     shares = np.empty((n_axes, n_columns), values.dtype)
     cells, interval, member = np.empty((3, n_columns), np.int32)
     lowest, highest = n_cells, -1
@@ -101,7 +103,14 @@ def add_pairs(
             for m in range(n_members):
                 same &= classes[m, point] == classes[m, point - 1] and weights[m, point] == weights[m, point - 1]
             if not same:
-                flush(sums, lowest, highest, classes[:, point - 1], weights[:, point - 1], total)
+                flush(
+                    by_class,
+                    lowest * n_corners,
+                    (highest + 1) * n_corners,
+                    classes[:, point - 1],
+                    weights[:, point - 1],
+                    total,
+                )
                 lowest, highest = n_cells, -1
         cell = cells[:n_pairs]
         cell[:] = 0
@@ -121,12 +130,19 @@ def add_pairs(
             if n_axes == 1:
                 share_one_axis(member[:n_pairs], shares[0], weights[m, other:], sums)
             elif n_axes == 2:
-                share_two_axes(member[:n_pairs], shares[0], shares[1], weights[m, other:], sums)
+                share_two_axes(member[:n_pairs], shares[0], shares[1], weights[m, other:], sums, 0)
             elif n_axes == 4:
                 share_four_axes(member[:n_pairs], shares, weights[m, other:], sums)
             else:
                 share_axes(member[:n_pairs], shares, weights[m, other:], sums)
-    flush(sums, lowest, highest, classes[:, row + n_rows - 1], weights[:, row + n_rows - 1], total)
+    flush(
+        by_class,
+        lowest * n_corners,
+        (highest + 1) * n_corners,
+        classes[:, row + n_rows - 1],
+        weights[:, row + n_rows - 1],
+        total,
+    )
 
 
 @compiled(error_model="numpy")
@@ -168,9 +184,10 @@ def tables(
             inverse[k, 0] = 1 / gap
             continue
         for q in range(1, n - 1):
-            below[k, np.int64((centres[k, q] - first) * per_length[k]) + 1 :] += 1
+            below[k, np.int64((centres[k, q] - first) * per_length[k]) + 1] += 1
         for step in range(n_steps):
-            most[k] = max(most[k], below[k, step + 1] - below[k, step])
+            most[k] = max(most[k], below[k, step + 1])
+            below[k, step + 1] += below[k, step]
     return inverse, below, per_length, most
 
 
@@ -261,10 +278,11 @@ def share_two_axes(
     second: NDArray[Any],
     weights: NDArray[np.float64],
     sums: NDArray[np.float64],
+    at: int,
 ) -> None:
-    """`share_one_axis` of the shares along two axes."""
+    """`share_one_axis` of the shares along two axes, into four corners from one on."""
     for j in range(len(cell)):
-        add_quarters(weights[j], first[j], second[j], sums[cell[j]], 0)
+        add_quarters(weights[j], np.float64(first[j]), np.float64(second[j]), sums[cell[j]], at)
 
 
 @compiled(error_model="numpy")
@@ -272,17 +290,17 @@ def share_four_axes(
     cell: NDArray[np.int32], shares: NDArray[Any], weights: NDArray[np.float64], sums: NDArray[np.float64]
 ) -> None:
     """`share_one_axis` of the shares (4, n) along four axes: a distance and three cosines."""
-    a, b, c, d = shares[0], shares[1], shares[2], shares[3]
     for j in range(len(cell)):
         into = sums[cell[j]]
-        beyond = weights[j] * a[j]
+        c, d = np.float64(shares[2, j]), np.float64(shares[3, j])
+        beyond = weights[j] * shares[0, j]
         before = weights[j] - beyond
-        corner = beyond * b[j]
-        side = before * b[j]
-        add_quarters(before - side, c[j], d[j], into, 0)
-        add_quarters(side, c[j], d[j], into, 4)
-        add_quarters(beyond - corner, c[j], d[j], into, 8)
-        add_quarters(corner, c[j], d[j], into, 12)
+        corner = beyond * shares[1, j]
+        side = before * shares[1, j]
+        add_quarters(before - side, c, d, into, 0)
+        add_quarters(side, c, d, into, 4)
+        add_quarters(beyond - corner, c, d, into, 8)
+        add_quarters(corner, c, d, into, 12)
 
 
 @compiled(error_model="numpy")
@@ -293,7 +311,8 @@ def share_axes(
     n_outer = len(shares) - 2
     rest = np.empty(len(cell))
     for corner in range(1 << n_outer):
-        rest[:] = weights[: len(cell)]
+        for j in range(len(cell)):
+            rest[j] = weights[j]
         for k in range(n_outer):
             if corner >> (n_outer - 1 - k) & 1:
                 for j in range(len(cell)):
@@ -301,11 +320,11 @@ def share_axes(
             else:
                 for j in range(len(cell)):
                     rest[j] -= rest[j] * shares[k, j]
-        share_two_axes(cell, shares[n_outer], shares[n_outer + 1], rest, sums[:, 4 * corner : 4 * corner + 4])
+        share_two_axes(cell, shares[n_outer], shares[n_outer + 1], rest, sums, 4 * corner)
 
 
 @compiled(error_model="numpy")
-def add_quarters(weight: float, first: Any, second: Any, into: NDArray[np.float64], at: int) -> None:
+def add_quarters(weight: float, first: float, second: float, into: NDArray[np.float64], at: int) -> None:
     """Share a weight between the four corners of two axes."""
     beyond = weight * first
     before = weight - beyond
@@ -326,17 +345,16 @@ def flush(
     weights: NDArray[np.float64],
     total: NDArray[np.float64],
 ) -> None:
-    """Add the sums (C·cells, corners) of rows in the classes (M,) by weights (M,) to the total, and clear them.
+    """Add the sums (C, cells·corners) of rows in the classes (M,) by weights (M,) to the total, and clear them.
 
-    All that was counted is in the cells from the lowest to the highest.
+    All that was counted is from the lowest place to before the highest.
     """
-    n_cells = total.shape[1]
-    n_classes = len(sums) // n_cells
+    n_classes = len(sums)
     for other in range(n_classes):
-        part = sums[other * n_cells + lowest : other * n_cells + highest + 1].ravel()
         for m in range(len(classes)):
             a, b = min(classes[m], other), max(classes[m], other)
-            into = total[a * n_classes - a * (a - 1) // 2 + b - a, lowest : highest + 1].ravel()
-            for c in range(len(part)):
-                into[c] += weights[m] * part[c]
-        part[:] = 0
+            row = a * n_classes - a * (a - 1) // 2 + b - a
+            for c in range(lowest, highest):
+                total[row, c] += weights[m] * sums[other, c]
+        for c in range(lowest, highest):
+            sums[other, c] = 0
