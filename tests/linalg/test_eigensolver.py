@@ -151,12 +151,19 @@ def test_a_shift_beside_an_eigenvalue_costs_no_orthogonality(
     ritz = space.ritz_pairs(shift)
     basis = space._basis[: space._stop]
     torch.testing.assert_close(basis @ basis.T, torch.eye(len(basis), dtype=torch.float64), atol=1e-10, rtol=0)
-    exact, values = torus_oracle[0] * area, ritz.eigenvalues.numpy()
+    exact = torus_oracle[0] * area
     exact = np.sort(exact[np.abs(exact - shift).argsort()[:20]])
-    values = np.sort(values[np.abs(values - shift).argsort()[:20]])
-    # what a relative error of rounding in the operator makes of θ = 1 / (λ − σ)
-    rounding = np.finfo(float).eps * (exact - shift) ** 2 / (shift * distance)
-    assert np.all(np.abs(values - exact) <= 1e-9 * exact + 10 * rounding)
+    _, vectors = space.eigenvectors(ritz, torch.argsort((ritz.eigenvalues - shift).abs())[:20])
+    quotients = np.sort(np.einsum("vk,vk->k", vectors, matrix @ vectors))
+    np.testing.assert_allclose(quotients, exact, rtol=1e-10)
+
+
+def test_eigenvalues_are_the_quotients_of_their_vectors(torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    spectrum = eigenpairs(stiffness, mass, 100, positions=positions, tolerance=1e-3)
+    functions = spectrum.eigenfunctions
+    quotients = np.einsum("vk,vk->k", functions, stiffness @ functions)
+    np.testing.assert_allclose(spectrum.eigenvalues, quotients, rtol=1e-13)
 
 
 def test_a_large_basis_gives_its_place_to_the_eigenvectors(

@@ -40,6 +40,7 @@ from igps.linalg.checks import ROUNDING, checked_mass, checked_stiffness
 from igps.linalg.direct import analyse
 from igps.linalg.factorization import SingularMatrixError
 from igps.linalg.lanczos import ConvergenceError, gap_behind, lanczos
+from igps.threads import one_thread
 
 logger = logging.getLogger(__name__)
 
@@ -68,6 +69,7 @@ class Spectrum:
     residual: float
 
 
+@one_thread()
 def eigenpairs(
     stiffness: sparse.sparray | sparse.spmatrix,
     mass: np.ndarray | sparse.sparray | sparse.spmatrix,
@@ -82,7 +84,7 @@ def eigenpairs(
 
     None is missing: their number is proved by inertia. The residual of each pair, ‖L φ − λ M φ‖ / λ in the norm of M⁻¹,
     is at most the tolerance, or as small as rounding allows, and then at most RESIDUAL_LIMIT. Within a multiplet the
-    basis is arbitrary. The result is the same for the same seed and number of threads.
+    basis is arbitrary. The result is the same for the same seed. It is computed on one thread.
 
     The matrices may come from any library, with the sign that makes the stiffness positive semi-definite.
 
@@ -115,7 +117,7 @@ def eigenpairs(
     matrix.sort_indices()
     if method == "eigsh":
         eigenvalues, eigenfunctions = _arpack(stiffness, mass, n_eigenpairs, seed)
-        residual = _residual(matrix, eigenvalues * area, eigenfunctions * np.sqrt(mass)[:, None], math.inf)
+        residual, _ = _residual(matrix, eigenvalues * area, eigenfunctions * np.sqrt(mass)[:, None], math.inf)
         return Spectrum(eigenvalues, eigenfunctions, mass, residual)
 
     eigenvalues, vectors, residual = _solve(matrix, stiffness, mass, n_eigenpairs, positions, tolerance, seed)
@@ -155,7 +157,13 @@ def _solve(
     for solver in solvers:
         try:
             eigenvalues, vectors = solver()
-            return eigenvalues, vectors, _residual(matrix, eigenvalues, vectors, tolerance)
+            residual, correction = _residual(matrix, eigenvalues, vectors, tolerance)
+            # Rayleigh's quotients: what rounding leaves in (A − σI)⁻¹ near an eigenvalue is not in A y
+            eigenvalues = eigenvalues + correction
+            order = np.argsort(eigenvalues, kind="stable")
+            if (order[1:] < order[:-1]).any():  # in a multiplet
+                eigenvalues, vectors = eigenvalues[order], vectors[:, order]
+            return eigenvalues, vectors, residual
         except (ConvergenceError, SingularMatrixError, np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
             if solver is solvers[-1]:
                 raise ConvergenceError(f"no solver reached the tolerance, the last one: {error}") from error
@@ -192,14 +200,16 @@ def _prove_complete(
         raise ConvergenceError(f"found {gap[0]} of {n_present} eigenvalues below {gap[1]:.6g} / area")
 
 
-def _residual(matrix: sparse.csr_array, eigenvalues: np.ndarray, vectors: np.ndarray, tolerance: float) -> float:
-    """The largest relative residual.
+def _residual(
+    matrix: sparse.csr_array, eigenvalues: np.ndarray, vectors: np.ndarray, tolerance: float
+) -> tuple[float, np.ndarray]:
+    """The largest relative residual, and what makes of the eigenvalues Rayleigh's quotients of their vectors (K,).
 
     Raises:
         ConvergenceError: one is above the tolerance though rounding allows a smaller one, or above RESIDUAL_LIMIT.
     """
     largest = 0.0
-    defects = _defects(matrix, eigenvalues, vectors)
+    defects, corrections = _defects(matrix, eigenvalues, vectors)
     for start in range(0, len(eigenvalues), 64):
         part = slice(start, start + 64)
         values = eigenvalues[part]
@@ -215,18 +225,20 @@ def _residual(matrix: sparse.csr_array, eigenvalues: np.ndarray, vectors: np.nda
                     f"{allowed[bad].min():.1e}, up to {residuals[bad].max():.1e}: raise the tolerance, or of a surface "
                     "repair the bad triangles"
                 )
-    return largest
+    return largest, corrections
 
 
-def _defects(matrix: sparse.csr_array, eigenvalues: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """(K,) lengths ‖A y − λ y‖."""
+def _defects(matrix: sparse.csr_array, eigenvalues: np.ndarray, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(K,) lengths of A y − λ y and (K,) its products with y."""
     if is_available():
         from igps.linalg import loops
 
         return loops.defects(matrix.data, matrix.indptr, matrix.indices, eigenvalues, np.ascontiguousarray(vectors))
     pieces = [slice(start, start + 64) for start in range(0, len(eigenvalues), 64)]
-    defects = []
+    lengths, products = [], []
     for piece in pieces:  # to keep the memory small
         y = np.ascontiguousarray(vectors[:, piece])
-        defects.append(np.linalg.norm(matrix @ y - y * eigenvalues[piece], axis=0))
-    return np.concatenate(defects)
+        defect = matrix @ y - y * eigenvalues[piece]
+        lengths.append(np.linalg.norm(defect, axis=0))
+        products.append(np.einsum("vk,vk->k", defect, y))
+    return np.concatenate(lengths), np.concatenate(products)

@@ -490,10 +490,10 @@ def _solve(
 @compiled()
 def _defects(
     values: np.ndarray, indptr: np.ndarray, indices: np.ndarray, eigenvalues: np.ndarray, vectors: np.ndarray
-) -> np.ndarray:
-    """(K,) lengths of A y − λ y, for a csr matrix and vectors (V, K)."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """(K,) lengths of A y − λ y and (K,) its products with y, for a csr matrix and vectors (V, K)."""
     n_vertices, n_vectors = vectors.shape
-    defect, squares = np.empty(n_vectors), np.zeros(n_vectors)
+    defect, squares, products = np.empty(n_vectors), np.zeros(n_vectors), np.zeros(n_vectors)
     for i in range(n_vertices):
         for c in range(n_vectors):
             defect[c] = -eigenvalues[c] * vectors[i, c]
@@ -503,7 +503,8 @@ def _defects(
                 defect[c] += value * vectors[j, c]
         for c in range(n_vectors):
             squares[c] += defect[c] * defect[c]
-    return np.sqrt(squares)
+            products[c] += defect[c] * vectors[i, c]
+    return np.sqrt(squares), products
 
 
 dissect, tree, eliminate, solve, defects = _dissect, _tree, _eliminate, _solve, _defects
