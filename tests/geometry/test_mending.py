@@ -178,6 +178,10 @@ UNUSABLE: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray | None]], st
     ),
     "point": (lambda: (np.ones((4, 3)), np.array([[0, 1, 2], [1, 2, 3]])), "in one point"),
     "five": (lambda: (np.random.default_rng(0).random((5, 3)), None), "a cloud of 5 points"),
+    "line of points": (
+        lambda: (np.outer(np.linspace(0, 1, 30), [1, 2, 3]).astype(np.float32) + 5, None),
+        "all 30 points are on one line",
+    ),
     "nan": (lambda: (np.full((4, 3), np.nan), np.array([[0, 1, 2], [1, 2, 3]])), "NaN"),
     "nan cloud": (lambda: (np.full((40, 3), np.nan), None), "NaN"),
     "out of range": (lambda: (np.eye(3), np.array([[0, 1, 9], [0, 1, 2]])), "out of range"),
