@@ -69,9 +69,8 @@ def mend(
         faces: (F, 3) vertex indices; None or empty for a cloud of points, which is made watertight.
         how: "auto" for the above; "never" takes bodies only; "always" makes watertight whatever is not the boundary of
             one body already: closed, oriented, edge-manifold, of one piece, and not crossing itself, which "auto" lets
-            pass. Only smoothing and subdividing change those that are. A grid would change them little where they are
-            thick (0.2 % of the distance between classes, median), and join what lies side by side nearer than a cell,
-            as the coils of a spring do.
+            pass. Only welding, smoothing and subdividing change those that are. A grid would join what lies side by
+            side nearer than a cell, as the coils of a spring do.
         least_vertices: such as the number of eigenpairs plus two; not with "never".
         normals: (V, 3) of a cloud of points, if known.
         name: what error messages call the surface, usually its file.
@@ -133,12 +132,15 @@ def _body(vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[s
 
 
 def _remade(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> Mesh:
-    """The surface as it is, or smoothed, if it bounds one body already; otherwise what a grid makes of it."""
+    """The surface as it is, welded or smoothed, if it bounds one body then; otherwise what a grid makes of it."""
     notes: list[str] = []
-    if (body := _body(vertices, faces, notes, name)) and not crosses_itself(body.vertices, body.faces):
-        return body
-    notes = []
-    neat, triangles = welded(vertices, faces, [])
+    neat, triangles = vertices, faces
+    for step in (None, welded):
+        if step is not None:
+            neat, triangles = step(vertices, faces, notes)
+        if (body := _body(neat, triangles, notes, name)) and not crosses_itself(body.vertices, body.faces):
+            return body
+        notes = []
     smooth = _smoothed(neat, triangles, notes)
     body = watertight(smooth, triangles, name=name) if notes else watertight(vertices, faces, name=name)
     return replace(body, notes=(*notes, *body.notes))
