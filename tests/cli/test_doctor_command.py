@@ -8,7 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from damaged_files import N_FACES, N_VERTICES, without_lxml, write_box, write_clean, write_soup, write_unusable
+from damaged_files import (
+    N_FACES,
+    N_VERTICES,
+    without_lxml,
+    write_box,
+    write_clean,
+    write_holed,
+    write_soup,
+    write_unusable,
+)
 from igps.cli import main
 
 FEW = ["--signature.n_eigenpairs", "20", "--n_workers", "1"]
@@ -77,7 +86,7 @@ def test_status_is_1_if_a_file_cannot_be_used(
 def test_options_choose_the_mending(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_soup(tmp_path / "soup.off")
+    write_holed(tmp_path / "holed.off")
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, "doctor", tmp_path, "--mend", "never", *FEW)
     assert "cannot be used" in capsys.readouterr().out

@@ -12,6 +12,7 @@ import trimesh
 from bodies_on_disk import write_body
 
 import igps.data.recipe as recipe_module
+from igps.data.cache import SignatureCache
 from igps.data.recipe import Recipe
 from igps.geometry.attributes import AttributeName
 from igps.geometry.mesh import Mesh, MeshError
@@ -89,6 +90,43 @@ def test_keys_are_those_of_the_caches_that_exist(recipe: Recipe, tmp_path: Path)
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
     assert SignatureConfig.ALGORITHM_VERSION == 4
     assert recipe.key(tmp_path / "frozen.off") == "a75ab4e79d95e15f56ca4e5e68e03c5b743a43fc7a5f05b9f19fbd1a5e9140c7"
+
+
+def test_a_new_version_of_the_mending_leaves_bodies_that_are_read_as_they_are(
+    tmp_path: Path, computed: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body = trimesh.creation.icosphere(subdivisions=2)
+    body.export(tmp_path / "body.off")
+    open_body = trimesh.Trimesh(body.vertices, body.faces[1:], process=False)
+    open_body.export(tmp_path / "open.off")
+    recipe = Recipe(CONFIG, MeshReading(), tmp_path / "cache")
+
+    def fill() -> int:
+        """How many had to be computed."""
+        before = len(computed)
+        for name in ("body.off", "open.off"):
+            recipe.fill(tmp_path / name)
+            assert recipe.is_cached(tmp_path / name)
+        return len(computed) - before
+
+    assert [fill(), fill()] == [2, 0]
+    assert recipe.notes(tmp_path / "open.off")
+    monkeypatch.setattr(recipe_module, "MENDING_VERSION", recipe_module.MENDING_VERSION + 1)
+    assert not recipe.is_cached(tmp_path / "open.off")
+    assert [fill(), fill()] == [1, 0]
+
+
+def test_a_mended_body_of_before_versions_of_the_mending_is_made_again(tmp_path: Path, computed: list[int]) -> None:
+    """Its Signature lies under the key of a body that is read as it is, and its notes tell that it was none."""
+    body = trimesh.creation.icosphere(subdivisions=2)
+    path = tmp_path / "open.off"
+    trimesh.Trimesh(body.vertices, body.faces[1:], process=False).export(path)
+    recipe = Recipe(CONFIG, MeshReading(), tmp_path / "cache")
+    SignatureCache(tmp_path / "cache").put(recipe.key(path), compute_signature(recipe.mesh(path), CONFIG))
+    assert not recipe.is_cached(path)
+    recipe.fill(path)
+    assert computed == [CONFIG.n_kept]
+    assert recipe.is_cached(path)
 
 
 USUAL = replace(CONFIG, n_eigenpairs=None)

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from igps.geometry.denoising import denoised, is_noisy
+from igps.geometry.denoising import denoised, is_noisy, noise_over_edge
 from igps.geometry.disturbances import noise
 from igps.geometry.mending import mend, mended_by
 from igps.geometry.mesh import Mesh
+from igps.geometry.surface import area_vectors
+from igps.shapes import ArticulatedShapes
 
 
 def bumpy() -> Mesh:
@@ -53,6 +55,48 @@ def test_area_and_volume_come_back(sphere: Mesh) -> None:
     assert (
         np.abs(np.linalg.norm(smooth.vertices, axis=1) - 1).std() < 0.6 * np.linalg.norm(noisy.vertices, axis=1).std()
     )
+
+
+@pytest.mark.parametrize("ratio", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("subdivisions", [4, 5])
+def test_passes_follow_the_noise(ratio: float, subdivisions: int) -> None:
+    """What is left adds the same share of the area whatever the noise; the ball of which it is told is the oracle."""
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    noise_length = ratio * np.sqrt((ball.edges_unique_length**2).mean())
+    lengths = np.random.default_rng(0).normal(0, noise_length, len(vertices))
+    noisy = vertices * (1 + lengths)[:, None]
+    # The noise makes the edges longer.
+    assert noise_over_edge(noisy, faces) == pytest.approx(ratio / np.sqrt(1 + 2 * ratio**2), rel=0.08)
+    assert is_noisy(noisy, faces)
+    smooth = Mesh(denoised(noisy, faces), faces)
+    assert smooth.area == pytest.approx(ball.area, rel=0.008)
+    assert smooth.volume == pytest.approx(ball.volume, rel=0.006)
+    # In degrees; of the noisy surface from 10 upward.
+    normals = smooth.vertices[faces].mean(axis=1)
+    cosines = np.einsum("ij,ij->i", _unit(area_vectors(smooth.vertices, faces)), _unit(normals))
+    assert np.degrees(np.arccos(cosines.clip(-1, 1))).mean() < 4.5
+
+
+def test_noise_of_a_smooth_shape_is_next_to_none(sphere: Mesh) -> None:
+    assert noise_over_edge(sphere.vertices, sphere.faces) < 0.01
+    assert noise_over_edge(3 * sphere.vertices, sphere.faces) == pytest.approx(
+        noise_over_edge(sphere.vertices, sphere.faces)
+    )
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("index", [0, 3, 7, 12, 20])
+def test_coarse_bodies_are_told_apart_from_noisy_ones(index: int) -> None:
+    """Of about 1,500 vertices, where an edge is long and the surface bends within it."""
+    body = ArticulatedShapes(index + 1, 1, seed=2, n_vertices=1500)[index]
+    mesh = Mesh(body.vertices, body.faces)
+    assert not is_noisy(mesh.vertices, mesh.faces)
+    edge = np.linalg.norm(np.diff(mesh.vertices[mesh.faces], axis=1), axis=2).mean()
+    assert is_noisy(noise(mesh, 0.18 * edge / mesh.diagonal, 0).vertices, mesh.faces)
 
 
 def test_boundaries_stay(sphere: Mesh) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
 from igps.geometry.damage import DAMAGES, halves, holes
 from igps.geometry.mending import mend, mended_by
@@ -14,6 +15,7 @@ from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.subdivision import subdivided
 from igps.geometry.surface import area_vectors
 from igps.geometry.tidying import welded
+from igps.geometry.watertight import watertight
 
 pytest.importorskip("igl")
 pytest.importorskip("skimage")
@@ -134,11 +136,67 @@ def test_never_refuses_and_always_makes_watertight(blob: Mesh) -> None:
     vertices, faces = holes(blob)
     with pytest.raises(MeshError, match="open surface"):
         mend(vertices, faces, how="never")
-    mesh = mend(blob.vertices, blob.faces, how="always")
+    mesh = mend(vertices, faces, how="always")
     assert mended_by(mesh.notes) == ("watertight",)
     assert mesh.volume == pytest.approx(blob.volume, rel=0.01)
     with pytest.raises(ValueError, match="how"):
         mend(vertices, faces, how="sometimes")  # type: ignore[arg-type]
+
+
+def test_always_leaves_the_boundary_of_one_body_as_it_is(blob: Mesh) -> None:
+    mesh = mend(blob.vertices, blob.faces, how="always")
+    assert mesh.notes == ()
+    np.testing.assert_array_equal(mesh.vertices, blob.vertices)
+    np.testing.assert_array_equal(mesh.faces, blob.faces)
+
+
+def test_what_lies_side_by_side_stays_apart_always() -> None:
+    """Two turns of a coil, half a cell from each other: a grid joins them."""
+    near = coil(turns=2.2, pitch=0.41)
+    assert watertight(near.vertices, near.faces).area < 0.97 * near.area
+    for vertices, faces in ((near.vertices, near.faces), DAMAGES["soup"].apply(near, 0)):
+        mesh = mend(vertices, faces, how="always")
+        assert "watertight" not in mended_by(mesh.notes)
+        assert mesh.area == pytest.approx(near.area, rel=1e-6)
+
+
+def test_a_closed_surface_that_crosses_itself_passes_and_is_always_made_watertight() -> None:
+    """A coil with less room than it is thick; the union of its balls is the oracle for the volume."""
+    crossing = coil(turns=2.2, pitch=0.3)
+    assert mend(crossing.vertices, crossing.faces).notes == ()
+    mesh = mend(crossing.vertices, crossing.faces, how="always")
+    assert mended_by(mesh.notes) == ("watertight",)
+    points = np.random.default_rng(0).uniform(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), (100_000, 3))
+    turn = np.linspace(0, 2.2, 3000)
+    middles = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn), 0.3 * turn], axis=1)
+    away, nearest = cKDTree(middles).query(points)
+    # Without the half balls beyond the flat ends; the radius is that of a circle of the polygon's area.
+    inside = (away < 0.2 * np.sqrt(8 / np.pi * np.sin(np.pi / 8))) & (nearest > 0) & (nearest < len(middles) - 1)
+    assert mesh.volume == pytest.approx(inside.mean() * np.prod(np.ptp(mesh.vertices, axis=0)), rel=0.02)
+    assert mesh.volume < 0.95 * crossing.volume
+
+
+def coil(turns: float, pitch: float, radius: float = 0.2) -> Mesh:
+    """A tube around a helix of radius 1, with flat ends."""
+    n, around = round(90 * turns), 16
+    turn = np.linspace(0, turns, n)[:, None]
+    angle = 2 * np.pi * turn
+    middles = np.hstack([np.cos(angle), np.sin(angle), pitch * turn])
+    along = np.hstack([-np.sin(angle), np.cos(angle), np.full_like(turn, pitch / (2 * np.pi))])
+    outward = np.hstack([np.cos(angle), np.sin(angle), np.zeros_like(turn)])
+    upward = np.cross(outward, along / np.linalg.norm(along, axis=1, keepdims=True))
+    phase = 2 * np.pi * np.arange(around) / around
+    rings = np.cos(phase)[:, None] * outward[:, None] + np.sin(phase)[:, None] * upward[:, None]
+    vertices = np.vstack([(middles[:, None] + radius * rings).reshape(-1, 3), middles[[0, -1]]])
+    i, j = np.meshgrid(np.arange(n - 1), np.arange(around), indexing="ij")
+    a, b = i * around + j, i * around + (j + 1) % around
+    c, d = a + around, b + around
+    walls = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(-1, 3)
+    ring, following = np.arange(around), (np.arange(around) + 1) % around
+    last = (n - 1) * around
+    start = np.stack([following, ring, np.full(around, n * around)], axis=1)
+    end = np.stack([last + ring, last + following, np.full(around, n * around + 1)], axis=1)
+    return Mesh(vertices, np.vstack([walls, start, end]))
 
 
 def test_a_cloud_is_a_surface(sphere: Mesh) -> None:
@@ -178,6 +236,10 @@ UNUSABLE: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray | None]], st
     ),
     "point": (lambda: (np.ones((4, 3)), np.array([[0, 1, 2], [1, 2, 3]])), "in one point"),
     "five": (lambda: (np.random.default_rng(0).random((5, 3)), None), "a cloud of 5 points"),
+    "line of points": (
+        lambda: (np.outer(np.linspace(0, 1, 30), [1, 2, 3]).astype(np.float32) + 5, None),
+        "all 30 points are on one line",
+    ),
     "nan": (lambda: (np.full((4, 3), np.nan), np.array([[0, 1, 2], [1, 2, 3]])), "NaN"),
     "nan cloud": (lambda: (np.full((40, 3), np.nan), None), "NaN"),
     "out of range": (lambda: (np.eye(3), np.array([[0, 1, 9], [0, 1, 2]])), "out of range"),

@@ -38,8 +38,8 @@ def doctor(
         root: folder of meshes, with or without classes.
         out: a CSV file for the findings, with all notes.
         signature: parameters of the signatures to come.
-        mend: auto does the least that makes a body of each mesh, never refuses what is no body, always makes all
-            watertight.
+        mend: auto does the least that makes a body of each mesh, never refuses what is no body, always makes
+            watertight all that does not bound one body without crossing itself.
         component: largest keeps only the largest connected component of each mesh.
         allow_open: accept surfaces with holes
         n_workers: processes; all cores if not given.

@@ -73,7 +73,7 @@ def topology(
         n_eigenpairs: eigenpairs of the embedding; 250 in the paper.
         resolution: voxels along the longest side, one sample each; 32 in the paper.
         mend: auto does the least that makes a body of the mesh, never refuses what is no body, always makes it
-            watertight.
+            watertight unless it bounds one body without crossing itself.
     """
     if weld is not None and len(weld) != 2:
         raise ValueError(f"weld: expected the indices of two vertices, got {len(weld)}.")
@@ -113,7 +113,7 @@ def potential(
         n_eigenpairs: eigenpairs of the embedding; 250 in the paper.
         resolution: voxels along the longest side, near the best of which the barycentroid is searched; 32 in the paper.
         mend: auto does the least that makes a body of the mesh, never refuses what is no body, always makes it
-            watertight.
+            watertight unless it bounds one body without crossing itself.
     """
     from igps.report.paper import draw_potential_slice, upright
 

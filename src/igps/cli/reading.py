@@ -49,8 +49,8 @@ def signatures(
         descriptors: whose needs the signatures satisfy.
         cache_dir: folder where computed signatures are kept; the user's cache directory if not given.
         signature: parameters of the signatures.
-        mend: auto does the least that makes a body of each mesh, never refuses what is no body, always makes all
-            watertight, for collections of mixed quality.
+        mend: auto does the least that makes a body of each mesh, never refuses what is no body, always makes
+            watertight all that does not bound one body without crossing itself, for collections of mixed quality.
         component: largest keeps only the largest connected component of each mesh.
         n_workers: processes that compute; all cores if not given.
         time_limit: seconds that the signature of one mesh may take; no limit if not given.

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from igps.data.cache import SignatureCache
-from igps.geometry.mending import mended_by
+from igps.geometry.mending import MENDING_VERSION, mended_by
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.reading import MeshReading, load_mesh
 from igps.geometry.signature import Signature, SignatureConfig, compute_signature
@@ -45,7 +45,7 @@ class Recipe:
             if signature is not None:
                 return signature.beginning(self.config)
         signature = compute_signature(self.mesh(path), self.config)
-        cache.put(self.key(path), signature)
+        cache.put(self.key(path, mended=bool(mended_by(signature.notes))), signature)
         return signature
 
     def fill(self, path: Path) -> None:
@@ -64,29 +64,40 @@ class Recipe:
         except MeshError:
             return False
 
-    def key(self, path: Path) -> str:
-        """The name of the Signature in the cache: content of the file, how it is read, every parameter and version.
+    def key(self, path: Path, *, mended: bool = False) -> str:
+        """A Signature's name in the cache: content of the file, how it is read, every parameter and version.
+
+        Args:
+            path: the file.
+            mended: whether anything was done to its mesh. Only then does the version of the mending count, so that a
+                new one leaves the Signatures of bodies that are read as they are.
 
         Raises:
             MeshError: the file cannot be read.
         """
-        return self._key(path, _content(path), self.config)
+        return self._key(path, _content(path), self.config, mended)
 
     def _cached(self, path: Path) -> Iterator[str]:
         """The keys that the cache has of the Signature of a file and of larger ones, which begin with it."""
         cache, content = SignatureCache(self.cache_dir), _content(path)
         for config in (self.config, *self.config.larger()):
-            key = self._key(path, content, config)
-            if key not in cache:
-                continue
-            # A mesh that was subdivided for more vertices is another one.
-            read_alike = config.n_vertices_read == self.config.n_vertices_read
-            if read_alike or "subdivided" not in mended_by(cache.notes(key)):
-                yield key
+            for mended in (False, True):
+                key = self._key(path, content, config, mended)
+                if key not in cache:
+                    continue
+                steps = mended_by(cache.notes(key))
+                # A former version of the mending made another body.
+                of_this_version = mended or not steps
+                # A mesh that was subdivided for more vertices is another one.
+                read_alike = config.n_vertices_read == self.config.n_vertices_read
+                if of_this_version and (read_alike or "subdivided" not in steps):
+                    yield key
 
-    def _key(self, path: Path, content: bytes, config: SignatureConfig) -> str:
+    def _key(self, path: Path, content: bytes, config: SignatureConfig, mended: bool) -> str:
         # The suffix chooses the reader, so the same bytes under another suffix are another mesh.
-        reading = [path.suffix.lower(), asdict(self.reading)]
+        reading: list[object] = [path.suffix.lower(), asdict(self.reading)]
+        if mended:
+            reading.append({"mending_version": MENDING_VERSION})
         parameters = json.dumps([reading, config.as_dict()], sort_keys=True)
         key = hashlib.sha256(parameters.encode() + b"\0")
         key.update(content)  # not joined with them: the file may be large

@@ -20,12 +20,15 @@ from igps.geometry.mesh import Mesh, MeshError, check_arrays
 from igps.geometry.subdivision import subdivided
 from igps.geometry.tidying import tidied, welded, without_hidden
 from igps.geometry.union import united, without_walls
-from igps.geometry.watertight import watertight
+from igps.geometry.watertight import crosses_itself, watertight
 
 logger = logging.getLogger(__name__)
 
 Mending = Literal["auto", "never", "always"]
 Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertight"]
+
+MENDING_VERSION = 2
+"""Raised whenever a surface that is mended would give another body: part of the cache keys of such bodies alone."""
 
 # The first words of the notes of each step.
 _WORDS: dict[str, Step] = {
@@ -64,7 +67,10 @@ def mend(
     Args:
         vertices: (V, 3) positions, any length unit.
         faces: (F, 3) vertex indices; None or empty for a cloud of points, which is made watertight.
-        how: "auto" for the above; "never" takes bodies only; "always" makes everything watertight.
+        how: "auto" for the above; "never" takes bodies only; "always" makes watertight whatever is not the boundary of
+            one body already: closed, oriented, edge-manifold, of one piece, and not crossing itself, which "auto" lets
+            pass. Only welding, smoothing and subdividing change those that are. A grid would join what lies side by
+            side nearer than a cell, as the coils of a spring do.
         least_vertices: such as the number of eigenpairs plus two; not with "never".
         normals: (V, 3) of a cloud of points, if known.
         name: what error messages call the surface, usually its file.
@@ -126,8 +132,15 @@ def _body(vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[s
 
 
 def _remade(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> Mesh:
+    """The surface as it is, welded or smoothed, if it bounds one body then; otherwise what a grid makes of it."""
     notes: list[str] = []
-    neat, triangles = welded(vertices, faces, [])
+    neat, triangles = vertices, faces
+    for step in (None, welded):
+        if step is not None:
+            neat, triangles = step(vertices, faces, notes)
+        if (body := _body(neat, triangles, notes, name)) and not crosses_itself(body.vertices, body.faces):
+            return body
+        notes = []
     smooth = _smoothed(neat, triangles, notes)
     body = watertight(smooth, triangles, name=name) if notes else watertight(vertices, faces, name=name)
     return replace(body, notes=(*notes, *body.notes))

@@ -35,7 +35,8 @@ class MeshReading:
 
     Args:
         mend: "auto" does the least that makes a body of the surface, and leaves a body as it is, see `mend`; "never"
-            refuses what is no body; "always" makes every surface watertight, for collections of mixed quality.
+            refuses what is no body; "always" makes every surface watertight that does not bound one body without
+            crossing itself, for collections of mixed quality.
         component: "largest" keeps only the connected component of the largest area.
         allow_open: accept open boundaries; inside and outside are then told apart by the winding number.
 

@@ -10,6 +10,8 @@ from igps.geometry.mesh import MeshError
 
 # Points beyond which they are thinned out first.
 _MANY_POINTS = 200_000
+# Points that are so much less spread across than along are on a line, whatever single precision did to them.
+_LINE = 1e-5
 
 
 def splats(
@@ -24,6 +26,13 @@ def splats(
     side = float(np.ptp(points, axis=0).max())
     if side == 0:
         raise MeshError(f"{name}: all points are in one place; a surface was expected. Check the file.")
+    from_middle = points - points.mean(axis=0)
+    _, across, along = np.linalg.eigvalsh(from_middle.T @ from_middle)
+    if across < _LINE**2 * along:
+        raise MeshError(
+            f"{name}: all {len(points)} points are on one line; a surface was expected. If the file holds lines, give "
+            "them thickness."
+        )
     if len(points) > _MANY_POINTS:
         # One point in each half of a cell.
         lattice = np.floor((points - points.min(axis=0)) / (side / (4 * resolution))).astype(np.int64)

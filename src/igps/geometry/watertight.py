@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from igps.geometry.distance_grid import Grid, distances, rounded
+from igps.geometry.extras import libigl
 from igps.geometry.isosurface import marched, simplified
 from igps.geometry.level_set import joined, level_set
 from igps.geometry.mesh import Mesh, MeshError
@@ -92,6 +93,21 @@ def watertight(
     if max_vertices is not None:
         surface_vertices, surface_faces = simplified(surface_vertices, surface_faces, max_vertices)
     return Mesh(grid.from_cells(surface_vertices), surface_faces, name=name, notes=tuple(notes))
+
+
+def crosses_itself(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
+    """Whether any two faces have points in common beyond their common vertices and edge, by exact predicates.
+
+    Raises:
+        ImportError: libigl is not installed.
+    """
+    libigl()
+    from igl import predicates
+
+    found, _, _ = predicates.find_self_intersections(
+        np.ascontiguousarray(vertices), np.ascontiguousarray(faces), first_only=True
+    )
+    return bool(found)
 
 
 def _with_area(

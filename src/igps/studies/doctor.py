@@ -19,11 +19,12 @@ from igps.geometry.signature import SignatureConfig
 from igps.parallel import Failed, Limits, run
 
 # Of a signature on one core: seconds and bytes by vertices and eigenpairs, as tests/benchmarks/cost.py fits them.
-# Thirty signatures of generated bodies of 700 to 95,000 vertices, with 50 and 250 eigenpairs, took times within a
-# factor of 1.5 of this (93 % of those of bodies left out of the fit) and memory within 1.05, that of the process before
-# it reads anything included. Other processors are slower or faster as a whole.
-_SECONDS, _SECONDS_PER_VERTEX, _SECONDS_PER_ENTRY = 0.281, 2.95e-5, 3.97e-7
-_BYTES, _BYTES_PER_VERTEX, _BYTES_PER_ENTRY = 3.49e8, 4010.0, 24.2
+# 62 signatures of 31 generated bodies of 770 to 119,000 vertices, with 50 and 250 eigenpairs, took times within a
+# factor of 1.5 of this (97 % of those of bodies left out of the fit; 90 % within 1.28) and memory within 1.05, that of
+# the process before it reads anything included. The constant holds what a process pays once, such as loading compiled
+# code. Other processors are slower or faster as a whole.
+_SECONDS, _SECONDS_PER_VERTEX, _SECONDS_PER_ENTRY = 0.468, 2.33e-5, 2.31e-7
+_BYTES, _BYTES_PER_VERTEX, _BYTES_PER_ENTRY = 4.57e8, 2820.0, 30.0
 
 
 @dataclass(frozen=True)
