@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,9 +26,11 @@ from pages import (
 )
 
 from conftest import as_mesh
+from igps.cli import main
 from igps.geometry.mesh import Mesh
 from igps.report.page import write_page
 from igps.report.results import read_results
+from igps.shapes import ArticulatedShapes
 
 pytest.importorskip("jinja2")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: it drives the browser")
@@ -197,6 +200,9 @@ def test_repairs_are_told(retrieval: Visit) -> None:
     assert NOTE in retrieval.open(2).locator("#facts").inner_text()
     retrieval.page.locator("#close").click()
     assert NOTE in retrieval.page.locator("#repaired").inner_text()
+    retrieval.page.locator("#repaired a").click()
+    retrieval.wait_until(lambda: retrieval.name() == NAMES[2])
+    retrieval.page.locator("#close").click()
     assert "nothing had to be done" in retrieval.open(0).locator("#facts").inner_text()
 
 
@@ -394,3 +400,23 @@ def test_the_checker_would_see_a_fault(retrieval: Visit) -> None:
     )
     violations = axe.Axe().run(retrieval.page).response["violations"]
     assert "button-name" in {one["id"] for one in violations}
+
+
+def test_the_demo_ends_with_its_page(
+    browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A smaller demo, the last line of which names a page that opens."""
+    pytest.importorskip("skimage")
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(
+        sys.modules["igps.cli.demo"], "ArticulatedShapes", lambda **_: ArticulatedShapes(n_classes=2, n_per_class=2)
+    )
+    monkeypatch.setattr(sys, "argv", ["igps", "demo", "--out", str(tmp_path), "--n_workers", "1"])
+    main()
+    *_, last = capsys.readouterr().out.splitlines()
+    path = Path(last.removeprefix("page of results: "))
+    assert path == tmp_path / "report.html"
+    with Visit(browser, path) as visit:
+        assert visit.page.locator("h1").inner_text() == "4 shapes in 2 classes, interior"
+        visit.wait_until(lambda: visit.page.locator("#shapes canvas.drawn").count() == 4)
+        assert visit.open(0).locator("#ranking-list .shape").count() == 3
