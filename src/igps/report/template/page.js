@@ -129,7 +129,7 @@ function card(query, { shape, distance }, rank) {
   const canvas = element("canvas", { "data-shape": shape, width: 1, height: 1, "aria-hidden": "true" });
   const button = element(
     "button",
-    { type: "button", class: "shape", "data-shape": shape },
+    { type: "button", class: "shape", "data-shape": shape, title: shapes[shape].name },
     element("span", { class: "rank" }, element("span", { class: "unseen" }, "rank "), String(rank)),
     canvas,
     element("span", { class: "name" }, shapes[shape].name),
