@@ -17,6 +17,7 @@ from igps.cli.demo import demo
 from igps.cli.doctor import doctor
 from igps.cli.figure import pose, potential, topology
 from igps.cli.reading import FLAGS
+from igps.cli.report import report
 from igps.cli.retrieval import extract, query, retrieve
 from igps.cli.robustness import robustness
 from igps.parallel import MachineError, is_machines, machines_words
@@ -35,6 +36,7 @@ COMMANDS: Commands = {
     "robustness": robustness,
     "damage": damage,
     "doctor": doctor,
+    "report": report,
 }
 """What follows `igps`: a function, or the commands of a group by name."""
 

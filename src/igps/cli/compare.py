@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 
 from igps.cli.reading import signatures, write_notes, write_rows
+from igps.cli.report import check_report
+from igps.cli.report import report as write_report
 from igps.data.dataset import Failure
 from igps.data.sources import labelled_meshes
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
+from igps.report.sources import write_sources
 from igps.report.tables import comparison_table
 from igps.retrieval import precision_recall_curve
 from igps.studies.comparison import Result
@@ -24,6 +27,7 @@ def compare(
     root: Path,
     descriptors: list[str] | None = None,
     out: Path | None = None,
+    report: bool = False,
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
@@ -36,10 +40,13 @@ def compare(
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
         descriptors: names, or package.module:NAME of your own; all of the library if not given.
-        out: folder for compare.json, distances/NAME.npz, precision_recall.png, and failures.csv if there are any.
+        out: folder for compare.json, distances/NAME.npz, precision_recall.png, meshes.json that tells where the meshes
+            lie, and failures.csv if there are any.
+        report: make a page of the results in that folder, report.html, see `igps report`
         n_workers: processes that compute; all cores if not given.
         strict: stop at the first mesh that cannot be used instead of skipping it
     """
+    check_report(report, out)
     chosen = [descriptor_of(name) for name in descriptors or NAMES]
     dataset, failures = signatures(labelled_meshes(root), chosen, n_workers=n_workers, strict=strict, **reading)
     results: list[Result] = []
@@ -53,8 +60,11 @@ def compare(
         print(f"{n_failed} meshes could not be used or described.")
     if out is not None:
         write_notes(out / "notes.csv", dataset)
+        write_sources(out, dataset)
         _write_figure(out, results)
         print(f"written to {out}")
+        if report:
+            write_report(out, n_workers=n_workers)
 
 
 def _write(out: Path, results: Sequence[Result], failures: Sequence[Failure]) -> None:

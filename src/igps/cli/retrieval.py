@@ -13,11 +13,14 @@ import torch
 from torch import Tensor
 
 from igps.cli.reading import signatures, write_notes, write_rows
+from igps.cli.report import check_report
+from igps.cli.report import report as write_report
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import MeshFiles, find_meshes, labelled_meshes
 from igps.descriptors import descriptor as descriptor_of
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor
+from igps.report.sources import write_sources
 from igps.report.tables import scores_table
 from igps.retrieval import RetrievalScores, rank, retrieval_scores, search
 from igps.studies.comparison import pair_distances
@@ -27,6 +30,7 @@ def retrieve(
     root: Path,
     descriptor: str = "interior",
     out: Path | None = None,
+    report: bool = False,
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
@@ -38,10 +42,13 @@ def retrieve(
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
         descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
-        out: folder for scores.json, ranking.csv, distances.npz, and failures.csv if a mesh could not be used.
+        out: folder for scores.json, ranking.csv, distances.npz, meshes.json that tells where the meshes lie, and
+            failures.csv if a mesh could not be used.
+        report: make a page of the results in that folder, report.html, see `igps report`
         n_workers: processes that compute; all cores if not given.
         strict: stop at the first mesh that cannot be used instead of skipping it
     """
+    check_report(report, out)
     chosen = descriptor_of(descriptor)
     dataset, descriptions, failures = _described(
         labelled_meshes(root), chosen, n_workers=n_workers, strict=strict, **reading
@@ -54,6 +61,8 @@ def retrieve(
     if out is not None:
         _write_retrieval(out, dataset, descriptor, distances, scores, failures)
         print(f"written to {out}")
+        if report:
+            write_report(out, n_workers=n_workers)
 
 
 def extract(
@@ -163,3 +172,4 @@ def _write_retrieval(
     rows = [(failure.id, failure.error) for failure in failures]
     write_rows(out / "failures.csv", ("file", "error"), rows)
     write_notes(out / "notes.csv", dataset)
+    write_sources(out, dataset)

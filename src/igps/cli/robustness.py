@@ -6,10 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-from igps.cli.reading import signatures
+from igps.cli.reading import signatures, write_notes, write_rows
+from igps.cli.report import check_report
+from igps.cli.report import report as write_report
 from igps.data.sources import MeshFiles, find_meshes, labelled_meshes
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
+from igps.report.sources import write_sources
 from igps.report.tables import robustness_table
 from igps.studies.robustness import robustness as measure
 
@@ -20,6 +23,7 @@ def robustness(
     gallery: Path | None = None,
     poses: Path | None = None,
     out: Path | None = None,
+    report: bool = False,
     n_workers: int | None = None,
     **reading: Any,
 ) -> None:
@@ -34,9 +38,12 @@ def robustness(
         descriptors: names, or package.module:NAME of your own; all of the library if not given.
         gallery: labelled folder that tells the distance between classes; if not given, each of the meshes is a class.
         poses: folder with meshes of one body, for the movement between any two of them.
-        out: folder for robustness.json.
+        out: folder for robustness.json, meshes.json that tells where the meshes lie, notes.csv of what was done to
+            which mesh, and failures.csv if a mesh could not be used.
+        report: make a page of the results in that folder, report.html, see `igps report`
         n_workers: processes that compute; all cores if not given.
     """
+    check_report(report, out)
     chosen = [descriptor_of(name) for name in descriptors or NAMES]
     reading["n_workers"] = n_workers
     dataset, failures = signatures(meshes, chosen, **reading)
@@ -56,4 +63,9 @@ def robustness(
         out.mkdir(parents=True, exist_ok=True)
         summary = {**found.as_dict(), "config": dataset.config.as_dict()}
         (out / "robustness.json").write_text(json.dumps(summary, indent=2) + "\n")
+        write_notes(out / "notes.csv", dataset)
+        write_rows(out / "failures.csv", ("file", "error"), [(failure.id, failure.error) for failure in failures])
+        write_sources(out, dataset)
         print(f"written to {out}")
+        if report:
+            write_report(out, n_workers=n_workers)

@@ -88,6 +88,11 @@ class SignatureDataset(Dataset[LabelledSignature]):
         return self._recipe.config
 
     @property
+    def recipe(self) -> Recipe:
+        """How a file becomes a Signature."""
+        return self._recipe
+
+    @property
     def labels(self) -> Tensor:
         """(N,) int64 index of each mesh's class in `classes`, −1 where unknown."""
         index = {name: i for i, name in enumerate(self.classes)}

@@ -1,0 +1,48 @@
+"""`igps report`, and the `--report` of other commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from igps.report.page import jinja, write_page
+from igps.report.results import read_results
+from igps.report.sources import read_sources
+from igps.report.surfaces import keep_surfaces, read_surfaces
+
+PAGE, SURFACES = "report.html", "surfaces.npz"
+
+
+def report(
+    results: Path,
+    out: Path | None = None,
+    meshes: Path | None = None,
+    n_workers: int | None = None,
+) -> None:
+    """Make a page of results, to look at in a browser: one HTML file that needs nothing else.
+
+    Small pictures of the meshes are kept in the folder, in surfaces.npz. Meshes that are gone by then have no picture.
+
+    Args:
+        results: folder that `igps retrieve`, `igps compare` or `igps robustness` wrote (--out).
+        out: the page; report.html in the folder of results if not given.
+        meshes: the folder of the meshes, if they were moved since.
+        n_workers: processes that make the pictures; all cores if not given.
+    """
+    found = read_results(results)
+    jinja()  # told before the pictures are made
+    dataset = read_sources(results, meshes)
+    if dataset is None:
+        surfaces = read_surfaces(results / SURFACES)
+    else:
+        surfaces = keep_surfaces(results / SURFACES, dataset, n_workers=n_workers)
+    page = out or results / PAGE
+    write_page(page, found, surfaces)
+    print(f"page of results: {page}")
+
+
+def check_report(is_wanted: bool, out: Path | None) -> None:
+    """Raise, before anything is computed, where a page is wanted that could not be made."""
+    if is_wanted and out is None:
+        raise ValueError("report: expected --out beside it, the folder that the page is written to. Give one.")
+    if is_wanted:
+        jinja()

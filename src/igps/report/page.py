@@ -1,0 +1,149 @@
+"""The page of results: one HTML file that loads nothing, to look at rankings, scores and bodies."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from igps.geometry.disturbances import DISTURBANCES
+from igps.report.page_data import data_of, letters
+from igps.report.results import Results
+from igps.report.surfaces import Surface
+from igps.report.tables import TITLES
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+_TEMPLATE = files("igps.report") / "template"
+_SCRIPTS = ("three.min.js", "bodies.js", "tables.js", "page.js")
+# Inside the axes of the plot of precision and recall, in units of its drawing.
+_PLOT_WIDTH, _PLOT_HEIGHT = 600, 340
+
+MEANINGS = dict(  # noqa: C408
+    nn="nearest neighbour: share of queries whose nearest shape is of their class",
+    ft="first tier: share of the class among as many nearest shapes as it has other members",
+    st="second tier: share of the class among twice as many",
+    e="E-measure: harmonic mean of precision and recall in the first 32",
+    dcg="discounted cumulative gain: hits count less the later they come",
+    adr="average dynamic recall",
+    adr_self="average dynamic recall with the query itself in the ranking, as in SHREC'07",
+    map="mean average precision",
+)
+"""What the scores are, by name."""
+
+
+def write_page(path: Path, results: Results, surfaces: Mapping[str, Surface]) -> None:
+    """Write the page of results.
+
+    Args:
+        path: an HTML file.
+        results: of a folder, see `read_results`.
+        surfaces: pictures by the name of the mesh; those without have none.
+
+    Raises:
+        ImportError: jinja2 is missing.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(page_of(results, surfaces), encoding="utf-8")
+
+
+def page_of(results: Results, surfaces: Mapping[str, Surface]) -> str:
+    """The page of results as text, for the arguments see `write_page`."""
+    from markupsafe import Markup
+
+    environment = jinja()
+    data = data_of(results, surfaces)
+    # A policy that names the page's own scripts and style by content: no other can run, wherever it came from.
+    scripts = [(_TEMPLATE / name).read_text(encoding="utf-8").strip() + "\n" for name in _SCRIPTS]
+    style = (_TEMPLATE / "page.css").read_text(encoding="utf-8")
+    for source in (*scripts, style):
+        if re.search(r"</(script|style)", source, re.IGNORECASE):
+            raise AssertionError("a script of the page closes its own element.")
+    policy = (
+        f"default-src 'none'; script-src {' '.join(map(_fingerprint, scripts))}; style-src {_fingerprint(style)}; "
+        "img-src data:; base-uri 'none'; form-action 'none'"
+    )
+    classes = data["classes"]
+    members: list[list[int]] = [[] for _ in classes] or [[]]
+    for i, shape in enumerate(data["shapes"]):
+        members[shape["label"] if classes else 0].append(i)
+    packed = [surfaces[name] for name in results.names if name in surfaces]
+    return environment.get_template("page.html.j2").render(
+        results=results,
+        title=_title(results, data),
+        data=data,
+        members=members,
+        surfaces=Markup("\n".join(letters(surface.packed()) for surface in packed)),
+        scripts=[Markup(source) for source in scripts],
+        style=Markup(style),
+        policy=policy,
+        licence=(_TEMPLATE / "three.LICENSE").read_text(encoding="utf-8"),
+        titles=TITLES,
+        meanings=MEANINGS,
+        curves=[_drawn(i, system) for i, system in enumerate(data["systems"]) if system["curve"]],
+        plot=(_PLOT_WIDTH, _PLOT_HEIGHT),
+        config=_flat(results.config),
+        disturbances={name: one.description for name, one in DISTURBANCES.items()},
+        n_repaired=sum(bool(shape["notes"]) for shape in data["shapes"]),
+    )
+
+
+def jinja() -> Environment:
+    """The environment of the templates, which escapes all that it is given.
+
+    Raises:
+        ImportError: jinja2 is missing.
+    """
+    try:
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+    except ImportError as error:
+        raise ImportError('the page of results needs jinja2: pip install "interior-gps[page]".') from error
+    return Environment(
+        loader=PackageLoader("igps.report", "template"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def _fingerprint(source: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(source.encode()).digest()).decode()}'"
+
+
+def _title(results: Results, data: Mapping[str, Any]) -> str:
+    shapes = f"{len(results.names)} shape{'s' * (len(results.names) != 1)}"
+    if data["classes"]:
+        shapes += f" in {len(data['classes'])} class{'es' * (len(data['classes']) != 1)}"
+    names = [system.name for system in results.systems] or list((results.robustness or {}).get("movements", {}))
+    what = names[0] if len(names) == 1 else f"{len(names)} descriptors"
+    return f"{shapes}, {what}" + (" under disturbance" if results.robustness else "")
+
+
+def _drawn(i: int, system: Mapping[str, Any]) -> dict[str, Any]:
+    """A curve of precision and recall as points of the drawing."""
+    points = [
+        (round(recall * _PLOT_WIDTH, 1), round((1 - precision) * _PLOT_HEIGHT, 1))
+        for recall, precision in zip(*system["curve"], strict=True)
+    ]
+    return {
+        "style": i,
+        "name": system["name"],
+        "points": points,
+        "path": "M" + " L".join(f"{x} {y}" for x, y in points),
+        "values": list(zip(*system["curve"], strict=True)),
+    }
+
+
+def _flat(config: Mapping[str, Any]) -> Sequence[tuple[str, str]]:
+    def told(value: Any) -> str:
+        if isinstance(value, list | tuple):
+            return ", ".join(map(str, value)) or "none"
+        return "none" if value is None else str(value)
+
+    return [(name.replace("_", " "), told(value)) for name, value in config.items()]

@@ -1,0 +1,131 @@
+"""The numbers that the page of results is drawn from, as its scripts read them."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.report.results import Results, System
+from igps.report.surfaces import Surface
+from igps.retrieval import RetrievalScores
+
+_LEAST_RANKED = 48
+_DECIMALS = 5
+
+
+def data_of(results: Results, surfaces: Mapping[str, Surface]) -> dict[str, Any]:
+    """All numbers of the page but the surfaces themselves.
+
+    Returns:
+        `classes`: names in alphabetical order; `shapes`: see `_shapes`; `systems`: see `_of_system`; `movements` of a
+        robustness study, by descriptor and disturbance.
+    """
+    classes = sorted(set(results.labels or ()))
+    index = {name: i for i, name in enumerate(results.names)}
+    sizes = Counter(results.labels or ())
+    # As long as a second tier is.
+    n_ranked = max(_LEAST_RANKED, 2 * max(sizes.values(), default=0))
+    return {
+        "classes": classes,
+        "shapes": _shapes(results, surfaces, classes),
+        "systems": [_of_system(system, index, classes, n_ranked) for system in results.systems],
+        "movements": _finite((results.robustness or {}).get("movements", {})),
+    }
+
+
+def letters(content: bytes) -> str:
+    """Bytes in base 64."""
+    return base64.b64encode(content).decode("ascii")
+
+
+def _shapes(results: Results, surfaces: Mapping[str, Surface], classes: Sequence[str]) -> list[dict[str, Any]]:
+    """Of each mesh its name, class, notes and surface: place among the surfaces and numbers of vertices and faces."""
+    found, place = [], 0
+    for i, name in enumerate(results.names):
+        shape: dict[str, Any] = {
+            "name": name,
+            "label": classes.index(results.labels[i]) if results.labels else -1,
+            "notes": list(results.notes.get(name, ())),
+        }
+        if name in surfaces:
+            one = surfaces[name]
+            shape["surface"] = [place, len(one.vertices), len(one.faces)]
+            shape["mesh"] = [one.n_vertices, one.n_faces, _significant(one.area), _significant(one.volume)]
+            shape["potential"] = [_significant(value) for value in one.potential_range]
+            place += 1
+        found.append(shape)
+    return found
+
+
+def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str], n_ranked: int) -> dict[str, Any]:
+    """Of a descriptor: `shapes` it describes as numbers among all; for each of them the nearest others, uint32 (N, top)
+    `ranked` and float32 (N, top) `distances`; mean scores, those of each class and each query; confusion, curve."""
+    order = system.ranked()
+    near = order[:, :n_ranked]
+    places = np.array([index[name] for name in system.names])
+    distances = np.take_along_axis(system.distances.numpy(), near, axis=1)
+    scores, curve = system.scores(), system.curve()
+    return {
+        "name": system.name,
+        "seconds": system.seconds_per_mesh,
+        "shapes": places.tolist(),
+        "top": near.shape[1],
+        "ranked": letters(places[near].astype("<u4").tobytes()),
+        "distances": letters(distances.astype("<f4").tobytes()),
+        "scores": None if scores is None else _rounded(scores.mean()),
+        "per_class": None if scores is None else _per_class(scores, classes),
+        "per_query": None if scores is None else _per_query(scores),
+        "curve": None if curve is None else [_numbers(curve.recall.tolist()), _numbers(curve.precision.tolist())],
+        "confusion": None if system.labels is None else _confusion(order, system.labels, classes),
+    }
+
+
+def _per_class(scores: RetrievalScores, classes: Sequence[str]) -> list[dict[str, Any] | None]:
+    """In the order of the classes; None for one without a scored query."""
+    found = {str(label): values for label, values in scores.per_class().items()}
+    return [_rounded(found[name]) if name in found else None for name in classes]
+
+
+def _per_query(scores: RetrievalScores) -> dict[str, list[float | None]]:
+    return {name: _numbers(getattr(scores, name).tolist()) for name in ("nn", "ft", "st", "map")}
+
+
+def _confusion(
+    order: NDArray[np.int64], labels: Sequence[str], classes: Sequence[str]
+) -> dict[str, list[list[int]]] | None:
+    """(C, C) how many shapes of a class (row) have their nearest in a class (column), and so for their first tiers."""
+    if not order.size:
+        return None
+    codes = np.array([classes.index(label) for label in labels])
+    sizes = np.bincount(codes, minlength=len(classes))[codes] - 1
+    nearest, tier = np.zeros((2, len(classes), len(classes)), dtype=np.int64)
+    np.add.at(nearest, (codes, codes[order[:, 0]]), 1)
+    rows, columns = np.nonzero(np.arange(order.shape[1]) < sizes[:, None])
+    np.add.at(tier, (codes[rows], codes[order[rows, columns]]), 1)
+    return {"nearest": nearest.tolist(), "tier": tier.tolist()}
+
+
+def _rounded(values: Mapping[str, float]) -> dict[str, float | None]:
+    return dict(zip(values, _numbers(list(values.values())), strict=True))
+
+
+def _numbers(values: Sequence[float]) -> list[float | None]:
+    """None in place of what JSON does not know."""
+    return [round(value, _DECIMALS) if math.isfinite(value) else None for value in values]
+
+
+def _finite(value: Any) -> Any:
+    """The same with None in place of numbers that JSON does not know."""
+    if isinstance(value, Mapping):
+        return {name: _finite(one) for name, one in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _significant(value: float) -> float:
+    return float(f"{value:.4g}")

@@ -1,0 +1,61 @@
+"""Where the meshes of a folder of results lie and how they were read, so that their page can be made afterwards."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from igps.data.dataset import SignatureDataset
+from igps.data.sources import MeshFiles
+from igps.geometry.reading import MeshReading
+from igps.geometry.signature import SignatureConfig
+
+MESHES_FILE = "meshes.json"
+_FORMAT = "igps-meshes-1"
+
+
+def write_sources(folder: Path, dataset: SignatureDataset) -> None:
+    """Write meshes.json: for each mesh its name in the results and its path; reading, signature, and cache folder."""
+    recipe, files = dataset.recipe, dataset.files
+    summary = {
+        "format": _FORMAT,
+        "meshes": [
+            {"file": name, "path": str(path.resolve())} for name, path in zip(files.names, files.paths, strict=True)
+        ],
+        "reading": asdict(recipe.reading),
+        "signature": asdict(recipe.config),
+        "cache_dir": str(recipe.cache_dir.resolve()),
+    }
+    (folder / MESHES_FILE).write_text(json.dumps(summary, indent=1) + "\n")
+
+
+def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset | None:
+    """The meshes of a folder of results, None where it does not tell them.
+
+    Args:
+        folder: of results.
+        meshes: the folder in which the meshes lie now, if they were moved.
+
+    Raises:
+        ValueError: meshes.json is not what `write_sources` writes.
+    """
+    path = folder / MESHES_FILE
+    if not path.is_file():
+        return None
+    try:
+        summary: dict[str, Any] = json.loads(path.read_text())
+        if summary["format"] != _FORMAT:
+            raise ValueError(f"its format is {summary['format']!r}")
+        names = tuple(str(one["file"]) for one in summary["meshes"])
+        paths = tuple(Path(one["path"]) if meshes is None else meshes / one["file"] for one in summary["meshes"])
+        signature = {**summary["signature"], "attributes": tuple(summary["signature"]["attributes"])}
+        return SignatureDataset(
+            MeshFiles(paths, names, None),
+            SignatureConfig(**signature),
+            Path(summary["cache_dir"]),
+            reading=MeshReading(**summary["reading"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected the format {_FORMAT} ({error}). Run the command again.") from error

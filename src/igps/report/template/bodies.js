@@ -1,0 +1,211 @@
+"use strict";
+// Bodies: surfaces as the page holds them, small pictures of them, and one that turns under the mouse.
+
+// From the least potential to the largest; every kind of colour vision tells the order (viridis, van der Walt and Smith).
+const COLOURS = ["#482878", "#3e4989", "#31688e", "#26828e", "#1f9e89", "#35b779", "#6ece58", "#b5de2b", "#fde725"];
+const FIELD_OF_VIEW = 26;
+const MILLISECONDS_A_FRAME = 12;
+
+const packedSurfaces = document.getElementById("surfaces").textContent.trim().split("\n");
+
+function bytesOf(letters) {
+  return Uint8Array.from(atob(letters), (letter) => letter.charCodeAt(0));
+}
+
+// The 256 colours of the potential, as three numbers each in the linear space that three.js computes in.
+const colourTable = (() => {
+  const stops = COLOURS.map((colour) => new THREE.Color(colour));
+  const table = new Float32Array(3 * 256);
+  for (let i = 0; i < 256; i++) {
+    const place = (i / 255) * (stops.length - 1);
+    const first = Math.min(Math.floor(place), stops.length - 2);
+    stops[first].clone().lerp(stops[first + 1], place - first).toArray(table, 3 * i);
+  }
+  return table;
+})();
+
+// The geometry of [place among the surfaces, vertices, faces], in a box around the origin whose longest side is 1.
+function geometryOf([place, nVertices, nFaces]) {
+  const { buffer } = bytesOf(packedSurfaces[place]);
+  const steps = new Uint16Array(buffer, 0, 3 * nVertices);
+  const faces = new Uint16Array(buffer, 6 * nVertices, 3 * nFaces);
+  const potential = new Uint8Array(buffer, 6 * (nVertices + nFaces), nVertices);
+  const positions = Float32Array.from(steps, (step) => step / 65535 - 0.5);
+  const colours = new Float32Array(3 * nVertices);
+  potential.forEach((value, i) => colours.set(colourTable.subarray(3 * value, 3 * value + 3), 3 * i));
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+  geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
+  geometry.setIndex(new THREE.BufferAttribute(faces, 1));
+  geometry.computeVertexNormals();
+  geometry.computeBoundingSphere();
+  return geometry;
+}
+
+// One body before a camera, drawn without a background.
+class Stage {
+  constructor(canvas) {
+    this.renderer = new THREE.WebGLRenderer({ canvas, alpha: true, antialias: true });
+    this.camera = new THREE.PerspectiveCamera(FIELD_OF_VIEW, 1, 0.05, 50);
+    const lamp = new THREE.DirectionalLight(0xffffff, 2.1);
+    lamp.position.set(0.6, 1.0, 1.2);
+    this.camera.add(lamp);
+    this.scene = new THREE.Scene();
+    this.scene.add(this.camera, new THREE.HemisphereLight(0xffffff, 0x8890a0, 1.7));
+    const material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.75, side: THREE.DoubleSide });
+    this.body = new THREE.Mesh(new THREE.BufferGeometry(), material);
+    this.scene.add(this.body);
+  }
+
+  show(surface) {
+    this.body.geometry.dispose();
+    this.body.geometry = geometryOf(surface);
+    const { center, radius } = this.body.geometry.boundingSphere;
+    this.body.position.copy(center).negate();
+    this.distance = radius / Math.sin((FIELD_OF_VIEW * Math.PI) / 360);
+    // From the front, a little from the right and above, where a body is seen to be one.
+    this.camera.position.set(0.46, 0.26, 0.85).setLength(this.distance);
+    this.camera.lookAt(0, 0, 0);
+  }
+
+  draw() {
+    this.renderer.render(this.scene, this.camera);
+  }
+}
+
+// Null where the browser has no WebGL.
+function stageOn(canvas) {
+  try {
+    return new Stage(canvas);
+  } catch {
+    document.documentElement.classList.add("without-3d");
+    return null;
+  }
+}
+
+// Small pictures, each drawn once it comes near the window.
+class Pictures {
+  constructor(shapes) {
+    this.shapes = shapes;
+    this.source = document.createElement("canvas");
+    this.stage = stageOn(this.source);
+    this.drawn = new Map(); // shape: a canvas that shows it
+    this.waiting = new Set();
+    this.isPlanned = false;
+    this.watcher = new IntersectionObserver((entries) => this.#arrived(entries), { rootMargin: "300px" });
+    if (this.stage) {
+      this.size = Math.round(96 * Math.min(2, Math.max(1.5, window.devicePixelRatio)));
+      this.stage.renderer.setSize(this.size, this.size, false);
+    }
+    window.addEventListener("beforeprint", () => this.drawAll());
+  }
+
+  // A canvas that will show a shape.
+  watch(canvas) {
+    if (this.stage && this.shapes[canvas.dataset.shape].surface) {
+      this.watcher.observe(canvas);
+    }
+  }
+
+  drawAll() {
+    document.querySelectorAll("canvas[data-shape]:not(.drawn)").forEach((canvas) => this.#draw(canvas));
+    this.waiting.clear();
+  }
+
+  #arrived(entries) {
+    for (const { target, isIntersecting } of entries) {
+      if (isIntersecting) this.waiting.add(target);
+      else this.waiting.delete(target);
+    }
+    this.#plan();
+  }
+
+  #plan() {
+    if (!this.isPlanned && this.waiting.size) {
+      this.isPlanned = true;
+      requestAnimationFrame(() => this.#work());
+    }
+  }
+
+  #work() {
+    const end = performance.now() + MILLISECONDS_A_FRAME;
+    for (const canvas of this.waiting) {
+      this.waiting.delete(canvas);
+      this.#draw(canvas);
+      if (performance.now() > end) break;
+    }
+    this.isPlanned = false;
+    this.#plan();
+  }
+
+  #draw(canvas) {
+    const shape = Number(canvas.dataset.shape);
+    if (!this.stage || !this.shapes[shape].surface) return;
+    let picture = this.drawn.get(shape);
+    if (!picture) {
+      this.stage.show(this.shapes[shape].surface);
+      this.stage.draw();
+      picture = this.source;
+      this.drawn.set(shape, canvas);
+    }
+    canvas.width = canvas.height = this.size;
+    canvas.getContext("2d").drawImage(picture, 0, 0);
+    canvas.classList.add("drawn");
+    this.watcher.unobserve(canvas);
+  }
+}
+
+// The body that turns: dragged with the mouse or a finger, or by the arrow keys.
+class Turntable {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.stage = stageOn(canvas);
+    if (!this.stage) return;
+    this.controls = new THREE.OrbitControls(this.stage.camera, canvas);
+    this.controls.enablePan = false;
+    this.controls.addEventListener("change", () => this.stage.draw());
+    canvas.addEventListener("keydown", (event) => this.#pressed(event));
+    new ResizeObserver(() => this.#fit()).observe(canvas);
+  }
+
+  show(surface) {
+    this.canvas.hidden = !this.stage || !surface;
+    if (this.canvas.hidden) return;
+    this.stage.show(surface);
+    this.controls.minDistance = 0.4 * this.stage.distance;
+    this.controls.maxDistance = 2 * this.stage.distance;
+    this.controls.target.set(0, 0, 0);
+    this.controls.update();
+    this.#fit();
+    this.controls.saveState();
+  }
+
+  #fit() {
+    const { clientWidth, clientHeight } = this.canvas;
+    if (!clientWidth || !clientHeight) return;
+    this.stage.renderer.setPixelRatio(Math.min(2, window.devicePixelRatio));
+    this.stage.renderer.setSize(clientWidth, clientHeight, false);
+    this.stage.camera.aspect = clientWidth / clientHeight;
+    // In a narrow frame the width must hold the body.
+    this.stage.camera.zoom = Math.min(1, this.stage.camera.aspect);
+    this.stage.camera.updateProjectionMatrix();
+    this.stage.draw();
+  }
+
+  #pressed(event) {
+    const step = Math.PI / 18;
+    const turns = {
+      ArrowLeft: () => this.controls.rotateLeft(step),
+      ArrowRight: () => this.controls.rotateLeft(-step),
+      ArrowUp: () => this.controls.rotateUp(step),
+      ArrowDown: () => this.controls.rotateUp(-step),
+      "+": () => this.controls.dollyIn(0.9),
+      "-": () => this.controls.dollyIn(1 / 0.9),
+      Home: () => this.controls.reset(),
+    };
+    if (!turns[event.key] || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    event.stopPropagation(); // the arrows lead to other shapes elsewhere
+    turns[event.key]();
+  }
+}

@@ -1,0 +1,230 @@
+"use strict";
+// What happens on the page: search, the choice of a descriptor, and the window of one shape.
+
+const byId = (id) => document.getElementById(id);
+const data = JSON.parse(byId("data").textContent);
+const { classes, shapes, systems } = data;
+const pictures = new Pictures(shapes);
+const wall = [...document.querySelectorAll("#shapes .shape")];
+const buttonOf = new Map(wall.map((button) => [Number(button.dataset.shape), button]));
+const dialog = byId("shape");
+let turntable = null; // made when the first body is opened
+let system = 0;
+let current = null; // the shape in the window
+
+for (const one of systems) {
+  one.row = new Map(one.shapes.map((shape, row) => [shape, row]));
+  one.ranked = new Uint32Array(bytesOf(one.ranked).buffer);
+  one.distances = new Float32Array(bytesOf(one.distances).buffer);
+}
+
+// The shapes nearest to one, nearest first; null where the descriptor does not know it.
+function rankingOf(shape) {
+  const one = systems[system];
+  const row = one?.row.get(shape);
+  if (row === undefined) return null;
+  const places = Array.from({ length: one.top }, (_, i) => row * one.top + i);
+  return places.map((place) => ({ shape: one.ranked[place], distance: one.distances[place] }));
+}
+
+// True, false, or null where it cannot be told.
+function isNearestRight(shape) {
+  const first = rankingOf(shape)?.[0];
+  const isScored = systems[system]?.per_query?.nn[systems[system].row.get(shape)] != null;
+  return first && isScored ? shapes[first.shape].label === shapes[shape].label : null;
+}
+
+// A mark that is told by its form and its words, too. The words are for those who hear the page.
+function setMark(place, isRight, words) {
+  place.replaceChildren();
+  if (isRight === null) return;
+  place.append(
+    element("span", { "aria-hidden": "true" }, isRight ? "✓" : "✗"),
+    element("span", { class: "unseen" }, isRight ? words[0] : words[1]),
+  );
+}
+
+function setKind(button, isRight) {
+  button.classList.toggle("hit", isRight === true);
+  button.classList.toggle("miss", isRight === false);
+}
+
+function chooseSystem(chosen) {
+  system = chosen;
+  for (const [shape, button] of buttonOf) {
+    const isRight = isNearestRight(shape);
+    setKind(button, isRight);
+    setMark(button.querySelector(".mark"), isRight, ["nearest is of the same class", "nearest is of another class"]);
+  }
+  const one = systems[system];
+  if (one && systems.length > 1) {
+    document.querySelectorAll(".of-system").forEach((place) => (place.textContent = `, ${one.name}`));
+    document.querySelectorAll("[data-system]").forEach((place) => {
+      place.classList.toggle("chosen", Number(place.dataset.system) === system);
+    });
+  }
+  if (byId("class-scores")) showClassScores(byId("class-scores"), classes, shapes, one?.per_class ?? []);
+  showChosenConfusion();
+  filter();
+}
+
+function showChosenConfusion() {
+  if (!byId("confusion-table")) return;
+  const counts = systems[system]?.confusion?.[byId("confusion-of").value] ?? [];
+  showConfusion(byId("confusion-table"), classes, counts);
+}
+
+const searched = shapes.map((shape) => [shape.name, classes[shape.label] ?? "", ...shape.notes].join(" ").toLowerCase());
+
+function filter() {
+  const words = byId("search").value.toLowerCase().split(/\s+/).filter(Boolean);
+  const only = byId("only").value;
+  let count = 0;
+  for (const [shape, button] of buttonOf) {
+    const isShown =
+      words.every((word) => searched[shape].includes(word)) &&
+      (only !== "missed" || isNearestRight(shape) === false) &&
+      (only !== "found" || isNearestRight(shape) === true) &&
+      (only !== "repaired" || shapes[shape].notes.length > 0);
+    button.parentElement.hidden = !isShown;
+    count += isShown;
+  }
+  document.querySelectorAll("#shapes .class").forEach((section) => {
+    section.hidden = !section.querySelector("li:not([hidden])");
+  });
+  byId("nothing").hidden = count > 0;
+  const all = `${shapes.length} shape${shapes.length === 1 ? "" : "s"}`;
+  byId("shown").textContent = count === shapes.length ? all : `${count} of ${all}`;
+}
+
+function fact(term, ...definition) {
+  return element("div", {}, element("dt", {}, term), element("dd", {}, ...definition));
+}
+
+function factsOf(shape) {
+  const { label, notes, mesh, potential } = shapes[shape];
+  const scores = systems[system]?.per_query;
+  const row = systems[system]?.row.get(shape);
+  const facts = [];
+  if (label >= 0) facts.push(fact("class", classes[label]));
+  if (scores && row !== undefined && scores.nn[row] !== null) {
+    facts.push(fact("first tier", `${percent(scores.ft[row])} %`));
+    facts.push(fact("second tier", `${percent(scores.st[row])} %`));
+    facts.push(fact("average precision", `${percent(scores.map[row])} %`));
+  }
+  if (mesh) {
+    facts.push(fact("mesh", `${mesh[0].toLocaleString("en")} vertices, ${mesh[1].toLocaleString("en")} faces`));
+    facts.push(fact("area, volume", `${mesh[2]}, ${mesh[3]} (units of the file, squared and cubed)`));
+    facts.push(fact("potential", `${potential[0]} to ${potential[1]} on the surface`));
+  }
+  const done = notes.map((note) => element("div", {}, note));
+  facts.push(fact("repaired", ...(done.length ? done : ["nothing had to be done"])));
+  return facts;
+}
+
+function card(query, { shape, distance }, rank) {
+  const isRight = classes.length ? shapes[shape].label === shapes[query].label : null;
+  const mark = element("span", { class: "mark" });
+  setMark(mark, isRight, ["same class", "another class"]);
+  const canvas = element("canvas", { "data-shape": shape, width: 1, height: 1, "aria-hidden": "true" });
+  const button = element(
+    "button",
+    { type: "button", class: "shape", "data-shape": shape, title: shapes[shape].name },
+    element("span", { class: "rank" }, element("span", { class: "unseen" }, "rank "), String(rank)),
+    canvas,
+    element("span", { class: "name" }, shapes[shape].name),
+    element("span", { class: "about" }, classes[shapes[shape].label] ?? ""),
+    element("span", { class: "about" }, element("span", { class: "unseen" }, "distance "), distance.toPrecision(3)),
+    mark,
+  );
+  setKind(button, isRight);
+  pictures.watch(canvas);
+  return element("li", {}, button);
+}
+
+function openShape(shape) {
+  if (!shapes[shape]) return;
+  current = shape;
+  byId("shape-name").textContent = shapes[shape].name;
+  byId("facts").replaceChildren(...factsOf(shape));
+  const ranking = rankingOf(shape);
+  const name = systems[system]?.name;
+  byId("ranking").hidden = !systems.length;
+  byId("ranking-heading").textContent = ranking
+    ? `Nearest to it by ${name}, ${ranking.length} of ${systems[system].shapes.length - 1}`
+    : `${name} could not describe this shape; the section Not used tells why.`;
+  byId("ranking-list").replaceChildren(...(ranking ?? []).map((found, i) => card(shape, found, i + 1)));
+  const moves = Object.keys(data.movements).length > 0;
+  byId("moved").hidden = !moves;
+  if (moves) showMovements(byId("moved-table"), shapes[shape].name, data.movements);
+  if (!dialog.open) dialog.showModal();
+  turntable ??= new Turntable(byId("turntable"));
+  turntable.show(shapes[shape].surface);
+  byId("turntable-hint").textContent = byId("turntable").hidden
+    ? "There is no picture of this body."
+    : "Drag or use the arrow keys to turn, wheel or + and − to come closer.";
+  dialog.scrollTop = 0;
+  // The card that was chosen is gone; who holds a button or the body keeps it.
+  if (!dialog.contains(document.activeElement) || document.activeElement === dialog) byId("shape-name").focus();
+}
+
+// The shape in the window is part of the address, so that Back goes back and a link leads to it.
+function goTo(shape) {
+  location.hash = `shape-${shape}`;
+}
+
+function followAddress() {
+  const found = location.hash.match(/^#shape-(\d+)$/);
+  if (found) openShape(Number(found[1]));
+  else if (dialog.open) dialog.close();
+}
+
+// The next shape that the search lets through.
+function step(by) {
+  const shown = wall.filter((button) => !button.parentElement.hidden).map((button) => Number(button.dataset.shape));
+  const place = shown.indexOf(current);
+  if (shown.length) goTo(shown[(Math.max(place, 0) + by + shown.length) % shown.length]);
+}
+
+function setTheme(theme) {
+  document.documentElement.dataset.theme = theme;
+  byId("theme").textContent = `Colours: ${theme}`;
+  byId("theme").setAttribute("aria-label", `Colours: ${theme === "system" ? "as the system" : theme}`);
+}
+
+byId("theme").addEventListener("click", () => {
+  const order = ["system", "light", "dark"];
+  setTheme(order[(order.indexOf(document.documentElement.dataset.theme) + 1) % order.length]);
+});
+byId("search").addEventListener("input", filter);
+byId("only").addEventListener("change", filter);
+byId("controls").addEventListener("submit", (event) => event.preventDefault());
+byId("system")?.addEventListener("change", (event) => chooseSystem(Number(event.target.value)));
+byId("confusion-of")?.addEventListener("change", showChosenConfusion);
+document.addEventListener("click", (event) => {
+  const button = event.target.closest("button.shape");
+  if (button) goTo(Number(button.dataset.shape));
+});
+byId("previous").addEventListener("click", () => step(-1));
+byId("next").addEventListener("click", () => step(1));
+byId("close").addEventListener("click", () => dialog.close());
+dialog.addEventListener("click", (event) => {
+  if (event.target === dialog) dialog.close(); // beside the window
+});
+dialog.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  if (event.key === "ArrowLeft") step(-1);
+  if (event.key === "ArrowRight") step(1);
+});
+dialog.addEventListener("close", () => {
+  if (location.hash.startsWith("#shape-")) history.pushState(null, "", location.pathname + location.search);
+  buttonOf.get(current)?.focus();
+});
+window.addEventListener("hashchange", followAddress);
+window.addEventListener("popstate", followAddress);
+
+document.querySelectorAll("[data-share]").forEach((cell) => tint(cell, Number(cell.dataset.share)));
+document.querySelectorAll("canvas[data-shape]").forEach((canvas) => pictures.watch(canvas));
+setTheme("system");
+chooseSystem(0);
+followAddress();

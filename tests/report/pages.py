@@ -1,0 +1,91 @@
+"""Folders of results for the tests of their page, with names that would be markup if they were not escaped."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+
+from igps.geometry.mesh import Mesh
+from igps.geometry.signature import SignatureConfig, compute_signature
+from igps.report.surfaces import Surface, surface_of
+
+EVIL = "<script>window.ran = 1</script>"
+LABELS = ("egg", "egg", "egg", EVIL, EVIL, EVIL, "alone")
+NAMES = (
+    "egg/a.off",
+    "egg/<img src=x onerror='window.ran=2'>.off",
+    "egg/c.off",
+    f"{EVIL}/a.off",
+    '"></script><b>/b.off',
+    "{{ 7 * 7 }}/c.off",
+    "alone/a.off",
+)
+NOTE = "3 holes of <i>which</i> & two were filled"
+DESCRIPTORS = ("interior", "gps")
+
+
+def distances_of(seed: int) -> np.ndarray:
+    """Symmetric, classes mostly together."""
+    rng = np.random.default_rng(seed)
+    centres = {label: rng.uniform(0, 1.5, 3) for label in dict.fromkeys(LABELS)}
+    points = np.array([centres[label] for label in LABELS]) + rng.normal(0, 0.4, (len(LABELS), 3))
+    return np.linalg.norm(points[:, None] - points[None], axis=2).astype(np.float32)
+
+
+def write_rows(path: Path, rows: list[tuple[str, ...]]) -> None:
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+
+
+def retrieval_folder(folder: Path, labels: tuple[str, ...] = LABELS, seed: int = 0) -> Path:
+    """What `igps retrieve` writes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        folder / "distances.npz", distances=distances_of(seed), names=np.array(NAMES), labels=np.array(labels)
+    )
+    config = {"descriptor": "interior", "n_eigenpairs": 20, "attributes": [], "max_vertices": None}
+    (folder / "scores.json").write_text(json.dumps({"config": config}))
+    write_rows(folder / "failures.csv", [("file", "error"), ("bad<b>.off", "bad<b>.off: it is open.")])
+    write_rows(folder / "notes.csv", [("file", "note"), (NAMES[2], NOTE)])
+    return folder
+
+
+def comparison_folder(folder: Path) -> Path:
+    """What `igps compare` writes; the second descriptor does not describe the last mesh."""
+    (folder / "distances").mkdir(parents=True)
+    rows = []
+    for seed, name in enumerate(DESCRIPTORS):
+        n = len(NAMES) - seed
+        arrays = {"distances": distances_of(seed)[:n, :n], "names": np.array(NAMES[:n]), "labels": np.array(LABELS[:n])}
+        np.savez_compressed(folder / "distances" / f"{name}.npz", **arrays)
+        rows.append({"descriptor": name, "n_models": n, "seconds_per_mesh": 0.25})
+    rows.append({"descriptor": "broken", "n_models": 0, "seconds_per_mesh": None})
+    (folder / "compare.json").write_text(json.dumps(rows))
+    failed = [("gps", NAMES[-1], "it has no surface."), ("all", "bad.off", "it is open.")]
+    write_rows(folder / "failures.csv", [("descriptor", "file", "error"), *failed])
+    write_rows(folder / "notes.csv", [("file", "note"), (NAMES[2], NOTE)])
+    return folder
+
+
+def robustness_folder(folder: Path) -> Path:
+    """What `igps robustness` writes."""
+    folder.mkdir(parents=True)
+    noise = {"mean": 0.125, "each": {NAMES[0]: 0.05, NAMES[1]: 0.2}, "notes": {NAMES[2]: "no surface left."}}
+    pose = {"mean": None, "each": {}, "notes": {}}
+    summary = {
+        "disturbances": {"noise": "random"},
+        "movements": {"interior": {"noise": noise, "pose": pose}},
+        "config": {"n_eigenpairs": 20},
+    }
+    (folder / "robustness.json").write_text(json.dumps(summary))
+    return folder
+
+
+def surfaces(mesh: Mesh) -> dict[str, Surface]:
+    """The mesh as a picture for all but the last but one of the names."""
+    config = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=200)
+    one = surface_of(mesh, compute_signature(mesh, config), 300)
+    return {name: one for name in NAMES if name != NAMES[-2]}

@@ -1,0 +1,422 @@
+"""The page of results in a headless Chromium: it is opened, clicked, searched, turned and printed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pages import (
+    DESCRIPTORS,
+    EVIL,
+    LABELS,
+    NAMES,
+    NOTE,
+    comparison_folder,
+    distances_of,
+    retrieval_folder,
+    robustness_folder,
+    surfaces,
+)
+
+from conftest import as_mesh
+from igps.cli import main
+from igps.geometry.mesh import Mesh
+from igps.report.page import write_page
+from igps.report.results import read_results
+from igps.shapes import ArticulatedShapes
+
+pytest.importorskip("jinja2")
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: it drives the browser")
+
+# Software renders in place of a graphics card; in containers root must go without the sandbox.
+FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+PATIENCE = 60_000  # milliseconds
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
+    flags = [*FLAGS, "--no-sandbox"] if os.geteuid() == 0 else FLAGS
+    with playwright.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=path, args=flags, timeout=PATIENCE)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page of each kind of results."""
+    import trimesh
+
+    body = trimesh.creation.icosphere(subdivisions=3)
+    body.vertices *= [1.0, 0.6 + 0.3 * (body.vertices[:, 2] > 0).mean(), 2.2]
+    mesh: Mesh = as_mesh(body)
+    root, pictures = tmp_path_factory.mktemp("pages"), surfaces(mesh)
+    made = {
+        "retrieve": retrieval_folder(root / "retrieve"),
+        "compare": comparison_folder(root / "compare"),
+        "robustness": robustness_folder(root / "robustness"),
+        "unlabelled": retrieval_folder(root / "unlabelled", labels=()),
+    }
+    for name, results in made.items():
+        write_page(root / f"{name}.html", read_results(results), pictures)
+    return root
+
+
+class Visit:
+    """A page in the browser, and what went wrong or over the network."""
+
+    def __init__(self, browser: Any, path: Path, **options: Any) -> None:
+        self.context = browser.new_context(**{"viewport": {"width": 1200, "height": 900}, **options})
+        self.context.set_default_timeout(PATIENCE)
+        self.page = self.context.new_page()
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("console", lambda message: self.complaints.append(f"{message.type}: {message.text}"))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.address = path.as_uri()
+        self.page.goto(self.address)
+
+    def __enter__(self) -> Visit:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self.context.close()
+        if failure[0] is None:
+            assert self.complaints == []
+            assert {url for url in self.requests if not url.startswith("data:")} == {self.address}
+
+    def wait_until(self, is_so: Callable[[], bool]) -> None:
+        """The page's policy forbids the waiting of Playwright's own, which evaluates text in the page."""
+        end = time.monotonic() + PATIENCE / 1000
+        while not is_so():
+            assert time.monotonic() < end
+            self.page.wait_for_timeout(50)
+
+    def name(self) -> str:
+        """Of the shape that is open."""
+        return str(self.page.locator("#shape-name").inner_text())
+
+    def shown(self) -> list[str]:
+        """Names on the wall that the search lets through."""
+        return list(self.page.locator("#shapes .shape:visible .name").all_inner_texts())
+
+    def open(self, shape: int) -> Any:
+        self.page.locator(f'#shapes .shape[data-shape="{shape}"]').click()
+        dialog = self.page.locator("dialog[open]")
+        dialog.wait_for()
+        return dialog
+
+
+@pytest.fixture
+def retrieval(browser: Any, folder: Path) -> Iterator[Visit]:
+    with Visit(browser, folder / "retrieve.html") as visit:
+        yield visit
+
+
+@pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness", "unlabelled"])
+def test_every_kind_opens_without_complaint_or_request(browser: Any, folder: Path, kind: str) -> None:
+    with Visit(browser, folder / f"{kind}.html") as visit:
+        assert len(visit.shown()) == (3 if kind == "robustness" else len(NAMES))
+        visit.open(1).locator("#close").click()
+        visit.page.locator("dialog[open]").wait_for(state="detached")
+
+
+def test_names_run_nothing(retrieval: Visit) -> None:
+    page = retrieval.page
+    assert page.evaluate("window.ran") is None
+    assert EVIL in page.locator("#shapes h3").all_inner_texts()[0]
+    retrieval.open(1)
+    assert page.locator("#shape-name").inner_text() == NAMES[1]
+    assert page.evaluate("window.ran") is None
+    assert page.locator("main img, main b").count() == 0
+
+
+def test_no_other_script_could_run(browser: Any, folder: Path) -> None:
+    with Visit(browser, folder / "retrieve.html") as visit:
+        visit.page.evaluate("() => { const s = document.createElement('script'); s.text = 'window.ran = 3'; "
+                            "document.body.append(s); }")  # fmt: skip
+        assert visit.page.evaluate("window.ran") is None
+        assert "Content Security Policy" in visit.complaints.pop()
+
+
+def test_pictures_are_drawn(retrieval: Visit) -> None:
+    page = retrieval.page
+    retrieval.wait_until(lambda: page.locator("#shapes canvas.drawn").count() == len(NAMES) - 1)
+    pixels = page.evaluate(
+        "() => { const c = document.querySelector('#shapes canvas.drawn');"
+        "return [...c.getContext('2d').getImageData(0, 0, c.width, c.height).data]; }"
+    )
+    pixels = np.array(pixels).reshape(-1, 4)
+    inside = pixels[:, 3] > 200
+    assert 0.1 < inside.mean() < 0.8  # a body on a clear ground
+    assert np.ptp(pixels[inside, 0].astype(int)) > 60  # violet in the middle, yellow at the ends
+    assert not page.locator(f'#shapes .shape[data-shape="{len(NAMES) - 2}"] canvas.drawn').count()
+
+
+def test_a_click_shows_the_ranking(retrieval: Visit) -> None:
+    query, distances = 3, distances_of(0)
+    dialog = retrieval.open(query)
+    order = sorted((j for j in range(len(NAMES)) if j != query), key=lambda j: distances[query, j])
+    cards = dialog.locator("#ranking-list .shape")
+    assert cards.locator(".name").all_inner_texts() == [NAMES[j] for j in order]
+    for place, j in enumerate(order):
+        told = cards.nth(place).inner_text()
+        assert str(place + 1) in told
+        assert f"{distances[query, j]:.3g}"[:4] in told
+        right = LABELS[j] == LABELS[query]
+        assert ("✓" in told, "✗" in told) == (right, not right)
+        assert ("same class" in told, "another class" in told) == (right, not right)
+        border = cards.nth(place).evaluate("button => getComputedStyle(button).borderStyle")
+        assert border == ("solid" if right else "dashed")
+    cards.nth(0).click()
+    retrieval.wait_until(lambda: retrieval.name() == NAMES[order[0]])
+    retrieval.page.go_back()
+    retrieval.wait_until(lambda: retrieval.name() == NAMES[query])
+    retrieval.page.go_back()
+    retrieval.page.locator("dialog[open]").wait_for(state="detached")
+
+
+def test_marks_on_the_wall_tell_the_nearest(retrieval: Visit) -> None:
+    distances = distances_of(0) + np.diag([np.inf] * len(NAMES))
+    for i, name in enumerate(NAMES):
+        told = retrieval.page.locator(f'#shapes .shape[data-shape="{i}"]').inner_text()
+        right = LABELS[distances[i].argmin()] == LABELS[i]
+        alone = LABELS.count(LABELS[i]) == 1
+        assert ("✓" in told, "✗" in told) == (right and not alone, not right and not alone), name
+
+
+def test_repairs_are_told(retrieval: Visit) -> None:
+    assert NOTE in retrieval.open(2).locator("#facts").inner_text()
+    retrieval.page.locator("#close").click()
+    assert NOTE in retrieval.page.locator("#repaired").inner_text()
+    retrieval.page.locator("#repaired a").click()
+    retrieval.wait_until(lambda: retrieval.name() == NAMES[2])
+    retrieval.page.locator("#close").click()
+    assert "nothing had to be done" in retrieval.open(0).locator("#facts").inner_text()
+
+
+def test_search_and_filter(retrieval: Visit) -> None:
+    page = retrieval.page
+    page.locator("#search").fill("EGG c.off")
+    assert retrieval.shown() == [NAMES[2]]
+    assert page.locator("#shown").inner_text() == f"1 of {len(NAMES)} shapes"
+    assert page.locator("#shapes .class:visible").count() == 1
+    page.locator("#search").fill("holes")  # a repair
+    assert retrieval.shown() == [NAMES[2]]
+    page.locator("#search").fill("no such shape")
+    assert page.locator("#nothing").is_visible()
+    page.locator("#search").fill("")
+    assert sorted(retrieval.shown()) == sorted(NAMES)
+    page.locator("#only").select_option("repaired")
+    assert retrieval.shown() == [NAMES[2]]
+    page.locator("#only").select_option("missed")
+    missed = retrieval.shown()
+    page.locator("#only").select_option("found")
+    assert sorted([*missed, *retrieval.shown(), NAMES[-1]]) == sorted(NAMES)
+
+
+def test_a_body_turns(retrieval: Visit) -> None:
+    dialog, page = retrieval.open(0), retrieval.page
+    canvas = dialog.locator("#turntable")
+    canvas.wait_for()
+    before = canvas.screenshot()
+    box = canvas.bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 120, y + 40, steps=4)
+    page.mouse.up()
+    dragged = canvas.screenshot()
+    assert dragged != before
+    canvas.focus()
+    focused = canvas.screenshot()
+    page.keyboard.press("ArrowLeft")
+    assert canvas.screenshot() != focused
+    assert page.locator("#shape-name").inner_text() == NAMES[0]  # the arrow turned the body and led nowhere
+    page.keyboard.press("Home")
+    page.locator("#close").focus()
+    assert canvas.screenshot() == before
+    page.locator("#close").press("ArrowRight")
+    retrieval.wait_until(lambda: retrieval.name() == NAMES[1])
+
+
+def test_a_shape_without_picture_says_so(retrieval: Visit) -> None:
+    dialog = retrieval.open(len(NAMES) - 2)
+    assert dialog.locator("#turntable").is_hidden()
+    assert "no picture" in dialog.locator("#turntable-hint").inner_text()
+
+
+def test_all_by_keyboard(retrieval: Visit) -> None:
+    page = retrieval.page
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.className") == "skip"
+    for _ in range(40):
+        page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.dataset.shape") is not None:
+            break
+    opened = page.evaluate("document.activeElement.dataset.shape")
+    page.keyboard.press("Enter")
+    page.locator("dialog[open]").wait_for()
+    assert page.evaluate("document.activeElement.id") == "shape-name"
+    page.keyboard.press("Escape")
+    page.locator("dialog[open]").wait_for(state="detached")
+    retrieval.wait_until(lambda: page.evaluate("document.activeElement.dataset.shape") == opened)
+    retrieval.wait_until(lambda: page.evaluate("location.hash") == "")
+
+
+def test_a_link_leads_to_a_shape(browser: Any, folder: Path) -> None:
+    with Visit(browser, folder / "retrieve.html") as visit:
+        visit.page.goto(f"{visit.address}#shape-4")
+        visit.page.reload()
+        visit.page.locator("dialog[open]").wait_for()
+        assert visit.page.locator("#shape-name").inner_text() == NAMES[4]
+        visit.requests = [url.partition("#")[0] for url in visit.requests]
+
+
+def test_another_descriptor_ranks_otherwise(browser: Any, folder: Path) -> None:
+    with Visit(browser, folder / "compare.html") as visit:
+        page = visit.page
+        query, found = 0, {}
+        for seed, name in enumerate(DESCRIPTORS):
+            page.locator("#system").select_option(str(seed))
+            assert name in page.locator("#confusion-heading").inner_text()
+            distances = distances_of(seed)[: len(NAMES) - seed, : len(NAMES) - seed]
+            dialog = visit.open(query)
+            found[name] = dialog.locator("#ranking-list .name").all_inner_texts()
+            order = sorted(range(1, len(distances)), key=lambda j: distances[query, j])
+            assert found[name] == [NAMES[j] for j in order]
+            page.locator("#close").click()
+        assert found["interior"] != found["gps"]
+        assert "could not describe" in visit.open(len(NAMES) - 1).inner_text()
+        page.locator("#close").click()
+        assert page.locator("#precision-recall .legend li").all_inner_texts() == list(DESCRIPTORS)
+
+
+def test_confusion_and_sorted_scores(retrieval: Visit) -> None:
+    page = retrieval.page
+    rows = page.locator("#confusion-table tbody tr")
+    assert rows.count() == 3
+    before = rows.all_inner_texts()
+    page.locator("#confusion-of").select_option("tier")
+    assert rows.all_inner_texts() != before
+    table = page.locator("#class-scores")
+    names = table.locator("tbody th").all_inner_texts()
+    assert names == sorted(set(LABELS))
+    table.locator("thead button", has_text="class").click()
+    assert table.locator("tbody th").all_inner_texts() == names[::-1]
+    table.locator("thead button", has_text="FT").click()
+    values = [text for text in table.locator("tbody td:nth-child(4)").all_inner_texts() if text != "–"]
+    assert [float(value) for value in values] == sorted(map(float, values))
+    assert table.locator("thead th[aria-sort=ascending]").inner_text().startswith("FT")
+
+
+def test_movements_of_a_mesh(browser: Any, folder: Path) -> None:
+    with Visit(browser, folder / "robustness.html") as visit:
+        dialog = visit.open(1)
+        assert dialog.locator("#moved-table tbody").inner_text().split() == ["interior", "20.0"]
+        assert dialog.locator("#ranking").is_hidden()
+
+
+def test_light_and_dark(browser: Any, folder: Path) -> None:
+    def background(visit: Visit) -> float:
+        colour = visit.page.evaluate("getComputedStyle(document.body).backgroundColor")
+        return np.mean([float(part) for part in colour.strip("rgb()").split(",")])
+
+    with Visit(browser, folder / "retrieve.html", color_scheme="dark") as visit:
+        assert background(visit) < 60
+        visit.page.locator("#theme").click()
+        assert background(visit) > 200
+        visit.page.locator("#theme").click()
+        assert background(visit) < 60
+    with Visit(browser, folder / "retrieve.html", color_scheme="light") as visit:
+        assert background(visit) > 200
+
+
+def test_a_narrow_window_holds_all(browser: Any, folder: Path) -> None:
+    with Visit(browser, folder / "compare.html", viewport={"width": 360, "height": 700}) as visit:
+        assert visit.page.evaluate("document.documentElement.scrollWidth") <= 360
+        dialog = visit.open(0)
+        assert dialog.evaluate("dialog => dialog.scrollWidth <= dialog.clientWidth")
+
+
+def test_print_has_all_pictures_and_no_controls(retrieval: Visit) -> None:
+    page = retrieval.page
+    page.set_viewport_size({"width": 1200, "height": 120})  # most shapes are out of sight
+    content = page.pdf()
+    assert content.startswith(b"%PDF")
+    assert page.locator("#shapes canvas.drawn").count() == len(NAMES) - 1
+    page.emulate_media(media="print")
+    assert page.locator("nav").is_hidden()
+    assert page.locator("#search").is_hidden()
+    assert page.locator("#confusion-table").is_visible()
+    page.emulate_media(media="screen")
+    page.set_viewport_size({"width": 1200, "height": 900})
+    retrieval.open(0)
+    page.emulate_media(media="print")
+    assert page.locator("main").is_hidden()
+    assert page.locator("#facts").is_visible()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness"])
+def test_nothing_serious_for_accessibility(browser: Any, folder: Path, scheme: str, kind: str) -> None:
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+    with Visit(browser, folder / f"{kind}.html", color_scheme=scheme) as visit:
+
+        def serious() -> list[str]:
+            violations = axe.Axe().run(visit.page).response["violations"]
+            return [
+                f"{one['id']}: {node['html']}: {node['failureSummary']}"
+                for one in violations
+                for node in one["nodes"]
+                if one["impact"] in ("serious", "critical")
+            ]
+
+        for details in visit.page.locator("details").all():
+            details.evaluate("details => { details.open = true; }")
+        assert serious() == []
+        visit.open(1)
+        assert serious() == []
+        visit.page.set_viewport_size({"width": 400, "height": 700})
+        assert serious() == []
+
+
+def test_the_checker_would_see_a_fault(retrieval: Visit) -> None:
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+    retrieval.page.locator("#theme").evaluate(
+        "button => { button.removeAttribute('aria-label'); button.textContent = ''; }"
+    )
+    violations = axe.Axe().run(retrieval.page).response["violations"]
+    assert "button-name" in {one["id"] for one in violations}
+
+
+def test_the_demo_ends_with_its_page(
+    browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A smaller demo, the last line of which names a page that opens."""
+    pytest.importorskip("skimage")
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(
+        sys.modules["igps.cli.demo"], "ArticulatedShapes", lambda **_: ArticulatedShapes(n_classes=2, n_per_class=2)
+    )
+    monkeypatch.setattr(sys, "argv", ["igps", "demo", "--out", str(tmp_path), "--n_workers", "1"])
+    main()
+    *_, last = capsys.readouterr().out.splitlines()
+    path = Path(last.removeprefix("page of results: "))
+    assert path == tmp_path / "report.html"
+    with Visit(browser, path) as visit:
+        assert visit.page.locator("h1").inner_text() == "4 shapes in 2 classes, interior"
+        visit.wait_until(lambda: visit.page.locator("#shapes canvas.drawn").count() == 4)
+        assert visit.open(0).locator("#ranking-list .shape").count() == 3

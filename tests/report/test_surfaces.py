@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from conftest import as_mesh, horseshoe
+from igps.data.dataset import SignatureDataset
+from igps.geometry.signature import SignatureConfig, compute_signature
+from igps.geometry.surface import components
+from igps.report import surfaces
+from igps.report.surfaces import (
+    clustered,
+    fitting_vertices,
+    keep_surfaces,
+    read_surfaces,
+    surface_of,
+    write_surfaces,
+)
+
+CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=400)
+
+
+def egg() -> trimesh.Trimesh:
+    surface = trimesh.creation.icosphere(subdivisions=3)
+    surface.vertices *= [1.0, 0.7, 2.5]
+    return surface
+
+
+def test_a_surface_keeps_the_form_with_few_vertices() -> None:
+    """The closed form of an ellipsoid: its axes, longest up, and its volume."""
+    mesh = as_mesh(egg())
+    one = surface_of(mesh, compute_signature(mesh, CONFIG), 150)
+    assert 100 < len(one.vertices) <= 150
+    points = one.vertices / 65535
+    np.testing.assert_allclose(np.ptp(points, axis=0), [1.0 / 2.5, 1.0, 0.7 / 2.5], rtol=0.06)
+    body = trimesh.Trimesh(points, one.faces, process=False)
+    assert body.is_watertight
+    assert body.volume == pytest.approx(np.pi / 6 * 0.4 * 0.28, rel=0.06)  # positive: not a mirror image
+    assert (one.n_vertices, one.n_faces) == (642, 1280)
+    assert one.volume == pytest.approx(4 / 3 * np.pi * 1.75, rel=0.02)
+
+
+def test_the_potential_is_that_of_the_nearest_samples() -> None:
+    """Against a loop; and on an egg it is least around the middle and largest at the ends."""
+    mesh = as_mesh(egg())
+    signature = compute_signature(mesh, CONFIG)
+    one = surface_of(mesh, signature, 1000)
+    heights, potential = one.vertices[:, 1] / 65535 - 0.5, one.potential / 255
+    assert potential[np.abs(heights) > 0.45].min() > 0.7
+    assert potential[np.abs(heights) < 0.1].max() < 0.3
+    assert potential.min() == 0
+    assert potential.max() == 1
+    low, high = one.potential_range
+    for vertex in range(0, len(mesh.vertices), 50):  # small enough: the vertices are those of the mesh
+        away = np.linalg.norm(signature.surface.points - mesh.vertices[vertex], axis=1)
+        total = weights = 0.0
+        for sample in np.argsort(away)[:4]:
+            phi = signature.surface.eigenfunctions[sample].astype(float)
+            weight = 1 / (away[sample] + 1e-6 * mesh.diagonal)
+            total += weight * np.sqrt(sum(phi**2 / signature.eigenvalues))
+            weights += weight
+        assert low + potential[vertex] * (high - low) == pytest.approx(total / weights, abs=(high - low) / 400)
+
+
+def test_turned_and_moved_bodies_look_alike() -> None:
+    mesh = horseshoe()
+    turn = trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).uniform(size=3))[:3, :3]
+    other = as_mesh(trimesh.Trimesh(3 * mesh.vertices @ turn.T + [5, 1, 2], mesh.faces, process=False))
+    one, two = (surface_of(body, compute_signature(body, CONFIG), 1000) for body in (mesh, other))
+    np.testing.assert_allclose(one.vertices / 65535, two.vertices / 65535, atol=2e-3)
+
+
+def test_clusters_are_means_of_cells() -> None:
+    surface = egg()
+    vertices, faces = clustered(np.asarray(surface.vertices), np.asarray(surface.faces), 120)
+    assert 40 < len(vertices) <= 120
+    assert components(faces, len(vertices))[0] == 1
+    inside = (vertices / [1.0, 0.7, 2.5]) ** 2
+    assert (inside.sum(axis=1) <= 1 + 1e-9).all()  # means of points of a convex surface
+    assert trimesh.Trimesh(vertices, faces).area == pytest.approx(surface.area, rel=0.1)
+
+
+def test_without_libigl_clusters_serve(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(mesh: object, n_vertices: int) -> None:
+        raise ImportError("no libigl")
+
+    monkeypatch.setattr(surfaces, "simplify", missing)
+    mesh = as_mesh(egg())
+    assert 40 < len(surface_of(mesh, compute_signature(mesh, CONFIG), 150).vertices) <= 150
+
+
+def test_written_and_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "surfaces.npz"
+    assert read_surfaces(path) == {}
+    mesh = as_mesh(egg())
+    signature = compute_signature(mesh, CONFIG)
+    written = {"a": surface_of(mesh, signature, 100, "key"), "ü": surface_of(mesh, signature, 300)}
+    write_surfaces(path, written)
+    found = read_surfaces(path)
+    assert list(found) == ["a", "ü"]
+    for name, one in written.items():
+        assert one.packed() == found[name].packed()
+        for field in ("potential_range", "n_vertices", "n_faces", "area", "volume", "key"):
+            assert getattr(one, field) == getattr(found[name], field)
+    write_surfaces(path, {})
+    assert read_surfaces(path) == {}
+    np.savez(path, names=np.array(["a"]))
+    with pytest.raises(ValueError, match="igps-surfaces-1"):
+        read_surfaces(path)
+
+
+def test_kept_surfaces_follow_their_files(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Made once, again where the file changed, kept where it is gone; one that cannot be read has none."""
+    files = [tmp_path / f"{i}.off" for i in range(3)]
+    for i, file in enumerate(files):
+        surface = egg()
+        surface.vertices *= [1, 1, 1 - 0.1 * i]
+        surface.export(file)
+    kept = tmp_path / "surfaces.npz"
+
+    def keep() -> dict[str, surfaces.Surface]:
+        dataset = SignatureDataset(files, CONFIG, tmp_path / "cache")
+        return {Path(name).name: one for name, one in keep_surfaces(kept, dataset, n_workers=1).items()}
+
+    first = keep()
+    assert list(first) == ["0.off", "1.off", "2.off"]
+    time_made = kept.stat().st_mtime_ns
+    assert {name: one.key for name, one in keep().items()} == {name: one.key for name, one in first.items()}
+    assert kept.stat().st_mtime_ns == time_made
+
+    changed = egg()
+    changed.vertices *= [1, 1, 0.5]
+    changed.export(files[0])
+    files[1].unlink()
+    second = keep()
+    assert second["0.off"].volume == pytest.approx(changed.volume)
+    assert second["0.off"].volume < 0.6 * first["0.off"].volume
+    assert second["1.off"].packed() == first["1.off"].packed()
+
+    files[2].write_text("no mesh")
+    kept.unlink()
+    assert list(keep()) == ["0.off"]
+    assert "2.off: no picture" in caplog.text
+
+
+def test_many_shapes_share_the_room() -> None:
+    assert fitting_vertices(0) == fitting_vertices(400) == 1200
+    assert 150 < fitting_vertices(2000) < 500
+    for n in (1, 400, 1000, 5000):
+        assert n * fitting_vertices(n) * 19 * 4 / 3 < 21e6
+    assert fitting_vertices(10**6) == 150
