@@ -20,7 +20,7 @@ from igps.descriptors import NAMES, descriptor
 from igps.descriptors.d2 import D2
 from igps.geometry.signature import SignatureConfig
 from igps.nn.description import describe
-from igps.retrieval import chi_square, retrieval_scores
+from igps.retrieval import chi_square, rerank, retrieval_scores
 from own_descriptors import SMALL, small_interior
 
 INTERIOR = "own_descriptors:small_interior"
@@ -84,6 +84,24 @@ def test_retrieve_prints_and_writes_what_python_computes(
         assert [row["model"] for row in ranked] == [dataset.files.names[j] for j in others]
         assert [row["relevant"] for row in ranked] == [str(int(i // 3 == j // 3)) for j in others]
     assert not (out / "failures.csv").exists()
+
+
+def test_retrieve_reranks_in_a_table_of_its_own(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--descriptor", INTERIOR, "--cache_dir", tmp_path / "cache", *SMALL)
+    for name, further in (("plain", ()), ("both", ("--rerank",))):
+        igps(monkeypatch, "retrieve", root, "--out", tmp_path / name, *options, *further)
+    printed = capsys.readouterr().out
+    assert printed.count("re-ranked by the whole collection") == 1
+    plain, both = (json.loads((tmp_path / name / "scores.json").read_text()) for name in ("plain", "both"))
+    with np.load(tmp_path / "both" / "distances.npz") as archive:
+        expected = rerank(torch.from_numpy(archive["distances"]))
+        np.testing.assert_allclose(archive["reranked"], expected, atol=1e-7)
+        labels = archive["labels"].tolist()
+    assert both.pop("reranked") == pytest.approx(retrieval_scores(expected, labels).mean())
+    assert both == plain
+    assert "reranked" not in plain
 
 
 def test_gps_is_another_descriptor_on_the_same_cache(

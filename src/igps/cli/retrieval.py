@@ -23,6 +23,7 @@ from igps.nn.descriptor import Descriptor
 from igps.report.sources import write_sources
 from igps.report.tables import scores_table
 from igps.retrieval import RetrievalScores, rank, retrieval_scores, search
+from igps.retrieval import rerank as reranked_distances
 from igps.studies.comparison import pair_distances
 
 
@@ -31,6 +32,7 @@ def retrieve(
     descriptor: str = "interior",
     out: Path | None = None,
     report: bool = False,
+    rerank: bool = False,
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
@@ -45,6 +47,8 @@ def retrieve(
         out: folder for scores.json, ranking.csv, distances.npz, meshes.json that tells where the meshes lie, and
             failures.csv if a mesh could not be used.
         report: make a page of the results in that folder, report.html, see `igps report`
+        rerank: score the distances that the whole collection has set right by its neighbourhoods, too, in a table of
+            their own (k-reciprocal re-ranking, without labels); distances.npz has them as "reranked".
         n_workers: processes that compute; all cores if not given.
         strict: stop at the first mesh that cannot be used instead of skipping it
     """
@@ -56,10 +60,16 @@ def retrieve(
     distances = pair_distances(chosen, descriptions)
     scores = retrieval_scores(distances, dataset.files.labels or ())
     print(scores_table(scores))
+    reranked = reranked_distances(distances) if rerank else None
+    scores_reranked = None if reranked is None else retrieval_scores(reranked, dataset.files.labels or ())
+    if scores_reranked is not None:
+        print(f"\nre-ranked by the whole collection, without its labels\n{scores_table(scores_reranked)}")
     if failures:
         print(f"{len(failures)} of {len(failures) + len(dataset)} meshes could not be used.")
     if out is not None:
         _write_retrieval(out, dataset, descriptor, distances, scores, failures)
+        if reranked is not None and scores_reranked is not None:
+            _write_reranked(out, reranked, scores_reranked)
         print(f"written to {out}")
         if report:
             write_report(out, n_workers=n_workers)
@@ -68,7 +78,7 @@ def retrieve(
 def extract(
     meshes: list[Path],
     out: Path,
-    descriptor: str = "interior",
+    descriptor: str = "pretrained",
     **reading: Any,
 ) -> None:
     """Write the descriptions of meshes to a file, for use in any classifier.
@@ -101,7 +111,7 @@ def query(
     mesh: Path,
     gallery: Path,
     top: int = 10,
-    descriptor: str = "interior",
+    descriptor: str = "pretrained",
     **reading: Any,
 ) -> None:
     """List the meshes of a gallery that are most similar to one mesh.
@@ -173,3 +183,11 @@ def _write_retrieval(
     write_rows(out / "failures.csv", ("file", "error"), rows)
     write_notes(out / "notes.csv", dataset)
     write_sources(out, dataset)
+
+
+def _write_reranked(out: Path, distances: Tensor, scores: RetrievalScores) -> None:
+    """Add the re-ranked distances, and the means of their scores, to what is written."""
+    summary = json.loads((out / "scores.json").read_text())
+    (out / "scores.json").write_text(json.dumps({**summary, "reranked": scores.mean()}, indent=2) + "\n")
+    with np.load(out / "distances.npz") as plain:
+        np.savez_compressed(out / "distances.npz", **plain, reranked=distances.numpy())

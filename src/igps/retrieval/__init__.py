@@ -1,6 +1,7 @@
 """Tensors in, numbers out: distances between descriptors, rankings and retrieval scores."""
 
 from igps.retrieval.distances import Distance, chi_square, cosine, euclidean, hellinger
+from igps.retrieval.reranking import rerank
 from igps.retrieval.scores import (
     Labels,
     PrecisionRecallCurve,
@@ -22,6 +23,7 @@ __all__ = [
     "hellinger",
     "precision_recall_curve",
     "rank",
+    "rerank",
     "retrieval_scores",
     "search",
 ]

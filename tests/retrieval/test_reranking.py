@@ -1,0 +1,98 @@
+"""Re-ranking against the paper's sets and sums, written out shape by shape, and what it promises."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from igps.retrieval import euclidean, rerank, retrieval_scores
+
+
+def by_hand(distances: list[list[float]], k: int, n_expanded: int, share: float) -> list[list[float]]:
+    """Zhong, Zheng, Cao and Li 2017, equations 2, 3, 7, 10, 11 and 12; the units of distance are this library's."""
+    n = len(distances)
+    ranked = [[i, *sorted((j for j in range(n) if j != i), key=lambda j, i=i: distances[i][j])] for i in range(n)]
+
+    def reciprocal(i: int, k: int) -> set[int]:
+        return {j for j in ranked[i][: k + 1] if i in ranked[j][: k + 1]}
+
+    weights = []
+    for i in range(n):
+        members = reciprocal(i, k)
+        for j in sorted(reciprocal(i, k)):
+            half = reciprocal(j, max(1, round(k / 2)))
+            if len(half & reciprocal(i, k)) >= 2 / 3 * len(half):
+                members |= half
+        near = sum(distances[i][j] for j in ranked[i][1 : k + 1]) / k
+        row = [math.exp(-distances[i][j] / near) if j in members else 0.0 for j in range(n)]
+        weights.append([value / sum(row) for value in row])
+    weights = [[sum(weights[m][j] for m in ranked[i][:n_expanded]) / n_expanded for j in range(n)] for i in range(n)]
+    mean = sum(map(sum, distances)) / (n * (n - 1))
+    found = []
+    for i in range(n):
+        row = []
+        for j in range(n):
+            smaller = sum(min(a, b) for a, b in zip(weights[i], weights[j], strict=True))
+            larger = sum(max(a, b) for a, b in zip(weights[i], weights[j], strict=True))
+            row.append((1 - share) * (1 - smaller / larger) + share * distances[i][j] / mean if i != j else 0.0)
+        found.append(row)
+    return found
+
+
+@pytest.fixture
+def points() -> Tensor:
+    return torch.randn(30, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+@pytest.mark.parametrize(("k", "n_expanded", "share"), [(6, 3, 0.3), (9, 1, 0.0), (4, 6, 1.0), (12, 4, 0.5)])
+def test_sets_and_sums_of_the_paper(k: int, n_expanded: int, share: float, points: Tensor) -> None:
+    distances = euclidean(points, points)
+    expected = torch.tensor(by_hand(distances.tolist(), k, n_expanded, share), dtype=torch.float64)
+    torch.testing.assert_close(rerank(distances, k, n_expanded, share), expected, atol=1e-10, rtol=0)
+
+
+def test_the_order_of_shapes_does_not_matter(points: Tensor) -> None:
+    order = torch.randperm(30, generator=torch.Generator().manual_seed(1))
+    found = rerank(euclidean(points, points))
+    torch.testing.assert_close(rerank(euclidean(points[order], points[order])), found[order][:, order])
+    torch.testing.assert_close(found, found.T)
+    torch.testing.assert_close(rerank(3 * euclidean(points, points)), found)
+
+
+def test_classes_that_scatter_are_found_better() -> None:
+    """Twelve of twenty points each, so far apart that a third of the first tier is of another class."""
+    generator = torch.Generator().manual_seed(0)
+    centres = torch.randn(12, 1, 20, generator=generator)
+    scattered = (centres + 1.0 * torch.randn(12, 20, 20, generator=generator)).flatten(0, 1)
+    labels = torch.arange(12).repeat_interleave(20)
+    plain = euclidean(scattered, scattered)
+    before, after = (retrieval_scores(d, labels).mean()["ft"] for d in (plain, rerank(plain)))
+    assert 0.5 < before < 0.8
+    assert after > before + 0.1
+
+
+def test_few_shapes_and_equal_ones() -> None:
+    assert rerank(torch.zeros(1, 1)).tolist() == [[0.0]]
+    twins = torch.tensor([[0.0, 0, 1], [0, 0, 1], [1, 1, 0]])
+    found = rerank(twins)
+    assert torch.isfinite(found).all()
+    assert found[0, 1] < found[0, 2]
+    assert torch.isfinite(rerank(torch.zeros(5, 5))).all()
+
+
+@pytest.mark.parametrize(
+    ("distances", "numbers", "message"),
+    [
+        (torch.zeros(2, 3), {}, r"expected those of a collection to itself, \(N, N\), got \(2, 3\)"),
+        (-torch.ones(2, 2), {}, "finite numbers ≥ 0"),
+        (torch.full((2, 2), math.nan), {}, "finite numbers ≥ 0"),
+        (torch.zeros(2, 2), {"n_neighbours": 0}, "got 0, 6 and 0.3"),
+        (torch.zeros(2, 2), {"share": 1.5}, "got 20, 6 and 1.5"),
+    ],
+)
+def test_what_it_refuses(distances: Tensor, numbers: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        rerank(distances, **numbers)  # type: ignore[arg-type]
