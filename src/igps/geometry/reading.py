@@ -18,6 +18,9 @@ from igps.geometry.surface import compact, face_parts
 from igps.threads import one_thread
 
 logger = logging.getLogger(__name__)
+# What a file has against it is told by an error that names it; a traceback on the terminal, from trimesh's last resort
+# where nobody has set up logging, says nothing to its reader
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 Component = Literal["largest"]
 
