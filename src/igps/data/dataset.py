@@ -88,6 +88,11 @@ class SignatureDataset(Dataset[LabelledSignature]):
         return self._recipe.config
 
     @property
+    def reading(self) -> MeshReading:
+        """How the mesh files are read."""
+        return self._recipe.reading
+
+    @property
     def labels(self) -> Tensor:
         """(N,) int64 index of each mesh's class in `classes`, −1 where unknown."""
         index = {name: i for i, name in enumerate(self.classes)}
@@ -112,6 +117,14 @@ class SignatureDataset(Dataset[LabelledSignature]):
             MeshError: it cannot be used.
         """
         return self._recipe.mesh(self.files.paths[index])
+
+    def key(self, index: int) -> str:
+        """The name of a Signature in the cache, by the content of its file and everything that it depends on.
+
+        Raises:
+            MeshError: the file cannot be read.
+        """
+        return self._recipe.key(self.files.paths[index])
 
     def notes(self, index: int) -> tuple[str, ...]:
         """What was done to a mesh on its way to its cached Signature, in words."""
