@@ -25,6 +25,8 @@ _MOST_FLAT = 50_000
 # Vectors to learn each cluster from, as FAISS advises at the least, and clusters looked into.
 _TRAINED_ON = 39
 _PROBED = 64
+# Of k-means, which hardly moves any more after so many.
+_ROUNDS = 10
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ def _write_clusters(folder: Path, vectors: NDArray[np.float32], seed: int) -> No
     faiss = import_faiss()
     n_clusters = 2 ** round(np.log2(4 * np.sqrt(len(vectors))))
     index = faiss.index_factory(vectors.shape[1], f"IVF{n_clusters},SQ8")
-    index.cp.seed = seed + 1
+    index.cp.seed, index.cp.niter = seed + 1, _ROUNDS
     chosen = np.random.default_rng(seed).choice(len(vectors), min(len(vectors), _TRAINED_ON * n_clusters), False)
     index.train(np.ascontiguousarray(vectors[np.sort(chosen)]))
     for i in range(0, len(vectors), 16 * _ROWS_AT_ONCE):
