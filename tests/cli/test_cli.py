@@ -303,7 +303,7 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(
         logging.disable(logging.NOTSET)
 
 
-@pytest.mark.parametrize("command", ["retrieve", "extract", "query", "demo", "compare", "robustness"])
+@pytest.mark.parametrize("command", ["retrieve", "extract", "query", "precompute", "demo", "compare", "robustness"])
 def test_help_explains_every_option(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:

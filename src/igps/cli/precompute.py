@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import re
 from collections.abc import Iterator
 from concurrent.futures import Executor
@@ -93,6 +94,9 @@ def dask_executor(address: str) -> Iterator[Executor]:
         from distributed import Client
     except ImportError as error:
         raise ImportError('cluster: needs Dask: pip install "interior-gps[cluster]".') from error
+    # A lost scheduler is told in one sentence; Dask adds the tracebacks of its attempts to find it again.
+    for name in ("distributed", "distributed.client", "tornado.application"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=_ANSWERS_WITHIN, set_as_default=False)
     except (OSError, ValueError) as error:  # a TimeoutError is an OSError
