@@ -83,6 +83,15 @@ def test_the_nearest_of_many_are_those_of_all(tmp_path: Path, monkeypatch: pytes
     )
 
 
+def test_more_may_be_wanted_than_are_near(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(index_part, "_MOST_FLAT", 1000)
+    monkeypatch.setattr(index_part, "_PROBED", 1)
+    rows = units(2000)
+    index = write_index(tmp_path / "g.igps", ABOUT, "cosine", batches(rows))
+    found = index.search(rows[:3], cosine, top=1500)
+    assert torch.equal(found.indices, search(rows[:3], rows, top=1500, distance=cosine).indices)
+
+
 def test_long_descriptions_are_kept_in_half_precision(tmp_path: Path) -> None:
     """Each number to 0.05 %, however small all of them are."""
     rows = histograms(60, 1500)

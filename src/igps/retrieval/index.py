@@ -137,9 +137,10 @@ class VectorIndex:
             found = [self._ranked(query[None], self._chunks(), distance, top) for query in queries]
         else:
             flat = queries.reshape(len(queries), -1).cpu().float().numpy()
+            # Where fewer are near than are wanted, all are ranked.
             found = [
-                self._ranked(query[None], [positions], distance, top)
-                for query, positions in zip(queries, self._nearest(flat, max(candidates, top)), strict=True)
+                self._ranked(query[None], [near] if len(near) >= top else self._chunks(), distance, top)
+                for query, near in zip(queries, self._nearest(flat, max(candidates, top)), strict=True)
             ]
         return SearchResult(torch.stack([one.indices for one in found]), torch.stack([one.distances for one in found]))
 
