@@ -24,7 +24,7 @@ _MOST_IN_FULL = 1024
 _MOST_FLAT = 50_000
 # Vectors to learn each cluster from, as FAISS advises at the least, and clusters looked into.
 _TRAINED_ON = 39
-_PROBED = 64
+_PROBED = 32
 # Of k-means, which hardly moves any more after so many.
 _ROUNDS = 10
 
