@@ -56,7 +56,7 @@ class Cluster:
         self.workers = [self.start_worker() for _ in range(3)]
 
     def start_worker(self) -> subprocess.Popen[bytes]:
-        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "60"]
+        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "300"]
         return self._start("worker", self.address, *options, "--local-directory", str(self._folder))
 
     def _start(self, *words: str) -> subprocess.Popen[bytes]:
@@ -75,8 +75,8 @@ class Cluster:
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     one = Cluster(tmp_path_factory.mktemp("cluster"))
     try:
-        with distributed.Client(one.address, timeout=60, set_as_default=False) as client:
-            client.wait_for_workers(3, timeout=60)
+        with distributed.Client(one.address, timeout=300, set_as_default=False) as client:
+            client.wait_for_workers(3, timeout=300)
         yield one
     finally:
         one.end()
@@ -113,7 +113,7 @@ def test_a_worker_that_is_killed_costs_nothing(cluster: Cluster, root: Path, tmp
             time.sleep(0.005)
         cluster.workers[0].send_signal(signal.SIGKILL)
         assert len(stored(tmp_path / "there")) < 12
-        assert running.result(timeout=120) == []
+        assert running.result(timeout=300) == []
     cluster.workers.append(cluster.start_worker())
     assert {name.removesuffix(".safetensors") for name in stored(tmp_path / "there")} == {
         dataset.key(i) for i in range(12)
