@@ -46,6 +46,7 @@ NAMES = [
 
 # Import names whose distribution is called otherwise.
 DISTRIBUTIONS = {
+    "faiss": "faiss-cpu",
     "igl": "libigl",
     "ot": "POT",
     "skimage": "scikit-image",

@@ -19,6 +19,7 @@ FLOORS = (
     ("data",),
     ("nn",),
     ("descriptors",),
+    ("gallery",),
     ("studies",),
     ("report",),
     ("cli", "sklearn"),

@@ -11,6 +11,7 @@ import contextlib
 import errno
 import multiprocessing
 import os
+import queue
 import signal
 import threading
 import time
@@ -18,15 +19,16 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
+    CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
-    as_completed,
     wait,
 )
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from typing import Any, Generic, TypeVar
 
 from igps.threads import n_cores, one_thread, stay_on_one_thread
@@ -54,6 +56,12 @@ _KILLED = (
     "the process that worked on it was killed, twice. It may need more memory than there is: use fewer workers, or set "
     "a memory limit to be told."
 )
+_KILLED_ELSEWHERE = (
+    "the workers that had it were killed, one after the other. It may need more memory than they have: start them with "
+    "more."
+)
+# Enough for the workers of a large cluster, few enough for the memory of who asks.
+_MOST_SUBMITTED = 10_000
 _MACHINES = frozenset(
     getattr(errno, name, 0)
     for name in ("ENOSPC", "EDQUOT", "EFBIG", "EIO", "EROFS", "EACCES", "EPERM", "EMFILE", "ENFILE", "ENOMEM")
@@ -169,7 +177,7 @@ def _attempt(result: Callable[[], Result], limits: Limits) -> Result | Failed:
     """The result; the job's failure in words, where the machine is not at fault."""
     try:
         return result()
-    except BrokenExecutor:
+    except (BrokenExecutor, CancelledError):
         raise
     except MachineError:
         raise
@@ -182,7 +190,8 @@ def _attempt(result: Callable[[], Result], limits: Limits) -> Result | Failed:
             raise MachineError(machines_words(error)) from error
         return Failed(_sentence(error))
     except Exception as error:
-        return Failed(_sentence(error))
+        # The exception of Dask, where so many workers were lost with a job that it is not given to another.
+        return Failed(_KILLED_ELSEWHERE if type(error).__name__ == "KilledWorker" else _sentence(error))
 
 
 def _sentence(error: Exception) -> str:
@@ -192,15 +201,33 @@ def _sentence(error: Exception) -> str:
 def _by_executor(
     executor: Executor, function: Callable[[Job], Result], jobs: Sequence[Job]
 ) -> Generator[tuple[int, Result | Failed], None, None]:
-    futures: dict[Future[Result], int] = {executor.submit(function, job): number for number, job in enumerate(jobs)}
-    try:
-        for future in as_completed(futures):
+    done: queue.SimpleQueue[Future[Result]] = queue.SimpleQueue()
+    numbers: dict[Future[Result], int] = {}
+    waiting = enumerate(jobs)
+
+    def submit(n_more: int) -> None:
+        for number, job in islice(waiting, n_more):
             try:
-                yield futures[future], _attempt(future.result, Limits())
+                future = executor.submit(function, job)
+            except RuntimeError as error:  # it takes no work any more
+                raise MachineError(f"the executor broke ({error}). Run again: what is done is kept.") from error
+            numbers[future] = number
+            future.add_done_callback(done.put)
+
+    try:
+        submit(_MOST_SUBMITTED)
+        while numbers:
+            future = done.get()
+            number = numbers.pop(future)
+            try:
+                yield number, _attempt(future.result, Limits())
+            except CancelledError as error:
+                raise MachineError("the executor gave the work up. Run again: what is done is kept.") from error
             except BrokenExecutor as error:
                 raise MachineError(f"the executor broke ({error}). Run again: what is done is kept.") from error
+            submit(1)
     finally:
-        for future in futures:
+        for future in numbers:
             future.cancel()
 
 

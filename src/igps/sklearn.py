@@ -42,7 +42,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
 
     def __init__(
         self,
-        descriptor: str | Descriptor = "rich",
+        descriptor: str | Descriptor = "pretrained",
         *,
         square_root: bool = True,
         config: SignatureConfig | None = None,

@@ -16,6 +16,8 @@ from igps.cli.damage import damage
 from igps.cli.demo import demo
 from igps.cli.doctor import doctor
 from igps.cli.figure import pose, potential, topology
+from igps.cli.index import index_add, index_build, index_merge
+from igps.cli.precompute import precompute
 from igps.cli.reading import FLAGS
 from igps.cli.report import report
 from igps.cli.retrieval import extract, query, retrieve
@@ -30,6 +32,8 @@ COMMANDS: Commands = {
     "retrieve": retrieve,
     "extract": extract,
     "query": query,
+    "precompute": precompute,
+    "index": {"build": index_build, "add": index_add, "merge": index_merge},
     "demo": demo,
     "compare": compare,
     "figure": {"pose": pose, "topology": topology, "potential": potential},

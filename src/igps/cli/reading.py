@@ -60,12 +60,8 @@ def signatures(
     Raises:
         ValueError: no mesh could be used, or `paper` beside other parameters of the signatures.
     """
-    if paper and signature != SignatureConfig():
-        raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
-    config = SignatureConfig.paper() if paper else signature
-    if descriptors:
-        config = reduce(or_, (one.needs for one in descriptors), Needs()).completed(config)
-    dataset = SignatureDataset(source, config, cache_dir, reading=MeshReading(mend, component, allow_open))
+    needs = reduce(or_, (one.needs for one in descriptors), Needs()) if descriptors else None
+    dataset = chosen_dataset(source, needs, cache_dir, signature, paper, mend, component, allow_open)
     limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
     failures = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits)
     if len(failures) == len(dataset):
@@ -76,9 +72,42 @@ def signatures(
     return usable, failures
 
 
+def chosen_dataset(
+    source: Path | Sequence[Path] | MeshFiles,
+    needs: Needs | None,
+    cache_dir: Path | None = None,
+    signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
+    paper: bool = False,
+    mend: Mending = "auto",
+    component: Component | None = None,
+    allow_open: bool = False,
+) -> SignatureDataset:
+    """The dataset that the options tell; nothing is computed.
+
+    Args:
+        source: a folder, files, or what was found in a folder.
+        needs: what the signatures satisfy, if that is known.
+        cache_dir: folder where computed signatures are kept; the user's cache directory if not given.
+        signature: parameters of the signatures.
+        mend: auto does the least that makes a body of each mesh, never refuses what is no body, always makes all
+            watertight, for collections of mixed quality.
+        component: largest keeps only the largest connected component of each mesh.
+        paper, allow_open: see `FLAGS`.
+
+    Raises:
+        ValueError: `paper` beside other parameters of the signatures.
+    """
+    if paper and signature != SignatureConfig():
+        raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
+    config = SignatureConfig.paper() if paper else signature
+    if needs is not None:
+        config = needs.completed(config)
+    return SignatureDataset(source, config, cache_dir, reading=MeshReading(mend, component, allow_open))
+
+
 def mending_summary(dataset: SignatureDataset, n_given: int) -> str:
     """How many meshes were mended and by what, in one line; nothing where none was."""
-    steps = [mended_by(dataset.notes(i)) for i in range(len(dataset))]
+    steps = [mended_by(notes) for notes in dataset.all_notes()]
     counts = Counter(step for taken in steps for step in taken)
     if not counts:
         return ""
@@ -90,7 +119,7 @@ def mending_summary(dataset: SignatureDataset, n_given: int) -> str:
 
 def write_notes(path: Path, dataset: SignatureDataset) -> None:
     """Write a table of what was done to which mesh; or remove that of an earlier run where nothing was done."""
-    notes = ((name, dataset.notes(i)) for i, name in enumerate(dataset.files.names))
+    notes = zip(dataset.files.names, dataset.all_notes(), strict=True)
     write_rows(path, ("file", "note"), [(name, note) for name, told in notes for note in told])
 
 

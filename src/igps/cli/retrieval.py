@@ -12,12 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from igps.cli.index import as_indexed
 from igps.cli.reading import signatures, write_notes, write_rows
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import MeshFiles, find_meshes, labelled_meshes
 from igps.descriptors import descriptor as descriptor_of
+from igps.gallery.gallery import Gallery
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor
 from igps.report.sources import write_sources
@@ -109,9 +111,10 @@ def extract(
 
 def query(
     mesh: Path,
-    gallery: Path,
+    gallery: Path | None = None,
+    index: Path | None = None,
     top: int = 10,
-    descriptor: str = "pretrained",
+    descriptor: str | None = None,
     **reading: Any,
 ) -> None:
     """List the meshes of a gallery that are most similar to one mesh.
@@ -119,20 +122,40 @@ def query(
     Args:
         mesh: the mesh to look for.
         gallery: folder of meshes, with or without classes.
+        index: an index of meshes in place of their folder, see igps index.
         top: how many to list.
-        descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
+        descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own; pretrained if not given, or
+            that of the index.
     """
     if top < 1:
         raise ValueError(f"top: expected at least 1, got {top}.")
-    chosen = descriptor_of(descriptor)
+    if (gallery is None) == (index is None):
+        raise ValueError("gallery, index: expected one of them. Name a folder of meshes, or an index of one.")
+    if index is not None:
+        opened = Gallery(index, descriptor)
+        reading = as_indexed(opened, reading)
+        _, wanted, _ = _described([mesh], opened.descriptor, **{**reading, "n_workers": 1})
+        matches = opened.nearest(wanted, top=top)[0]
+        rows = [(match.name, match.label, match.distance) for match in matches]
+        missing = sum(not match.path.exists() for match in matches)
+        _print_found(rows)
+        if missing:
+            print(f"{missing} of these {len(matches)} files are no longer where they were when they were indexed.")
+        return
+    chosen = descriptor_of(descriptor or "pretrained")
     _, wanted, _ = _described([mesh], chosen, **reading)
-    dataset, descriptions, _ = _described(find_meshes(gallery), chosen, **reading)
+    dataset, descriptions, _ = _described(find_meshes(gallery), chosen, **reading)  # type: ignore[arg-type]
     found = search(wanted, descriptions, top=min(top, len(dataset)), distance=chosen.distances)
-    width = max(len(dataset.files.names[i]) for i in found.indices[0].tolist())
+    names, labels = dataset.files.names, dataset.files.labels
+    places = zip(found.indices[0].tolist(), found.distances[0].tolist(), strict=True)
+    _print_found([(names[i], None if labels is None else labels[i], distance) for i, distance in places])
+
+
+def _print_found(rows: Sequence[tuple[str, str | None, float]]) -> None:
+    width = max(len(name) for name, _, _ in rows)
     print(f"{'rank':>4}  {'distance':>8}  {'mesh':<{width}}  class")
-    for place, (i, distance) in enumerate(zip(found.indices[0].tolist(), found.distances[0].tolist(), strict=True), 1):
-        label = dataset.files.labels[i] if dataset.files.labels is not None else "-"
-        print(f"{place:>4}  {distance:>8.4f}  {dataset.files.names[i]:<{width}}  {label}")
+    for place, (name, label, distance) in enumerate(rows, 1):
+        print(f"{place:>4}  {distance:>8.4f}  {name:<{width}}  {'-' if label is None else label}")
 
 
 def _described(

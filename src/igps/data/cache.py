@@ -38,7 +38,7 @@ class SignatureCache:
 
     A file is written beside its place and moved there in one step, so that a reader sees all of it or nothing. What a
     killed run leaves of one is removed a day later, see `remove_abandoned`. Two processes that compute the same
-    Signature write the same content. Who may read folders and files is for the umask to say.
+    Signature write the same bytes. Who may read folders and files is for the umask to say.
 
     Args:
         directory: made if it is missing.
@@ -88,7 +88,7 @@ class SignatureCache:
         temporary = path.with_name(f"{key}.{os.getpid()}-{secrets.token_hex(8)}{_PARTIAL}")
         try:
             with open(temporary, "xb") as file:
-                file.write(save(tensors, metadata={"format": _FORMAT, "key": key, **metadata}))
+                file.write(_ordered(save(tensors, metadata={"format": _FORMAT, "key": key, **metadata})))
             self._move(temporary, key)
         except BaseException as error:
             temporary.unlink(missing_ok=True)
@@ -119,6 +119,16 @@ def _remove_abandoned(partials: Iterable[Path]) -> None:
                 partial.unlink()
         except OSError:  # another process was first, or may and we may not
             continue
+
+
+def _ordered(content: bytes) -> bytes:
+    """A safetensors file with its metadata by name: that library writes them in an order that differs each time."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    header: dict[str, Any] = json.loads(content[8:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)
+    return b"".join((len(text).to_bytes(8, "little"), text, memoryview(content)[end:]))
 
 
 def _checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:

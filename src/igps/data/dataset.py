@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +20,19 @@ from tqdm import tqdm
 
 from igps.data.batch import LabelledSignature, SignatureBatch, collate
 from igps.data.cache import SignatureCache, default_cache_dir
-from igps.data.recipe import Recipe
+from igps.data.known_files import KnownFiles
+from igps.data.recipe import Recipe, Served, fill_elsewhere, version
 from igps.data.sources import MeshFiles, find_meshes, mesh_files
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.reading import MeshReading
 from igps.geometry.signature import Samples, SignatureConfig
-from igps.parallel import Failed, Limits, run
+from igps.parallel import Failed, Limits, MachineError, run
 
 logger = logging.getLogger(__name__)
+
+# Seconds until a file that another machine wrote is seen here, by a file system for many.
+_SHARED_WITHIN = 60.0
+_REMEMBERED_AT_ONCE = 1000
 
 PointFunction = Callable[[NDArray[np.float64]], NDArray[np.floating]]
 
@@ -93,6 +100,11 @@ class SignatureDataset(Dataset[LabelledSignature]):
         return self._recipe
 
     @property
+    def reading(self) -> MeshReading:
+        """How the mesh files are read."""
+        return self._recipe.reading
+
+    @property
     def labels(self) -> Tensor:
         """(N,) int64 index of each mesh's class in `classes`, −1 where unknown."""
         index = {name: i for i, name in enumerate(self.classes)}
@@ -118,9 +130,22 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """
         return self._recipe.mesh(self.files.paths[index])
 
+    def key(self, index: int) -> str:
+        """The name of a Signature in the cache, by the content of its file and everything that it depends on.
+
+        Raises:
+            MeshError: the file cannot be read.
+        """
+        return self._recipe.key(self.files.paths[index])
+
     def notes(self, index: int) -> tuple[str, ...]:
         """What was done to a mesh on its way to its cached Signature, in words."""
         return self._recipe.notes(self.files.paths[index])
+
+    def all_notes(self) -> list[tuple[str, ...]]:
+        """The notes of all meshes; of files that are known from `precompute` without reading them again."""
+        ready = KnownFiles(self._recipe).ready(self.files.paths)
+        return [ready[path].notes if path in ready else self.notes(i) for i, path in enumerate(self.files.paths)]
 
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
         """Some of the items as a batch, with or without their meshes."""
@@ -147,7 +172,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """Fill the cache, skipping what is there, and list the meshes that cannot be used.
 
         Args:
-            executor: any `concurrent.futures.Executor`; processes of ours with one BLAS thread each if None.
+            executor: any `concurrent.futures.Executor`, such as that of a cluster, whose workers must see the files and
+                the cache by the same paths; processes of ours with one BLAS thread each if None.
             n_workers: of those processes; all cores if None.
             strict: raise at the first bad mesh instead of listing it.
             progress: show a bar.
@@ -158,17 +184,37 @@ class SignatureDataset(Dataset[LabelledSignature]):
             MachineError: the disk is full, or the like; what is done is kept.
         """
         SignatureCache(self._recipe.cache_dir).remove_abandoned()
-        missing = [i for i in range(len(self)) if not self._recipe.is_cached(self.files.paths[i])]
-        paths = [self.files.paths[i] for i in missing]
+        known = KnownFiles(self._recipe)
+        ready = known.ready(self.files.paths)
+        missing = [i for i, path in enumerate(self.files.paths) if path not in ready]
+        fill: Callable[[Path], Served] = self._recipe.fill
+        if executor is None:
+            served = {i: self._served(i) for i in missing}
+            known.remember({self.files.paths[i]: one for i, one in served.items() if one is not None})
+            missing = [i for i, one in served.items() if one is None]
+            paths = [self.files.paths[i] for i in missing]
+        else:
+            # Elsewhere, and from another folder: the workers look for themselves what there is.
+            recipe = replace(self._recipe, cache_dir=self._recipe.cache_dir.absolute())
+            fill = partial(fill_elsewhere, recipe, version())
+            paths = [self.files.paths[i].absolute() for i in missing]
         failures: dict[int, Failure] = {}
-        results = run(self._recipe.fill, paths, n_workers=n_workers, executor=executor, limits=limits)
+        new: dict[Path, Served] = {}
+        results = run(fill, paths, n_workers=n_workers, executor=executor, limits=limits)
         with (
             tqdm(total=len(self), initial=len(self) - len(missing), desc="signatures", disable=not progress) as bar,
             contextlib.closing(results),
+            contextlib.ExitStack() as at_the_end,
         ):
+            at_the_end.callback(lambda: known.remember(new))
             for number, outcome in results:
                 bar.update()
                 if not isinstance(outcome, Failed):
+                    self._check_visible(outcome, first=not new)
+                    new[self.files.paths[missing[number]]] = outcome
+                    if len(new) >= _REMEMBERED_AT_ONCE:
+                        known.remember(new)
+                        new.clear()
                     continue
                 failure = self.failure(missing[number], outcome)
                 if strict:
@@ -176,6 +222,24 @@ class SignatureDataset(Dataset[LabelledSignature]):
                 failures[missing[number]] = failure
                 logger.warning("skipped: %s", failure.error)
         return [failures[i] for i in sorted(failures)]
+
+    def _served(self, index: int) -> Served | None:
+        try:
+            return self._recipe.served(self.files.paths[index])
+        except MeshError:  # computing it will say why
+            return None
+
+    def _check_visible(self, served: Served, first: bool) -> None:
+        """Raise a MachineError if what a worker put into its cache does not come to this one, asked at the first."""
+        path = SignatureCache(self._recipe.cache_dir).path(served.key)
+        deadline = time.monotonic() + _SHARED_WITHIN
+        while first and not path.exists():
+            if time.monotonic() > deadline:
+                raise MachineError(
+                    f"{self._recipe.cache_dir}: the workers' signatures do not appear there. Choose a cache_dir that "
+                    "this machine and all workers share, by the same path."
+                )
+            time.sleep(0.1)
 
     def failure(self, index: int, failed: Failed) -> Failure:
         """What failed of a mesh, in a sentence that names its file."""

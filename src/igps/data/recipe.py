@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import json
+import os
+import socket
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,6 +16,30 @@ from igps.geometry.mending import MENDING_VERSION, mended_by
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.reading import MeshReading, load_mesh
 from igps.geometry.signature import Signature, SignatureConfig, compute_signature
+from igps.parallel import MachineError
+
+
+@dataclass(frozen=True)
+class Served:
+    """The Signature in the cache that serves a file.
+
+    Args:
+        key: its name in the cache; that of a larger one, if that is there.
+        n_bytes: size of its file.
+        notes: what was done to the mesh, in words.
+        stamp: of the mesh file when it was read, see `stamp_of`.
+    """
+
+    key: str
+    n_bytes: int
+    notes: tuple[str, ...]
+    stamp: tuple[int, int, int]
+
+    @staticmethod
+    def stamp_of(path: Path) -> tuple[int, int, int]:
+        """Bytes of a file, and when its content and its name or rights were last changed, in nanoseconds."""
+        found = os.stat(path)
+        return found.st_size, found.st_mtime_ns, found.st_ctime_ns
 
 
 @dataclass(frozen=True)
@@ -48,9 +75,29 @@ class Recipe:
         cache.put(self.key(path, mended=bool(mended_by(signature.notes))), signature)
         return signature
 
-    def fill(self, path: Path) -> None:
+    def fill(self, path: Path) -> Served:
         """Put the Signature of a file into the cache; it is not returned, so that it need not travel to the caller."""
-        self.signature(path)
+        stamp = _stamp(path)
+        served = self.served(path)
+        if served is not None:
+            return served
+        signature = compute_signature(self.mesh(path), self.config)
+        key, cache = self.key(path), SignatureCache(self.cache_dir)
+        cache.put(key, signature)
+        return Served(key, cache.path(key).stat().st_size, tuple(signature.notes), stamp)
+
+    def served(self, path: Path) -> Served | None:
+        """What in the cache serves a file, None if nothing does.
+
+        Raises:
+            MeshError: the file cannot be read.
+        """
+        stamp = _stamp(path)
+        key = next(self._cached(path), None)
+        if key is None:
+            return None
+        cache = SignatureCache(self.cache_dir)
+        return Served(key, cache.path(key).stat().st_size, cache.notes(key), stamp)
 
     def notes(self, path: Path) -> tuple[str, ...]:
         """What was done to the mesh of a cached Signature, in words."""
@@ -60,7 +107,7 @@ class Recipe:
     def is_cached(self, path: Path) -> bool:
         """Whether the Signature of a file can be read; false for a file that cannot."""
         try:
-            return next(self._cached(path), None) is not None
+            return self.served(path) is not None
         except MeshError:
             return False
 
@@ -102,6 +149,33 @@ class Recipe:
         key = hashlib.sha256(parameters.encode() + b"\0")
         key.update(content)  # not joined with them: the file may be large
         return key.hexdigest()
+
+
+def version() -> str:
+    """What must be the same wherever Signatures of one cache are computed."""
+    return f"{importlib.metadata.version('interior-gps')}, signatures {SignatureConfig.ALGORITHM_VERSION}"
+
+
+def fill_elsewhere(recipe: Recipe, expected: str, path: Path) -> Served:
+    """`Recipe.fill` by a worker of a cluster.
+
+    Raises:
+        MachineError: the worker has another version of the library.
+    """
+    here = version()
+    if here != expected:
+        raise MachineError(
+            f"the worker on {socket.gethostname()} has igps {here}, where {expected} is asked for. Install one version "
+            "everywhere and run again: what is done is kept."
+        )
+    return recipe.fill(path)
+
+
+def _stamp(path: Path) -> tuple[int, int, int]:
+    try:
+        return Served.stamp_of(path)
+    except OSError as error:
+        raise MeshError(f"{path}: cannot be read ({error.strerror}). Check the path.") from error
 
 
 def _content(path: Path) -> bytes:

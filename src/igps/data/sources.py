@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,17 +108,18 @@ def _from_labels_file(root: Path) -> MeshFiles:
         where = f"line {incomplete[0]} lacks a file or a label" if incomplete else "no rows"
         raise ValueError(f"{file}: {where}. Each line names a mesh file and its class.")
     names = [name for name, _ in rows]
-    twice = {name for name in names if names.count(name) > 1}
+    twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
-        raise ValueError(f"{file}: {sorted(twice)[0]} is listed twice. List each mesh once.")
+        raise ValueError(f"{file}: {twice[0]} is listed twice. List each mesh once.")
     return MeshFiles(tuple(root / name for name in names), tuple(names), tuple(label for _, label in rows))
 
 
 def _meshes_in(folder: Path) -> list[Path]:
+    suffixes = _suffixes()
     return sorted(
         path
         for path in folder.rglob("*")
-        if path.is_file() and path.suffix.lower().lstrip(".") in _suffixes() and not path.name.startswith(".")
+        if path.suffix.lower().lstrip(".") in suffixes and not path.name.startswith(".") and path.is_file()
     )
 
 

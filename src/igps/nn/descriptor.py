@@ -18,6 +18,7 @@ from igps.nn.histogram import PairHistogram
 from igps.nn.needs import Needs
 from igps.nn.view import Views
 from igps.retrieval import chi_square, cosine
+from igps.retrieval.vectors import Comparison
 from igps.threads import one_thread
 
 
@@ -33,12 +34,15 @@ class Descriptor(nn.Module, ABC):
         invariant_to: which of "motion" (rotation, translation, reflection), "scale" and "pose" (isometric bending)
             leave its descriptions as they are, but for discretisation.
         needs: of a body; all eigenpairs, unless redefined.
+        comparison: "cosine" or "chi_square" where `distances` is that of unit vectors or of histograms, so that an
+            index has short vectors of them; None for all others, which it compares one by one.
     """
 
     name: str = "descriptor"
     source: str = ""
     invariant_to: tuple[str, ...] = ()
     needs: Needs = Needs(whole_spectrum=True)
+    comparison: Comparison | None = None
 
     @abstractmethod
     def describe(self, batch: SignatureBatch) -> Tensor:
@@ -86,6 +90,8 @@ class HistogramDescriptor(Descriptor):
     Raises:
         ValueError: no histogram.
     """
+
+    comparison = "chi_square"
 
     def __init__(
         self,
@@ -136,6 +142,8 @@ class EmbeddedDescriptor(Descriptor):
         head: descriptions to (N, D) of length 1.
         name, source: see `Descriptor`.
     """
+
+    comparison = "cosine"
 
     def __init__(self, descriptor: Descriptor, head: nn.Module, *, name: str = "embedded", source: str = "") -> None:
         super().__init__()

@@ -1,0 +1,122 @@
+"""`igps precompute`."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import re
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from functools import reduce
+from operator import or_
+from pathlib import Path
+from typing import Any
+
+from igps.cli.reading import chosen_dataset, write_rows
+from igps.data.recipe import version
+from igps.data.sources import MeshFiles, find_meshes
+from igps.descriptors import descriptor as descriptor_of
+from igps.nn.needs import Needs
+from igps.parallel import Limits, MachineError
+
+# Seconds until a scheduler that does not answer is taken for missing.
+_ANSWERS_WITHIN = 15
+
+
+def precompute(
+    root: Path,
+    descriptors: list[str] | None = None,
+    cluster: str | None = None,
+    shard: str | None = None,
+    failures: Path | None = None,
+    strict: bool = False,
+    n_workers: int | None = None,
+    time_limit: float | None = None,
+    memory_limit: float | None = None,
+    **reading: Any,
+) -> None:
+    """Compute the signatures of a folder of meshes into the cache, here or on a cluster.
+
+    What is there already is not computed again, so that a run that was stopped is finished by another.
+
+    Args:
+        root: folder of meshes, with or without classes.
+        descriptors: whose needs the signatures shall satisfy; interior if not given.
+        cluster: address of a Dask scheduler, such as tcp://scheduler:8786, whose workers see folder and cache by the
+            same paths as this machine.
+        shard: such as 3/64, the third of 64 parts of the meshes, for as many jobs of a batch system.
+        failures: a CSV file for the meshes that cannot be used.
+        strict: stop at the first mesh that cannot be used instead of skipping it
+        n_workers: processes that compute; all cores if not given.
+        time_limit: seconds that the signature of one mesh may take; no limit if not given.
+        memory_limit: gigabytes of memory that the signature of one mesh may take; no limit if not given.
+    """
+    files = part_of(find_meshes(root), shard)
+    if not len(files):
+        print(f"{root}: no mesh in shard {shard}")
+        return
+    needs = reduce(or_, (descriptor_of(name).needs for name in descriptors or ["pretrained"]), Needs())
+    dataset = chosen_dataset(files, needs, **reading)
+    limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
+    if cluster is None:
+        failed = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits)
+    else:
+        with dask_executor(cluster) as executor:
+            failed = dataset.precompute(executor, strict=strict, limits=limits)
+    if failures is not None:
+        write_rows(failures, ("file", "error"), [(failure.id, failure.error) for failure in failed])
+    part = "" if shard is None else f" in shard {shard}"
+    print(f"{len(dataset) - len(failed)} of {len(dataset)} signatures{part} are in the cache; {len(failed)} failed")
+
+
+def part_of(files: MeshFiles, shard: str | None) -> MeshFiles:
+    """Every so manieth of the files, so that the shards 1/n to n/n have all, each once; all of them if None.
+
+    Raises:
+        ValueError: not two numbers, or the first not one of the second.
+    """
+    if shard is None:
+        return files
+    found = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
+    if found is None or int(found[1]) > int(found[2]):
+        raise ValueError(f"shard: expected such as 3/64, from 1/64 to 64/64, got {shard!r}.")
+    return files.subset(range(int(found[1]) - 1, len(files), int(found[2])))
+
+
+@contextlib.contextmanager
+def dask_executor(address: str) -> Iterator[Executor]:
+    """The workers of a Dask scheduler, which must have the version of the library that is here.
+
+    Raises:
+        MachineError: no scheduler answers, or a worker has another version.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ImportError('cluster: needs Dask: pip install "interior-gps[cluster]".') from error
+    # A lost scheduler is told in one sentence; Dask adds the tracebacks of its attempts to find it again.
+    for name in ("distributed", "distributed.client", "tornado.application"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        client = Client(address, timeout=_ANSWERS_WITHIN, set_as_default=False)
+    except (OSError, ValueError) as error:  # a TimeoutError is an OSError
+        raise MachineError(
+            f"cluster: no Dask scheduler answers at {address}. Start one by `dask scheduler`, and workers by `dask "
+            "worker` with its address."
+        ) from error
+    with client:
+        for worker, theirs in client.run(_version_there, on_error="return").items():
+            if theirs != version():
+                raise MachineError(
+                    f"cluster: the worker at {worker} has igps {_words(theirs)}, where {version()} is asked for. "
+                    "Install one version everywhere and run again."
+                )
+        yield client.get_executor()
+
+
+def _version_there() -> str:
+    return version()
+
+
+def _words(theirs: object) -> str:
+    return theirs if isinstance(theirs, str) else f"of another version ({type(theirs).__name__})"

@@ -1,0 +1,1 @@
+"""Collections that are asked again and again: indexed, searched, and freed of duplicates."""

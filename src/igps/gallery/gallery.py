@@ -1,0 +1,269 @@
+"""The meshes of a collection in an index, with the descriptor that they were described by."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from igps.data.dataset import Failure, SignatureDataset
+from igps.descriptors import descriptor as descriptor_of
+from igps.geometry.mesh import MeshError
+from igps.geometry.reading import MeshReading
+from igps.geometry.signature import SignatureConfig
+from igps.nn.description import describe_usable
+from igps.nn.descriptor import Descriptor
+from igps.retrieval.index import Entry, VectorIndex, check_alike, extend_index, merge_indices, write_index
+
+# So many descriptions are in memory at once.
+_AT_ONCE = 256
+
+
+@dataclass(frozen=True)
+class Match:
+    """A mesh that a query found.
+
+    Args:
+        name: in its collection.
+        label: its class, if it is known.
+        path: its file when it was indexed, which may have been moved since.
+        distance: from the query, by the descriptor's own distance.
+    """
+
+    name: str
+    label: str | None
+    path: Path
+    distance: float
+
+
+class Gallery:
+    """An index of meshes, opened to be asked.
+
+    It needs neither the mesh files nor their Signatures any more.
+
+    Args:
+        path: folder of the index.
+        descriptor: the one that it was built with, if that cannot be found by its name; or to be sure that it is this.
+
+    Raises:
+        FileNotFoundError: there is no index.
+        ValueError: it is damaged, or of another descriptor, another version of it, or another version of Signatures.
+    """
+
+    def __init__(self, path: str | Path, descriptor: str | Descriptor | None = None) -> None:
+        self.index = VectorIndex(path)
+        about = self.index.about
+        if isinstance(descriptor, str):
+            check_alike(self.index, {"descriptor": descriptor})
+        self.descriptor = descriptor_of(about["descriptor"] if descriptor is None else descriptor)
+        check_alike(self.index, {"descriptor": name_of(descriptor or about["descriptor"])})
+        check_alike(self.index, {"model": fingerprint(self.descriptor)})
+        version = SignatureConfig.ALGORITHM_VERSION
+        if about["signature"]["algorithm_version"] != version:
+            raise ValueError(
+                f"{path}: the index is of version {about['signature']['algorithm_version']} of the signatures, not "
+                f"{version} as here. Build it again."
+            )
+        parameters = {name: value for name, value in about["signature"].items() if name != "algorithm_version"}
+        self.config = SignatureConfig(**{**parameters, "attributes": tuple(parameters["attributes"])})
+        self.reading = MeshReading(**about["reading"])
+
+    @property
+    def path(self) -> Path:
+        """Folder of the index."""
+        return self.index.path
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def query(
+        self, mesh: str | Path, *, top: int = 10, cache_dir: str | Path | None = None, exact: bool = False
+    ) -> list[Match]:
+        """The meshes closest to that of a file, closest first.
+
+        Args:
+            mesh: a file, read as those of the index were.
+            top: how many; all if there are fewer.
+            cache_dir: of Signatures; the user's cache directory if None.
+            exact: compare with all, which takes long in a large index.
+
+        Raises:
+            MeshError: the mesh cannot be used.
+        """
+        dataset = SignatureDataset([mesh], self.config, cache_dir, reading=self.reading)
+        descriptions, _ = describe_usable(dataset, self.descriptor, n_workers=1, strict=True)
+        return self.nearest(descriptions, top=top, exact=exact)[0]
+
+    def nearest(self, descriptions: Tensor, *, top: int = 10, exact: bool = False) -> list[list[Match]]:
+        """For each of the descriptions (Q, ...) the meshes closest to it, closest first."""
+        with torch.inference_mode():
+            found = self.index.search(descriptions, self.descriptor.distances, top=min(top, len(self)), exact=exact)
+        return [
+            [
+                Match(entry.name, entry.label, Path(entry.id), distance)
+                for entry, distance in zip(self.index.entries(indices.numpy()), distances.tolist(), strict=True)
+            ]
+            for indices, distances in zip(found.indices, found.distances, strict=True)
+        ]
+
+    @classmethod
+    def build(
+        cls,
+        path: str | Path,
+        dataset: SignatureDataset,
+        descriptor: str | Descriptor,
+        *,
+        n_workers: int | None = None,
+        strict: bool = False,
+    ) -> tuple[Gallery, list[Failure]]:
+        """Index the meshes of a dataset, in place of an index that is there; and tell those that cannot be described.
+
+        Signatures that are not cached are computed on the way; `dataset.precompute()` does that on all cores.
+
+        Args:
+            path: folder of the index.
+            dataset: of the meshes.
+            descriptor: a name, which the index remembers, or the descriptor itself, which has to be given again.
+            n_workers: threads or processes that describe; all cores if None.
+            strict: raise at the first mesh that cannot be described.
+        """
+        chosen = descriptor_of(descriptor)
+        failures: list[Failure] = []
+        about = about_of(dataset.config, dataset.reading, descriptor)
+        write_index(path, about, chosen.comparison, _batches(dataset, chosen, {}, failures, n_workers, strict))
+        return cls(path, descriptor), failures
+
+    @classmethod
+    def add(
+        cls,
+        path: str | Path,
+        dataset: SignatureDataset,
+        descriptor: str | Descriptor,
+        *,
+        n_workers: int | None = None,
+        strict: bool = False,
+    ) -> tuple[Gallery, list[Failure]]:
+        """Add the meshes of a dataset to an index. Files that it has already are passed over, changed ones replaced.
+
+        Args:
+            path, dataset, descriptor, n_workers, strict: see `build`.
+
+        Raises:
+            ValueError: the index is of another descriptor or of other Signatures.
+        """
+        chosen, about = descriptor_of(descriptor), about_of(dataset.config, dataset.reading, descriptor)
+        failures: list[Failure] = []
+        index = VectorIndex(path)
+        check_alike(index, about)
+        known = index.marks([_id(one) for one in dataset.files.paths])
+        extend_index(path, about, _batches(dataset, chosen, known, failures, n_workers, strict))
+        return cls(path, descriptor), failures
+
+    @classmethod
+    def merge(
+        cls, path: str | Path, others: Sequence[str | Path], descriptor: str | Descriptor | None = None
+    ) -> Gallery:
+        """An index of the meshes of others, added to that at `path`, if there is one.
+
+        Raises:
+            ValueError: they are of different descriptors or Signatures.
+        """
+        merge_indices(path, others)
+        return cls(path, descriptor)
+
+
+def about_of(config: SignatureConfig, reading: MeshReading, descriptor: str | Descriptor) -> dict[str, Any]:
+    """What an index says of itself: with any other of these, distances would mean nothing."""
+    signature = {**asdict(config), "algorithm_version": SignatureConfig.ALGORITHM_VERSION}
+    return {
+        "descriptor": name_of(descriptor),
+        "model": fingerprint(descriptor_of(descriptor)),
+        "signature": {**signature, "attributes": list(config.attributes)},
+        "reading": asdict(reading),
+    }
+
+
+def name_of(descriptor: str | Descriptor) -> str:
+    """The name by which a descriptor was asked for, or its own."""
+    return descriptor if isinstance(descriptor, str) else descriptor.name
+
+
+def fingerprint(descriptor: nn.Module) -> str:
+    """A checksum of all parameters of a descriptor: numbers, learned or given, and classes of all its modules."""
+    found = hashlib.sha256()
+    of_every_module = vars(nn.Module())  # differ between versions of PyTorch
+    for name, module in descriptor.named_modules():
+        plain = {k: v for k, v in sorted(vars(module).items()) if k not in of_every_module and _is_plain(v)}
+        found.update(f"{name} {type(module).__qualname__} {plain!r}\0".encode())
+    for name, tensor in sorted(descriptor.state_dict().items()):
+        values = tensor.detach().cpu().contiguous()
+        found.update(f"{name} {values.dtype} {tuple(values.shape)}\0".encode())
+        found.update(values.numpy().tobytes())
+    return found.hexdigest()[:32]
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, tuple):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, bool | int | float | str)
+
+
+def _batches(
+    dataset: SignatureDataset,
+    descriptor: Descriptor,
+    known: dict[str, str],
+    failures: list[Failure],
+    n_workers: int | None,
+    strict: bool,
+) -> Iterator[tuple[Tensor, list[Entry]]]:
+    for start in range(0, len(dataset), _AT_ONCE):
+        part = dataset.subset(range(start, min(start + _AT_ONCE, len(dataset))))
+        keys = [_key(part, i) for i in range(len(part))]
+        new = [i for i, path in enumerate(part.files.paths) if keys[i] is None or known.get(_id(path)) != keys[i]]
+        if not new:
+            continue
+        descriptions, failed = _described(part.subset(new), descriptor, n_workers, strict)
+        failures += failed
+        lost = {failure.id for failure in failed}
+        labels = part.files.labels or (None,) * len(part)
+        yield (
+            descriptions,
+            [
+                Entry(_id(part.files.paths[i]), part.files.names[i], labels[i], keys[i] or "")
+                for i in new
+                if part.files.names[i] not in lost
+            ],
+        )
+
+
+def _described(
+    dataset: SignatureDataset, descriptor: Descriptor, n_workers: int | None, strict: bool
+) -> tuple[Tensor, list[Failure]]:
+    try:
+        return describe_usable(dataset, descriptor, n_workers=n_workers, strict=strict)
+    except MeshError as error:
+        if strict:
+            raise
+        if len(dataset) == 1:
+            path = dataset.files.paths[0]
+            words = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
+            return torch.zeros(0), [Failure(dataset.files.names[0], path, words)]
+    # None of them: each tells why, where all at once tell of one alone.
+    each = [_described(dataset.subset([i]), descriptor, 1, strict) for i in range(len(dataset))]
+    return torch.zeros(0), [failure for _, failed in each for failure in failed]
+
+
+def _key(dataset: SignatureDataset, i: int) -> str | None:
+    try:
+        return dataset.key(i)
+    except MeshError:  # describing it will say why
+        return None
+
+
+def _id(path: Path) -> str:
+    return str(path.resolve())

@@ -1,0 +1,199 @@
+"""A real scheduler and worker processes on this machine."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bodies_on_disk import write_body
+
+from igps.cli import main
+from igps.cli.precompute import dask_executor, part_of
+from igps.data.dataset import SignatureDataset
+from igps.data.recipe import fill_elsewhere
+from igps.data.sources import mesh_files
+from igps.geometry.signature import SignatureConfig
+from igps.parallel import MachineError
+
+distributed = pytest.importorskip("distributed")
+
+CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
+SMALL = ["--signature.n_eigenpairs", "20", "--signature.resolution", "10", "--signature.min_samples", "0"]
+SMALL += ["--signature.n_surface_samples", "50"]
+SOURCE = str(Path(fill_elsewhere.__code__.co_filename).parents[2])
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        port: int = one.getsockname()[1]
+        return port
+
+
+class Cluster:
+    """A scheduler and three workers, each a process."""
+
+    def __init__(self, folder: Path) -> None:
+        self.address = f"tcp://127.0.0.1:{free_port()}"
+        self._folder = folder
+        self._environment = {
+            **os.environ,
+            "PYTHONPATH": SOURCE,
+            "OMP_NUM_THREADS": "1",
+            "DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "error",
+        }
+        host, port = self.address.removeprefix("tcp://").split(":")
+        self.scheduler = self._start("scheduler", "--host", host, "--port", port, "--no-dashboard")
+        self.workers = [self.start_worker() for _ in range(3)]
+
+    def start_worker(self) -> subprocess.Popen[bytes]:
+        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "300"]
+        return self._start("worker", self.address, *options, "--local-directory", str(self._folder))
+
+    def _start(self, *words: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "dask", *words]
+        return subprocess.Popen(
+            command, env=self._environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=self._folder
+        )
+
+    def end(self) -> None:
+        for process in [*self.workers, self.scheduler]:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    one = Cluster(tmp_path_factory.mktemp("cluster"))
+    try:
+        with distributed.Client(one.address, timeout=300, set_as_default=False) as client:
+            client.wait_for_workers(3, timeout=300)
+        yield one
+    finally:
+        one.end()
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    for i in range(12):
+        write_body(tmp_path / "meshes" / f"{i:02}.off", 1.0 + 0.1 * i, 1.5)
+    return tmp_path / "meshes"
+
+
+def stored(cache: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in cache.rglob("*.safetensors")}
+
+
+def test_a_cluster_leaves_the_bytes_of_this_machine(cluster: Cluster, root: Path, tmp_path: Path) -> None:
+    (root / "bad.off").write_text("nothing")
+    with dask_executor(cluster.address) as executor:
+        (failure,) = SignatureDataset(root, CONFIG, tmp_path / "there").precompute(executor, progress=False)
+        assert SignatureDataset(root, CONFIG, tmp_path / "there").precompute(executor, progress=False) == [failure]
+    assert failure.id == "bad.off"
+    assert SignatureDataset(root, CONFIG, tmp_path / "here").precompute(n_workers=1, progress=False) == [failure]
+    assert stored(tmp_path / "there") == stored(tmp_path / "here")
+    assert len(stored(tmp_path / "here")) == 12
+
+
+def test_a_worker_that_is_killed_costs_nothing(cluster: Cluster, root: Path, tmp_path: Path) -> None:
+    """In the middle of its work: the others do that."""
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "there")
+    with dask_executor(cluster.address) as executor, ThreadPoolExecutor(1) as beside:
+        running = beside.submit(dataset.precompute, executor, progress=False)
+        while len(stored(tmp_path / "there")) < 3:
+            time.sleep(0.005)
+        cluster.workers[0].send_signal(signal.SIGKILL)
+        assert len(stored(tmp_path / "there")) < 12
+        assert running.result(timeout=300) == []
+    cluster.workers.append(cluster.start_worker())
+    assert {name.removesuffix(".safetensors") for name in stored(tmp_path / "there")} == {
+        dataset.key(i) for i in range(12)
+    }
+
+
+def test_the_command_and_what_it_says_of_no_scheduler(
+    cluster: Cluster, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["igps", "precompute", str(root), "--cache_dir", str(tmp_path / "cache"), *SMALL]
+    words += ["--descriptors", "own_descriptors:small_interior"]
+    monkeypatch.setattr(
+        sys, "argv", [*words, "--cluster", cluster.address, "--descriptors", "own_descriptors:small_interior"]
+    )
+    main()
+    assert capsys.readouterr().out == "12 of 12 signatures are in the cache; 0 failed\n"
+    monkeypatch.setattr(sys.modules[dask_executor.__module__], "_ANSWERS_WITHIN", 1)
+    monkeypatch.setattr(sys, "argv", [*words, "--cluster", f"tcp://127.0.0.1:{free_port()}"])
+    with pytest.raises(SystemExit, match="2"):
+        main()
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("igps: ")]
+    assert "no Dask scheduler answers at tcp://127.0.0.1" in line
+    assert len(stored(tmp_path / "cache")) == 12
+
+
+def test_shards_have_all_files_once(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = mesh_files([f"{i}.off" for i in range(100)])
+    for n in (1, 7, 64, 300):
+        names = [name for k in range(1, n + 1) for name in part_of(files, f"{k}/{n}").names]
+        assert sorted(names) == sorted(files.names)
+    for wrong in ("0/4", "5/4", "3", "a/b", "-1/4", "1/4/2"):
+        with pytest.raises(ValueError, match="shard: expected such as 3/64"):
+            part_of(files, wrong)
+    words = ["igps", "precompute", str(root), "--cache_dir", str(tmp_path / "cache"), "--n_workers", "1", *SMALL]
+    words += ["--descriptors", "own_descriptors:small_interior"]
+    for k, n_there in ((2, 6), (1, 12)):
+        monkeypatch.setattr(
+            sys, "argv", [*words, "--shard", f"{k}/2", "--descriptors", "own_descriptors:small_interior"]
+        )
+        main()
+        assert capsys.readouterr().out == f"6 of 6 signatures in shard {k}/2 are in the cache; 0 failed\n"
+        assert len(stored(tmp_path / "cache")) == n_there
+
+
+class Broken(ThreadPoolExecutor):
+    """What an executor does whose scheduler is lost."""
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.cancel()
+        future.set_running_or_notify_cancel()
+        return future
+
+
+class Elsewhere(ThreadPoolExecutor):
+    """Does nothing that is seen here."""
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
+        return super().submit(lambda path: Nowhere(), *arguments)
+
+
+class Nowhere:
+    key = "00" * 32
+
+
+@pytest.mark.parametrize(
+    ("executor", "words"), [(Broken(1), "gave the work up"), (Elsewhere(1), "signatures do not appear there")]
+)
+def test_a_cluster_that_fails_is_told(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executor: Executor, words: str
+) -> None:
+    monkeypatch.setattr("igps.data.dataset._SHARED_WITHIN", 0.2)
+    with pytest.raises(MachineError, match=words):
+        SignatureDataset(root, CONFIG, tmp_path / "cache").precompute(executor, progress=False)
+
+
+def test_a_worker_of_another_version_is_refused(root: Path, tmp_path: Path) -> None:
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
+    with pytest.raises(MachineError, match=r"has igps .*, signatures \d+, where 9\.9, signatures 9 is asked for"):
+        fill_elsewhere(dataset._recipe, "9.9, signatures 9", root / "00.off")
+    assert stored(tmp_path / "cache") == {}
