@@ -321,7 +321,9 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(
         logging.disable(logging.NOTSET)
 
 
-@pytest.mark.parametrize("command", ["retrieve", "extract", "query", "precompute", "demo", "compare", "robustness", "report"])
+@pytest.mark.parametrize(
+    "command", ["retrieve", "extract", "query", "precompute", "demo", "compare", "robustness", "report"]
+)
 def test_help_explains_every_option(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:

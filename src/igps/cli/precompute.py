@@ -41,7 +41,7 @@ def precompute(
 
     Args:
         root: folder of meshes, with or without classes.
-        descriptors: whose needs the signatures shall satisfy; interior if not given.
+        descriptors: whose needs the signatures shall satisfy; pretrained if not given.
         cluster: address of a Dask scheduler, such as tcp://scheduler:8786, whose workers see folder and cache by the
             same paths as this machine.
         shard: such as 3/64, the third of 64 parts of the meshes, for as many jobs of a batch system.

@@ -124,8 +124,8 @@ def query(
         gallery: folder of meshes, with or without classes.
         index: an index of meshes in place of their folder, see igps index.
         top: how many to list.
-        descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own; pretrained if not given, or
-            that of the index.
+        descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own; if not given, that of the
+            index, or pretrained.
     """
     if top < 1:
         raise ValueError(f"top: expected at least 1, got {top}.")
