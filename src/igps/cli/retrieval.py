@@ -34,7 +34,7 @@ def retrieve(
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
-) -> None:
+) -> dict[str, Any]:
     """Query a labelled collection with each of its meshes and print the retrieval scores.
 
     Every mesh is compared with all others (leave-one-out) by the descriptor's own distance.
@@ -58,11 +58,13 @@ def retrieve(
     print(scores_table(scores))
     if failures:
         print(f"{len(failures)} of {len(failures) + len(dataset)} meshes could not be used.")
+    summary = _summary(dataset, descriptor, scores, failures)
     if out is not None:
-        _write_retrieval(out, dataset, descriptor, distances, scores, failures)
+        _write_retrieval(out, dataset, summary, distances, failures)
         print(f"written to {out}")
         if report:
             write_report(out, n_workers=n_workers)
+    return summary
 
 
 def extract(
@@ -103,7 +105,7 @@ def query(
     top: int = 10,
     descriptor: str = "interior",
     **reading: Any,
-) -> None:
+) -> list[dict[str, Any]]:
     """List the meshes of a gallery that are most similar to one mesh.
 
     Args:
@@ -120,9 +122,12 @@ def query(
     found = search(wanted, descriptions, top=min(top, len(dataset)), distance=chosen.distances)
     width = max(len(dataset.files.names[i]) for i in found.indices[0].tolist())
     print(f"{'rank':>4}  {'distance':>8}  {'mesh':<{width}}  class")
+    rows = []
     for place, (i, distance) in enumerate(zip(found.indices[0].tolist(), found.distances[0].tolist(), strict=True), 1):
         label = dataset.files.labels[i] if dataset.files.labels is not None else "-"
         print(f"{place:>4}  {distance:>8.4f}  {dataset.files.names[i]:<{width}}  {label}")
+        rows.append({"rank": place, "distance": distance, "mesh": dataset.files.names[i], "class": label})
+    return rows
 
 
 def _described(
@@ -138,25 +143,25 @@ def _described(
     return dataset.usable(undescribed), descriptions, [*unread, *undescribed]
 
 
-def _write_retrieval(
-    out: Path,
-    dataset: SignatureDataset,
-    descriptor: str,
-    distances: Tensor,
-    scores: RetrievalScores,
-    failures: Sequence[Failure],
-) -> None:
-    out.mkdir(parents=True, exist_ok=True)
-    names, labels = dataset.files.names, dataset.files.labels or ()
-    summary = {
+def _summary(
+    dataset: SignatureDataset, descriptor: str, scores: RetrievalScores, failures: Sequence[Failure]
+) -> dict[str, Any]:
+    return {
         **scores.mean(),
         "n_queries": scores.n_queries,
-        "n_given": len(names) + len(failures),
-        "n_used": len(names),
+        "n_given": len(dataset) + len(failures),
+        "n_used": len(dataset),
         "n_refused": len(failures),
         "per_class": {str(label): values for label, values in scores.per_class().items()},
         "config": {"descriptor": descriptor, **dataset.config.as_dict()},
     }
+
+
+def _write_retrieval(
+    out: Path, dataset: SignatureDataset, summary: dict[str, Any], distances: Tensor, failures: Sequence[Failure]
+) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    names, labels = dataset.files.names, dataset.files.labels or ()
     (out / "scores.json").write_text(json.dumps(summary, indent=2) + "\n")
     np.savez_compressed(
         out / "distances.npz", distances=distances.numpy(), names=np.array(names), labels=np.array(labels)
