@@ -38,6 +38,10 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test,lint]"
 	touch $(READY)
 
+# make release-check: wheel and source archive in empty environments, with the lowest and the newest versions; some gigabytes
+release-check: $(READY)
+	$(BIN)/python tests/release_check.py
+
 # make docs: the documentation as a site, in build/site; a warning is an error. The variable silences advertisement.
 docs: $(READY) $(VENV)/.ready-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -116,7 +116,7 @@ def test_reading_is_passed_on(paths: list[Path], tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("descriptor", [DISTANCES, interior(n_eigenpairs=3)])
 def test_columns_have_names_and_tables_have_them(paths: list[Path], tmp_path: Path, descriptor: Descriptor) -> None:
-    features = VolumetricFeatures(descriptor, config=TINY, cache_dir=tmp_path, n_workers=1)
+    features = VolumetricFeatures(descriptor, config=CONFIG, cache_dir=tmp_path, n_workers=1)
     with pytest.raises(NotFittedError):
         features.get_feature_names_out()
     values = features.fit(paths).transform(paths)

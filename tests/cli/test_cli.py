@@ -362,7 +362,7 @@ def test_json_is_what_the_table_tells(
     order = distances.argsort()[:3]
     assert [row["mesh"] for row in rows] == [dataset.files.names[i] for i in order]
     assert [row["distance"] for row in rows] == pytest.approx(distances[order].tolist(), abs=1e-6)
-    assert [(row["rank"], row["class"]) for row in rows][0] == (1, "ball")
+    assert (rows[0]["rank"], rows[0]["class"]) == (1, "ball")
 
     igps(monkeypatch, "compare", root, "--descriptors", INTERIOR, "--json", *options)
     (row,) = json.loads(capsys.readouterr().out)
