@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint campaign shrec07 bench clean
+.PHONY: demo test lint docs release-check campaign shrec07 bench clean
 
 demo: $(READY)
 	$(BIN)/igps demo --out build/demo
@@ -37,6 +37,18 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test,lint]"
 	touch $(READY)
+
+# make release-check: wheel and source archive in empty environments, with the lowest and the newest versions; some gigabytes
+release-check: $(READY)
+	$(BIN)/python tests/release_check.py
+
+# make docs: the documentation as a site, in build/site; a warning is an error. The variable silences advertisement.
+docs: $(READY) $(VENV)/.ready-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+$(VENV)/.ready-docs: $(READY)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	touch $@
 
 # make bench [DATA=folder-of-meshes-with-labels.csv]
 bench: $(READY)

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 from sklearn.base import clone
+from sklearn.exceptions import NotFittedError
+from sklearn.model_selection import GridSearchCV
 from sklearn.neighbors import KNeighborsClassifier
-from sklearn.pipeline import make_pipeline
+from sklearn.pipeline import make_pipeline, make_union
 from sklearn.utils import check_array, estimator_checks
 from sklearn.utils.estimator_checks import check_estimator
 
@@ -112,6 +114,33 @@ def test_reading_is_passed_on(paths: list[Path], tmp_path: Path) -> None:
     np.testing.assert_allclose(whole, features.transform(paths[:1]), atol=0.05)
 
 
+@pytest.mark.parametrize("descriptor", [DISTANCES, interior(n_eigenpairs=3)])
+def test_columns_have_names_and_tables_have_them(paths: list[Path], tmp_path: Path, descriptor: Descriptor) -> None:
+    features = VolumetricFeatures(descriptor, config=CONFIG, cache_dir=tmp_path, n_workers=1)
+    with pytest.raises(NotFittedError):
+        features.get_feature_names_out()
+    values = features.fit(paths).transform(paths)
+    names = features.get_feature_names_out()
+    assert names.tolist() == [f"{descriptor.name}{i}" for i in range(values.shape[1])]
+    pandas = pytest.importorskip("pandas")
+    table = clone(features).set_output(transform="pandas").fit_transform(paths)
+    assert isinstance(table, pandas.DataFrame)
+    assert table.columns.tolist() == names.tolist()
+    np.testing.assert_array_equal(table.to_numpy(), values)
+    union = make_union(clone(features), clone(features)).fit(
+        paths
+    )  # names of each have the name of the step before them
+    assert len(set(union.get_feature_names_out())) == 2 * values.shape[1]
+
+
+def test_parameters_are_searched(paths: list[Path], features: VolumetricFeatures) -> None:
+    labels = [path.parent.name for path in paths]
+    pipeline = make_pipeline(features, KNeighborsClassifier(1))
+    grid = {"volumetricfeatures__square_root": [True, False]}
+    found = GridSearchCV(pipeline, grid, cv=2, error_score="raise").fit(paths, labels)
+    assert found.best_score_ == 1
+
+
 class OnRows(VolumetricFeatures):
     """`VolumetricFeatures` for the checks of scikit-learn, which know tables of numbers: each row makes a mesh."""
 
@@ -175,6 +204,9 @@ def test_conventions_of_scikit_learn() -> None:
         "check_fit_score_takes_y", "check_mixin_order", "check_valid_tag_types", "check_fit_check_is_fitted",
     } <= passed  # fmt: skip
     assert len(passed) > 25
+    # What is left out asks for other libraries of arrays; nothing that is about transformers.
+    skipped = {name for name, one in status.items() if one == "skipped"}
+    assert skipped <= {"check_array_api_input"}, skipped
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from igps.nn.descriptor import Descriptor, HistogramDescriptor
 
 try:
     from sklearn.base import BaseEstimator, TransformerMixin
+    from sklearn.utils.validation import check_is_fitted
 except ImportError as error:
     raise ImportError('igps.sklearn needs scikit-learn: pip install "interior-gps[sklearn]".') from error
 
@@ -30,6 +31,13 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
 
     The square roots of a histogram's cells are given by default: their Euclidean distance is Hellinger's between
     histograms, what linear classifiers and Gaussian kernels can work with. For a χ² kernel ask for the cells.
+
+    Example:
+        >>> from igps import ArticulatedShapes, Mesh
+        >>> shape = ArticulatedShapes(n_vertices=600)[0]
+        >>> features = VolumetricFeatures("interior").fit([Mesh(shape.vertices, shape.faces)])
+        >>> features.get_feature_names_out()[-1]
+        'interior639'
 
     Args:
         descriptor: a name, "package.module:NAME", or a `Descriptor`; see `igps.descriptor`.
@@ -58,9 +66,14 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         self.n_workers = n_workers
 
     def fit(self, X: Sequence[str | Path | Mesh], y: Any = None) -> Self:
-        """Check the parameters and the kind of input; there is nothing to learn."""
-        descriptor_of(self.descriptor)
-        _checked(X)
+        """Check the parameters and the kind of input, and count the columns; there is nothing to learn."""
+        chosen = descriptor_of(self.descriptor)
+        shapes = _checked(X)
+        self._name = chosen.name
+        if isinstance(chosen, HistogramDescriptor):
+            self._n_features_out = sum(chosen.part_cells)
+        else:  # only a description tells
+            self._n_features_out = self._features(shapes[:1]).shape[1]
         return self
 
     def transform(self, X: Sequence[str | Path | Mesh]) -> NDArray[np.float32]:
@@ -70,7 +83,21 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
             MeshError: a mesh that cannot be used; see `load_mesh`.
             TypeError: other input.
         """
-        shapes = _checked(X)
+        return self._features(_checked(X))
+
+    def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
+        """Names of the columns: the descriptor's name and a number; of `set_output(transform="pandas")` too.
+
+        Args:
+            input_features: ignored, as meshes have no columns.
+
+        Raises:
+            NotFittedError: before `fit`.
+        """
+        check_is_fitted(self, "_n_features_out")
+        return np.array([f"{self._name}{i}" for i in range(self._n_features_out)], dtype=object)
+
+    def _features(self, shapes: list[Any]) -> NDArray[np.float32]:
         chosen = descriptor_of(self.descriptor)
         config = chosen.needs.completed(self.config or SignatureConfig())
         if isinstance(shapes[0], Mesh):

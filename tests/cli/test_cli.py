@@ -4,8 +4,11 @@ import csv
 import json
 import logging
 import re
+import shutil
+import subprocess
 import sys
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -358,3 +361,76 @@ def test_commands_may_be_grouped(monkeypatch: pytest.MonkeyPatch, capsys: pytest
             igps(monkeypatch, *arguments, "--help")
         text = capsys.readouterr().out
         assert all(word in text for word in words)
+
+
+def test_json_is_what_the_table_tells(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", *SMALL]
+    out = tmp_path / "out"
+    igps(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--out", out, "--json", *options)
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == json.loads((out / "scores.json").read_text())
+    assert "ADR self" in printed.err  # the table, where progress goes
+
+    wanted = root / "ball" / "1.off"
+    igps(monkeypatch, "query", wanted, "--gallery", root, "--top", "3", "--descriptor", INTERIOR, "--json", *options)
+    rows = json.loads(capsys.readouterr().out)
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
+    histograms = describe(dataset, small_interior())
+    distances = chi_square(histograms[1:2], histograms)[0]
+    order = distances.argsort()[:3]
+    assert [row["mesh"] for row in rows] == [dataset.files.names[i] for i in order]
+    assert [row["distance"] for row in rows] == pytest.approx(distances[order].tolist(), abs=1e-6)
+    assert (rows[0]["rank"], rows[0]["class"]) == (1, "ball")
+
+    igps(monkeypatch, "compare", root, "--descriptors", INTERIOR, "--json", *options)
+    (row,) = json.loads(capsys.readouterr().out)
+    expected = retrieval_scores(chi_square(histograms, histograms), dataset.files.labels or ()).mean()
+    assert {name: row[name] for name in expected} == pytest.approx(expected)
+
+
+def test_json_has_no_numbers_that_json_does_not_know(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The scores of a class of one mesh are not defined."""
+    for path in sorted((root / "egg").iterdir())[1:]:
+        path.unlink()
+    options = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", *SMALL]
+    igps(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, "--json", *options)
+
+    def refuse(name: str) -> None:
+        raise AssertionError(name)
+
+    found = json.loads(capsys.readouterr().out, parse_constant=refuse)
+    assert found["per_class"].get("egg", {"nn": None})["nn"] is None
+    assert found["n_queries"] == 3
+
+
+def test_every_command_that_prints_a_table_has_json() -> None:
+    told = ("retrieve", "query", "compare", "robustness", "damage", "doctor", "demo")
+    for name in told:
+        assert get_type_hints(cli.COMMANDS[name])["return"] is not type(None), name
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_completion_knows_commands_and_options(
+    shell: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The shell itself reads the script, and completes by it."""
+    igps(monkeypatch, "completion", shell)
+    script = capsys.readouterr().out
+    assert all(word in script for word in ("retrieve", "doctor", "--mend", "--cache_dir"))
+    program = shutil.which(shell)
+    if program is None:
+        pytest.skip(f"{shell} is not installed")
+    path = tmp_path / "script"
+    path.write_text(script)
+    subprocess.run([program, "-n", str(path)], check=True)
+    if shell == "bash":
+        ask = (
+            f"source {path}; COMP_WORDS=(igps rob); COMP_CWORD=1; "
+            + "$(complete -p igps | sed 's/.*-F \\([^ ]*\\).*/\\1/') igps rob igps; echo ${COMPREPLY[@]}"
+        )
+        done = subprocess.run([program, "-c", ask], capture_output=True, text=True, check=True)
+        assert done.stdout.split() == ["robustness"]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
+import json
 import logging
+import math
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any, get_args, get_origin, get_type_hints
@@ -12,21 +15,23 @@ from docstring_parser import parse
 from jsonargparse import ArgumentParser, Namespace
 
 from igps.cli.compare import compare
+from igps.cli.completion import completion
 from igps.cli.damage import damage
 from igps.cli.demo import demo
 from igps.cli.doctor import doctor
 from igps.cli.figure import pose, potential, topology
 from igps.cli.index import index_add, index_build, index_merge
 from igps.cli.precompute import precompute
-from igps.cli.reading import FLAGS
+from igps.cli.reading import FLAGS, Verdict
 from igps.cli.report import report
 from igps.cli.retrieval import extract, query, retrieve
 from igps.cli.robustness import robustness
 from igps.parallel import MachineError, is_machines, machines_words
 from igps.threads import one_thread
 
-Command = Callable[..., None]
+Command = Callable[..., Any]
 Commands = Mapping[str, "Command | Commands"]
+JSON = "json"
 
 COMMANDS: Commands = {
     "retrieve": retrieve,
@@ -41,19 +46,24 @@ COMMANDS: Commands = {
     "damage": damage,
     "doctor": doctor,
     "report": report,
+    "completion": completion,
 }
-"""What follows `igps`: a function, or the commands of a group by name."""
+"""What follows `igps`: a function, or the commands of a group by name.
+
+A command that prints a table returns what it tells, for `--json`.
+"""
 
 
 def main() -> None:
     """Entry point of the `igps` command: status 1 where the input is at fault, 2 where the machine is."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
-    parser = ArgumentParser(prog="igps", description="Volumetric shape retrieval by interior Global Point Signatures.")
-    _add_commands(parser, COMMANDS)
+    parser = command_parser()
     command, options = _chosen(parser.instantiate(parser.parse_args()), COMMANDS)
+    as_json = options.pop(JSON, False)
     try:
-        with one_thread():
-            command(**options)
+        # With --json, what a reader is told goes where progress goes
+        with one_thread(), contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+            found = command(**options)
     except MachineError as error:
         print(f"igps: {error}", file=sys.stderr)
         sys.exit(2)
@@ -64,6 +74,29 @@ def main() -> None:
             sys.exit(2)
         print(f"igps: {error}", file=sys.stderr)
         sys.exit(1)
+    status = 0
+    if isinstance(found, Verdict):
+        found, status = found.told, int(not found.is_good)
+    if as_json:
+        print(json.dumps(_finite(found), indent=2))
+    if status:
+        sys.exit(status)
+
+
+def command_parser() -> ArgumentParser:
+    """The parser of all commands."""
+    parser = ArgumentParser(prog="igps", description="Volumetric shape retrieval by interior Global Point Signatures.")
+    _add_commands(parser, COMMANDS)
+    return parser
+
+
+def _finite(found: Any) -> Any:
+    """The same without numbers that JSON does not know: null where a score is not defined."""
+    if isinstance(found, Mapping):
+        return {name: _finite(value) for name, value in found.items()}
+    if isinstance(found, list | tuple):
+        return [_finite(value) for value in found]
+    return None if isinstance(found, float) and not math.isfinite(found) else found
 
 
 def _chosen(arguments: Namespace, commands: Commands) -> tuple[Command, dict[str, Any]]:
@@ -97,6 +130,8 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
     switches = {name: meanings.get(name) for name in parameters if kinds[name] is bool}
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
         switches = {**FLAGS, **switches}
+    if kinds["return"] is not type(None):
+        switches[JSON] = "print what the table tells as JSON, and all else to standard error"
     by_hand: set[str | int] = set(switches)
     for place, (name, parameter) in enumerate(parameters.items()):
         positional = place == 0 and parameter.default is parameter.empty

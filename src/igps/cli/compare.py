@@ -31,7 +31,7 @@ def compare(
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
-) -> None:
+) -> list[dict[str, Any]]:
     """Compare descriptors on a labelled collection and print a table of their scores.
 
     Every mesh is compared with all others (leave-one-out) by the distance of each descriptor. A mesh that a descriptor
@@ -65,6 +65,7 @@ def compare(
         print(f"written to {out}")
         if report:
             write_report(out, n_workers=n_workers)
+    return [result.row() for result in results]
 
 
 def _write(out: Path, results: Sequence[Result], failures: Sequence[Failure]) -> None:

@@ -25,7 +25,7 @@ def damage(
     out: Path | None = None,
     n_workers: int | None = None,
     **reading: Any,
-) -> None:
+) -> dict[str, Any]:
     """Damage clean meshes as scanners, modelling programs and converters do, and measure what that costs retrieval.
 
     Every damaged mesh, mended as a file would be, queries the clean meshes but its own twin. The table tells the share
@@ -51,12 +51,13 @@ def damage(
     print(damage_table(found))
     for failure in failures:
         print(f"not used: {failure.error}")
+    summary = {
+        "damages": {name: one.description for name, one in DAMAGES.items()},
+        "results": {name: {way: one.as_dict() for way, one in of.items()} for name, of in found.items()},
+        "config": dataset.config.as_dict(),
+    }
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        summary = {
-            "damages": {name: one.description for name, one in DAMAGES.items()},
-            "results": {name: {way: one.as_dict() for way, one in of.items()} for name, of in found.items()},
-            "config": dataset.config.as_dict(),
-        }
         (out / "damage.json").write_text(json.dumps(summary, indent=2) + "\n")
         print(f"written to {out}")
+    return summary

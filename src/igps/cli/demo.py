@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from igps.cli.report import check_report, report
 from igps.cli.retrieval import retrieve
 from igps.shapes import ArticulatedShapes
 
 
-def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> None:
+def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> dict[str, Any]:
     """Make a small benchmark of articulated shapes, run the retrieval on it, and save a figure and a page of results.
 
     Args:
@@ -21,7 +22,8 @@ def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> None:
     check_report(True, out)
     shapes = ArticulatedShapes(n_classes=8, n_per_class=10)
     shapes.write(out / "shapes", progress=True)
-    retrieve(out / "shapes", out=out, cache_dir=out / "cache", n_workers=n_workers)
+    summary = retrieve(out / "shapes", out=out, cache_dir=out / "cache", n_workers=n_workers)
     ranked_results(out / "shapes", out / "ranking.csv", out / "ranked.png")
     print(f"ranked results of one query per class: {out / 'ranked.png'}")
     report(out, n_workers=n_workers)
+    return summary

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
+from dataclasses import asdict
 from pathlib import Path
 
-from igps.cli.reading import write_rows
+from igps.cli.reading import Verdict, write_rows
 from igps.data.sources import find_meshes
 from igps.geometry.mending import Mending
 from igps.geometry.reading import Component, MeshReading
@@ -29,7 +29,7 @@ def doctor(
     n_workers: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
-) -> None:
+) -> Verdict:
     """Tell what is wrong with each mesh file of a folder, what will be done about it, and what that will cost.
 
     Nothing is computed but the mending. The exit status is 1 if a file cannot be used.
@@ -54,8 +54,7 @@ def doctor(
         out.parent.mkdir(parents=True, exist_ok=True)
         write_rows(out, _HEADER, [_row(finding) for finding in found])
         print(f"written to {out}")
-    if not usable(found):
-        sys.exit(1)
+    return Verdict([asdict(finding) for finding in found], usable(found))
 
 
 def _row(finding: Finding) -> tuple[str, ...]:

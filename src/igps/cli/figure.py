@@ -17,7 +17,7 @@ from igps.geometry.surface import genus
 from igps.studies.paper import pose_curves, potential_slice, weld_change
 
 
-def pose(root: Path, classes: list[str] | None = None, out: Path = Path("pose.png"), **reading: Any) -> None:
+def pose(root: Path, classes: list[str] | None = None, out: Path = Path("pose.png"), **reading: Any) -> dict[str, Any]:
     """Draw the distribution of interior distances of every mesh of some classes (Rustamov 2010, figure 1).
 
     One potential class, 64 bins, one curve a mesh, one colour a class: the poses of one body lie together, other bodies
@@ -50,6 +50,14 @@ def pose(root: Path, classes: list[str] | None = None, out: Path = Path("pose.pn
     if failures:
         print(f"{len(failures)} meshes could not be used.")
     print(f"written to {out}")
+    return {
+        name: {
+            "n_meshes": len(curves),
+            "within": float(np.median(found.within[name])) if found.within[name].size else None,
+            "to_others": float(np.median(found.to_others[name])) if found.to_others[name].size else None,
+        }
+        for name, curves in found.curves.items()
+    }
 
 
 def topology(

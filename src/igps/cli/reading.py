@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import reduce
 from operator import or_
 from pathlib import Path
+from typing import Any
 
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import MeshFiles
@@ -24,6 +26,14 @@ FLAGS = {
     "strict": "stop at the first mesh that cannot be used instead of skipping it",
 }
 """Switches of every command that passes its `**reading` on to `signatures`, and what they do."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a command tells, and whether its exit status is 0."""
+
+    told: Any
+    is_good: bool
 
 
 def signatures(

@@ -38,7 +38,7 @@ def retrieve(
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
-) -> None:
+) -> dict[str, Any]:
     """Query a labelled collection with each of its meshes and print the retrieval scores.
 
     Every mesh is compared with all others (leave-one-out) by the descriptor's own distance.
@@ -68,13 +68,15 @@ def retrieve(
         print(f"\nre-ranked by the whole collection, without its labels\n{scores_table(scores_reranked)}")
     if failures:
         print(f"{len(failures)} of {len(failures) + len(dataset)} meshes could not be used.")
+    summary = _summary(dataset, descriptor, scores, failures)
+    if scores_reranked is not None:
+        summary["reranked"] = scores_reranked.mean()
     if out is not None:
-        _write_retrieval(out, dataset, descriptor, distances, scores, failures)
-        if reranked is not None and scores_reranked is not None:
-            _write_reranked(out, reranked, scores_reranked)
+        _write_retrieval(out, dataset, summary, distances, failures, reranked)
         print(f"written to {out}")
         if report:
             write_report(out, n_workers=n_workers)
+    return summary
 
 
 def extract(
@@ -116,7 +118,7 @@ def query(
     top: int = 10,
     descriptor: str | None = None,
     **reading: Any,
-) -> None:
+) -> list[dict[str, Any]]:
     """List the meshes of a gallery that are most similar to one mesh.
 
     Args:
@@ -141,14 +143,16 @@ def query(
         _print_found(rows)
         if missing:
             print(f"{missing} of these {len(matches)} files are no longer where they were when they were indexed.")
-        return
+        return _as_rows(rows)
     chosen = descriptor_of(descriptor or "pretrained")
     _, wanted, _ = _described([mesh], chosen, **reading)
     dataset, descriptions, _ = _described(find_meshes(gallery), chosen, **reading)  # type: ignore[arg-type]
     found = search(wanted, descriptions, top=min(top, len(dataset)), distance=chosen.distances)
     names, labels = dataset.files.names, dataset.files.labels
     places = zip(found.indices[0].tolist(), found.distances[0].tolist(), strict=True)
-    _print_found([(names[i], None if labels is None else labels[i], distance) for i, distance in places])
+    rows = [(names[i], None if labels is None else labels[i], distance) for i, distance in places]
+    _print_found(rows)
+    return _as_rows(rows)
 
 
 def _print_found(rows: Sequence[tuple[str, str | None, float]]) -> None:
@@ -156,6 +160,13 @@ def _print_found(rows: Sequence[tuple[str, str | None, float]]) -> None:
     print(f"{'rank':>4}  {'distance':>8}  {'mesh':<{width}}  class")
     for place, (name, label, distance) in enumerate(rows, 1):
         print(f"{place:>4}  {distance:>8.4f}  {name:<{width}}  {'-' if label is None else label}")
+
+
+def _as_rows(rows: Sequence[tuple[str, str | None, float]]) -> list[dict[str, Any]]:
+    return [
+        {"rank": place, "distance": distance, "mesh": name, "class": "-" if label is None else label}
+        for place, (name, label, distance) in enumerate(rows, 1)
+    ]
 
 
 def _described(
@@ -171,29 +182,35 @@ def _described(
     return dataset.usable(undescribed), descriptions, [*unread, *undescribed]
 
 
-def _write_retrieval(
-    out: Path,
-    dataset: SignatureDataset,
-    descriptor: str,
-    distances: Tensor,
-    scores: RetrievalScores,
-    failures: Sequence[Failure],
-) -> None:
-    out.mkdir(parents=True, exist_ok=True)
-    names, labels = dataset.files.names, dataset.files.labels or ()
-    summary = {
+def _summary(
+    dataset: SignatureDataset, descriptor: str, scores: RetrievalScores, failures: Sequence[Failure]
+) -> dict[str, Any]:
+    return {
         **scores.mean(),
         "n_queries": scores.n_queries,
-        "n_given": len(names) + len(failures),
-        "n_used": len(names),
+        "n_given": len(dataset) + len(failures),
+        "n_used": len(dataset),
         "n_refused": len(failures),
         "per_class": {str(label): values for label, values in scores.per_class().items()},
         "config": {"descriptor": descriptor, **dataset.config.as_dict()},
     }
+
+
+def _write_retrieval(
+    out: Path,
+    dataset: SignatureDataset,
+    summary: dict[str, Any],
+    distances: Tensor,
+    failures: Sequence[Failure],
+    reranked: Tensor | None,
+) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    names, labels = dataset.files.names, dataset.files.labels or ()
     (out / "scores.json").write_text(json.dumps(summary, indent=2) + "\n")
-    np.savez_compressed(
-        out / "distances.npz", distances=distances.numpy(), names=np.array(names), labels=np.array(labels)
-    )
+    arrays: dict[str, Any] = {"distances": distances.numpy(), "names": np.array(names), "labels": np.array(labels)}
+    if reranked is not None:
+        arrays["reranked"] = reranked.numpy()
+    np.savez_compressed(out / "distances.npz", **arrays)
     others = ~torch.eye(len(names), dtype=torch.bool)
     with (out / "ranking.csv").open("w", newline="") as file:
         writer = csv.writer(file)
@@ -206,11 +223,3 @@ def _write_retrieval(
     write_rows(out / "failures.csv", ("file", "error"), rows)
     write_notes(out / "notes.csv", dataset)
     write_sources(out, dataset)
-
-
-def _write_reranked(out: Path, distances: Tensor, scores: RetrievalScores) -> None:
-    """Add the re-ranked distances, and the means of their scores, to what is written."""
-    summary = json.loads((out / "scores.json").read_text())
-    (out / "scores.json").write_text(json.dumps({**summary, "reranked": scores.mean()}, indent=2) + "\n")
-    with np.load(out / "distances.npz") as plain:
-        np.savez_compressed(out / "distances.npz", **plain, reranked=distances.numpy())

@@ -26,7 +26,7 @@ def robustness(
     report: bool = False,
     n_workers: int | None = None,
     **reading: Any,
-) -> None:
+) -> dict[str, Any]:
     """Measure how far the description of each descriptor moves when a mesh is disturbed, and print a table.
 
     A movement is the distance between the descriptions of a mesh before and after, in percent of the descriptor's
@@ -59,9 +59,9 @@ def robustness(
     print(robustness_table(found.movements))
     for failure in failures:
         print(f"not used: {failure.error}")
+    summary = {**found.as_dict(), "config": dataset.config.as_dict()}
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        summary = {**found.as_dict(), "config": dataset.config.as_dict()}
         (out / "robustness.json").write_text(json.dumps(summary, indent=2) + "\n")
         write_notes(out / "notes.csv", dataset)
         write_rows(out / "failures.csv", ("file", "error"), [(failure.id, failure.error) for failure in failures])
@@ -69,3 +69,4 @@ def robustness(
         print(f"written to {out}")
         if report:
             write_report(out, n_workers=n_workers)
+    return summary

@@ -43,6 +43,10 @@ NAMES: tuple[str, ...] = tuple(_MAKERS)
 def descriptor(which: str | Descriptor) -> Descriptor:
     """A descriptor by its name, in evaluation mode; one that is given is returned as it is.
 
+    Example:
+        >>> descriptor("interior").needs.n_eigenpairs
+        250
+
     Args:
         which: one of `NAMES`; or "package.module:NAME", where NAME is a descriptor of your own or makes one when
             called; or a descriptor.

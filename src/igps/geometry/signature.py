@@ -229,6 +229,15 @@ class Signature:
 def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Signature:
     """Sample the eigenfunctions of a mesh in its interior and on its surface (Rustamov 2010, section 3).
 
+    Example:
+        The first eigenvalues of the unit sphere are l (l + 1), each 2 l + 1 times.
+
+        >>> import trimesh
+        >>> ball = trimesh.creation.icosphere(subdivisions=3)
+        >>> signature = compute_signature(Mesh(ball.vertices, ball.faces), SignatureConfig(n_eigenpairs=8))
+        >>> signature.eigenvalues.round(1).tolist()
+        [2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]
+
     Args:
         mesh: the body.
         config: `SignatureConfig()` if None.

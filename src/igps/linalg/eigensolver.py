@@ -88,6 +88,15 @@ def eigenpairs(
 
     The matrices may come from any library, with the sign that makes the stiffness positive semi-definite.
 
+    Example:
+        A ring of n equal springs has the eigenvalues 2 − 2 cos(2 π k / n), each twice.
+
+        >>> ring = sparse.diags_array([2.0] * 12) - sparse.diags_array([1.0] * 11, offsets=1)
+        >>> ring = ring - sparse.diags_array([1.0] * 11, offsets=-1)
+        >>> ring = ring - sparse.coo_array(([1.0, 1.0], ([0, 11], [11, 0])), shape=(12, 12))
+        >>> eigenpairs(ring, np.ones(12), 4).eigenvalues.round(6).tolist()
+        [0.267949, 0.267949, 1.0, 1.0]
+
     Args:
         stiffness: (V, V) positive semi-definite, symmetric, rows summing to zero; no unit (cotangents).
         mass: (V,) lumped vertex areas, length², or a diagonal (V, V) sparse matrix of them.

@@ -33,6 +33,12 @@ def chi_square(queries: Tensor, gallery: Tensor, weights: Tensor | None = None) 
     function has no derivative. Memory beyond inputs, result and gradients stays below 256 MiB, backward included.
     First derivatives only. Source: Rustamov 2010 (comparison of histograms by χ²).
 
+    Example:
+        >>> import torch
+        >>> histograms = torch.tensor([[0.5, 0.5, 0.0], [0.0, 0.5, 0.5], [0.0, 0.0, 1.0]])
+        >>> chi_square(histograms[:1], histograms)
+        tensor([[0.0000, 0.5000, 1.0000]])
+
     Args:
         queries: (Q, ...) histograms, entries ≥ 0; all dimensions after the first are cells.
         gallery: (G, ...) histograms of the same cells.

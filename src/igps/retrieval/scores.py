@@ -110,6 +110,15 @@ def retrieval_scores(distances: Tensor, query_labels: Labels, gallery_labels: La
 
     Sources: Shilane, Min, Kazhdan, Funkhouser 2004 (Princeton Shape Benchmark); Typke, Veltkamp, Wiering 2006 (ADR).
 
+    Example:
+        >>> import torch
+        >>> places = torch.tensor([0.0, 1.0, 3.0, 3.5])  # of four shapes on a line
+        >>> scores = retrieval_scores((places[:, None] - places).abs(), ["cup", "cup", "cup", "ant"])
+        >>> scores.nn.tolist()
+        [1.0, 1.0, 0.0, nan]
+        >>> scores.mean()["nn"]
+        0.6666666666666666
+
     Args:
         distances: (Q, G), ≥ 0, smaller is closer; infinity is allowed.
         query_labels: Q class labels.

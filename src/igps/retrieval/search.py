@@ -40,6 +40,13 @@ def search(
 
     A query that is itself in the gallery is found there like any other entry, at distance zero.
 
+    Example:
+        >>> import torch
+        >>> from igps.retrieval import euclidean
+        >>> found = search(torch.tensor([[0.0]]), torch.tensor([[3.0], [1.0], [-2.0]]), top=2, distance=euclidean)
+        >>> found.indices.tolist(), found.distances.tolist()
+        ([[1, 2]], [[1.0, 2.0]])
+
     Args:
         query_descriptors: (Q, ...) as the distance takes them.
         gallery_descriptors: (G, ...).

@@ -51,6 +51,11 @@ class ArticulatedShapes:
     A class index means the same class for the same seed whatever ``n_classes``, and a shape depends on its class, its
     number in the class, ``seed`` and ``n_vertices`` alone, so shapes may be made in any order and by many processes.
 
+    Example:
+        >>> shapes = ArticulatedShapes(n_classes=3, n_per_class=2)
+        >>> shapes.class_names, len(shapes)
+        (['biped', 'quadruped', 'octopus'], 6)
+
     Args:
         n_classes: number of classes; the first twelve are named templates, the rest are drawn from a grammar.
         n_per_class: number of shapes of each class.

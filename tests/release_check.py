@@ -1,0 +1,51 @@
+"""Install wheel and source archive into empty environments, and try them there: python tests/release_check.py
+
+Once with the lowest versions of all dependencies that pyproject.toml allows, once with the newest. It needs an index of
+packages and minutes, and is no part of the tests; `tests/test_distribution.py` is the quick form.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tempfile
+import tomllib
+import venv
+from pathlib import Path
+
+PROJECT = Path(__file__).parents[1]
+
+
+def lowest(requirements: list[str]) -> list[str]:
+    """Constraints that pin each requirement to the lowest version it allows."""
+    found = []
+    for requirement in requirements:
+        name, least = re.match(r"([\w.-]+)(?:\[[\w,-]+\])?.*?>=\s*([\w.]+)", requirement).groups()  # type: ignore[union-attr]
+        found.append(f"{name}=={least}")
+    return found
+
+
+def main() -> None:
+    """Build, install, try; the first command that fails ends it."""
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        subprocess.run([sys.executable, "-m", "build", "--outdir", folder / "dist", PROJECT], check=True)
+        (wheel,), (source,) = (folder / "dist").glob("*.whl"), (folder / "dist").glob("*.tar.gz")
+        # Lightning needs a setuptools that still has pkg_resources in its lowest versions
+        pins = {"lowest": [*lowest(project["dependencies"]), "setuptools<81"], "newest": []}
+        for (which, constraints), archive in zip(pins.items(), (wheel, source), strict=True):
+            place = folder / which
+            venv.create(place, with_pip=True)
+            python = str(place / "bin" / "python")
+            (folder / "constraints.txt").write_text("\n".join(constraints))
+            command = [python, "-m", "pip", "install", "--quiet", "--constraint", folder / "constraints.txt", archive]
+            subprocess.run([*command, *(["setuptools<81"] if which == "lowest" else [])], check=True)
+            smoke = [python, PROJECT / "tests" / "smoke.py", project["version"], place]
+            subprocess.run(smoke, check=True, cwd=folder)
+            print(f"{which} versions, {archive.name}: works")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""Wheel and source archive are built, hold what they must, and work where they are installed."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+import tarfile
+import tomllib
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).parents[1]
+VERSION = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]["version"]
+SMOKE = PROJECT / "tests" / "smoke.py"
+
+
+@pytest.fixture(scope="module")
+def archives(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Wheel and source archive; the former made of the latter, as an installation from source would."""
+    for module in ("build", "setuptools"):
+        if importlib.util.find_spec(module) is None:
+            pytest.skip(f"needs {module}")
+    out = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(PROJECT)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if "ERROR Missing dependencies" in done.stdout + done.stderr:
+        pytest.skip("needs the build backend that pyproject.toml asks for")
+    assert done.returncode == 0, done.stdout + done.stderr
+    (wheel,), (source,) = out.glob("*.whl"), out.glob("*.tar.gz")
+    return wheel, source
+
+
+def test_archives_hold_what_the_package_needs(archives: tuple[Path, Path]) -> None:
+    wheel, source = archives
+    package = PROJECT / "src" / "igps"
+    wanted = {path.relative_to(package.parent).as_posix() for path in package.rglob("*.py")}
+    wanted |= {"igps/py.typed", "igps/descriptors/pretrained.safetensors", "igps/report/template/page.html.j2"}
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    assert wanted <= names
+    assert not [name for name in names if name.startswith(("tests/", "training/", "docs/"))]
+    with tarfile.open(source) as archive:
+        inside = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"pyproject.toml", "README.md", "LICENSE"} <= inside
+    assert {f"src/{name}" for name in wanted} <= inside
+
+
+def test_the_installed_wheel_works(archives: tuple[Path, Path], tmp_path: Path) -> None:
+    """In an environment of its own, without this tree; what it depends on is borrowed from the one of the tests."""
+    venv.create(tmp_path / "venv", with_pip=False)
+    python = tmp_path / "venv" / "bin" / "python"
+    if not python.exists():
+        pytest.skip("knows only the layout of environments on Unix")
+    (there,) = (tmp_path / "venv" / "lib").glob("python*/site-packages")
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*command, "--target", str(there), str(archives[0])], check=True)
+    borrowed = [path for path in sys.path if path.endswith("site-packages")]
+    # Only their modules: pth files, such as that of an editable install of this very tree, are not read
+    environment = {"PYTHONPATH": ":".join([str(there), *borrowed]), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin"}
+    command = [str(python), str(SMOKE), VERSION, str(there)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "works"
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    citation = (PROJECT / "CITATION.cff").read_text()
+    assert re.search(r"^version: (.*)$", citation, flags=re.MULTILINE).group(1) == VERSION  # type: ignore[union-attr]
+    newest = re.search(r"^## (.*)$", (PROJECT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
+    assert newest is not None
+    assert newest.group(1) == VERSION

@@ -1,0 +1,316 @@
+"""The Python of README and documentation runs as it is printed, and prints what it says; commands and links exist."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from sklearn.svm import SVC
+
+from igps.cli import COMMANDS, main
+from igps.data.dataset import SignatureDataset
+from igps.descriptors import NAMES
+from igps.shapes import ArticulatedShapes
+from paper_histogram import paper_histogram
+
+PROJECT = Path(__file__).parents[1]
+README = PROJECT / "README.md"
+PAGES = [README, PROJECT / "CONTRIBUTING.md", *sorted((PROJECT / "docs").rglob("*.md"))]
+TEXT = {path.relative_to(PROJECT).as_posix(): path.read_text(encoding="utf-8") for path in PAGES}
+SCORES = ["nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map"]
+NOT_FOR_TESTS = {"pyFM"}  # modules that a page is about and the tests do not install
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block: its language, the file that its title names, and its text."""
+
+    language: str
+    title: str | None
+    text: str
+
+
+def blocks(page: str) -> list[Block]:
+    found = re.findall(r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```', TEXT[page], flags=re.DOTALL | re.MULTILINE)
+    return [Block(language, title or None, text) for language, title, text in found]
+
+
+def python(page: str) -> list[Block]:
+    return [block for block in blocks(page) if block.language == "python"]
+
+
+def run(folder: Path, *arguments: str) -> str:
+    paths = [str(PROJECT / "src"), str(folder), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, *arguments]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def is_there(block: Block) -> bool:
+    """Whether all that a block imports is installed, of what the tests need not have."""
+    wanted = {name for name in NOT_FOR_TESTS if re.search(rf"^(?:from|import) {name}\b", block.text, re.MULTILINE)}
+    return all(importlib.util.find_spec(name) for name in wanted)
+
+
+def program(page: str, folder: Path) -> tuple[str, str]:
+    """The blocks of a page as one program, those with a title written as files; and what it has to print.
+
+    Output that a page shows, in a text block after the code, must be printed next. A block that needs what is not
+    installed ends the program.
+    """
+    code, expected = [], []
+    for i, block in enumerate(blocks(page)):
+        if block.language == "python" and block.title:
+            (folder / block.title).write_text(block.text)
+        elif block.language == "python":
+            ast.parse(block.text)
+            if not is_there(block):
+                break
+            code.append(block.text)
+        elif block.language == "text" and i and blocks(page)[i - 1].language == "python":
+            expected.append(block.text)
+    return "\n".join(code), "".join(expected)
+
+
+def first_tier(distances: np.ndarray, labels: list[str]) -> tuple[float, float]:
+    """NN and FT by hand: of each query, is the nearest of its class, and what share of its class is among as many."""
+    nearest, tiers = [], []
+    for i, row in enumerate(distances):
+        others = [j for j in np.argsort(row, kind="stable") if j != i]
+        relevant = [labels[j] == labels[i] for j in others]
+        nearest.append(relevant[0])
+        tiers.append(np.mean(relevant[: sum(relevant)]))
+    return float(np.mean(nearest)), float(np.mean(tiers))
+
+
+def histograms_by_loops(dataset: SignatureDataset) -> list[np.ndarray]:
+    signatures = [dataset[i].signature for i in range(len(dataset))]
+    return [paper_histogram(one.interior.eigenfunctions, one.eigenvalues).ravel() for one in signatures]
+
+
+def test_readme_is_short_and_has_its_examples() -> None:
+    text = TEXT["README.md"]
+    assert len(text.splitlines()) <= 150
+    assert len(python("README.md")) == 2
+
+
+def test_the_ten_lines_print_scores_and_the_nearest(tmp_path: Path) -> None:
+    example = python("README.md")[0].text
+    (tmp_path / "example.py").write_text(example)
+    assert len([line for line in example.splitlines() if line]) <= 10
+    scores, nearest = run(tmp_path, "example.py").splitlines()
+    found = ast.literal_eval(scores)
+    assert list(found) == SCORES
+    dataset = SignatureDataset(tmp_path / "shapes", cache_dir=tmp_path / "cache")
+    cells = histograms_by_loops(dataset)
+    distances = np.array([[np.sum((a - b) ** 2 / np.maximum(a + b, 1e-300)) / 2 for b in cells] for a in cells])
+    labels = list(dataset.files.labels or ())
+    assert (found["nn"], found["ft"]) == pytest.approx(first_tier(distances, labels))
+    expected = [dataset.files.names[i] for i in np.argsort(distances[0], kind="stable")[:3]]
+    assert ast.literal_eval(nearest) == expected
+    assert expected[0] == dataset.files.names[0]
+
+
+def test_the_classifier_of_the_readme_tells_classes_apart(tmp_path: Path) -> None:
+    (tmp_path / "example.py").write_text(python("README.md")[1].text)
+    score, predicted = run(tmp_path, "example.py").split(maxsplit=1)
+    paths = sorted((tmp_path / "shapes").rglob("*.off"))
+    roots = np.sqrt(histograms_by_loops(SignatureDataset(paths, cache_dir=tmp_path / "cache")))
+    labels = [path.parent.name for path in paths]
+    machine = SVC().fit(roots[::2], labels[::2])
+    expected = machine.score(roots[1::2], labels[1::2])
+    assert expected > 0.5  # by guessing
+    assert float(score) == expected
+    assert predicted.strip() == str(machine.predict(roots[1:2]))
+
+
+def test_the_descriptor_of_ones_own_runs_by_its_place(tmp_path: Path) -> None:
+    mine = next(block for block in python("docs/how-to/own-descriptors.md") if block.title == "mine.py")
+    (tmp_path / "mine.py").write_text(mine.text)
+    ArticulatedShapes(n_classes=2, n_per_class=3, n_vertices=600).write(tmp_path / "shapes")
+    options = ["--signature.n_eigenpairs", "5", "--n_workers", "1", "--cache_dir", "cache", "--out", "out"]
+    run(tmp_path, "-m", "igps.cli", "retrieve", "shapes", "--descriptor", "mine:Roundness", *options)
+    with np.load(tmp_path / "out" / "distances.npz") as archive:
+        distances, names, labels = archive["distances"], archive["names"], archive["labels"]
+    bodies = [trimesh.load(tmp_path / "shapes" / name) for name in names]
+    roundness = np.array([abs(body.volume) / body.area**1.5 for body in bodies])
+    expected = np.abs(roundness[:, None] - roundness)
+    np.testing.assert_allclose(distances, expected, atol=1e-6)
+    scores = json.loads((tmp_path / "out" / "scores.json").read_text())
+    assert (scores["nn"], scores["ft"]) == pytest.approx(first_tier(distances, list(labels)))
+
+
+@pytest.mark.parametrize("page", [page for page in TEXT if page != "README.md" and python(page)])
+def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page: str, tmp_path: Path) -> None:
+    code, expected = program(page, tmp_path)
+    if not code:
+        pytest.skip(f"{page} begins with what is not installed")
+    (tmp_path / "page.py").write_text(code)
+    printed = run(tmp_path, "page.py")
+    shown = iter(printed.splitlines())
+    missing = [line for line in expected.splitlines() if line not in shown]  # in this order, others between
+    assert not missing, f"{page} shows {missing}, printed was\n{printed}"
+    check = CHECKS.get(page)
+    if check:
+        check(printed, tmp_path)
+
+
+def check_retrieval(printed: str, folder: Path) -> None:
+    dataset = SignatureDataset(folder / "shapes", cache_dir=folder / "cache")
+    cells, labels = histograms_by_loops(dataset), list(dataset.files.labels or ())
+    distances = np.array([[np.sum((a - b) ** 2 / np.maximum(a + b, 1e-300)) / 2 for b in cells] for a in cells])
+    bipeds = [i for i, label in enumerate(labels) if label == "biped"]
+    rankings = [[labels[j] for j in np.argsort(distances[i], kind="stable") if j != i] for i in bipeds]
+    tier = np.mean([ranking[:3].count("biped") / 3 for ranking in rankings])
+    first = np.mean([ranking[0] == "biped" for ranking in rankings])
+    assert ast.literal_eval(printed) == {"nn": round(100 * first), "ft": round(100 * tier)}
+
+
+def check_classification(printed: str, folder: Path) -> None:
+    told = dict(line.split(": ", 1) for line in printed.splitlines() if ": " in line)
+    paths = sorted((folder / "shapes").rglob("*.off"))
+    cells = np.array(histograms_by_loops(SignatureDataset(paths, cache_dir=folder / "cache")))
+    labels = np.array([path.parent.name for path in paths])
+    from sklearn.metrics.pairwise import chi2_kernel
+    from sklearn.model_selection import StratifiedKFold
+
+    expected = []
+    for train, test in StratifiedKFold(3, shuffle=True, random_state=0).split(cells, labels):
+        machine = SVC().fit(np.sqrt(cells[train]), labels[train])
+        expected.append(np.mean(machine.predict(np.sqrt(cells[test])) == labels[test]))
+    np.testing.assert_allclose(np.fromstring(told["folds"].strip("[]"), sep=" "), expected, atol=1e-6)
+    assert min(expected) > 1 / 3  # by guessing
+    chosen, score = told["chosen"].split()
+    assert chosen in ("interior", "d2")
+    assert float(score) >= round(float(np.mean(expected)), 2)  # the first of the grid is this very pipeline
+    assert told["predicted"] == labels[0]
+    kernel = chi2_kernel(cells)
+    expected_score = SVC(kernel="precomputed").fit(kernel, labels).score(kernel, labels)
+    assert float(told["on what it was fitted to"]) == pytest.approx(expected_score)
+
+
+def check_fine_tuning(printed: str, folder: Path) -> None:
+    plain, whitened = map(int, re.findall(r"(\d+) (?:plain|whitened)", printed))
+    assert whitened >= plain > 50  # of four classes, by guessing: 18
+    assert float(printed.rpartition(": ")[2]) > 0.5  # by guessing: 0.25
+
+
+def check_anatomy(printed: str, folder: Path) -> None:
+    assert int(printed.split("%")[0]) >= 75  # by guessing: 50
+    assert len(list((folder / "kidneys").rglob("*.ply"))) == 12
+
+
+CHECKS = {
+    "docs/how-to/retrieve.md": check_retrieval,
+    "docs/how-to/classify.md": check_classification,
+    "docs/how-to/fine-tune.md": check_fine_tuning,
+    "docs/how-to/anatomy.md": check_anatomy,
+}
+"""What a page prints that is not printed in it: against another way to compute it, or against guessing."""
+
+
+def shell_lines(page: str) -> list[str]:
+    """The commands of its shell blocks, and those within sentences."""
+    text = "\n".join(block.text for block in blocks(page) if block.language == "sh").replace("\\\n", " ")
+    lines = [line.split(" #")[0] for line in text.splitlines()]
+    words = [part.strip() for line in lines for part in re.split(r";|&&|\|", line)]
+    prose = re.sub(r"^```.*?^```", "", TEXT[page], flags=re.DOTALL | re.MULTILINE)
+    inline = re.findall(r"`((?:PYTHONPATH=\. )?(?:igps|make|python|pip) [^`]*)`", prose)
+    return [line for line in words + inline if line and not line.startswith("#")]
+
+
+def known_command(words: list[str]) -> list[str]:
+    """The command of `igps` that words begin with, in one or two words."""
+    commands, found = COMMANDS, []
+    for word in words:
+        if callable(commands) or word not in commands:
+            break
+        found.append(word)
+        commands = commands[word]
+    assert found, f"no command {words[:1]}"
+    assert callable(commands) or len(words) == len(found), f"{found} has no {words[len(found) :]}"
+    return found
+
+
+@pytest.mark.parametrize("page", [page for page in TEXT if shell_lines(page)])
+def test_what_the_shell_is_told_exists(
+    page: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    targets = re.findall(r"^([a-z0-9-]+):", (PROJECT / "Makefile").read_text(), flags=re.MULTILINE)
+    extras = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for line in shell_lines(page):
+        line = line.removeprefix("PYTHONPATH=. ")
+        words = [word for word in shlex.split(line) if not word.startswith(">")]
+        if words[:2] == ["igps", "--help"]:
+            continue
+        if words[0] == "igps":
+            command = known_command(words[1:])
+            monkeypatch.setattr(sys, "argv", ["igps", *command, "--help"])
+            with pytest.raises(SystemExit, match="0"):
+                main()
+            text = capsys.readouterr().out
+            for option in [word for word in words if word.startswith("--")]:
+                assert re.search(rf"{option}\b", text), f"{line}: no option {option}"
+        elif words[0] == "make":
+            wanted = [word for word in words[1:] if "=" not in word]
+            assert wanted
+            assert set(wanted) <= set(targets), line
+        elif words[0] == "python":
+            script = next(word for word in words[1:] if not word.startswith("-"))
+            assert "-m" in words or (PROJECT / script).is_file(), line
+            source = "" if "-m" in words else (PROJECT / script).read_text()
+            for option in re.findall(r"--([a-z_]+)", line) if source and "LightningCLI" not in source else ():
+                assert option == "config" or re.search(rf"\b{option}\b|--{option}\b", source), f"{line}: no {option}"
+        elif words[0] == "pip":
+            assert words[1] == "install", line
+            named = {name for several in re.findall(r"\[([^\]]+)\]", line) for name in several.split(",")}
+            assert named <= set(extras), line
+        else:
+            assert words[0] in {"git", "cd", "dask", "sbatch", "squeue", "eval", "source", "ssh", "rsync", "sudo"}, line
+
+
+def test_descriptors_and_commands_are_named() -> None:
+    for name in NAMES:
+        assert f"`{name}`" in TEXT["docs/index.md"], name
+    extras = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for name in set(extras) - {"test", "lint", "campaign", "docs"}:
+        assert f"`{name}`" in TEXT["docs/index.md"] or f"[{name}]" in "".join(TEXT.values()), name
+
+
+def anchors(text: str) -> set[str]:
+    """Ids of the headings, as GitHub and MkDocs make them of plain words."""
+    headings = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", TEXT)
+def test_links_lead_somewhere(page: str) -> None:
+    here = PROJECT / page
+    prose = re.sub(r"^```.*?^```", "", TEXT[page], flags=re.DOTALL | re.MULTILINE)
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose):
+        if target.startswith(("https://", "mailto:")):
+            continue
+        name, _, anchor = target.partition("#")
+        path = (here.parent / name).resolve() if name else here
+        assert path.exists(), f"{page}: {target}"
+        if anchor:
+            assert anchor in anchors(path.read_text(encoding="utf-8")), f"{page}: {target}"
+
+
+def test_pictures_are_small() -> None:
+    for path in (PROJECT / "docs").rglob("*.png"):
+        assert path.stat().st_size < 400_000, path
