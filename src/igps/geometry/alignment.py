@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
@@ -22,6 +23,7 @@ _GAP = 2.5
 # Principal axes whose extents differ by a smaller factor are ambiguous: other starts are tried beside them.
 _AMBIGUOUS = 1.1
 _N_ROTATIONS = 300
+_N_PROFILE = 1000
 _N_SCORED, _N_COARSE, _N_FINE = 60, 250, 1000
 _N_TRIED, _COARSE_STEPS, _FINE_STEPS = 6, 15, 8
 _MOST_SCALED = math.log(1.1)
@@ -53,6 +55,16 @@ class SurfaceSamples:
     def extents(self) -> Array:
         """(3,) standard deviations along the principal axes, ascending, without unit."""
         return np.sqrt(np.linalg.eigvalsh(np.cov(self.points.T)))
+
+    @property
+    def profile(self) -> Array:
+        """(64,) quantiles of the distances between samples, without unit.
+
+        The root mean square difference of two surfaces' profiles is at most twice their distance, however they are
+        laid, but for what the sampling adds: distances between corresponding points differ by no more than both moved.
+        """
+        distances = pdist(_subset(self, _N_PROFILE).points)
+        return np.quantile(distances, (np.arange(64) + 0.5) / 64)
 
     @property
     def gap(self) -> float:
