@@ -10,23 +10,24 @@ import torch
 from torch import Tensor
 
 from igps.data.splits import split_seen
-from igps.nn.fitted import KernelHead, WhitenedHead
+from igps.nn.fitted import KernelHead
+from igps.nn.heads import Head, distances_of
 from igps.report.learned import transfer_curve
-from igps.retrieval import chi_square, cosine, retrieval_scores
+from igps.retrieval import chi_square, retrieval_scores
 
 COLUMNS = ("nn", "ft", "st", "dcg")
 
 
-def report(title: str, histograms: Tensor, labels: Tensor, head: WhitenedHead) -> None:
+def report(title: str, histograms: Tensor, labels: Tensor, head: Head) -> None:
     """Print the scores of the plain distance and of the head."""
     print(f"{title}\n{'':<12}" + "".join(f"{name.upper():>7}" for name in COLUMNS))
     plain = retrieval_scores(chi_square(histograms, histograms), labels).mean()
-    for name, found in (("plain", plain), ("pretrained", scores(head(histograms), labels))):
+    for name, found in (("plain", plain), ("pretrained", scores(head, histograms, labels))):
         print(f"{name:<12}" + "".join(f"{100 * found[column]:>7.1f}" for column in COLUMNS))
 
 
 def curve(
-    fit: Callable[[int, int], WhitenedHead],
+    fit: Callable[[int, int], Head],
     counts: Sequence[int],
     histograms: Tensor,
     labels: Tensor,
@@ -40,30 +41,40 @@ def curve(
         histograms, labels: of the shapes to measure on.
         figure: path of the picture.
     """
-    found = {n: [scores(fit(n, seed)(histograms), labels)["ft"] for seed in range(3)] for n in counts}
+    found = {n: [scores(fit(n, seed), histograms, labels)["ft"] for seed in range(3)] for n in counts}
     for n, values in found.items():
         print(f"{n:>4} generated classes: FT {' '.join(f'{100 * value:.1f}' for value in values)} (three draws)")
     transfer_curve(found, retrieval_scores(chi_square(histograms, histograms), labels).mean()["ft"], figure)
 
 
-def scores(embedding: Tensor, labels: Tensor) -> dict[str, float]:
-    """Leave-one-out scores of the cosine distance."""
-    return retrieval_scores(cosine(embedding, embedding), labels).mean()
+def scores(head: Head, histograms: Tensor, labels: Tensor) -> dict[str, float]:
+    """Leave-one-out scores of a head's distance."""
+    vectors = head(histograms)
+    return retrieval_scores(distances_of(head)(vectors, vectors), labels).mean()
 
 
-def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: WhitenedHead) -> None:
-    """Print FT of heads fitted to n shapes of each class, from the pretrained metric and from scratch."""
+def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: Head, part_cells: Sequence[int]) -> None:
+    """Print FT of heads fitted to n shapes of each class, on the pretrained metric and from scratch."""
     found: dict[str, list[float]] = {"pretrained, no labels": [], "from pretrained": [], "from scratch": []}
     for seed in range(100, 105):
         split = split_seen(labels, n, seed=seed)
         train, test = torch.tensor(split.train), torch.tensor(split.test)
         fitted = {
             "from pretrained": KernelHead(pretrained),
-            "from scratch": KernelHead(n_directions=pretrained.n_directions),
+            "from scratch": KernelHead(),
         }
         for head in fitted.values():
-            head.fit(histograms[train], labels[train], pretrained.part_cells.tolist())
+            head.fit(histograms[train], labels[train], part_cells)
         for name, head in {"pretrained, no labels": pretrained, **fitted}.items():
-            found[name].append(100 * scores(head(histograms[test]), labels[test])["ft"])
+            found[name].append(100 * scores(head, histograms[test], labels[test])["ft"])
     rows = ", ".join(f"{name} FT {mean(values):.1f} ± {stdev(values):.1f}" for name, values in found.items())
     print(f"{n} labels a class: {rows}")
+
+
+def two_level_scores(name: str, distances: Tensor, labels: Tensor, bodies: Tensor) -> None:
+    """Print the scores by the labels of bodies, and by those of classes."""
+    rows = []
+    for level, of_level in (("body", bodies), ("class", labels)):
+        found = retrieval_scores(distances, of_level).mean()
+        rows.append(f"{level} " + " ".join(f"{key.upper()} {100 * found[key]:.1f}" for key in ("nn", "ft", "dcg")))
+    print(f"{name:<28}" + " | ".join(rows), flush=True)

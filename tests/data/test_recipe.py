@@ -50,9 +50,11 @@ def test_a_signature_is_computed_once_and_is_that_of_the_mesh(
         np.testing.assert_array_equal(found.eigenvalues, expected.eigenvalues)
 
 
-def test_fill_caches_and_returns_nothing(recipe: Recipe, path: Path) -> None:
-    assert recipe.fill(path) is None  # type: ignore[func-returns-value]
+def test_fill_caches_and_returns_only_what_serves(recipe: Recipe, path: Path) -> None:
+    filled = recipe.fill(path)
+    assert len(pickle.dumps(filled)) < 1000
     assert recipe.is_cached(path)
+    assert recipe.served(path) == filled == recipe.fill(path)
 
 
 def test_a_worker_gets_a_small_copy(recipe: Recipe, path: Path) -> None:

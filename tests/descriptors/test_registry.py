@@ -107,7 +107,7 @@ def test_what_a_descriptor_needs_is_added_or_asked_for() -> None:
         config, attributes=("electrostatic_potential", "depth", "surface_direction")
     )
     assert igps.descriptor("d2").needs.completed(config) == config
-    for name, least in {"pretrained": 50, "rich": 50, "interior": 250, "gps": 250, "multiscale": 250}.items():
+    for name, least in {"pretrained": 64, "rich": 50, "interior": 250, "gps": 250, "multiscale": 250}.items():
         needs = igps.descriptor(name).needs
         assert needs.n_eigenpairs == least
         needs.completed(SignatureConfig(n_eigenpairs=least))

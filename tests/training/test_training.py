@@ -12,12 +12,12 @@ from statistics import mean, stdev
 
 import pytest
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
 import igps
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, split_seen, split_unseen
+from igps.descriptors.pretrained import pretrained
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.fitted import KernelHead, WhitenedHead
 from igps.nn.learner import RetrievalLearner
@@ -179,22 +179,19 @@ def test_ablation_prints_every_head_of_every_layout(root: Path) -> None:
 
 def test_pretraining_saves_a_metric_and_measures_it(root: Path, tmp_path: Path) -> None:
     out = run(
-        "pretrain.py", "--root", tmp_path / "generated", "--n_classes", 7, "--n_per_class", 3, "--n_held_out", 3,
-        "--n_eigenpairs", 50, "--n_directions", 4, "--cache_dir", root / "cache", "--data", root / "meshes",
-        "--out", tmp_path / "metric.safetensors", "--figures", tmp_path / "figures", "--n_epochs", 1,
-        "--n_training_samples", 50,
+        "pretrain.py", "--root", tmp_path / "generated", "--n_classes", 15, "--n_bodies", 2, "--n_poses", 2,
+        "--n_held_out", 4, "--cache_dir", root / "cache", "--data", root / "meshes", "--plain", '["interior"]',
+        "--out", tmp_path / "metric.safetensors", "--figures", tmp_path / "figures",
     )  # fmt: skip
-    stored = load_file(tmp_path / "metric.safetensors")
-    head = {name: tuple(value.shape) for name, value in stored.items() if name.startswith("head.")}
-    assert head == {
-        "head.mean": (27420,), "head.directions": (4, 27420), "head.gains": (3, 4), "head.part_cells": (3,),
-    }  # fmt: skip
-    learned = [value for name, value in stored.items() if name.endswith(("log_gain", "log_gap"))]
-    assert learned
-    assert all((value != 0).any() for value in learned)
-    for name in ("pretrain.png", "pretrain_layout.png"):
-        assert (tmp_path / "figures" / name).stat().st_size > 5_000
-    assert "3 held-out generated classes" in out
-    assert "   4 generated classes: FT" in out
+    vectors = igps.describe(
+        igps.SignatureDataset(root / "meshes", pretrained().needs.completed(igps.SignatureConfig()), root / "cache"),
+        pretrained(tmp_path / "metric.safetensors"),
+    )
+    torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-4, rtol=0)
+    assert (tmp_path / "figures" / "pretrain.png").stat().st_size > 5_000
+    assert "4 held-out generated classes" in out
+    assert re.search(r"interior +body NN \d+\.\d FT \d+\.\d", out)
+    assert "without look-alikes" in out
+    assert "  11 generated classes: FT" in out
     assert "1 labels a class" in out
     assert "5 labels a class" not in out  # a single shape of each class would be left to score

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from igps.data.cache import SignatureCache
 from igps.data.recipe import Recipe, Served
+from igps.geometry.mending import MENDING_VERSION
 
 logger = logging.getLogger(__name__)
 
@@ -51,7 +52,7 @@ class KnownFiles:
     def __init__(self, recipe: Recipe) -> None:
         self._recipe = recipe
         self._path = recipe.cache_dir / _FILE
-        told = json.dumps([asdict(recipe.reading), recipe.config.as_dict()], sort_keys=True)
+        told = json.dumps([asdict(recipe.reading), recipe.config.as_dict(), MENDING_VERSION], sort_keys=True)
         self._name = hashlib.sha256(told.encode()).hexdigest()[:32]
 
     def ready(self, paths: Sequence[Path]) -> dict[Path, Known]:

@@ -71,9 +71,7 @@ class Recipe:
             signature = cache.get(key)
             if signature is not None:
                 return signature.beginning(self.config)
-        signature = compute_signature(self.mesh(path), self.config)
-        cache.put(self.key(path, mended=bool(mended_by(signature.notes))), signature)
-        return signature
+        return self._put(path)[1]
 
     def fill(self, path: Path) -> Served:
         """Put the Signature of a file into the cache; it is not returned, so that it need not travel to the caller."""
@@ -81,10 +79,8 @@ class Recipe:
         served = self.served(path)
         if served is not None:
             return served
-        signature = compute_signature(self.mesh(path), self.config)
-        key, cache = self.key(path), SignatureCache(self.cache_dir)
-        cache.put(key, signature)
-        return Served(key, cache.path(key).stat().st_size, tuple(signature.notes), stamp)
+        key, signature = self._put(path)
+        return Served(key, SignatureCache(self.cache_dir).path(key).stat().st_size, tuple(signature.notes), stamp)
 
     def served(self, path: Path) -> Served | None:
         """What in the cache serves a file, None if nothing does.
@@ -123,6 +119,13 @@ class Recipe:
             MeshError: the file cannot be read.
         """
         return self._key(path, _content(path), self.config, mended)
+
+    def _put(self, path: Path) -> tuple[str, Signature]:
+        """The Signature of a file, computed, and its key in the cache where it is then."""
+        signature = compute_signature(self.mesh(path), self.config)
+        key = self.key(path, mended=bool(mended_by(signature.notes)))
+        SignatureCache(self.cache_dir).put(key, signature)
+        return key, signature
 
     def _cached(self, path: Path) -> Iterator[str]:
         """The keys that the cache has of the Signature of a file and of larger ones, which begin with it."""

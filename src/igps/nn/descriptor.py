@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from igps.data.batch import Body, SignatureBatch
+from igps.nn.heads import distances_of
 from igps.nn.histogram import PairHistogram
 from igps.nn.needs import Needs
 from igps.nn.view import Views
-from igps.retrieval import chi_square, cosine
+from igps.retrieval import chi_square
 from igps.retrieval.vectors import Comparison
 from igps.threads import one_thread
 
@@ -135,7 +136,7 @@ class HistogramDescriptor(Descriptor):
 
 
 class EmbeddedDescriptor(Descriptor):
-    """A descriptor under a head that was fitted to its descriptions, compared by the cosine distance.
+    """A descriptor under a head fitted to its descriptions, compared by the head's own distance or by the cosine.
 
     Args:
         descriptor: `SignatureBatch` to descriptions.
@@ -157,5 +158,5 @@ class EmbeddedDescriptor(Descriptor):
         return self.head(self.descriptor(batch))
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, G) cosine distances."""
-        return cosine(queries, gallery)
+        """(Q, G) distances of the head's own, such as a `TwoLevelHead` has, or cosine distances."""
+        return distances_of(self.head)(queries, gallery)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from igps.nn.heads import SizedByData, check_cells, square_roots
+from igps.nn.heads import Head, SizedByData, check_cells, square_roots
 
 
 class WhitenedHead(SizedByData):
@@ -123,8 +123,8 @@ class KernelHead(SizedByData):
     there is here for classes that were trained on; for other classes use the `WhitenedHead`.
 
     Args:
-        whitened: the head below: one that is fitted already stays as it is, which serves better where labels are few;
-            a new one, fitted to the same shapes, if None.
+        whitened: the head below: one that is fitted already, such as that of `pretrained`, stays as it is, which serves
+            better where labels are few; a new one, fitted to the same shapes, if None.
         n_directions, shrinkage: of a new one.
         ridge: added to the kernel's diagonal, which is 1.
     """
@@ -136,7 +136,7 @@ class KernelHead(SizedByData):
 
     def __init__(
         self,
-        whitened: WhitenedHead | None = None,
+        whitened: Head | None = None,
         n_directions: int = 64,
         shrinkage: float = 0.3,
         ridge: float = 0.03,
@@ -144,7 +144,7 @@ class KernelHead(SizedByData):
         super().__init__()
         if ridge <= 0:
             raise ValueError(f"ridge: expected a positive number, got {ridge}.")
-        self.whitened = whitened or WhitenedHead(n_directions, shrinkage)
+        self.whitened: Head = WhitenedHead(n_directions, shrinkage) if whitened is None else whitened
         self._whiten = whitened is None
         self.ridge = ridge
         self.register_buffer("anchors", torch.zeros(0, 0))
@@ -168,13 +168,13 @@ class KernelHead(SizedByData):
             raise ValueError(f"labels: expected at least two classes, got {len(classes)}.")
         if self._whiten and len(classes) < len(labels):
             self.whitened.fit(descriptions, labels, part_cells)
-        elif self._whiten:
+        elif isinstance(self.whitened, WhitenedHead) and self._whiten:
             # A single shape of a class tells nothing of the variation within it; what is left is to centre.
             self.whitened.centre(descriptions, part_cells)
         self.classes = classes
         self.anchors = self.whitened(descriptions)
         i, j = torch.triu_indices(len(self.anchors), len(self.anchors), 1, device=self.anchors.device)
-        self.medians = self.medians.new_ones(len(self.whitened.part_cells))
+        self.medians = self.medians.new_ones(len(self._parts(self.anchors)))
         distances = self._distances(self.anchors)[:, i, j]
         self.medians = distances.median(dim=1).values.clamp_min(torch.finfo(distances.dtype).tiny)
         kernel = self._kernel(self.anchors).double()
@@ -206,9 +206,12 @@ class KernelHead(SizedByData):
 
     def _distances(self, whitened: Tensor) -> Tensor:
         """(parts, N, n_shapes) cosine distances to the training shapes."""
-        parts = zip(self.whitened.parts(whitened), self.whitened.parts(self.anchors), strict=True)
+        parts = zip(self._parts(whitened), self._parts(self.anchors), strict=True)
         # The parts of a vector of length 1 have that length together.
         return torch.stack([1 - len(self.medians) * part @ anchors.T for part, anchors in parts])
+
+    def _parts(self, whitened: Tensor) -> tuple[Tensor, ...]:
+        return self.whitened.parts(whitened) if isinstance(self.whitened, WhitenedHead) else (whitened,)
 
 
 def _checked(descriptions: Tensor, labels: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 
 from torch import Tensor, nn
 
-from igps.retrieval.distances import square_root
+from igps.retrieval.distances import Distance, cosine, square_root
 
 
 @runtime_checkable
@@ -24,6 +24,12 @@ class Head(Protocol):
     def __call__(self, descriptions: Tensor) -> Tensor:
         """(N, ...) descriptions to (N, D) of length 1."""
         ...
+
+
+def distances_of(head: object) -> Distance:
+    """The distance of a head's vectors: its own, if it has one, or the cosine's."""
+    own: Distance = getattr(head, "distances", cosine)
+    return own
 
 
 class SizedByData(nn.Module):

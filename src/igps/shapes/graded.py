@@ -18,7 +18,7 @@ from igps.geometry.mesh import Mesh, MeshError
 from igps.parallel import Failed, run
 from igps.shapes.bodies import Body, Pose, draw_body, draw_pose
 from igps.shapes.files import is_whole_off, off_text, write_whole
-from igps.shapes.kinds import BodyClass, body_classes
+from igps.shapes.kinds import LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, BodyClass, body_classes
 from igps.shapes.meshing import Faces
 from igps.shapes.scans import Scan
 from igps.shapes.solids import Array
@@ -265,6 +265,11 @@ _ARGUMENTS = ("n_classes", "n_bodies", "n_poses", "seed", "n_vertices", "look_al
 def body_of(name: str) -> str:
     """The body of a shape by its name or its file's, ``class/body/pose``."""
     return name.rsplit("/", 1)[0]
+
+
+def looks_alike(label: str) -> bool:
+    """Whether a class, by its name, resembles one of SHREC'07 (see `igps.shapes.kinds`)."""
+    return label in LOOK_ALIKE_TEMPLATES or label.split("-")[0] in LOOK_ALIKE_FAMILIES
 
 
 def _record_bodies(path: Path, names: list[str]) -> None:

@@ -1,0 +1,221 @@
+"""A head of two levels: poses of one body come first, then other bodies of its class, then the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from igps.nn.heads import SizedByData, check_cells, square_roots
+from igps.retrieval.distances import cosine, euclidean
+
+# Of a part so many principal directions are whitened; what is beyond them is discretisation
+_PRINCIPAL = 500
+
+
+class LevelHead(SizedByData):
+    """Histograms to unit vectors, damped along what tells shapes of one label apart and reduced to what tells labels.
+
+    The square roots of each part are centred, and whitened within labels as `WhitenedHead` does it, then projected on
+    the directions in which the means of the labels vary most. The parts, each brought to one length, are joined, and
+    projected on their principal directions. Source: within-class covariance normalisation, Hatch, Kajarekar and Stolcke
+    2006.
+
+    Args:
+        parts: which parts of a description it looks at; all if None.
+        width: D of the vectors, at most.
+        n_directions: of each part, at most.
+        shrinkage: added to the covariance within labels, in units of its mean eigenvalue.
+    """
+
+    mean: Tensor
+    directions: Tensor
+    joined: Tensor
+    part_cells: Tensor
+
+    def __init__(
+        self, parts: Sequence[int] | None = None, width: int = 128, n_directions: int = 60, shrinkage: float = 0.03
+    ) -> None:
+        super().__init__()
+        if min(width, n_directions) < 1:
+            raise ValueError(f"width, n_directions: expected at least 1, got {width} and {n_directions}.")
+        if shrinkage <= 0:
+            raise ValueError(f"shrinkage: expected a positive number, got {shrinkage}.")
+        self.width, self.n_directions, self.shrinkage = width, n_directions, shrinkage
+        self._parts = None if parts is None else tuple(parts)
+        self.register_buffer("mean", torch.zeros(0))
+        self.register_buffer("directions", torch.zeros(n_directions, 0))
+        self.register_buffer("joined", torch.zeros(0, 0))
+        self.register_buffer("part_cells", torch.zeros(0, dtype=torch.long))
+
+    @torch.no_grad()
+    def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
+        """Take mean and directions from the histograms (N, ...) and labels (N,) of the training shapes.
+
+        Args:
+            descriptions: histograms.
+            labels: integers.
+            part_cells: cells of each part, as a `HistogramDescriptor` tells them; None takes all as one part.
+
+        Raises:
+            ValueError: shapes that do not match, a part that is not there, or no label of two shapes.
+        """
+        roots = square_roots(descriptions)
+        if labels.shape != roots.shape[:1]:
+            raise ValueError(f"labels: expected one for each of {len(roots)} shapes, got shape {tuple(labels.shape)}.")
+        _, members = labels.to(roots.device).unique(return_inverse=True)
+        if int(members.max()) + 1 == len(roots):
+            raise ValueError("labels: expected a label of at least two shapes, got as many labels as shapes.")
+        cells = list(part_cells or (roots.shape[1],))
+        if min(cells) < 1 or sum(cells) != roots.shape[1]:
+            raise ValueError(f"part_cells: expected cells that add up to {roots.shape[1]}, got {cells}.")
+        if self._parts is not None and not set(self._parts) <= set(range(len(cells))):
+            raise ValueError(f"parts: expected some of 0 to {len(cells) - 1}, got {self._parts}.")
+        self.part_cells = torch.tensor(cells, device=roots.device)
+        self.mean = roots.mean(dim=0)
+        self.directions = roots.new_zeros(self.n_directions, len(self.mean))
+        for part, directions in zip(self._chosen(roots - self.mean), self._chosen(self.directions), strict=True):
+            found = self._directions(part.double(), members)
+            directions[: len(found)] = found
+        self.joined = torch.eye(len(self._chosen(roots)) * self.n_directions, dtype=roots.dtype, device=roots.device)
+        self.joined = _principal(self._vectors(roots).double(), self.width).to(roots.dtype)
+        return self
+
+    def forward(self, descriptions: Tensor) -> Tensor:
+        """(N, ...) histograms to (N, D) of length 1.
+
+        Raises:
+            RuntimeError: it has not been fitted.
+        """
+        roots = square_roots(descriptions)
+        if not len(self.mean):
+            raise RuntimeError("LevelHead: expected to be fitted first. Call fit(descriptions, labels).")
+        check_cells(roots, len(self.mean))
+        return functional.normalize(self._vectors(roots), dim=1)
+
+    def _directions(self, part: Tensor, members: Tensor) -> Tensor:
+        """(k, cells) that whiten a centred part (N, cells) and keep what tells labels."""
+        principal = _principal(part, _PRINCIPAL)
+        found = part @ principal.T
+        n_members = torch.bincount(members)
+        means = found.new_zeros(len(n_members), found.shape[1]).index_add_(0, members, found) / n_members[:, None]
+        residuals = found - means[members]
+        spread, axes = torch.linalg.eigh(residuals.T @ residuals)
+        rank = min(len(found) - len(n_members), len(spread))
+        relative = spread.clamp_min(0) * rank / spread.sum()
+        whitening = (axes * (self.shrinkage / (self.shrinkage + relative)).sqrt()) @ axes.T
+        return _principal(means @ whitening, self.n_directions) @ whitening @ principal
+
+    def _vectors(self, roots: Tensor) -> Tensor:
+        projected = [
+            functional.normalize(part @ directions.T, dim=1)
+            for part, directions in zip(self._chosen(roots - self.mean), self._chosen(self.directions), strict=True)
+        ]
+        return torch.cat(projected, dim=1) @ self.joined.T
+
+    def _chosen(self, cells: Tensor) -> list[Tensor]:
+        """Views of (N, cells) values, one of each part that it looks at."""
+        parts = cells.split(self.part_cells.tolist(), dim=1)
+        return list(parts) if self._parts is None else [parts[i] for i in self._parts]
+
+
+class TwoLevelHead(nn.Module):
+    """Descriptions to unit vectors, and a distance of them by which a body's other poses come first, then its class.
+
+    A vector is that of a `LevelHead` fitted to the labels of classes beside that of one fitted to the labels of bodies.
+    The cosine of the former orders the whole collection. The latter adds the kernel exp(−‖x − y‖ / reach), which counts
+    only between shapes that are nearly the same body: beyond its reach, where how different two bodies are says nothing
+    of their classes, it is silent. The cosine distance of the whole vector is nearly that of the classes, and serves
+    engines that know no other to find what is ranked by the distance then.
+
+    Args:
+        of_classes: head of the level of classes.
+        of_bodies: head of the level of bodies.
+        reach: of the kernel, between unit vectors.
+        weight: of the kernel, the cosine of the classes having 1.
+        share: of the squared length of a vector that belongs to the bodies.
+    """
+
+    reach: Tensor
+    weight: Tensor
+    share: Tensor
+
+    def __init__(
+        self,
+        of_classes: LevelHead | None = None,
+        of_bodies: LevelHead | None = None,
+        *,
+        reach: float = 0.1,
+        weight: float = 1.0,
+        share: float = 0.05,
+    ) -> None:
+        super().__init__()
+        if reach <= 0 or weight < 0 or not 0 < share < 1:
+            raise ValueError(
+                f"reach, weight, share: expected a positive number, one of at least 0, and one between 0 and 1, got "
+                f"{reach}, {weight} and {share}."
+            )
+        self.of_classes = of_classes or LevelHead(width=192)
+        self.of_bodies = of_bodies or LevelHead(width=64, shrinkage=0.3)
+        for name, value in (("reach", reach), ("weight", weight), ("share", share)):
+            self.register_buffer(name, torch.tensor(value))
+
+    @property
+    def part_cells(self) -> Tensor:
+        """Cells of each part of the descriptions that it was fitted to."""
+        return self.of_classes.part_cells
+
+    @torch.no_grad()
+    def fit(
+        self,
+        descriptions: Tensor,
+        labels: Tensor,
+        part_cells: Sequence[int] | None = None,
+        *,
+        bodies: Tensor | None = None,
+    ) -> Self:
+        """Fit both levels to the histograms (N, ...), classes (N,) and bodies (N,) of the training shapes.
+
+        Args:
+            descriptions, labels, part_cells: see `LevelHead.fit`.
+            bodies: integers; the classes where None.
+        """
+        self.of_classes.fit(descriptions, labels, part_cells)
+        self.of_bodies.fit(descriptions, labels if bodies is None else bodies, part_cells)
+        return self
+
+    def forward(self, descriptions: Tensor) -> Tensor:
+        """(N, ...) histograms to (N, D) of length 1.
+
+        Raises:
+            RuntimeError: it has not been fitted.
+        """
+        levels = (
+            (1 - self.share).sqrt() * self.of_classes(descriptions),
+            self.share.sqrt() * self.of_bodies(descriptions),
+        )
+        return torch.cat(levels, dim=1)
+
+    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        """(Q, D) and (G, D) vectors to (Q, G) distances from 0 to 2."""
+        n = len(self.of_classes.joined)
+        classes = cosine(queries[:, :n], gallery[:, :n])
+        bodies = euclidean(queries[:, n:], gallery[:, n:]) / self.share.sqrt()
+        kernel = torch.exp(-bodies / self.reach)
+        return (classes + self.weight * (1 - kernel)) / (1 + self.weight)
+
+
+def _principal(rows: Tensor, n: int) -> Tensor:
+    """(k, D) orthonormal principal directions of rows (N, D) about the origin, the largest first, k ≤ n."""
+    n_rows, width = rows.shape
+    if width <= n_rows:
+        squares, axes = torch.linalg.eigh(rows.T @ rows)
+    else:  # the same from the smaller matrix
+        squares, axes = torch.linalg.eigh(rows @ rows.T)
+    # What is left of the others is rounding: it has no direction.
+    kept = int((squares > 1e-10 * squares[-1]).sum().clamp_max(n))
+    squares, axes = squares.flip(0)[:kept], axes.flip(1)[:, :kept]
+    return axes.T if width <= n_rows else (axes.T @ rows) / squares.sqrt()[:, None]

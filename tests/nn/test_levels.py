@@ -1,0 +1,152 @@
+"""The head of two levels against SciPy's generalised eigenproblem, its kernel's formula, and what it promises."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import sqrtm
+from torch import Tensor
+
+from igps.nn.heads import Head
+from igps.nn.levels import LevelHead, TwoLevelHead
+from igps.retrieval import cosine, retrieval_scores
+
+N_CLASSES, N_BODIES, N_POSES, N_CELLS = 16, 4, 5, 40
+
+
+@pytest.fixture
+def collection() -> tuple[Tensor, Tensor, Tensor]:
+    """Histograms, classes and bodies; bodies of all classes differ along the same directions, poses along others."""
+    generator = torch.Generator().manual_seed(0)
+    kinds = torch.randn(N_CLASSES, 1, 1, N_CELLS, generator=generator)
+    of_bodies = torch.randn(N_CLASSES, N_BODIES, 1, 4, generator=generator) @ torch.randn(
+        4, N_CELLS, generator=generator
+    )
+    of_poses = torch.randn(N_CLASSES, N_BODIES, N_POSES, 2, generator=generator) @ torch.randn(
+        2, N_CELLS, generator=generator
+    )
+    noise = 0.02 * torch.randn(N_CLASSES, N_BODIES, N_POSES, N_CELLS, generator=generator)
+    cells = (0.3 * kinds + 0.4 * of_bodies + 0.3 * of_poses + noise).exp().flatten(0, 2)
+    bodies = torch.arange(N_CLASSES * N_BODIES).repeat_interleave(N_POSES)
+    return cells / cells.sum(dim=1, keepdim=True), bodies // N_BODIES, bodies
+
+
+def ft(vectors: Tensor, labels: Tensor) -> float:
+    return retrieval_scores(cosine(vectors, vectors), labels).mean()["ft"]
+
+
+def test_a_level_is_the_projection_of_the_whitened_roots_on_their_means(
+    collection: tuple[Tensor, Tensor, Tensor],
+) -> None:
+    """Written down with SciPy's matrix functions; the signs and the basis of the vectors are free, cosines are not."""
+    histograms, _, bodies = collection
+    roots = histograms.double().sqrt().numpy()
+    members = bodies.numpy()
+    means = np.stack([roots[members == b].mean(axis=0) for b in range(members.max() + 1)])
+    residuals = roots - means[members]
+    within = residuals.T @ residuals
+    rank = min(len(roots) - len(means), N_CELLS)
+    relative = within * rank / within.trace()
+    shrinkage = 0.2
+    whitening = np.real(sqrtm(shrinkage * np.linalg.inv(shrinkage * np.eye(N_CELLS) + relative)))
+    centred = roots - roots.mean(axis=0)
+    # of 40 cells the roots span all: nothing but the mean is taken off
+    _, _, axes = np.linalg.svd((means - roots.mean(axis=0)) @ whitening, full_matrices=False)
+    expected = centred @ whitening @ axes[:10].T
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    head = LevelHead(width=10, n_directions=10, shrinkage=shrinkage).fit(histograms.double(), bodies)
+    found = head(histograms.double()).numpy()
+    np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-6)
+
+
+def test_parts_have_equal_shares_and_others_do_not_count(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    histograms, classes, _ = collection
+    cells = (12, 18, 10)
+    alone = [LevelHead(width=60).fit(part, classes)(part) for part in histograms.split(cells, dim=1)]
+    head = LevelHead((0, 2), width=200).fit(histograms, classes, cells)
+    expected = (cosine(alone[0], alone[0]) + cosine(alone[2], alone[2])) / 2
+    found = head(histograms)
+    torch.testing.assert_close(cosine(found, found), expected, atol=2e-4, rtol=0)
+    changed = histograms.clone()
+    changed[:, 12:30] = torch.rand(len(changed), 18, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(head(changed), found, atol=1e-6, rtol=0)
+
+
+def test_the_distance_is_the_cosine_of_the_classes_and_a_kernel_of_the_bodies(
+    collection: tuple[Tensor, Tensor, Tensor],
+) -> None:
+    histograms, classes, bodies = collection
+    of_classes, of_bodies = LevelHead(width=20), LevelHead(width=6)
+    head = TwoLevelHead(of_classes, of_bodies, reach=0.4, weight=0.7, share=0.3)
+    vectors = head.fit(histograms, classes, bodies=bodies)(histograms)
+    torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
+    x, y = of_classes(histograms).double(), of_bodies(histograms).double()
+    torch.testing.assert_close((vectors @ vectors.T).double(), 0.7 * x @ x.T + 0.3 * y @ y.T, atol=1e-5, rtol=0)
+    kernel = torch.exp(-torch.cdist(y, y, compute_mode="donot_use_mm_for_euclid_dist") / 0.4)
+    expected = (1 - x @ x.T + 0.7 * (1 - kernel)) / 1.7
+    torch.testing.assert_close(head.distances(vectors, vectors).double(), expected, atol=2e-3, rtol=0)
+    assert kernel.min() < 0.1  # nor is it 1 throughout
+    assert ((kernel > 0.2) & (kernel < 0.9)).any()
+
+
+def test_both_levels_are_ordered(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    """On classes that it was not fitted to: each better than by the head of the other level alone."""
+    histograms, classes, bodies = collection
+    seen = classes < N_CLASSES // 2
+    head = TwoLevelHead().fit(histograms[seen], classes[seen], bodies=bodies[seen])
+    assert isinstance(head, Head)
+    rest, of_class, of_body = histograms[~seen], classes[~seen], bodies[~seen]
+    vectors = head(rest)
+    distances = head.distances(vectors, vectors)
+    found = {
+        level: retrieval_scores(distances, labels).mean()["ft"] for level, labels in (("b", of_body), ("c", of_class))
+    }
+    assert found["b"] > ft(head.of_classes(rest), of_body) + 0.05
+    assert found["c"] > ft(head.of_bodies(rest), of_class) + 0.05
+
+
+def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    histograms, classes, bodies = collection
+    fitted = TwoLevelHead(LevelHead((0,), 5, 7), LevelHead((1,), 6, 8), reach=0.3, weight=0.4, share=0.5)
+    fitted.fit(histograms, classes, (15, 25), bodies=bodies)
+    other = TwoLevelHead(LevelHead((0,)), LevelHead((1,)))
+    other.load_state_dict(fitted.state_dict())
+    torch.testing.assert_close(other(histograms), fitted(histograms))
+    vectors = other(histograms)
+    assert vectors.shape == (len(histograms), 5 + 6)
+    torch.testing.assert_close(other.distances(vectors, vectors), fitted.distances(vectors, vectors))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"parts": (0, 2)}, r"parts: expected some of 0 to 1"),
+        ({"width": 0}, "at least 1"),
+        ({"shrinkage": 0.0}, "shrinkage: expected a positive number"),
+    ],
+)
+def test_wrong_arguments_of_a_level_are_named(
+    arguments: dict[str, object], message: str, collection: tuple[Tensor, Tensor, Tensor]
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        LevelHead(**arguments).fit(collection[0], collection[1], (20, 20))  # type: ignore[arg-type]
+
+
+def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    histograms, classes, _ = collection
+    with pytest.raises(ValueError, match="part_cells: expected cells that add up to 40"):
+        LevelHead().fit(histograms, classes, (3, 4))
+    with pytest.raises(ValueError, match="labels: expected one for each of 320 shapes"):
+        LevelHead().fit(histograms, classes[:3])
+    with pytest.raises(ValueError, match="as many labels as shapes"):
+        LevelHead().fit(histograms, torch.arange(len(histograms)))
+    with pytest.raises(RuntimeError, match="expected to be fitted first"):
+        LevelHead()(histograms)
+    with pytest.raises(ValueError, match=r"reach, weight, share: .* got 0.0, 1.0 and 0.05"):
+        TwoLevelHead(reach=0.0)
+    with pytest.raises(ValueError, match=r"one between 0 and 1, got 0.1, 1.0 and 1"):
+        TwoLevelHead(share=1)
+    fitted = LevelHead().fit(histograms, classes)
+    with pytest.raises(ValueError, match="expected 40 cells as in training, got 39"):
+        fitted(histograms[:, :39])
