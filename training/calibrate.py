@@ -68,7 +68,7 @@ def calibrate(
         n_workers: processes; all cores if not given.
     """
     descriptor = pretrained(model)
-    shapes = _held_out(root, descriptor, n_classes, n_held_out, seed, n_measured, cache_dir, n_workers)
+    shapes = _held_out(root, descriptor, n_held_out, seed, n_measured, cache_dir, n_workers)
     bodies = np.array([body_of(name) for name in shapes.files.names])
     classes = np.array(shapes.files.labels)
     is_rigid = np.isin(classes, _rigid_classes(seed))
@@ -99,13 +99,10 @@ def calibrate(
     samples_of_copies = [surface_samples(copied, k) for k in range(len(copied))]
     same = [(samples[k], one) for k, one in zip(originals, samples_of_copies, strict=True)]
     same += [(samples[a], samples[b]) for a, b in zip(i[rigid_poses], j[rigid_poses], strict=True)]
-    # Those that tell the rate are the hard ones; of different classes, only what is near is looked at.
-    others = np.flatnonzero(of_kind["poses"] | of_kind["bodies"] | (~of_class & (distances <= near)))
+    # The hard ones tell the rate: other poses of bodies that bend, and other bodies of the class.
+    others = np.flatnonzero(of_kind["poses"] | of_kind["bodies"])
     of_same = np.array(list(on_threads(_apart, same, n_workers)))
-    of_others = np.full(len(others), np.inf)
-    looked = np.flatnonzero(distances[others] <= near)
-    pairs = [(samples[i[k]], samples[j[k]]) for k in others[looked]]
-    of_others[looked] = list(on_threads(_apart, pairs, n_workers))
+    of_others = np.array(list(on_threads(_apart, [(samples[i[k]], samples[j[k]]) for k in others], n_workers)))
 
     calibration = Calibration(
         "pretrained",
@@ -135,7 +132,6 @@ def _rigid_classes(seed: int) -> list[str]:
 def _held_out(
     root: Path,
     descriptor: Descriptor,
-    n_classes: int,
     n: int,
     seed: int,
     n_measured: int | None,
@@ -144,8 +140,9 @@ def _held_out(
 ) -> igps.SignatureDataset:
     """The shapes of the classes that pretrain.py held out, or of some of them."""
     shapes = igps.SignatureDataset(root, descriptor.needs.completed(igps.SignatureConfig()), cache_dir)
-    numbers = random.Random(seed).sample(range(n_classes), n)[:n_measured]
-    chosen = {shapes.classes[number] for number in numbers if number < len(shapes.classes)}
+    # As pretrain.py draws them; with as many as it found, which is nearly all.
+    numbers = random.Random(seed).sample(range(len(shapes.classes)), n)[:n_measured]
+    chosen = {shapes.classes[number] for number in numbers}
     some = shapes.subset([i for i, label in enumerate(shapes.files.labels or ()) if label in chosen])
     return some.usable(some.precompute(n_workers=n_workers))
 

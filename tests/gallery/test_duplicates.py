@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import ast
+import os
+import re
+import shlex
 import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +17,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from igps.cli import main
+from igps.cli import COMMANDS, main
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
 from igps.gallery.calibration import Calibration, told_of
@@ -21,6 +26,7 @@ from igps.gallery.gallery import Gallery, fingerprint
 from igps.geometry.signature import SignatureConfig
 from own_descriptors import Same
 
+PROJECT = Path(__file__).parents[2]
 CONFIG = descriptor("pretrained").needs.completed(SignatureConfig())
 SAME = {frozenset({"lump.off", "lump.stl"}), frozenset({"bar.off", "bar.ply", "bar.obj"})}
 
@@ -170,10 +176,29 @@ def test_the_commands(
     assert rows[5] == f"2,lump.stl,{root / 'lump.stl'}"
     command(monkeypatch, "distance", root / "bar.off", root / "bar.ply", *options)
     *_, by_descriptor, by_surfaces = capsys.readouterr().out.splitlines()
-    assert "of pairs of different classes" in by_descriptor
+    assert "pairs of different classes" in by_descriptor
     assert ", the same shape (the same up to " in by_surfaces
     command(monkeypatch, "distance", root / "bar.off", root / "bent.off", *options)
     assert "not the same shape" in capsys.readouterr().out
+
+
+def test_the_page_runs(tmp_path: Path) -> None:
+    """Its Python prints the group of the copy; its commands exist."""
+    page = (PROJECT / "docs" / "how-to" / "duplicates.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    groups, meaning, surfaces = done.stdout.splitlines()
+    ((one, other),) = ast.literal_eval(groups)
+    assert one.endswith("copy.stl") != other.endswith("copy.stl")
+    assert "poses of one body" in meaning
+    assert surfaces.endswith("the same shape: True")
+    for line in "".join(re.findall(r"```sh\n(.*?)```", page, flags=re.DOTALL)).splitlines():
+        program, name, *_ = shlex.split(line)
+        assert program == "igps"
+        assert name in COMMANDS
 
 
 def test_what_is_wrong_is_one_sentence(
