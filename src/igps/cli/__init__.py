@@ -19,6 +19,7 @@ from igps.cli.completion import completion
 from igps.cli.damage import damage
 from igps.cli.demo import demo
 from igps.cli.doctor import doctor
+from igps.cli.duplicates import distance, duplicates
 from igps.cli.figure import pose, potential, topology
 from igps.cli.index import index_add, index_build, index_merge
 from igps.cli.precompute import precompute
@@ -39,6 +40,8 @@ COMMANDS: Commands = {
     "query": query,
     "precompute": precompute,
     "index": {"build": index_build, "add": index_add, "merge": index_merge},
+    "duplicates": duplicates,
+    "distance": distance,
     "demo": demo,
     "compare": compare,
     "figure": {"pose": pose, "topology": topology, "potential": potential},
@@ -122,7 +125,8 @@ def _add_commands(parser: ArgumentParser, commands: Commands) -> None:
 def _add_options(parser: ArgumentParser, command: Command) -> None:
     """Options from the signature and docstring of a command, written as a shell user expects them.
 
-    A first parameter without default is positional, a list takes several words, and a truth value is a switch.
+    A first parameter without default is positional, and so is a first `root` that something else may replace. A list
+    takes several words, and a truth value is a switch.
     """
     kinds = get_type_hints(command)
     meanings = {parameter.arg_name: parameter.description for parameter in parse(command.__doc__ or "").params}
@@ -134,11 +138,13 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
         switches[JSON] = "print what the table tells as JSON, and all else to standard error"
     by_hand: set[str | int] = set(switches)
     for place, (name, parameter) in enumerate(parameters.items()):
-        positional = place == 0 and parameter.default is parameter.empty
+        replaceable = name == "root" and parameter.default is None
+        positional = place == 0 and (parameter.default is parameter.empty or replaceable)
         item = _list_item(kinds[name])
         if positional or item is not None:
             option = name if positional else f"--{name}"
-            parser.add_argument(option, nargs=item and "+", type=item or kinds[name], help=meanings[name])
+            n_words = "?" if replaceable else item and "+"
+            parser.add_argument(option, nargs=n_words, type=item or kinds[name], help=meanings[name])
             by_hand.add(name)
     parser.add_function_arguments(command, skip=by_hand)
     for name, meaning in switches.items():

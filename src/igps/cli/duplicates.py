@@ -1,0 +1,94 @@
+"""`igps duplicates` and `igps distance`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from igps.cli.index import as_indexed
+from igps.cli.reading import signatures, write_rows
+from igps.data.sources import find_meshes
+from igps.descriptors import descriptor as descriptor_of
+from igps.gallery.calibration import Calibration
+from igps.gallery.duplicates import Duplicates, compared
+from igps.gallery.duplicates import duplicates as find_duplicates
+from igps.gallery.gallery import Gallery
+
+DESCRIPTOR = "pretrained"
+"""The one whose distances are calibrated."""
+
+
+def duplicates(
+    root: Path | None = None,
+    index: Path | None = None,
+    poses: bool = False,
+    out: Path | None = None,
+    cache_dir: Path | None = None,
+    n_workers: int | None = None,
+    strict: bool = False,
+    **reading: Any,
+) -> None:
+    """List the files that show the same body, whatever its scale, mirror image, triangles, detail or file format.
+
+    Args:
+        root: folder of meshes, with or without classes.
+        index: an index of meshes in place of their folder, see igps index.
+        poses: take other poses of a body for the same, which mistakes more siblings for it
+        out: a table of the groups, a file ending in .csv.
+        cache_dir: folder where computed signatures are kept; the user's cache directory if not given.
+        n_workers: processes that compute; all cores if not given.
+        strict: stop at the first mesh that cannot be used instead of skipping it
+    """
+    if (root is None) == (index is None):
+        raise ValueError("root, index: expected one of them. Name a folder of meshes, or an index of one.")
+    calibration, n_skipped = Calibration.load(), 0
+    source: Any
+    if index is not None:
+        source = Gallery(index)
+        as_indexed(source, reading)
+    else:
+        assert root is not None
+        chosen, files = descriptor_of(DESCRIPTOR), find_meshes(root)
+        source, unread = signatures(files, [chosen], cache_dir, n_workers=n_workers, strict=strict, **reading)
+        n_skipped = len(unread)
+    found = find_duplicates(source, DESCRIPTOR, poses=poses, cache_dir=cache_dir, n_workers=n_workers)
+    _print_groups(found, calibration, poses)
+    n_skipped += len(found.failures)
+    if n_skipped:
+        print(f"{n_skipped} files could not be compared" + "".join(f"; {one.error}" for one in found.failures[:1]))
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        rows = [(str(n), name, str(found.paths[name])) for n, group in enumerate(found.groups, 1) for name in group]
+        write_rows(out, ("group", "file", "path"), rows)
+
+
+def distance(meshes: list[Path], **reading: Any) -> None:
+    """Tell how far two bodies are from each other, and what that means.
+
+    Args:
+        meshes: two files.
+    """
+    if len(meshes) != 2:
+        raise ValueError(f"meshes: expected two files, got {len(meshes)}.")
+    chosen = descriptor_of(DESCRIPTOR)
+    reading["strict"] = True
+    dataset, _ = signatures(meshes, [chosen], **reading)
+    found, calibration = compared(dataset, DESCRIPTOR), Calibration.load()
+    print(f"{found.distance:.4g} by {DESCRIPTOR}: {found.meaning}")
+    told = "the same shape" if found.same else "not the same shape"
+    print(
+        f"surfaces laid onto each other: {found.surfaces:.2%} of the root of the area apart, {told} "
+        f"(the same up to {calibration.same.distance:.2%})"
+    )
+
+
+def _print_groups(found: Duplicates, calibration: Calibration, poses: bool) -> None:
+    for number, group in enumerate(found.groups, 1):
+        print(f"group {number}: " + "  ".join(group))
+    n_alike = sum(map(len, found.groups))
+    threshold, what = (calibration.pose, "poses") if poses else (calibration.same, "copies")
+    print(
+        f"{n_alike} of {found.n_files} files in {len(found.groups)} groups; of generated bodies, {threshold.n_found} "
+        f"of {threshold.n_same} pairs of {what} are found, and {threshold.n_false} of {threshold.n_other} others taken "
+        "for such"
+    )

@@ -1,0 +1,185 @@
+"""What distances mean: how far apart pairs of generated bodies are, by how much they have in common."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from igps.descriptors.pretrained import PRETRAINED
+from igps.gallery.gallery import fingerprint, name_of
+from igps.geometry.signature import SignatureConfig
+from igps.nn.descriptor import Descriptor
+
+CALIBRATION = PRETRAINED.with_name("pretrained.calibration.json")
+"""The calibration of `pretrained`, written by training/calibrate.py."""
+
+KINDS = {
+    "copies": "copies of one body",
+    "poses": "poses of one body",
+    "bodies": "bodies of one class",
+    "classes": "pairs of different classes",
+}
+"""The pairs, from those that have most in common to those that have least, in words."""
+
+LEVELS = (0.0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, *(i / 10 for i in range(1, 10)),
+          0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 1.0)  # fmt: skip
+"""Shares of pairs whose greatest distance is kept."""
+
+
+_DEPENDS_ON = ("algorithm_version", "resolution", "min_samples", "n_surface_samples")
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A distance up to which two files are called the same, and how often that was wrong and right.
+
+    Args:
+        distance: the threshold.
+        n_other: pairs that are not the same, on which it was counted.
+        n_false: those of them that it takes for the same.
+        n_same: pairs that are.
+        n_found: those of them that it finds.
+    """
+
+    distance: float
+    n_other: int
+    n_false: int
+    n_same: int
+    n_found: int
+
+    @property
+    def false_rate(self) -> float:
+        """Share of pairs that are not the same and taken for it: at most so large, with 95 % certainty, if none is."""
+        return max(self.n_false, 3) / self.n_other  # three: Hanley and Lippman-Hand 1983
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Distances between generated bodies, by a descriptor and by their surfaces laid onto each other.
+
+    Args:
+        descriptor: its name.
+        model: its `fingerprint`.
+        signatures: version of the Signatures, and those of their parameters that distances depend on.
+        made_of: what was measured, in words.
+        distances: of each of `KINDS` the quantiles at `LEVELS` of the descriptor's distance.
+        n_pairs: of each of `KINDS`, how many pairs.
+        near: the descriptor's distance beyond which no pair is looked at: twice the largest between copies.
+        same: of `surface_distance`: up to it two files show the same body in the same shape.
+        pose: of the descriptor's distance: up to it they show poses of one body.
+    """
+
+    descriptor: str
+    model: str
+    signatures: Mapping[str, int]
+    made_of: str
+    distances: Mapping[str, Sequence[float]]
+    n_pairs: Mapping[str, int]
+    near: float
+    same: Threshold
+    pose: Threshold
+
+    def share_closer(self, kind: str, distance: float) -> float:
+        """Which share of the pairs of a kind is closer than a distance, interpolated between the quantiles."""
+        quantiles = np.asarray(self.distances[kind])
+        if distance < quantiles[0]:
+            return 0.0
+        # Of equal quantiles the last: what is as far as they are is farther than none of them.
+        return float(np.interp(distance, np.maximum.accumulate(quantiles), LEVELS))
+
+    def words(self, distance: float) -> str:
+        """What a distance of the descriptor means: "closer than 99.8 % of pairs of different classes, ..."."""
+        told = []
+        for kind, words in reversed(KINDS.items()):
+            closer = self.share_closer(kind, distance)
+            side, share = ("closer", 1 - closer) if closer < 0.5 else ("farther", closer)
+            told.append(f"{side} than {_percent(share)} {words}")
+        return ", ".join(told)
+
+    def check(self, descriptor: str | Descriptor, module: Descriptor, config: SignatureConfig) -> None:
+        """Raise a ValueError unless this is the calibration of a descriptor and of Signatures.
+
+        Args:
+            descriptor: as it was asked for.
+            module: the descriptor itself.
+            config: of the Signatures.
+        """
+        name = name_of(descriptor)
+        if name != self.descriptor:
+            raise ValueError(f"descriptor: expected {self.descriptor}, whose distances are calibrated, got {name}.")
+        if fingerprint(module) != self.model:
+            raise ValueError(
+                f"{self.descriptor}: its calibration was made for other parameters of it. Make one by "
+                "training/calibrate.py."
+            )
+        found = told_of(config)
+        for parameter, value in self.signatures.items():
+            if found[parameter] != value:
+                raise ValueError(
+                    f"{parameter}: expected {value}, as of the signatures that {self.descriptor} is calibrated for, "
+                    f"got {found[parameter]}. Leave it as it is, or make a calibration by training/calibrate.py."
+                )
+
+    def save(self, path: str | Path) -> None:
+        """Write it as JSON."""
+        Path(path).write_text(json.dumps(asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path = CALIBRATION) -> Self:
+        """What `save` wrote.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: it is no calibration.
+        """
+        try:
+            found: dict[str, Any] = json.loads(Path(path).read_text())
+            one = cls(**{**found, "same": Threshold(**found["same"]), "pose": Threshold(**found["pose"])})
+            if any(len(one.distances[kind]) != len(LEVELS) for kind in KINDS):
+                raise ValueError("other quantiles")
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}: expected a calibration as training/calibrate.py writes it ({error}).") from error
+        return one
+
+
+def told_of(config: SignatureConfig) -> dict[str, int]:
+    """What a calibration keeps of the Signatures that it was made with."""
+    return {name: config.as_dict()[name] for name in _DEPENDS_ON}
+
+
+def quantiles(distances: ArrayLike) -> list[float]:
+    """Those of distances at `LEVELS`."""
+    return [float(f"{value:.5g}") for value in np.quantile(np.asarray(distances, dtype=np.float64), LEVELS)]
+
+
+def threshold_between(same: ArrayLike, other: ArrayLike, rate: float) -> Threshold:
+    """The threshold between distances of pairs that are the same and of others.
+
+    Where the two do not overlap, the geometric mean of the largest of the ones and the smallest of the others; else as
+    large as the rate of false pairs allows.
+
+    Args:
+        same: distances of pairs that are the same.
+        other: of pairs that are not.
+        rate: of false pairs, at most.
+    """
+    same, other = np.sort(np.asarray(same, dtype=np.float64)), np.sort(np.asarray(other, dtype=np.float64))
+    n_allowed = int(rate * len(other))
+    first_refused = other[n_allowed]
+    distance = float(np.sqrt(same[-1] * first_refused)) if same[-1] < first_refused else float(
+        np.nextafter(first_refused, 0))  # fmt: skip
+    return Threshold(distance, len(other), int((other <= distance).sum()), len(same), int((same <= distance).sum()))
+
+
+def _percent(share: float) -> str:
+    """With as many digits as there are quantiles for, and never rounded up: 60 % of, 99.8 % of, all."""
+    if share >= 1:
+        return "all"
+    digits = 1 if share > 0.99 else 0
+    return f"{np.floor(share * 100 * 10**digits) / 10**digits:.{digits}f} % of"

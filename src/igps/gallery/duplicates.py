@@ -1,0 +1,305 @@
+"""Files that show the same body, whatever its scale, mirror image, triangulation, level of detail or file format.
+
+Two surfaces are laid onto each other, which tells the same shape from another pose and from a sibling. How far apart
+they may be is calibrated on generated bodies, see `Calibration`. That is done for those alone whose samples lie at
+about the same distances from each other, or in an index, whose descriptions are near.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from igps.data.dataset import Failure, SignatureDataset
+from igps.data.sources import MeshFiles
+from igps.descriptors import descriptor as descriptor_of
+from igps.gallery.calibration import Calibration
+from igps.gallery.gallery import Gallery
+from igps.geometry.alignment import SurfaceSamples, surface_distance
+from igps.geometry.mesh import MeshError
+from igps.nn.description import describe_usable
+from igps.nn.descriptor import Descriptor
+from igps.parallel import Failed, on_threads
+from igps.retrieval.distances import Distance, euclidean
+
+# Rows of distances, pairs whose surfaces are compared, and samples of surfaces, in memory at once.
+_ROWS, _PAIRS, _SURFACES = 256, 256, 512
+# Pairs as near as copies are asked for among so many of an index, then among ever more.
+_FIRST_TOP = 32
+# What sampling adds to the difference of the profiles of one surface: between copies, it is up to 0.01.
+_PROFILE_NOISE = 0.02
+# Copies differ by up to 0.045 in the logarithms of their extents; what differs by more is not laid onto each other.
+_MOST_STRETCHED = 0.15
+# A tenth of this is much between copies.
+_HOPELESS = 0.03
+
+
+@dataclass(frozen=True)
+class Duplicates:
+    """Groups of files that show the same body.
+
+    Args:
+        groups: names of at least two files each, in order; each is the same as some other of its group.
+        paths: where the files of the groups are, by name.
+        pairs: the pairs that make the groups, and how far apart: their surfaces over √area, or their descriptions where
+            poses are asked for.
+        n_files: among how many they were looked for.
+        failures: files that could not be compared.
+    """
+
+    groups: tuple[tuple[str, ...], ...]
+    paths: dict[str, Path]
+    pairs: dict[tuple[str, str], float]
+    n_files: int
+    failures: tuple[Failure, ...]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How far two bodies are from each other.
+
+    Args:
+        distance: by the descriptor.
+        surfaces: of their surfaces laid onto each other, root mean square over √area.
+        meaning: of the distance, in words.
+        same: whether they are the same body in the same shape.
+    """
+
+    distance: float
+    surfaces: float
+    meaning: str
+    same: bool
+
+
+def duplicates(
+    source: SignatureDataset | Gallery,
+    descriptor: str | Descriptor = "pretrained",
+    *,
+    poses: bool = False,
+    cache_dir: str | Path | None = None,
+    calibration: Calibration | None = None,
+    n_workers: int | None = None,
+) -> Duplicates:
+    """Groups of files that show the same body in the same shape.
+
+    Args:
+        source: the files; or an index of them, whose near pairs are found without comparing all, and of which only the
+            files of these are read again, if their Signatures are not cached.
+        descriptor: a calibrated one; for an index its own.
+        poses: whether other poses of a body count as the same; then nothing tells them from siblings but the distance
+            of descriptions, and false pairs are more.
+        cache_dir: of Signatures, for an index; the user's cache directory if None.
+        calibration: of the descriptor; the one that is shipped if None.
+        n_workers: threads; all cores if None.
+
+    Raises:
+        ValueError: the calibration is of another descriptor.
+        MeshError: none of the meshes can be described.
+    """
+    calibration = calibration or Calibration.load()
+    failures: list[Failure] = []
+    if isinstance(source, Gallery):
+        calibration.check(source.index.about["descriptor"], source.descriptor, source.config)
+        chosen, dataset = source.descriptor, _files_of(source, cache_dir)
+        near = _near_in_index(source, calibration.pose.distance if poses else calibration.near)
+    else:
+        chosen = descriptor_of(descriptor)
+        calibration.check(descriptor, chosen, source.config)
+        descriptions, failures = _described(source, chosen if poses else None, n_workers)
+        dataset = source.usable(failures)
+        if poses:
+            near = _near(descriptions, chosen.distances, calibration.pose.distance)
+        else:
+            near = _near(descriptions, _profile_distances, 2 * calibration.same.distance + _PROFILE_NOISE)
+    limit = calibration.pose.distance if poses else calibration.same.distance
+    group = _Groups(len(dataset))
+    names = dataset.files.names
+    pairs: dict[tuple[str, str], float] = {}
+    surfaces = _Surfaces(dataset)
+    while some := list(islice(near, _PAIRS)):
+        open_pairs = [(i, j, distance) for i, j, distance in some if group.of(i) != group.of(j)]
+        if poses:
+            found = iter([distance for _, _, distance in open_pairs])
+        else:
+            found = on_threads(lambda one: surfaces.distance(one[0], one[1], limit), open_pairs, n_workers)
+        for (i, j, _), distance in zip(open_pairs, found, strict=True):
+            if distance <= limit and group.of(i) != group.of(j):
+                group.join(i, j)
+                pairs[names[i], names[j]] = distance
+    members = [one for one in group.members() if len(one) > 1]
+    return Duplicates(
+        tuple(tuple(names[i] for i in one) for one in members),
+        {names[i]: dataset.files.paths[i] for one in members for i in one},
+        pairs,
+        len(dataset),
+        (*failures, *surfaces.failures.values()),
+    )
+
+
+def compared(
+    dataset: SignatureDataset,
+    descriptor: str | Descriptor = "pretrained",
+    *,
+    calibration: Calibration | None = None,
+) -> Comparison:
+    """How far the two meshes of a dataset are from each other, and what that means.
+
+    Args:
+        dataset: of two files.
+        descriptor: a calibrated one.
+        calibration: of the descriptor; the one that is shipped if None.
+
+    Raises:
+        ValueError: not two files, or the calibration is of another descriptor.
+        MeshError: a mesh that cannot be used.
+    """
+    if len(dataset) != 2:
+        raise ValueError(f"dataset: expected two meshes to compare, got {len(dataset)}.")
+    calibration, chosen = calibration or Calibration.load(), descriptor_of(descriptor)
+    calibration.check(descriptor, chosen, dataset.config)
+    descriptions, _ = describe_usable(dataset, chosen, n_workers=1, strict=True)
+    with torch.inference_mode():
+        distance = float(chosen.distances(descriptions[:1], descriptions[1:]))
+    surfaces = surface_distance(*(surface_samples(dataset, i) for i in range(2)))
+    return Comparison(distance, surfaces, calibration.words(distance), surfaces <= calibration.same.distance)
+
+
+def surface_samples(dataset: SignatureDataset, index: int) -> SurfaceSamples:
+    """Those of a mesh's Signature.
+
+    Raises:
+        MeshError: the mesh cannot be used.
+        ValueError: the Signatures have no directions of the surface.
+    """
+    signature = dataset[index].signature
+    if "surface_direction" not in signature.surface.attributes:
+        raise ValueError(
+            f"attributes: expected 'surface_direction' among those of the surface samples, got "
+            f"{sorted(signature.surface.attributes)}. Name it in SignatureConfig(attributes=...)."
+        )
+    return SurfaceSamples.of(
+        signature.surface.points, signature.surface.attributes["surface_direction"], signature.area
+    )
+
+
+def distance_if_alike(one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0) -> float:
+    """`surface_distance`, infinite where the extents of the two tell that they are not the same."""
+    if np.abs(np.log(one.extents / other.extents)).max() > _MOST_STRETCHED:
+        return float("inf")
+    return surface_distance(one, other, enough=enough, hopeless=_HOPELESS)
+
+
+class _Surfaces:
+    """The samples of surfaces of a dataset, the last used of them in memory."""
+
+    def __init__(self, dataset: SignatureDataset) -> None:
+        self.failures: dict[int, Failure] = {}
+        self._dataset = dataset
+        self._samples = lru_cache(_SURFACES)(self._read)
+
+    def distance(self, i: int, j: int, enough: float) -> float:
+        """That of two; infinite where they cannot be the same, or one cannot be read."""
+        one, other = self._samples(i), self._samples(j)
+        if one is None or other is None:
+            return float("inf")
+        return distance_if_alike(one, other, enough=enough)
+
+    def profile(self, i: int) -> NDArray[np.float64] | None:
+        """That of one; None where it cannot be read."""
+        samples = self._read(i)
+        return None if samples is None else samples.profile
+
+    def _read(self, i: int) -> SurfaceSamples | None:
+        try:
+            return surface_samples(self._dataset, i)
+        except MeshError as error:
+            self.failures[i] = self._dataset.failure(i, Failed(str(error)))
+            return None
+
+
+class _Groups:
+    """Numbers that are joined to groups (union by the smallest)."""
+
+    def __init__(self, n: int) -> None:
+        self._parent = list(range(n))
+
+    def of(self, i: int) -> int:
+        while self._parent[i] != i:
+            self._parent[i] = self._parent[self._parent[i]]
+            i = self._parent[i]
+        return i
+
+    def join(self, i: int, j: int) -> None:
+        first, second = sorted((self.of(i), self.of(j)))
+        self._parent[second] = first
+
+    def members(self) -> list[list[int]]:
+        found: dict[int, list[int]] = {}
+        for i in range(len(self._parent)):
+            found.setdefault(self.of(i), []).append(i)
+        return list(found.values())
+
+
+def _described(
+    dataset: SignatureDataset, descriptor: Descriptor | None, n_workers: int | None
+) -> tuple[Tensor, list[Failure]]:
+    """Descriptions, or where there is no descriptor the profiles of the surfaces, and what has none."""
+    if descriptor is not None:
+        return describe_usable(dataset, descriptor, n_workers=n_workers)
+    surfaces = _Surfaces(dataset)
+    found = list(on_threads(surfaces.profile, range(len(dataset)), n_workers))
+    profiles = [one for one in found if one is not None]
+    if not profiles:
+        raise MeshError(surfaces.failures[0].error)
+    return torch.from_numpy(np.stack(profiles)), [surfaces.failures[i] for i in sorted(surfaces.failures)]
+
+
+def _profile_distances(one: Tensor, other: Tensor) -> Tensor:
+    return euclidean(one, other) / one.shape[1] ** 0.5
+
+
+def _near(descriptions: Tensor, distance: Distance, limit: float) -> Iterator[tuple[int, int, float]]:
+    """Pairs i < j of descriptions that are no farther apart, and how far."""
+    for start in range(0, len(descriptions), _ROWS):
+        with torch.inference_mode():
+            distances = distance(descriptions[start : start + _ROWS], descriptions[start:])
+        for i, j in torch.nonzero(distances <= limit).tolist():
+            if i < j:
+                yield start + i, start + j, float(distances[i, j])
+
+
+def _near_in_index(gallery: Gallery, limit: float) -> Iterator[tuple[int, int, float]]:
+    """The same of the entries of an index, numbered as in `_files_of`."""
+    index = gallery.index
+    numbers: dict[int, int] = {}
+    for positions, _ in index.batches():
+        numbers.update(zip(positions.tolist(), range(len(numbers), len(numbers) + len(positions)), strict=True))
+    for positions, descriptions in index.batches():
+        for position, description in zip(positions.tolist(), descriptions, strict=True):
+            top = min(_FIRST_TOP, len(index))
+            with torch.inference_mode():
+                found = index.search(description[None], gallery.descriptor.distances, top=top)
+                while float(found.distances[0, -1]) <= limit and top < len(index):
+                    top = min(4 * top, len(index))
+                    found = index.search(description[None], gallery.descriptor.distances, top=top)
+            for other, distance in zip(found.indices[0].tolist(), found.distances[0].tolist(), strict=True):
+                if numbers[position] < numbers[other] and distance <= limit:
+                    yield numbers[position], numbers[other], distance
+
+
+def _files_of(gallery: Gallery, cache_dir: str | Path | None) -> SignatureDataset:
+    """The files that an index was made of, in its order."""
+    entries = [entry for positions, _ in gallery.index.batches() for entry in gallery.index.entries(positions)]
+    names = tuple(one.name for one in entries)
+    if len(set(names)) < len(names):  # of several folders
+        names = tuple(one.id for one in entries)
+    files = MeshFiles(tuple(Path(one.id) for one in entries), names, None)
+    return SignatureDataset(files, gallery.config, cache_dir, reading=gallery.reading)

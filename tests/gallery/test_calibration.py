@@ -1,0 +1,128 @@
+"""What a distance means, against counting; and for whom a calibration holds."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from igps.descriptors import descriptor
+from igps.gallery.calibration import KINDS, LEVELS, Calibration, Threshold, quantiles, threshold_between, told_of
+from igps.gallery.gallery import fingerprint
+from igps.geometry.signature import SignatureConfig
+from own_descriptors import Same
+
+CONFIG = SignatureConfig(n_eigenpairs=20)
+
+
+@pytest.fixture(scope="module")
+def drawn() -> dict[str, np.ndarray]:
+    generator = np.random.default_rng(0)
+    return {kind: (1 + place) * generator.gamma(2.0, size=5000) for place, kind in enumerate(KINDS)}
+
+
+@pytest.fixture
+def calibration(drawn: dict[str, np.ndarray]) -> Calibration:
+    threshold = Threshold(0.5, 1000, 0, 20, 19)
+    return Calibration(
+        "same",
+        fingerprint(Same()),
+        told_of(CONFIG),
+        "random numbers",
+        {kind: quantiles(values) for kind, values in drawn.items()},
+        dict.fromkeys(KINDS, 5000),
+        1.0,
+        threshold,
+        threshold,
+    )
+
+
+@pytest.mark.parametrize("distance", [0.3, 1.0, 3.0, 9.0])
+def test_the_share_that_is_closer_is_the_one_that_is_counted(
+    calibration: Calibration, drawn: dict[str, np.ndarray], distance: float
+) -> None:
+    for kind, values in drawn.items():
+        assert calibration.share_closer(kind, distance) == pytest.approx((values < distance).mean(), abs=0.02)
+
+
+def test_shares_at_the_ends(calibration: Calibration) -> None:
+    for kind in KINDS:
+        assert calibration.share_closer(kind, 0.0) == 0.0
+        assert calibration.share_closer(kind, 1e9) == 1.0
+
+
+def test_the_words_say_what_is_counted(calibration: Calibration, drawn: dict[str, np.ndarray]) -> None:
+    distance = float(np.quantile(drawn["poses"], 0.6))
+    parts = calibration.words(distance).split(", ")
+    assert [part.split(" of ", 1)[1] for part in parts] == [
+        "pairs of different classes",
+        "bodies of one class",
+        "poses of one body",
+        "copies of one body",
+    ]
+    for part, kind in zip(parts, reversed(KINDS), strict=True):
+        side, _, share, *_ = part.split()
+        counted = (drawn[kind] < distance).mean()
+        assert side == ("closer" if counted < 0.5 else "farther")
+        assert float(share) == pytest.approx(100 * max(counted, 1 - counted), abs=2)
+    assert "closer than all pairs of different classes" in calibration.words(0.0)
+
+
+def test_a_share_is_never_rounded_up(calibration: Calibration) -> None:
+    """What 99.96 % are farther than is not all."""
+    ends = replace(calibration, distances={kind: list(np.array(LEVELS) + 0.0) for kind in KINDS})
+    assert "closer than 99.9 % of poses of one body" in ends.words(0.0004)
+    assert "closer than 98 % of poses of one body" in ends.words(0.011)
+
+
+def test_a_threshold_lies_between_what_does_not_overlap() -> None:
+    found = threshold_between([0.001, 0.004], [0.016, 0.5, np.inf], 0.001)
+    assert found == Threshold(0.008, 3, 0, 2, 2)
+    assert found.false_rate == 1.0  # three of three: so few pairs say nothing
+
+
+def test_where_they_overlap_the_rate_decides() -> None:
+    generator = np.random.default_rng(1)
+    same, other = generator.normal(1, 0.3, 400), generator.normal(2, 0.3, 3000)
+    found = threshold_between(same, other, 0.01)
+    assert found.n_false == sum(one <= found.distance for one in other) == 30
+    assert found.n_found == sum(one <= found.distance for one in same)
+    assert found.false_rate == pytest.approx(0.01)
+    # No larger one is allowed.
+    assert sum(one <= np.nextafter(sorted(other)[30], 9) for one in other) == 31
+
+
+def test_it_holds_for_its_descriptor_its_parameters_and_its_signatures(calibration: Calibration) -> None:
+    calibration.check("same", Same(), CONFIG)
+    with pytest.raises(ValueError, match="descriptor: expected same, whose distances are calibrated, got interior"):
+        calibration.check("interior", descriptor("interior"), CONFIG)
+    with pytest.raises(ValueError, match="same: its calibration was made for other parameters of it"):
+        replace(calibration, model="0").check("same", Same(), CONFIG)
+    with pytest.raises(ValueError, match=r"resolution: expected 32, as of .* got 16\. Leave it"):
+        calibration.check("same", Same(), replace(CONFIG, resolution=16))
+
+
+def test_what_is_saved_is_loaded(calibration: Calibration, tmp_path: Path) -> None:
+    calibration.save(tmp_path / "c.json")
+    assert Calibration.load(tmp_path / "c.json") == calibration
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", json.dumps({"descriptor": "pretrained"})])
+def test_what_is_no_calibration_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "c.json").write_text(text)
+    with pytest.raises(ValueError, match=r"c\.json: expected a calibration as training/calibrate\.py writes it"):
+        Calibration.load(tmp_path / "c.json")
+
+
+def test_the_shipped_one_is_of_the_shipped_descriptor() -> None:
+    found, module = Calibration.load(), descriptor("pretrained")
+    found.check("pretrained", module, module.needs.completed(SignatureConfig()))
+    medians = [found.distances[kind][LEVELS.index(0.5)] for kind in KINDS]
+    assert medians == sorted(medians)
+    for kind in KINDS:
+        assert list(found.distances[kind]) == sorted(found.distances[kind])
+    assert found.same.n_found >= 0.99 * found.same.n_same
+    assert found.same.n_false <= 0.001 * found.same.n_other

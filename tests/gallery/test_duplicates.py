@@ -1,0 +1,219 @@
+"""Copies of bodies are found among others, from a folder and from an index."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from igps.cli import COMMANDS, main
+from igps.data.dataset import SignatureDataset
+from igps.descriptors import descriptor
+from igps.gallery.calibration import Calibration, told_of
+from igps.gallery.duplicates import compared, duplicates
+from igps.gallery.gallery import Gallery, fingerprint
+from igps.geometry.signature import SignatureConfig
+from own_descriptors import Same
+
+PROJECT = Path(__file__).parents[2]
+CONFIG = descriptor("pretrained").needs.completed(SignatureConfig())
+SAME = {frozenset({"lump.off", "lump.stl"}), frozenset({"bar.off", "bar.ply", "bar.obj"})}
+
+
+def ball(subdivisions: int) -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(subdivisions=subdivisions)
+
+
+def lump(subdivisions: int) -> trimesh.Trimesh:
+    """Without any symmetry."""
+    body = ball(subdivisions)
+    x, y, z = body.vertices.T
+    body.vertices *= (1 + 0.3 * np.sin(2 * x + 1) + 0.2 * np.cos(3 * y) + 0.2 * z * x)[:, None]
+    return body
+
+
+def bar(subdivisions: int, bend: float = 0.0) -> trimesh.Trimesh:
+    """Long, and bent by so many radians along its length."""
+    body = ball(subdivisions)
+    x, y, z = (body.vertices * [3.0, 0.8, 0.5]).T
+    if bend:
+        angle, radius = x / 6 * bend, 6 / bend + z
+        x, z = radius * np.sin(angle), radius * np.cos(angle)
+    body.vertices = np.column_stack([x, y, z])
+    return body
+
+
+def copied(body: trimesh.Trimesh, seed: int, scale: float) -> trimesh.Trimesh:
+    """Scaled, turned, and mirrored."""
+    turn = -scale * Rotation.random(random_state=seed).as_matrix()
+    return trimesh.Trimesh(body.vertices @ turn.T + 5.0, body.faces[:, ::-1], process=False)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("bodies") / "meshes"
+    root.mkdir()
+    lump(3).export(root / "lump.off")
+    fine = copied(lump(4), 1, 30.0)
+    fine.export(root / "lump.stl")
+    bar(3).export(root / "bar.off")
+    copied(bar(4), 2, 0.2).export(root / "bar.ply")
+    bar(4).export(root / "bar.obj")
+    bar(3, bend=1.5).export(root / "bent.off")
+    longer = bar(3)
+    longer.vertices *= [1.25, 1.0, 1.0]
+    longer.export(root / "longer.off")
+    return root
+
+
+@pytest.fixture(scope="module")
+def cache(root: Path) -> Path:
+    return root.parent / "cache"
+
+
+@pytest.fixture
+def dataset(root: Path, cache: Path) -> SignatureDataset:
+    return SignatureDataset(root, CONFIG, cache)
+
+
+def grouped(groups: tuple[tuple[str, ...], ...]) -> set[frozenset[str]]:
+    return set(map(frozenset, groups))
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["igps", *map(str, arguments)])
+    main()
+
+
+def error_of(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    with pytest.raises(SystemExit, match="1"):
+        command(monkeypatch, *arguments)
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("igps: ")]
+    return line
+
+
+def test_copies_are_grouped_and_neither_poses_nor_siblings(dataset: SignatureDataset, root: Path) -> None:
+    found = duplicates(dataset, n_workers=1)
+    assert grouped(found.groups) == SAME
+    assert found.n_files == 7
+    assert found.failures == ()
+    assert found.paths == {name: root / name for group in found.groups for name in group}
+    # As many pairs as join the groups, and each of one group.
+    assert len(found.pairs) == 3
+    assert all(any({*pair} <= group for group in SAME) for pair in found.pairs)
+    assert max(found.pairs.values()) <= Calibration.load().same.distance
+
+
+def test_poses_are_grouped_by_the_descriptor_alone(dataset: SignatureDataset) -> None:
+    """A descriptor that sees no difference takes all for poses of one body; their surfaces still tell."""
+    shipped = Calibration.load()
+    calibration = replace(shipped, descriptor="same", model=fingerprint(Same()), signatures=told_of(CONFIG))
+    all_of_them = duplicates(dataset, Same(), poses=True, calibration=calibration, n_workers=1)
+    assert grouped(all_of_them.groups) == {frozenset(dataset.files.names)}
+    assert set(all_of_them.pairs.values()) == {0.0}
+    assert grouped(duplicates(dataset, Same(), calibration=calibration, n_workers=1).groups) == SAME
+
+
+def test_an_index_gives_the_same_groups_and_tells_of_files_that_are_gone(
+    dataset: SignatureDataset, root: Path, cache: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("filelock")
+    moved = tmp_path / "moved"
+    shutil.copytree(root, moved)
+    here = SignatureDataset(moved, CONFIG, cache)
+    gallery, _ = Gallery.build(tmp_path / "g.igps", here, "pretrained", n_workers=1)
+    # So few triangles as the bars have here put descriptions farther apart than meshes in use do.
+    calibration = replace(Calibration.load(), near=1.0)
+    found = duplicates(gallery, cache_dir=cache, calibration=calibration)
+    assert grouped(found.groups) == SAME
+    assert found.pairs == pytest.approx(duplicates(dataset, n_workers=1).pairs)
+    (moved / "lump.stl").unlink()
+    found = duplicates(gallery, cache_dir=cache, calibration=calibration)
+    assert grouped(found.groups) == {group for group in SAME if "bar.off" in group}
+    (failure,) = found.failures
+    assert failure.error == f"{moved / 'lump.stl'}: cannot be read (No such file or directory). Check the path."
+
+
+def test_a_distance_and_what_it_means(dataset: SignatureDataset) -> None:
+    number = {name: i for i, name in enumerate(dataset.files.names)}
+
+    def between(one: str, other: str) -> tuple[float, bool]:
+        found = compared(dataset.subset([number[one], number[other]]))
+        assert found.meaning == Calibration.load().words(found.distance)
+        return found.surfaces, found.same
+
+    surfaces, same = between("bar.off", "bar.off")
+    assert surfaces < 1e-6
+    assert same
+    assert between("bar.off", "bar.ply")[1]
+    assert not between("bar.off", "bent.off")[1]
+    assert not between("bar.off", "longer.off")[1]
+    with pytest.raises(ValueError, match="dataset: expected two meshes to compare, got 7"):
+        compared(dataset)
+
+
+def test_the_commands(
+    root: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--cache_dir", cache, "--n_workers", 1]
+    command(monkeypatch, "duplicates", root, "--out", tmp_path / "out" / "groups.csv", *options)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-3:-1] == ["group 1: bar.obj  bar.off  bar.ply", "group 2: lump.off  lump.stl"]
+    assert lines[-1].startswith("5 of 7 files in 2 groups; of generated bodies, ")
+    rows = (tmp_path / "out" / "groups.csv").read_text().splitlines()
+    assert rows[0] == "group,file,path"
+    assert rows[5] == f"2,lump.stl,{root / 'lump.stl'}"
+    command(monkeypatch, "distance", root / "bar.off", root / "bar.ply", *options)
+    *_, by_descriptor, by_surfaces = capsys.readouterr().out.splitlines()
+    assert "pairs of different classes" in by_descriptor
+    assert ", the same shape (the same up to " in by_surfaces
+    command(monkeypatch, "distance", root / "bar.off", root / "bent.off", *options)
+    assert "not the same shape" in capsys.readouterr().out
+
+
+def test_the_page_runs(tmp_path: Path) -> None:
+    """Its Python prints the group of the copy; its commands exist."""
+    page = (PROJECT / "docs" / "how-to" / "duplicates.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    groups, meaning, surfaces = done.stdout.splitlines()
+    ((one, other),) = ast.literal_eval(groups)
+    assert one.endswith("copy.stl") != other.endswith("copy.stl")
+    assert "poses of one body" in meaning
+    assert surfaces.endswith("the same shape: True")
+    for line in "".join(re.findall(r"```sh\n(.*?)```", page, flags=re.DOTALL)).splitlines():
+        program, name, *_ = shlex.split(line)
+        assert program == "igps"
+        assert name in COMMANDS
+
+
+def test_what_is_wrong_is_one_sentence(
+    root: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--cache_dir", cache, "--n_workers", 1]
+    expected = "root, index: expected one of them"
+    assert expected in error_of(monkeypatch, capsys, "duplicates", *options)
+    assert expected in error_of(monkeypatch, capsys, "duplicates", root, "--index", tmp_path, *options)
+    assert "meshes: expected two files, got 1" in error_of(monkeypatch, capsys, "distance", root / "bar.off", *options)
+    fewer = ["--signature.n_surface_samples", "300"]
+    words = error_of(monkeypatch, capsys, "distance", root / "bar.off", root / "bar.off", *options, *fewer)
+    assert "n_surface_samples: expected 2000, as of the signatures that pretrained is calibrated for, got 300" in words
+    pytest.importorskip("filelock")
+    dataset = SignatureDataset([root / "bar.off", root / "lump.off"], None, cache)
+    Gallery.build(tmp_path / "g.igps", dataset, "gps", n_workers=1)
+    words = error_of(monkeypatch, capsys, "duplicates", "--index", tmp_path / "g.igps", *options)
+    assert "descriptor: expected pretrained, whose distances are calibrated, got gps" in words
