@@ -89,7 +89,8 @@ def pretrain(
     alike = torch.tensor([looks_alike(name) for name in generated.classes])
     strangers = ~held_out & ~alike[labels]
     n_strangers = len(labels[strangers].unique())
-    for name, among in (("without look-alikes", strangers), ("as many, with them", ~held_out)):
+    both = (("without look-alikes", strangers), ("as many, with them", ~held_out)) if n_strangers > 1 else ()
+    for name, among in both:
         fitted = fit(n_strangers, seed, among)
         title = f"{name} ({n_strangers})"
         two_level_scores(title, _distances(fitted, histograms[where]), labels[where], bodies[where])
@@ -99,7 +100,7 @@ def pretrain(
     real = _usable(data, descriptor, cache_dir, n_workers)
     found, classes = describe(real, descriptor, progress=True, n_workers=n_workers), real.labels
     report(str(data), found, classes, head)
-    for name, among in (("without look-alikes", strangers), ("as many, with them", ~held_out)):
+    for name, among in both:
         report(f"{data}, fitted to {n_strangers} classes, {name}", found, classes, fit(n_strangers, seed, among))
     counts = [n for n in (10, 30, 100) if n < n_fitted] + [n_fitted]
     curve(fit, counts, found, classes, figures / "pretrain.png")

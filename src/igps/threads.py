@@ -13,10 +13,11 @@ import contextlib
 import math
 import os
 import re
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -131,9 +132,9 @@ def _in_new_thread(function: Callable[[], Result]) -> Result:
     return results[0]
 
 
-@cache
-def _libraries() -> ThreadpoolController:
-    """NumPy's and SciPy's are loaded by now; to look for them takes as long as a small product."""
+@lru_cache(maxsize=1)
+def _libraries(n_modules: int) -> ThreadpoolController:
+    """Those that are loaded; to look for them takes as long as a small product, and only an import brings others."""
     return ThreadpoolController()
 
 
@@ -153,7 +154,7 @@ class _Blas:
     def on_one_thread(self) -> Iterator[None]:
         with self._lock:
             if self._users == 0:
-                limits = _in_new_thread(lambda: _libraries().limit(limits=1, user_api="blas"))
+                limits = _in_new_thread(lambda: _libraries(len(sys.modules)).limit(limits=1, user_api="blas"))
                 self._restore = limits.restore_original_limits
             self._users += 1
         try:

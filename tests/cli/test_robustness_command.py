@@ -77,7 +77,7 @@ def test_gallery_and_poses_are_read(
 def test_rich_and_pretrained_are_measured_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ArticulatedShapes(n_classes=2, n_per_class=1, seed=3, n_vertices=500).write(tmp_path / "meshes")
+    ArticulatedShapes(n_classes=2, n_per_class=1, seed=3, n_vertices=1000).write(tmp_path / "meshes")
     meshes = sorted((tmp_path / "meshes").rglob("*.off"))
     options = ["--signature.n_eigenpairs", "64", "--signature.resolution", "12", "--signature.min_samples", "0"]
     options += ["--signature.n_surface_samples", "100", "--n_workers", "1"]

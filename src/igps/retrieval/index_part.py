@@ -212,7 +212,9 @@ class Part:
             options = faiss.SearchParametersIVF(nprobe=self._clusters.nprobe)
             if self.removed:
                 options.sel = faiss.IDSelectorNot(faiss.IDSelectorBatch(np.array(sorted(self.removed))))
-            found = self._clusters.search(vectors, n_wanted, params=options)
+            # faiss.contrib.torch_utils, which other libraries import, replaces `search` by one that takes no options
+            search = getattr(self._clusters, "search_numpy", self._clusters.search)
+            found = search(vectors, n_wanted, params=options)
         else:
             found = faiss.knn(vectors, self._vectors, min(n_wanted + len(self.removed), self._n))
         for distances, positions in zip(*found, strict=True):
