@@ -160,5 +160,6 @@ def table(out: Path) -> Mapping[str, Any] | None:
 
 
 def partials(cache: Path) -> list[Path]:
-    """Files that somebody began to write."""
-    return [path for path in cache.rglob("*") if path.is_file() and path.suffix != ".safetensors"]
+    """Files that somebody began to write; the memory of files is a database, which mends itself."""
+    others = [path for path in cache.rglob("*") if path.is_file() and path.suffix != ".safetensors"]
+    return [path for path in others if not path.name.startswith("known_files.sqlite")]
