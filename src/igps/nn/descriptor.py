@@ -35,8 +35,9 @@ class Descriptor(nn.Module, ABC):
         invariant_to: which of "motion" (rotation, translation, reflection), "scale" and "pose" (isometric bending)
             leave its descriptions as they are, but for discretisation.
         needs: of a body; all eigenpairs, unless redefined.
-        comparison: "cosine" or "chi_square" where `distances` is that of unit vectors or of histograms, so that an
-            index has short vectors of them; None for all others, which it compares one by one.
+        comparison: "cosine" or "chi_square" where `distances` is that of unit vectors or of histograms, or follows it
+            so closely that what is near by `distances` is among the some hundreds that are nearest by it: an index has
+            short vectors of these. None for all others, which it compares one by one.
     """
 
     name: str = "descriptor"
