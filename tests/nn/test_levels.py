@@ -137,7 +137,7 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
     histograms, classes, _ = collection
     with pytest.raises(ValueError, match="part_cells: expected cells that add up to 40"):
         LevelHead().fit(histograms, classes, (3, 4))
-    with pytest.raises(ValueError, match="labels: expected one for each of 320 shapes"):
+    with pytest.raises(ValueError, match="labels: expected one for each of 320 descriptions"):
         LevelHead().fit(histograms, classes[:3])
     with pytest.raises(ValueError, match="as many labels as shapes"):
         LevelHead().fit(histograms, torch.arange(len(histograms)))

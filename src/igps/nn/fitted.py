@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from igps.nn.heads import Head, SizedByData, check_cells, square_roots
+from igps.nn.heads import Head, SizedByData, check_cells, checked_labels, means_of, square_roots
 
 
 class WhitenedHead(SizedByData):
@@ -60,16 +60,15 @@ class WhitenedHead(SizedByData):
             ValueError: shapes that do not match, or no class of two shapes.
         """
         roots = square_roots(descriptions)
-        labels = _checked(roots, labels)
+        labels = checked_labels(roots, labels)
         _, members = labels.unique(return_inverse=True)
-        n_members = torch.bincount(members)
-        if len(roots) == len(n_members):
+        means = means_of(roots, members)
+        if len(roots) == len(means):
             raise ValueError("labels: expected a class of at least two shapes, got as many classes as shapes.")
-        means = roots.new_zeros(len(n_members), roots.shape[1]).index_add_(0, members, roots) / n_members[:, None]
         self.centre(descriptions, part_cells)
         residuals = self.parts((roots - means[members]).double())
         for part, directions, gains in zip(residuals, self.parts(self.directions), self.gains, strict=True):
-            self._fit_part(part, len(roots) - len(n_members), directions, gains)
+            self._fit_part(part, len(roots) - len(means), directions, gains)
         return self
 
     @torch.no_grad()
@@ -162,7 +161,7 @@ class KernelHead(SizedByData):
         Raises:
             ValueError: shapes that do not match, or fewer than two classes.
         """
-        labels = _checked(descriptions, labels)
+        labels = checked_labels(descriptions, labels)
         classes, members = labels.unique(return_inverse=True)
         if len(classes) < 2:
             raise ValueError(f"labels: expected at least two classes, got {len(classes)}.")
@@ -212,11 +211,3 @@ class KernelHead(SizedByData):
 
     def _parts(self, whitened: Tensor) -> tuple[Tensor, ...]:
         return self.whitened.parts(whitened) if isinstance(self.whitened, WhitenedHead) else (whitened,)
-
-
-def _checked(descriptions: Tensor, labels: Tensor) -> Tensor:
-    if labels.shape != descriptions.shape[:1]:
-        raise ValueError(
-            f"labels: expected one for each of {len(descriptions)} descriptions, got shape {tuple(labels.shape)}."
-        )
-    return labels.to(descriptions.device)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Protocol, Self, runtime_checkable
 
+import torch
 from torch import Tensor, nn
 
 from igps.retrieval.distances import Distance, cosine, square_root
@@ -59,3 +60,18 @@ def check_cells(cells: Tensor, n_expected: int) -> None:
     """Raise a ValueError unless these (N, cells) are as many as the head was fitted to."""
     if cells.shape[1] != n_expected:
         raise ValueError(f"descriptions: expected {n_expected} cells as in training, got {cells.shape[1]}.")
+
+
+def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
+    """The labels (N,) on the device of the descriptions (N, ...); raises a ValueError if they are not aligned."""
+    if labels.shape != descriptions.shape[:1]:
+        raise ValueError(
+            f"labels: expected one for each of {len(descriptions)} descriptions, got shape {tuple(labels.shape)}."
+        )
+    return labels.to(descriptions.device)
+
+
+def means_of(rows: Tensor, members: Tensor) -> Tensor:
+    """(C, D) means of rows (N, D) by their classes (N,), numbered from 0 without a gap."""
+    n_members = torch.bincount(members)
+    return rows.new_zeros(len(n_members), rows.shape[1]).index_add_(0, members, rows) / n_members[:, None]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from igps.nn.heads import SizedByData, check_cells, square_roots
+from igps.nn.heads import SizedByData, check_cells, checked_labels, means_of, square_roots
 from igps.retrieval.distances import cosine, euclidean
 
 # Of a part so many principal directions are whitened; what is beyond them is discretisation
@@ -64,9 +64,7 @@ class LevelHead(SizedByData):
             ValueError: shapes that do not match, a part that is not there, or no label of two shapes.
         """
         roots = square_roots(descriptions)
-        if labels.shape != roots.shape[:1]:
-            raise ValueError(f"labels: expected one for each of {len(roots)} shapes, got shape {tuple(labels.shape)}.")
-        _, members = labels.to(roots.device).unique(return_inverse=True)
+        _, members = checked_labels(roots, labels).unique(return_inverse=True)
         if int(members.max()) + 1 == len(roots):
             raise ValueError("labels: expected a label of at least two shapes, got as many labels as shapes.")
         cells = list(part_cells or (roots.shape[1],))
@@ -100,11 +98,10 @@ class LevelHead(SizedByData):
         """(k, cells) that whiten a centred part (N, cells) and keep what tells labels."""
         principal = _principal(part, _PRINCIPAL)
         found = part @ principal.T
-        n_members = torch.bincount(members)
-        means = found.new_zeros(len(n_members), found.shape[1]).index_add_(0, members, found) / n_members[:, None]
+        means = means_of(found, members)
         residuals = found - means[members]
         spread, axes = torch.linalg.eigh(residuals.T @ residuals)
-        rank = min(len(found) - len(n_members), len(spread))
+        rank = min(len(found) - len(means), len(spread))
         relative = spread.clamp_min(0) * rank / spread.sum()
         whitening = (axes * (self.shrinkage / (self.shrinkage + relative)).sqrt()) @ axes.T
         return _principal(means @ whitening, self.n_directions) @ whitening @ principal
