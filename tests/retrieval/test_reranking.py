@@ -54,6 +54,16 @@ def test_sets_and_sums_of_the_paper(k: int, n_expanded: int, share: float, point
     torch.testing.assert_close(rerank(distances, k, n_expanded, share), expected, atol=1e-10, rtol=0)
 
 
+def test_a_shape_is_its_own_nearest_among_equals(points: Tensor) -> None:
+    """Three copies of each of four, and one of the others; the nearest of a copy is itself, then the next copies."""
+    repeated = torch.cat([points[:8], points[:4], points[:4]])
+    distances = euclidean(repeated, repeated)
+    distances = (distances + distances.T) / 2
+    for k in (3, 5):
+        expected = torch.tensor(by_hand(distances.tolist(), k, 1, 0.3), dtype=torch.float64)
+        torch.testing.assert_close(rerank(distances, k, 1, 0.3), expected, atol=1e-10, rtol=0)
+
+
 def test_the_order_of_shapes_does_not_matter(points: Tensor) -> None:
     order = torch.randperm(30, generator=torch.Generator().manual_seed(1))
     found = rerank(euclidean(points, points))
