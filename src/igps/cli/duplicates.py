@@ -51,7 +51,7 @@ def duplicates(
         chosen, files = descriptor_of(DESCRIPTOR), find_meshes(root)
         source, unread = signatures(files, [chosen], cache_dir, n_workers=n_workers, strict=strict, **reading)
         n_skipped = len(unread)
-    found = find_duplicates(source, DESCRIPTOR, poses=poses, cache_dir=cache_dir, n_workers=n_workers)
+    found = find_duplicates(source, DESCRIPTOR, poses=poses, cache_dir=cache_dir, n_workers=n_workers, progress=True)
     _print_groups(found, calibration, poses)
     n_skipped += len(found.failures)
     if n_skipped:

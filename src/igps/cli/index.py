@@ -37,7 +37,7 @@ def index_build(
     """
     chosen = descriptor_of(descriptor)
     dataset, unread = signatures(find_meshes(root), [chosen], n_workers=n_workers, strict=strict, **reading)
-    gallery, undescribed = Gallery.build(out, dataset, descriptor, n_workers=n_workers, strict=strict)
+    gallery, undescribed = Gallery.build(out, dataset, descriptor, n_workers=n_workers, strict=strict, progress=True)
     _print_state(gallery, [*unread, *undescribed])
 
 
@@ -60,7 +60,7 @@ def index_add(
     reading = as_indexed(gallery, reading)
     dataset, unread = signatures(find_meshes(root), [gallery.descriptor], n_workers=n_workers, strict=strict, **reading)
     name = gallery.index.about["descriptor"]
-    gallery, undescribed = Gallery.add(index, dataset, name, n_workers=n_workers, strict=strict)
+    gallery, undescribed = Gallery.add(index, dataset, name, n_workers=n_workers, strict=strict, progress=True)
     _print_state(gallery, [*unread, *undescribed])
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from tqdm import tqdm
 
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import MeshFiles
@@ -87,6 +88,7 @@ def duplicates(
     cache_dir: str | Path | None = None,
     calibration: Calibration | None = None,
     n_workers: int | None = None,
+    progress: bool = False,
 ) -> Duplicates:
     """Groups of files that show the same body in the same shape.
 
@@ -99,6 +101,7 @@ def duplicates(
         cache_dir: of Signatures, for an index; the user's cache directory if None.
         calibration: of the descriptor; the one that is shipped if None.
         n_workers: threads; all cores if None.
+        progress: show bars.
 
     Raises:
         ValueError: the calibration is of another descriptor.
@@ -109,16 +112,16 @@ def duplicates(
     if isinstance(source, Gallery):
         calibration.check(source.index.about["descriptor"], source.descriptor, source.config)
         chosen, dataset = source.descriptor, _files_of(source, cache_dir)
-        near = _near_in_index(source, calibration.pose.distance if poses else calibration.near)
+        near = _near_in_index(source, calibration.pose.distance if poses else calibration.near, progress)
     else:
         chosen = descriptor_of(descriptor)
         calibration.check(descriptor, chosen, source.config)
-        descriptions, failures = _described(source, chosen if poses else None, n_workers)
+        descriptions, failures = _described(source, chosen if poses else None, n_workers, progress)
         dataset = source.usable(failures)
         if poses:
-            near = _near(descriptions, chosen.distances, calibration.pose.distance)
+            near = _near(descriptions, chosen.distances, calibration.pose.distance, progress)
         else:
-            near = _near(descriptions, _profile_distances, 2 * calibration.same.distance + _PROFILE_NOISE)
+            near = _near(descriptions, _profile_distances, 2 * calibration.same.distance + _PROFILE_NOISE, progress)
     limit = calibration.pose.distance if poses else calibration.same.distance
     group = _Groups(len(dataset))
     names = dataset.files.names
@@ -249,13 +252,14 @@ class _Groups:
 
 
 def _described(
-    dataset: SignatureDataset, descriptor: Descriptor | None, n_workers: int | None
+    dataset: SignatureDataset, descriptor: Descriptor | None, n_workers: int | None, progress: bool
 ) -> tuple[Tensor, list[Failure]]:
     """Descriptions, or where there is no descriptor the profiles of the surfaces, and what has none."""
     if descriptor is not None:
-        return describe_usable(dataset, descriptor, n_workers=n_workers)
+        return describe_usable(dataset, descriptor, n_workers=n_workers, progress=progress)
     surfaces = _Surfaces(dataset)
-    found = list(on_threads(surfaces.profile, range(len(dataset)), n_workers))
+    profiled = on_threads(surfaces.profile, range(len(dataset)), n_workers)
+    found = list(tqdm(profiled, desc="surfaces", total=len(dataset), disable=not progress))
     profiles = [one for one in found if one is not None]
     if not profiles:
         raise MeshError(surfaces.failures[0].error)
@@ -266,33 +270,42 @@ def _profile_distances(one: Tensor, other: Tensor) -> Tensor:
     return euclidean(one, other) / one.shape[1] ** 0.5
 
 
-def _near(descriptions: Tensor, distance: Distance, limit: float) -> Iterator[tuple[int, int, float]]:
+def _near(descriptions: Tensor, distance: Distance, limit: float, progress: bool) -> Iterator[tuple[int, int, float]]:
     """Pairs i < j of descriptions that are no farther apart, and how far."""
-    for start in range(0, len(descriptions), _ROWS):
-        with torch.inference_mode():
-            distances = distance(descriptions[start : start + _ROWS], descriptions[start:])
-        for i, j in torch.nonzero(distances <= limit).tolist():
-            if i < j:
-                yield start + i, start + j, float(distances[i, j])
+    with _bar(len(descriptions), progress) as bar:
+        for start in range(0, len(descriptions), _ROWS):
+            rows = descriptions[start : start + _ROWS]
+            with torch.inference_mode():
+                distances = distance(rows, descriptions[start:])
+            for i, j in torch.nonzero(distances <= limit).tolist():
+                if i < j:
+                    yield start + i, start + j, float(distances[i, j])
+            bar.update(len(rows))
 
 
-def _near_in_index(gallery: Gallery, limit: float) -> Iterator[tuple[int, int, float]]:
+def _near_in_index(gallery: Gallery, limit: float, progress: bool) -> Iterator[tuple[int, int, float]]:
     """The same of the entries of an index, numbered as in `_files_of`."""
     index = gallery.index
     numbers: dict[int, int] = {}
     for positions, _ in index.batches():
         numbers.update(zip(positions.tolist(), range(len(numbers), len(numbers) + len(positions)), strict=True))
-    for positions, descriptions in index.batches():
-        for position, description in zip(positions.tolist(), descriptions, strict=True):
-            top = min(_FIRST_TOP, len(index))
-            with torch.inference_mode():
-                found = index.search(description[None], gallery.descriptor.distances, top=top)
-                while float(found.distances[0, -1]) <= limit and top < len(index):
-                    top = min(4 * top, len(index))
+    with _bar(len(index), progress) as bar:
+        for positions, descriptions in index.batches():
+            for position, description in zip(positions.tolist(), descriptions, strict=True):
+                top = min(_FIRST_TOP, len(index))
+                with torch.inference_mode():
                     found = index.search(description[None], gallery.descriptor.distances, top=top)
-            for other, distance in zip(found.indices[0].tolist(), found.distances[0].tolist(), strict=True):
-                if numbers[position] < numbers[other] and distance <= limit:
-                    yield numbers[position], numbers[other], distance
+                    while float(found.distances[0, -1]) <= limit and top < len(index):
+                        top = min(4 * top, len(index))
+                        found = index.search(description[None], gallery.descriptor.distances, top=top)
+                for other, distance in zip(found.indices[0].tolist(), found.distances[0].tolist(), strict=True):
+                    if numbers[position] < numbers[other] and distance <= limit:
+                        yield numbers[position], numbers[other], distance
+                bar.update()
+
+
+def _bar(n_files: int, progress: bool) -> tqdm:
+    return tqdm(desc="compared", total=n_files, disable=not progress)
 
 
 def _files_of(gallery: Gallery, cache_dir: str | Path | None) -> SignatureDataset:

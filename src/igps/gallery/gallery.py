@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from tqdm import tqdm
 
 from igps.data.dataset import Failure, SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
@@ -120,6 +121,7 @@ class Gallery:
         *,
         n_workers: int | None = None,
         strict: bool = False,
+        progress: bool = False,
     ) -> tuple[Gallery, list[Failure]]:
         """Index the meshes of a dataset, in place of an index that is there; and tell those that cannot be described.
 
@@ -131,11 +133,13 @@ class Gallery:
             descriptor: a name, which the index remembers, or the descriptor itself, which has to be given again.
             n_workers: threads or processes that describe; all cores if None.
             strict: raise at the first mesh that cannot be described.
+            progress: show a bar.
         """
         chosen = descriptor_of(descriptor)
         failures: list[Failure] = []
         about = about_of(dataset.config, dataset.reading, descriptor)
-        write_index(path, about, chosen.comparison, _batches(dataset, chosen, {}, failures, n_workers, strict))
+        batches = _batches(dataset, chosen, {}, failures, n_workers, strict, progress)
+        write_index(path, about, chosen.comparison, batches)
         return cls(path, descriptor), failures
 
     @classmethod
@@ -147,11 +151,12 @@ class Gallery:
         *,
         n_workers: int | None = None,
         strict: bool = False,
+        progress: bool = False,
     ) -> tuple[Gallery, list[Failure]]:
         """Add the meshes of a dataset to an index. Files that it has already are passed over, changed ones replaced.
 
         Args:
-            path, dataset, descriptor, n_workers, strict: see `build`.
+            path, dataset, descriptor, n_workers, strict, progress: see `build`.
 
         Raises:
             ValueError: the index is of another descriptor or of other Signatures.
@@ -161,7 +166,7 @@ class Gallery:
         index = VectorIndex(path)
         check_alike(index, about)
         known = index.marks([_id(one) for one in dataset.files.paths])
-        extend_index(path, about, _batches(dataset, chosen, known, failures, n_workers, strict))
+        extend_index(path, about, _batches(dataset, chosen, known, failures, n_workers, strict, progress))
         return cls(path, descriptor), failures
 
     @classmethod
@@ -220,25 +225,25 @@ def _batches(
     failures: list[Failure],
     n_workers: int | None,
     strict: bool,
+    progress: bool,
 ) -> Iterator[tuple[Tensor, list[Entry]]]:
-    for start in range(0, len(dataset), _AT_ONCE):
-        part = dataset.subset(range(start, min(start + _AT_ONCE, len(dataset))))
-        keys = [_key(part, i) for i in range(len(part))]
-        new = [i for i, path in enumerate(part.files.paths) if keys[i] is None or known.get(_id(path)) != keys[i]]
-        if not new:
-            continue
-        descriptions, failed = _described(part.subset(new), descriptor, n_workers, strict)
-        failures += failed
-        lost = {failure.id for failure in failed}
-        labels = part.files.labels or (None,) * len(part)
-        yield (
-            descriptions,
-            [
-                Entry(_id(part.files.paths[i]), part.files.names[i], labels[i], keys[i] or "")
-                for i in new
-                if part.files.names[i] not in lost
-            ],
-        )
+    with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
+        for start in range(0, len(dataset), _AT_ONCE):
+            part = dataset.subset(range(start, min(start + _AT_ONCE, len(dataset))))
+            keys = [_key(part, i) for i in range(len(part))]
+            new = [i for i, path in enumerate(part.files.paths) if keys[i] is None or known.get(_id(path)) != keys[i]]
+            if new:
+                descriptions, failed = _described(part.subset(new), descriptor, n_workers, strict)
+                failures += failed
+                lost = {failure.id for failure in failed}
+                labels = part.files.labels or (None,) * len(part)
+                entries = [
+                    Entry(_id(part.files.paths[i]), part.files.names[i], labels[i], keys[i] or "")
+                    for i in new
+                    if part.files.names[i] not in lost
+                ]
+                yield descriptions, entries
+            bar.update(len(part))
 
 
 def _described(
