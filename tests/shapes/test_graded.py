@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import pickle
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -83,6 +84,35 @@ def test_animals_bend_and_things_do_not(poses: dict[str, Pose]) -> None:
         np.testing.assert_array_equal(poses[kind].bent, poses[kind].rest)
     assert min(change(poses[kind]) for kind in BENDING) > 0.005  # some poses are nearly at rest
     assert np.median([change(poses[kind]) for kind in BENDING]) > 0.15
+
+
+def test_every_sheet_has_the_holes_that_its_name_tells() -> None:
+    """Of every outline, also of those whose middle is a disc; each hole is a handle."""
+    for outline in SHEETS:
+        without, *others = (sheet(np.random.default_rng(3), outline, n).genus for n in (0, 1, 2, 4))
+        assert others == [without + 1, without + 2, without + 4]
+    stars = [i for i, one in enumerate(CLASSES) if one.name.startswith("sheet-star-") and "-0-" not in one.name]
+    assert len(stars) == 3
+    for i in stars:
+        draw_body(CLASSES[i], [0, i], [1, i])  # its surface has that genus, or there is none
+
+
+def test_a_body_that_cannot_be_made_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = []
+
+    def impossible(*arguments: object) -> NoReturn:
+        tried.append(arguments)
+        raise ValueError("no sound body")
+
+    monkeypatch.setattr("igps.shapes.graded.draw_body", impossible)
+    shapes = GradedShapes(1, 2, 3)
+    for pose in range(3):
+        with pytest.raises(ValueError, match=rf"biped/00/0{pose} could not be made: no sound body"):
+            shapes[pose]
+    assert len(tried) == 1
+    with pytest.raises(ValueError, match="biped/01"):
+        shapes[4]
+    assert len(tried) == 2
 
 
 def test_shapes_are_read_without_mending(made: list[GradedShape], tmp_path: Path) -> None:

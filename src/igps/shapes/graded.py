@@ -23,7 +23,7 @@ from igps.shapes.meshing import Faces
 from igps.shapes.scans import Scan
 from igps.shapes.solids import Array
 
-_VERSION = 1  # raised whenever the same arguments would give other meshes
+_VERSION = 2  # raised whenever the same arguments would give other meshes
 _MAX_ATTEMPTS = 6
 _KIN, _BODY, _POSE = 10, 11, 12  # what a random stream is for: keeps the streams of one seed apart
 _SIBLINGS = 2  # bodies in a row with one skeleton, whose likeness makes bodies hard to tell apart
@@ -107,7 +107,7 @@ class GradedShapes:
         if n_classes > len(classes):
             raise ValueError(f"n_classes: expected at most {len(classes)}, which are all there are, got {n_classes}.")
         self._classes: list[BodyClass] = classes[:n_classes]
-        self._last: tuple[tuple[int, int], Body] | None = None
+        self._last: tuple[tuple[int, int], Body | ValueError] | None = None
 
     def __len__(self) -> int:
         return self.n_classes * self.n_bodies * self.n_poses
@@ -152,12 +152,16 @@ class GradedShapes:
         """
         body_class, number, pose = self._numbers(index)
         name = self.names[operator.index(index)]
+        try:
+            body = self._body(body_class, number)
+        except ValueError as error:
+            raise self._impossible(name, str(error)) from error
         found = ""
         for attempt in range(_MAX_ATTEMPTS):
             rng = np.random.default_rng([self.seed, _POSE, body_class, number, pose, attempt])
             scan = Scan.draw(rng, self.n_vertices)
             try:
-                posed = draw_pose(self._body(body_class, number), rng, scan.target)
+                posed = draw_pose(body, rng, scan.target)
                 mesh = scan.of(Mesh(posed.bent, posed.faces, name), rng)
             except (MeshError, ValueError) as error:
                 found = str(error)
@@ -166,10 +170,7 @@ class GradedShapes:
             label = self._classes[body_class].name
             vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
             return GradedShape(vertices, faces, label, body_of(name), name, mesh.genus, scan.motion, mesh.notes)
-        raise ValueError(
-            f"n_vertices={self.n_vertices}: {name} could not be made in {_MAX_ATTEMPTS} attempts, in the last {found} "
-            "Thin parts need more vertices, another seed gives other bodies."
-        )
+        raise self._impossible(name, f"in {_MAX_ATTEMPTS} attempts, in the last {found}")
 
     def pose(self, index: int) -> Pose:
         """The surface of one shape at rest and bent, with the same triangles, before anything else happens to it.
@@ -248,9 +249,21 @@ class GradedShapes:
     def _body(self, body_class: int, number: int) -> Body:
         if self._last is None or self._last[0] != (body_class, number):
             kin = [self.seed, _KIN, body_class, number // _SIBLINGS]
-            drawn = draw_body(self._classes[body_class], kin, [self.seed, _BODY, body_class, number])
+            drawn: Body | ValueError
+            try:
+                drawn = draw_body(self._classes[body_class], kin, [self.seed, _BODY, body_class, number])
+            except ValueError as error:  # kept as well: no other pose of it can be made either
+                drawn = error
             self._last = (body_class, number), drawn
+        if isinstance(self._last[1], ValueError):
+            raise self._last[1]
         return self._last[1]
+
+    def _impossible(self, name: str, reason: str) -> ValueError:
+        return ValueError(
+            f"n_vertices={self.n_vertices}: {name} could not be made: {reason} "
+            "Thin parts need more vertices, another seed gives other bodies."
+        )
 
     def __getstate__(self) -> dict[str, object]:
         return {name: getattr(self, name) for name in _ARGUMENTS}

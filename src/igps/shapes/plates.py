@@ -140,12 +140,15 @@ def _outline(g: np.random.Generator, outline: str) -> tuple[list[Bar], int]:
 
 def _holes(g: np.random.Generator, bar: Bar, count: int) -> tuple[Hole, ...]:
     """Holes along the middle of a bar, with room between them."""
+    if not count:
+        return ()
     x0, y0, x1, y1, r0, r1 = bar
-    length = float(np.hypot(x1 - x0, y1 - y0)) + 0.5 * (r0 + r1)
-    ends = 0.25 * (r0 + r1) / max(float(np.hypot(x1 - x0, y1 - y0)), 1e-9)
-    radius = min(0.45 * min(r0, r1), 0.26 * length / max(count, 1)) * g.uniform(0.85, 1.1)
-    if count > 1 and length < 3.2 * radius * count:  # around the middle where they have no room in a row
+    straight = float(np.hypot(x1 - x0, y1 - y0))
+    length = straight + 0.5 * (r0 + r1)
+    radius = min(0.45 * min(r0, r1), 0.26 * length / count) * g.uniform(0.85, 1.1)
+    if count > 1 and (straight == 0.0 or length < 3.2 * radius * count):  # around the middle without room in a row
         return tuple((0.55 * r0 * c, 0.55 * r0 * s, 0.3 * min(r0, r1)) for c, s in circle(count, 0.4))
+    ends = 0.25 * (r0 + r1) / max(straight, 1e-9)
     shares = np.linspace(-0.35 * ends, 1.0 + 0.35 * ends, count) if count > 1 else np.array([0.5])
     return tuple((float(x0 + t * (x1 - x0)), float(y0 + t * (y1 - y0)), float(radius)) for t in shares)
 
