@@ -329,6 +329,7 @@ def _twins(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[n
 def _seam(generator: Generator, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
     """Every face, or some, with vertices of their own."""
     own = generator.random(len(faces)) < generator.choice([0.02, 0.5, 1.0])
+    own &= ((faces >= 0) & (faces < len(vertices))).all(axis=1)  # before it, a fault may have named others
     corners = faces[own].ravel()
     new = faces.copy()
     new[own] = len(vertices) + np.arange(len(corners)).reshape(-1, 3)
