@@ -138,16 +138,20 @@ def test_without_classes_only_rankings(tmp_path: Path) -> None:
     seen = Elements(page_of(results, {}))
     (system,) = seen.data()["systems"]
     assert seen.data()["classes"] == []
-    assert [system[name] for name in ("scores", "curve", "confusion", "per_query")] == [None] * 4
+    assert [system[name] for name in ("scores", "curve", "confusion", "per_query", "worst")] == [None] * 5
     ids = {attributes.get("id") for _, attributes in seen.elements}
     assert {"shapes", "unused", "repaired"} <= ids
-    assert not {"scores", "confusion", "precision-recall"} & ids
+    assert not {"scores", "confusion", "precision-recall", "worst"} & ids
     assert sum(attributes.get("class") == "shape" for _, attributes in seen.elements) == len(NAMES)
 
 
-def test_classes_of_one_have_no_scores(tmp_path: Path) -> None:
-    results = read_results(retrieval_folder(tmp_path, labels=NAMES))
-    assert "scores" not in {attributes.get("id") for _, attributes in Elements(page_of(results, {})).elements}
+@pytest.mark.parametrize("kind", ["classes of one", "one class", "several"])
+def test_scores_and_confusions_need_classes(tmp_path: Path, kind: str) -> None:
+    labels = {"classes of one": NAMES, "one class": ("egg",) * len(NAMES), "several": LABELS}[kind]
+    results = read_results(retrieval_folder(tmp_path, labels=labels))
+    ids = {attributes.get("id") for _, attributes in Elements(page_of(results, {})).elements}
+    assert ("scores" in ids) == (kind != "classes of one")
+    assert ("worst" in ids) == (kind == "several")
 
 
 def test_a_comparison_has_all_descriptors(tmp_path: Path) -> None:

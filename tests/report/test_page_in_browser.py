@@ -23,6 +23,7 @@ from pages import (
     retrieval_folder,
     robustness_folder,
     surfaces,
+    worst_by_a_loop,
 )
 
 from conftest import as_mesh
@@ -304,6 +305,71 @@ def test_another_descriptor_ranks_otherwise(browser: Any, folder: Path) -> None:
         assert page.locator("#precision-recall .legend li").all_inner_texts() == list(DESCRIPTORS)
 
 
+def test_the_worst_confusions_follow_the_descriptor(browser: Any, folder: Path) -> None:
+    with Visit(browser, folder / "compare.html") as visit:
+        page = visit.page
+        for seed, name in enumerate(DESCRIPTORS):
+            page.locator("#system").select_option(str(seed))
+            assert page.locator("#worst-heading").inner_text() == f"Worst confusions, {name}"
+            n = len(NAMES) - seed
+            distances = distances_of(seed)[:n, :n]
+            expected = worst_by_a_loop(distances, LABELS[:n], NAMES[:n])
+            assert expected
+            rows = page.locator("#worst-list > li")
+            assert rows.count() == len(expected)
+            for row, one in zip(rows.all(), expected, strict=True):
+                query = one["query"]
+                order = sorted((j for j in range(n) if j != query), key=lambda j: distances[query, j])
+                wrong = [order[rank - 1] for rank in one["wrong"]]
+                assert row.locator(".name").all_inner_texts() == [NAMES[j] for j in (query, *wrong)]
+                assert row.locator(".name + .about").all_inner_texts() == [LABELS[j] for j in (query, *wrong)]
+                ranks = [text.split()[-1] for text in row.locator(".rank").all_inner_texts()]
+                assert ranks == [str(rank) for rank in one["wrong"]]
+                marks = [text.split() for text in row.locator(".mark").all_inner_texts()]
+                assert marks == [["✗", "another", "class"]] * len(wrong)
+                n_right = LABELS[:n].count(LABELS[query]) - 1
+                tier = sum(LABELS[j] == LABELS[query] for j in order[:n_right]) / n_right
+                told = f"First of the same class at rank {one['rank']} of {n - 1}. First tier: {100 * tier:.1f} %."
+                assert row.locator("p").inner_text() == told
+
+
+def test_a_worst_confusion_opens_its_rankings(retrieval: Visit) -> None:
+    """By click and by key; whoever closes the window is where they were, not on the wall."""
+    page = retrieval.page
+    expected = worst_by_a_loop(distances_of(0), LABELS, NAMES)[0]
+    pictures = page.locator("#worst-list > li").first.locator(".shape")
+    pictures.first.click()
+    retrieval.wait_until(lambda: retrieval.name() == NAMES[expected["query"]])
+    ranked = page.locator("#ranking-list .shape .name")
+    wrong = ranked.nth(expected["wrong"][0] - 1).inner_text()
+    assert pictures.nth(1).locator(".name").inner_text() == wrong
+    page.keyboard.press("Escape")
+    page.locator("dialog[open]").wait_for(state="detached")
+    retrieval.wait_until(lambda: pictures.first.evaluate("button => button === document.activeElement"))
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    retrieval.wait_until(lambda: retrieval.name() == wrong)
+    ranked.first.click()  # and on to another ranking within the window
+    retrieval.wait_until(lambda: retrieval.name() != wrong)
+    page.locator("#close").click()
+    retrieval.wait_until(lambda: pictures.nth(1).evaluate("button => button === document.activeElement"))
+    opened = retrieval.open(0)  # the wall has its own way back
+    opened.locator("#close").click()
+    retrieval.wait_until(
+        lambda: page.evaluate("document.activeElement === document.querySelector('#shapes [data-shape=\"0\"]')")
+    )
+
+
+def test_without_confusions_the_page_says_so(browser: Any, tmp_path: Path) -> None:
+    results = retrieval_folder(tmp_path)
+    right = np.array([[float(one != other) for other in LABELS] for one in LABELS])
+    np.savez_compressed(results / "distances.npz", distances=right, names=np.array(NAMES), labels=np.array(LABELS))
+    write_page(tmp_path / "right.html", read_results(results), {})
+    with Visit(browser, tmp_path / "right.html") as visit:
+        assert visit.page.locator("#worst-list").is_hidden()
+        assert "There are no confusions" in visit.page.locator("#worst").inner_text()
+
+
 def test_confusion_and_sorted_scores(retrieval: Visit) -> None:
     page = retrieval.page
     rows = page.locator("#confusion-table tbody tr")
@@ -357,6 +423,9 @@ def test_print_has_all_pictures_and_no_controls(retrieval: Visit) -> None:
     content = page.pdf()
     assert content.startswith(b"%PDF")
     assert page.locator("#shapes canvas.drawn").count() == len(NAMES) - 1
+    worst = page.locator(f'#worst-list canvas:not([data-shape="{len(NAMES) - 2}"])')
+    assert worst.count() > 0
+    assert page.locator("#worst-list canvas.drawn").count() == worst.count()
     page.emulate_media(media="print")
     assert page.locator("nav").is_hidden()
     assert page.locator("#search").is_hidden()
