@@ -7,6 +7,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -277,6 +278,20 @@ def test_all_by_keyboard(retrieval: Visit) -> None:
     retrieval.wait_until(lambda: page.evaluate("location.hash") == "")
 
 
+def test_a_shape_that_is_chosen_while_another_closes_is_opened(retrieval: Visit) -> None:
+    """The browser tells of the closing late, after the next shape was chosen."""
+    page = retrieval.page
+    for query, following in ((0, 3), (3, 1)):
+        retrieval.open(query)
+        page.evaluate(f"() => {{ document.getElementById('shape').close(); goTo({following}); }}")
+        retrieval.wait_until(partial(lambda name: retrieval.name() == name, NAMES[following]))
+        page.wait_for_timeout(300)
+        assert page.locator("dialog[open]").count() == 1
+        assert page.evaluate("location.hash") == f"#shape-{following}"
+        page.locator("#close").click()
+        retrieval.wait_until(lambda: page.evaluate("location.hash") == "")
+
+
 def test_a_link_leads_to_a_shape(browser: Any, folder: Path) -> None:
     with Visit(browser, folder / "retrieve.html") as visit:
         visit.page.goto(f"{visit.address}#shape-4")
@@ -345,7 +360,8 @@ def test_a_worst_confusion_opens_its_rankings(retrieval: Visit) -> None:
     assert pictures.nth(1).locator(".name").inner_text() == wrong
     page.keyboard.press("Escape")
     page.locator("dialog[open]").wait_for(state="detached")
-    retrieval.wait_until(lambda: pictures.first.evaluate("button => button === document.activeElement"))
+    retrieval.wait_until(lambda: page.evaluate("location.hash") == "")
+    assert pictures.first.evaluate("button => button === document.activeElement")
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     retrieval.wait_until(lambda: retrieval.name() == wrong)
@@ -361,13 +377,24 @@ def test_a_worst_confusion_opens_its_rankings(retrieval: Visit) -> None:
 
 
 def test_without_confusions_the_page_says_so(browser: Any, tmp_path: Path) -> None:
-    results = retrieval_folder(tmp_path)
+    """All right by the first descriptor, and the second describes one shape of each class."""
+    results = comparison_folder(tmp_path / "compare")
     right = np.array([[float(one != other) for other in LABELS] for one in LABELS])
-    np.savez_compressed(results / "distances.npz", distances=right, names=np.array(NAMES), labels=np.array(LABELS))
+    for name, some in zip(DESCRIPTORS, (list(range(len(NAMES))), [0, 3]), strict=True):
+        np.savez_compressed(
+            results / "distances" / f"{name}.npz",
+            distances=right[np.ix_(some, some)],
+            names=np.array(NAMES)[some],
+            labels=np.array(LABELS)[some],
+        )
     write_page(tmp_path / "right.html", read_results(results), {})
     with Visit(browser, tmp_path / "right.html") as visit:
-        assert visit.page.locator("#worst-list").is_hidden()
-        assert "There are no confusions" in visit.page.locator("#worst").inner_text()
+        worst = visit.page.locator("#worst")
+        assert "There are no confusions" in worst.inner_text()
+        assert worst.locator("#worst-list").is_hidden()
+        visit.page.locator("#system").select_option("1")
+        assert "gps describes no two shapes of one class" in worst.inner_text()
+        assert worst.locator("#worst-list").is_hidden()
 
 
 def test_confusion_and_sorted_scores(retrieval: Visit) -> None:
@@ -438,17 +465,24 @@ def test_print_has_all_pictures_and_no_controls(retrieval: Visit) -> None:
     assert page.locator("#facts").is_visible()
 
 
+@pytest.fixture
+def violations() -> Callable[[Any], list[dict[str, Any]]]:
+    """What axe-core finds wrong with a page."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+    return lambda page: list(axe.Axe().run(page).response["violations"])
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness"])
-def test_nothing_serious_for_accessibility(browser: Any, folder: Path, scheme: str, kind: str) -> None:
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+def test_nothing_serious_for_accessibility(
+    browser: Any, folder: Path, violations: Callable[[Any], list[dict[str, Any]]], scheme: str, kind: str
+) -> None:
     with Visit(browser, folder / f"{kind}.html", color_scheme=scheme) as visit:
 
         def serious() -> list[str]:
-            violations = axe.Axe().run(visit.page).response["violations"]
             return [
                 f"{one['id']}: {node['html']}: {node['failureSummary']}"
-                for one in violations
+                for one in violations(visit.page)
                 for node in one["nodes"]
                 if one["impact"] in ("serious", "critical")
             ]
@@ -462,13 +496,11 @@ def test_nothing_serious_for_accessibility(browser: Any, folder: Path, scheme: s
         assert serious() == []
 
 
-def test_the_checker_would_see_a_fault(retrieval: Visit) -> None:
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+def test_the_checker_would_see_a_fault(retrieval: Visit, violations: Callable[[Any], list[dict[str, Any]]]) -> None:
     retrieval.page.locator("#theme").evaluate(
         "button => { button.removeAttribute('aria-label'); button.textContent = ''; }"
     )
-    violations = axe.Axe().run(retrieval.page).response["violations"]
-    assert "button-name" in {one["id"] for one in violations}
+    assert "button-name" in {one["id"] for one in violations(retrieval.page)}
 
 
 def test_the_demo_ends_with_its_page(

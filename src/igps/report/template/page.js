@@ -152,6 +152,7 @@ function card(query, { shape, distance }, rank) {
   return element("li", {}, button);
 }
 
+// A query beside the wrong shapes that are too near to it.
 function confusion({ query, rank, wrong }) {
   const ranking = rankingOf(query);
   const one = systems[system];
@@ -255,6 +256,7 @@ dialog.addEventListener("keydown", (event) => {
   if (event.key === "ArrowRight") step(1);
 });
 dialog.addEventListener("close", () => {
+  if (dialog.open) return; // the browser tells of it late, when the next shape may be open already
   if (location.hash.startsWith("#shape-")) history.pushState(null, "", location.pathname + location.search);
   (opener ?? buttonOf.get(current))?.focus();
   opener = null;
