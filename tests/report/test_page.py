@@ -63,6 +63,12 @@ class Elements(HTMLParser):
         return json.loads(next(script for script in self.scripts if script.startswith('{"classes"')))
 
 
+@pytest.fixture
+def page(tmp_path: Path, blob: Mesh) -> str:
+    """A page of a labelled collection, with pictures."""
+    return page_of(read_results(retrieval_folder(tmp_path)), surfaces(blob))
+
+
 def test_rankings_and_scores_are_those_of_a_loop(tmp_path: Path) -> None:
     data = data_of(read_results(retrieval_folder(tmp_path)), {})
     assert data["classes"] == sorted(set(LABELS))
@@ -94,8 +100,7 @@ def test_rankings_and_scores_are_those_of_a_loop(tmp_path: Path) -> None:
     assert system["curve"][1] == pytest.approx(curve.precision.tolist(), abs=1e-5)
 
 
-def test_names_from_files_are_harmless_everywhere(tmp_path: Path, blob: Mesh) -> None:
-    page = page_of(read_results(retrieval_folder(tmp_path)), surfaces(blob))
+def test_names_from_files_are_harmless_everywhere(page: str) -> None:
     seen = Elements(page)
     tags = {tag for tag, _ in seen.elements}
     assert not {"img", "b", "i", "iframe"} & tags
@@ -108,8 +113,8 @@ def test_names_from_files_are_harmless_everywhere(tmp_path: Path, blob: Mesh) ->
     assert seen.data()["classes"] == sorted(set(LABELS))
 
 
-def test_nothing_is_loaded(tmp_path: Path, blob: Mesh) -> None:
-    seen = Elements(page_of(read_results(retrieval_folder(tmp_path)), surfaces(blob)))
+def test_nothing_is_loaded(page: str) -> None:
+    seen = Elements(page)
     links = [attributes.get(name) for _, attributes in seen.elements for name in ("src", "href", "action", "data")]
     assert {link for link in links if link} <= {"data:,"} | {link for link in links if link and link[0] == "#"}
     policy = next(attributes["content"] for _, attributes in seen.elements if "http-equiv" in attributes) or ""
