@@ -44,6 +44,13 @@ def options(out: Path, *more: object) -> list[object]:
     return ["--out", out, "--cache_dir", out.parent / "cache", "--n_workers", "1", *SMALL, *more]
 
 
+@pytest.fixture
+def retrieved(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Results without a page."""
+    igps(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(tmp_path / "out"))
+    return tmp_path / "out"
+
+
 def test_retrieve_with_its_page(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -61,9 +68,10 @@ def test_retrieve_with_its_page(
     assert not re.search(re.escape(str(tmp_path)), (out / "report.html").read_text("utf-8"))
 
 
-def test_a_page_afterwards_wherever_the_meshes_are(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out, page = tmp_path / "out", tmp_path / "pages" / "mine.html"
-    igps(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(out))
+def test_a_page_afterwards_wherever_the_meshes_are(
+    root: Path, retrieved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, page = retrieved, tmp_path / "pages" / "mine.html"
     assert not (out / "report.html").exists()
     assert not (out / "surfaces.npz").exists()
     moved = root.rename(tmp_path / "moved")
@@ -120,12 +128,10 @@ def test_what_is_missing_is_told_before_anything_is_computed(
 
 
 def test_sources_of_another_kind_are_refused(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    retrieved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "out"
-    igps(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(out))
     for wrong in ('{"format": "other"}', '{"format": "igps-meshes-1"}', "[]", "no JSON"):
-        (out / "meshes.json").write_text(wrong)
+        (retrieved / "meshes.json").write_text(wrong)
         with pytest.raises(SystemExit, match="1"):
-            igps(monkeypatch, "report", out)
+            igps(monkeypatch, "report", retrieved)
         assert "meshes.json: expected the format igps-meshes-1" in capsys.readouterr().err

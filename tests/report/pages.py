@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +35,26 @@ def distances_of(seed: int) -> np.ndarray:
     centres = {label: rng.uniform(0, 1.5, 3) for label in dict.fromkeys(LABELS)}
     points = np.array([centres[label] for label in LABELS]) + rng.normal(0, 0.4, (len(LABELS), 3))
     return np.linalg.norm(points[:, None] - points[None], axis=2).astype(np.float32)
+
+
+def worst_by_a_loop(distances: np.ndarray, labels: tuple[str, ...], names: tuple[str, ...]) -> list[dict[str, Any]]:
+    """The worst confusions from their definition: each query is looked at alone, walking down its ranking."""
+    found = []
+    for query, label in enumerate(labels):
+        others = sorted((j for j in range(len(labels)) if j != query), key=lambda j: (distances[query][j], j))
+        n_right = sum(labels[j] == label for j in others)
+        if n_right == 0:
+            continue
+        rank = 1
+        while labels[others[rank - 1]] != label:
+            rank += 1
+        tier = Fraction(sum(labels[j] == label for j in others[:n_right]), n_right)
+        if tier == 1:
+            continue
+        before = range(1, rank) if rank > 1 else range(1, n_right + 1)
+        wrong = [place for place in before if labels[others[place - 1]] != label]
+        found.append(((-rank, tier, names[query]), {"query": query, "rank": rank, "wrong": wrong[:3]}))
+    return [one for _, one in sorted(found, key=lambda pair: pair[0])][:20]
 
 
 def write_rows(path: Path, rows: list[tuple[str, ...]]) -> None:

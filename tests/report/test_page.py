@@ -63,6 +63,12 @@ class Elements(HTMLParser):
         return json.loads(next(script for script in self.scripts if script.startswith('{"classes"')))
 
 
+@pytest.fixture
+def page(tmp_path: Path, blob: Mesh) -> str:
+    """A page of a labelled collection, with pictures."""
+    return page_of(read_results(retrieval_folder(tmp_path)), surfaces(blob))
+
+
 def test_rankings_and_scores_are_those_of_a_loop(tmp_path: Path) -> None:
     data = data_of(read_results(retrieval_folder(tmp_path)), {})
     assert data["classes"] == sorted(set(LABELS))
@@ -94,8 +100,7 @@ def test_rankings_and_scores_are_those_of_a_loop(tmp_path: Path) -> None:
     assert system["curve"][1] == pytest.approx(curve.precision.tolist(), abs=1e-5)
 
 
-def test_names_from_files_are_harmless_everywhere(tmp_path: Path, blob: Mesh) -> None:
-    page = page_of(read_results(retrieval_folder(tmp_path)), surfaces(blob))
+def test_names_from_files_are_harmless_everywhere(page: str) -> None:
     seen = Elements(page)
     tags = {tag for tag, _ in seen.elements}
     assert not {"img", "b", "i", "iframe"} & tags
@@ -108,8 +113,8 @@ def test_names_from_files_are_harmless_everywhere(tmp_path: Path, blob: Mesh) ->
     assert seen.data()["classes"] == sorted(set(LABELS))
 
 
-def test_nothing_is_loaded(tmp_path: Path, blob: Mesh) -> None:
-    seen = Elements(page_of(read_results(retrieval_folder(tmp_path)), surfaces(blob)))
+def test_nothing_is_loaded(page: str) -> None:
+    seen = Elements(page)
     links = [attributes.get(name) for _, attributes in seen.elements for name in ("src", "href", "action", "data")]
     assert {link for link in links if link} <= {"data:,"} | {link for link in links if link and link[0] == "#"}
     policy = next(attributes["content"] for _, attributes in seen.elements if "http-equiv" in attributes) or ""
@@ -138,16 +143,20 @@ def test_without_classes_only_rankings(tmp_path: Path) -> None:
     seen = Elements(page_of(results, {}))
     (system,) = seen.data()["systems"]
     assert seen.data()["classes"] == []
-    assert [system[name] for name in ("scores", "curve", "confusion", "per_query")] == [None] * 4
+    assert [system[name] for name in ("scores", "curve", "confusion", "per_query", "worst")] == [None] * 5
     ids = {attributes.get("id") for _, attributes in seen.elements}
     assert {"shapes", "unused", "repaired"} <= ids
-    assert not {"scores", "confusion", "precision-recall"} & ids
+    assert not {"scores", "confusion", "precision-recall", "worst"} & ids
     assert sum(attributes.get("class") == "shape" for _, attributes in seen.elements) == len(NAMES)
 
 
-def test_classes_of_one_have_no_scores(tmp_path: Path) -> None:
-    results = read_results(retrieval_folder(tmp_path, labels=NAMES))
-    assert "scores" not in {attributes.get("id") for _, attributes in Elements(page_of(results, {})).elements}
+@pytest.mark.parametrize("kind", ["classes of one", "one class", "several"])
+def test_scores_and_confusions_need_classes(tmp_path: Path, kind: str) -> None:
+    labels = {"classes of one": NAMES, "one class": ("egg",) * len(NAMES), "several": LABELS}[kind]
+    results = read_results(retrieval_folder(tmp_path, labels=labels))
+    ids = {attributes.get("id") for _, attributes in Elements(page_of(results, {})).elements}
+    assert ("scores" in ids) == (kind != "classes of one")
+    assert ("worst" in ids) == (kind == "several")
 
 
 def test_a_comparison_has_all_descriptors(tmp_path: Path) -> None:

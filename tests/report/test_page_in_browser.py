@@ -7,6 +7,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from pages import (
     retrieval_folder,
     robustness_folder,
     surfaces,
+    worst_by_a_loop,
 )
 
 from conftest import as_mesh
@@ -276,6 +278,20 @@ def test_all_by_keyboard(retrieval: Visit) -> None:
     retrieval.wait_until(lambda: page.evaluate("location.hash") == "")
 
 
+def test_a_shape_that_is_chosen_while_another_closes_is_opened(retrieval: Visit) -> None:
+    """The browser tells of the closing late, after the next shape was chosen."""
+    page = retrieval.page
+    for query, following in ((0, 3), (3, 1)):
+        retrieval.open(query)
+        page.evaluate(f"() => {{ document.getElementById('shape').close(); goTo({following}); }}")
+        retrieval.wait_until(partial(lambda name: retrieval.name() == name, NAMES[following]))
+        page.wait_for_timeout(300)
+        assert page.locator("dialog[open]").count() == 1
+        assert page.evaluate("location.hash") == f"#shape-{following}"
+        page.locator("#close").click()
+        retrieval.wait_until(lambda: page.evaluate("location.hash") == "")
+
+
 def test_a_link_leads_to_a_shape(browser: Any, folder: Path) -> None:
     with Visit(browser, folder / "retrieve.html") as visit:
         visit.page.goto(f"{visit.address}#shape-4")
@@ -302,6 +318,83 @@ def test_another_descriptor_ranks_otherwise(browser: Any, folder: Path) -> None:
         assert "could not describe" in visit.open(len(NAMES) - 1).inner_text()
         page.locator("#close").click()
         assert page.locator("#precision-recall .legend li").all_inner_texts() == list(DESCRIPTORS)
+
+
+def test_the_worst_confusions_follow_the_descriptor(browser: Any, folder: Path) -> None:
+    with Visit(browser, folder / "compare.html") as visit:
+        page = visit.page
+        for seed, name in enumerate(DESCRIPTORS):
+            page.locator("#system").select_option(str(seed))
+            assert page.locator("#worst-heading").inner_text() == f"Worst confusions, {name}"
+            n = len(NAMES) - seed
+            distances = distances_of(seed)[:n, :n]
+            expected = worst_by_a_loop(distances, LABELS[:n], NAMES[:n])
+            assert expected
+            rows = page.locator("#worst-list > li")
+            assert rows.count() == len(expected)
+            for row, one in zip(rows.all(), expected, strict=True):
+                query = one["query"]
+                order = sorted((j for j in range(n) if j != query), key=lambda j: distances[query, j])
+                wrong = [order[rank - 1] for rank in one["wrong"]]
+                assert row.locator(".name").all_inner_texts() == [NAMES[j] for j in (query, *wrong)]
+                assert row.locator(".name + .about").all_inner_texts() == [LABELS[j] for j in (query, *wrong)]
+                ranks = [text.split()[-1] for text in row.locator(".rank").all_inner_texts()]
+                assert ranks == [str(rank) for rank in one["wrong"]]
+                marks = [text.split() for text in row.locator(".mark").all_inner_texts()]
+                assert marks == [["✗", "another", "class"]] * len(wrong)
+                n_right = LABELS[:n].count(LABELS[query]) - 1
+                tier = sum(LABELS[j] == LABELS[query] for j in order[:n_right]) / n_right
+                told = f"First of the same class at rank {one['rank']} of {n - 1}. First tier: {100 * tier:.1f} %."
+                assert row.locator("p").inner_text() == told
+
+
+def test_a_worst_confusion_opens_its_rankings(retrieval: Visit) -> None:
+    """By click and by key; whoever closes the window is where they were, not on the wall."""
+    page = retrieval.page
+    expected = worst_by_a_loop(distances_of(0), LABELS, NAMES)[0]
+    pictures = page.locator("#worst-list > li").first.locator(".shape")
+    pictures.first.click()
+    retrieval.wait_until(lambda: retrieval.name() == NAMES[expected["query"]])
+    ranked = page.locator("#ranking-list .shape .name")
+    wrong = ranked.nth(expected["wrong"][0] - 1).inner_text()
+    assert pictures.nth(1).locator(".name").inner_text() == wrong
+    page.keyboard.press("Escape")
+    page.locator("dialog[open]").wait_for(state="detached")
+    retrieval.wait_until(lambda: page.evaluate("location.hash") == "")
+    assert pictures.first.evaluate("button => button === document.activeElement")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    retrieval.wait_until(lambda: retrieval.name() == wrong)
+    ranked.first.click()  # and on to another ranking within the window
+    retrieval.wait_until(lambda: retrieval.name() != wrong)
+    page.locator("#close").click()
+    retrieval.wait_until(lambda: pictures.nth(1).evaluate("button => button === document.activeElement"))
+    opened = retrieval.open(0)  # the wall has its own way back
+    opened.locator("#close").click()
+    retrieval.wait_until(
+        lambda: page.evaluate("document.activeElement === document.querySelector('#shapes [data-shape=\"0\"]')")
+    )
+
+
+def test_without_confusions_the_page_says_so(browser: Any, tmp_path: Path) -> None:
+    """All right by the first descriptor, and the second describes one shape of each class."""
+    results = comparison_folder(tmp_path / "compare")
+    right = np.array([[float(one != other) for other in LABELS] for one in LABELS])
+    for name, some in zip(DESCRIPTORS, (list(range(len(NAMES))), [0, 3]), strict=True):
+        np.savez_compressed(
+            results / "distances" / f"{name}.npz",
+            distances=right[np.ix_(some, some)],
+            names=np.array(NAMES)[some],
+            labels=np.array(LABELS)[some],
+        )
+    write_page(tmp_path / "right.html", read_results(results), {})
+    with Visit(browser, tmp_path / "right.html") as visit:
+        worst = visit.page.locator("#worst")
+        assert "There are no confusions" in worst.inner_text()
+        assert worst.locator("#worst-list").is_hidden()
+        visit.page.locator("#system").select_option("1")
+        assert "gps describes no two shapes of one class" in worst.inner_text()
+        assert worst.locator("#worst-list").is_hidden()
 
 
 def test_confusion_and_sorted_scores(retrieval: Visit) -> None:
@@ -357,6 +450,9 @@ def test_print_has_all_pictures_and_no_controls(retrieval: Visit) -> None:
     content = page.pdf()
     assert content.startswith(b"%PDF")
     assert page.locator("#shapes canvas.drawn").count() == len(NAMES) - 1
+    worst = page.locator(f'#worst-list canvas:not([data-shape="{len(NAMES) - 2}"])')
+    assert worst.count() > 0
+    assert page.locator("#worst-list canvas.drawn").count() == worst.count()
     page.emulate_media(media="print")
     assert page.locator("nav").is_hidden()
     assert page.locator("#search").is_hidden()
@@ -369,17 +465,24 @@ def test_print_has_all_pictures_and_no_controls(retrieval: Visit) -> None:
     assert page.locator("#facts").is_visible()
 
 
+@pytest.fixture
+def violations() -> Callable[[Any], list[dict[str, Any]]]:
+    """What axe-core finds wrong with a page."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+    return lambda page: list(axe.Axe().run(page).response["violations"])
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness"])
-def test_nothing_serious_for_accessibility(browser: Any, folder: Path, scheme: str, kind: str) -> None:
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+def test_nothing_serious_for_accessibility(
+    browser: Any, folder: Path, violations: Callable[[Any], list[dict[str, Any]]], scheme: str, kind: str
+) -> None:
     with Visit(browser, folder / f"{kind}.html", color_scheme=scheme) as visit:
 
         def serious() -> list[str]:
-            violations = axe.Axe().run(visit.page).response["violations"]
             return [
                 f"{one['id']}: {node['html']}: {node['failureSummary']}"
-                for one in violations
+                for one in violations(visit.page)
                 for node in one["nodes"]
                 if one["impact"] in ("serious", "critical")
             ]
@@ -393,13 +496,11 @@ def test_nothing_serious_for_accessibility(browser: Any, folder: Path, scheme: s
         assert serious() == []
 
 
-def test_the_checker_would_see_a_fault(retrieval: Visit) -> None:
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+def test_the_checker_would_see_a_fault(retrieval: Visit, violations: Callable[[Any], list[dict[str, Any]]]) -> None:
     retrieval.page.locator("#theme").evaluate(
         "button => { button.removeAttribute('aria-label'); button.textContent = ''; }"
     )
-    violations = axe.Axe().run(retrieval.page).response["violations"]
-    assert "button-name" in {one["id"] for one in violations}
+    assert "button-name" in {one["id"] for one in violations(retrieval.page)}
 
 
 def test_the_demo_ends_with_its_page(

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from igps.geometry.disturbances import DISTURBANCES
+from igps.report.confusions import N_WORST
 from igps.report.page_data import data_of, letters
 from igps.report.results import Results
 from igps.report.surfaces import Surface
@@ -86,6 +87,7 @@ def page_of(results: Results, surfaces: Mapping[str, Surface]) -> str:
         titles=TITLES,
         meanings=MEANINGS,
         curves=[_drawn(i, system) for i, system in enumerate(data["systems"]) if system["curve"]],
+        n_worst=N_WORST,
         plot=(_PLOT_WIDTH, _PLOT_HEIGHT),
         config=_flat(results.config),
         disturbances={name: one.description for name, one in DISTURBANCES.items()},

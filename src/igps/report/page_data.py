@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.report.confusions import worst_confusions
 from igps.report.results import Results, System
 from igps.report.surfaces import Surface
 from igps.retrieval import RetrievalScores
@@ -65,7 +66,8 @@ def _shapes(results: Results, surfaces: Mapping[str, Surface], classes: Sequence
 
 def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str], n_ranked: int) -> dict[str, Any]:
     """Of a descriptor: `shapes` it describes as numbers among all; for each of them the nearest others, uint32 (N, top)
-    `ranked` and float32 (N, top) `distances`; mean scores, those of each class and each query; confusion, curve."""
+    `ranked` and float32 (N, top) `distances`; mean scores, those of each class and each query; confusion, curve; the
+    `worst` confusions, see `_worst`."""
     order = system.ranked()
     near = order[:, :n_ranked]
     places = np.array([index[name] for name in system.names])
@@ -83,6 +85,7 @@ def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str],
         "per_query": None if scores is None else _per_query(scores),
         "curve": None if curve is None else [_numbers(curve.recall.tolist()), _numbers(curve.precision.tolist())],
         "confusion": None if system.labels is None else _confusion(order, system.labels, classes),
+        "worst": None if scores is None else _worst(system, order, scores, places),
     }
 
 
@@ -109,6 +112,14 @@ def _confusion(
     rows, columns = np.nonzero(np.arange(order.shape[1]) < sizes[:, None])
     np.add.at(tier, (codes[rows], codes[order[rows, columns]]), 1)
     return {"nearest": nearest.tolist(), "tier": tier.tolist()}
+
+
+def _worst(
+    system: System, order: NDArray[np.int64], scores: RetrievalScores, places: NDArray[np.int64]
+) -> list[dict[str, Any]]:
+    """The worst first: `query`, its number among all shapes; `rank` of its first right one; ranks of `wrong` ones."""
+    found = worst_confusions(order, system.labels or (), system.names, scores.ft.numpy())
+    return [{"query": int(places[one.query]), "rank": one.rank, "wrong": list(one.wrong)} for one in found]
 
 
 def _rounded(values: Mapping[str, float]) -> dict[str, float | None]:

@@ -11,6 +11,7 @@ const dialog = byId("shape");
 let turntable = null; // made when the first body is opened
 let system = 0;
 let current = null; // the shape in the window
+let opener = null; // the picture that opened the window, if it is not on the wall
 
 for (const one of systems) {
   one.row = new Map(one.shapes.map((shape, row) => [shape, row]));
@@ -65,6 +66,7 @@ function chooseSystem(chosen) {
   }
   if (byId("class-scores")) showClassScores(byId("class-scores"), classes, shapes, one?.per_class ?? []);
   showChosenConfusion();
+  showWorst();
   filter();
 }
 
@@ -122,24 +124,59 @@ function factsOf(shape) {
   return facts;
 }
 
-function card(query, { shape, distance }, rank) {
-  const isRight = classes.length ? shapes[shape].label === shapes[query].label : null;
-  const mark = element("span", { class: "mark" });
-  setMark(mark, isRight, ["same class", "another class"]);
+// A picture with name and class, which opens the shape.
+function picture(shape) {
   const canvas = element("canvas", { "data-shape": shape, width: 1, height: 1, "aria-hidden": "true" });
   const button = element(
     "button",
     { type: "button", class: "shape", "data-shape": shape, title: shapes[shape].name },
-    element("span", { class: "rank" }, element("span", { class: "unseen" }, "rank "), String(rank)),
     canvas,
     element("span", { class: "name" }, shapes[shape].name),
     element("span", { class: "about" }, classes[shapes[shape].label] ?? ""),
+  );
+  pictures.watch(canvas);
+  return button;
+}
+
+function card(query, { shape, distance }, rank) {
+  const isRight = classes.length ? shapes[shape].label === shapes[query].label : null;
+  const mark = element("span", { class: "mark" });
+  setMark(mark, isRight, ["same class", "another class"]);
+  const button = picture(shape);
+  button.prepend(element("span", { class: "rank" }, element("span", { class: "unseen" }, "rank "), String(rank)));
+  button.append(
     element("span", { class: "about" }, element("span", { class: "unseen" }, "distance "), distance.toPrecision(3)),
     mark,
   );
   setKind(button, isRight);
-  pictures.watch(canvas);
   return element("li", {}, button);
+}
+
+// A query beside the wrong shapes that are too near to it.
+function confusion({ query, rank, wrong }) {
+  const ranking = rankingOf(query);
+  const one = systems[system];
+  const button = picture(query);
+  button.append(element("span", { class: "about" }, "query"));
+  const tier = percent(one.per_query.ft[one.row.get(query)]);
+  return element(
+    "li",
+    {},
+    button,
+    element("ol", { class: "wall" }, ...wrong.map((place) => card(query, ranking[place - 1], place))),
+    element("p", {}, `First of the same class at rank ${rank} of ${one.shapes.length - 1}. First tier: ${tier} %.`),
+  );
+}
+
+function showWorst() {
+  if (!byId("worst")) return;
+  const worst = systems[system].worst;
+  byId("worst-list").replaceChildren(...(worst ?? []).map(confusion));
+  byId("worst-some").hidden = !worst?.length;
+  byId("worst-none").hidden = Boolean(worst?.length);
+  byId("worst-none").textContent = worst
+    ? "There are no confusions: every shape finds all others of its class first."
+    : `${systems[system].name} describes no two shapes of one class.`;
 }
 
 function openShape(shape) {
@@ -203,7 +240,9 @@ byId("system")?.addEventListener("change", (event) => chooseSystem(Number(event.
 byId("confusion-of")?.addEventListener("change", showChosenConfusion);
 document.addEventListener("click", (event) => {
   const button = event.target.closest("button.shape");
-  if (button) goTo(Number(button.dataset.shape));
+  if (!button) return;
+  if (!dialog.open) opener = buttonOf.get(Number(button.dataset.shape)) === button ? null : button;
+  goTo(Number(button.dataset.shape));
 });
 byId("previous").addEventListener("click", () => step(-1));
 byId("next").addEventListener("click", () => step(1));
@@ -217,8 +256,10 @@ dialog.addEventListener("keydown", (event) => {
   if (event.key === "ArrowRight") step(1);
 });
 dialog.addEventListener("close", () => {
+  if (dialog.open) return; // the browser tells of it late, when the next shape may be open already
   if (location.hash.startsWith("#shape-")) history.pushState(null, "", location.pathname + location.search);
-  buttonOf.get(current)?.focus();
+  (opener ?? buttonOf.get(current))?.focus();
+  opener = null;
 });
 window.addEventListener("hashchange", followAddress);
 window.addEventListener("popstate", followAddress);
