@@ -1,16 +1,15 @@
-"""Measure what the distances of `pretrained` mean, on generated classes that it was not fitted to.
+"""Measure what the distances of `pretrained` mean, on generated bodies that it was not fitted to.
 
-    python training/calibrate.py --root build/pretrain
+    python training/calibrate.py
 
 makes the calibration that the package ships: how far apart copies of a body are (other triangles, half of them, scaled,
 mirrored and turned, another file format, and all of that), poses of a body, bodies of a class, and classes; and from
-which distance on two files are not the same. The classes are those that pretrain.py held out.
+which distance on two files are not the same. The bodies are those of another seed than pretrain.py's.
 """
 
 from __future__ import annotations
 
 import math
-import random
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,20 +30,18 @@ from igps.geometry.mesh import Mesh
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 from igps.parallel import on_threads
-from igps.shapes import body_of
+from igps.shapes import GradedShapes, body_of
 from igps.shapes.kinds import body_classes
 
 SUFFIXES = {"triangles": ".off", "half": ".off", "motion": ".ply", "format": ".stl", "all": ".obj"}
 
 
 def calibrate(
-    root: Path = Path("build/pretrain"),
+    root: Path = Path("build/calibration"),
     copies: Path = Path("build/copies"),
-    n_classes: int = 240,
-    n_held_out: int = 40,
-    seed: int = 0,
-    n_measured: int | None = None,
-    n_bodies: int = 2,
+    n_classes: int = 40,
+    seed: int = 1,
+    n_copied: int = 2,
     rate: float = 0.001,
     pose_rate: float = 0.01,
     model: Path = PRETRAINED,
@@ -55,11 +52,10 @@ def calibrate(
     """Make copies, measure all pairs, save the calibration, and print it.
 
     Args:
-        root: folder of the meshes that pretrain.py generated.
+        root: folder of the generated meshes.
         copies: folder of the copies that are made of them; those that are there stay.
-        n_classes, n_held_out, seed: as of pretrain.py.
-        n_measured: of the held-out classes, to measure on; all if not given.
-        n_bodies: of each class, to copy.
+        n_classes, seed: of `GradedShapes`, four bodies of a class and four poses of a body.
+        n_copied: bodies of each class to copy.
         rate: of false pairs among poses of bending bodies and bodies of one class, at most.
         pose_rate: of false pairs among bodies of one class where poses are the same, at most.
         model: the parameters of `pretrained`.
@@ -68,12 +64,12 @@ def calibrate(
         n_workers: processes; all cores if not given.
     """
     descriptor = pretrained(model)
-    shapes = _held_out(root, descriptor, n_held_out, seed, n_measured, cache_dir, n_workers)
+    shapes = _generated(root, descriptor, n_classes, seed, cache_dir, n_workers)
     bodies = np.array([body_of(name) for name in shapes.files.names])
     classes = np.array(shapes.files.labels)
     is_rigid = np.isin(classes, _rigid_classes(seed))
 
-    made = _copies(shapes, copies, n_bodies, seed)
+    made = _copies(shapes, copies, n_copied, seed)
     copied = igps.SignatureDataset([path for _, _, path in made], shapes.config, cache_dir)
     failures = copied.precompute(n_workers=n_workers)
     for failure in failures:
@@ -129,22 +125,16 @@ def _rigid_classes(seed: int) -> list[str]:
     ]
 
 
-def _held_out(
-    root: Path,
-    descriptor: Descriptor,
-    n: int,
-    seed: int,
-    n_measured: int | None,
-    cache_dir: Path | None,
-    n_workers: int | None,
+def _generated(
+    root: Path, descriptor: Descriptor, n_classes: int, seed: int, cache_dir: Path | None, n_workers: int | None
 ) -> igps.SignatureDataset:
-    """The shapes of the classes that pretrain.py held out, or of some of them."""
+    """The shapes, those that are not there yet written first."""
+    try:
+        GradedShapes(n_classes, 4, 4, seed).write(root, progress=True, n_workers=n_workers)
+    except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
+        print(error)
     shapes = igps.SignatureDataset(root, descriptor.needs.completed(igps.SignatureConfig()), cache_dir)
-    # As pretrain.py draws them; with as many as it found, which is nearly all.
-    numbers = random.Random(seed).sample(range(len(shapes.classes)), n)[:n_measured]
-    chosen = {shapes.classes[number] for number in numbers}
-    some = shapes.subset([i for i, label in enumerate(shapes.files.labels or ()) if label in chosen])
-    return some.usable(some.precompute(n_workers=n_workers))
+    return shapes.usable(shapes.precompute(n_workers=n_workers))
 
 
 def _copies(shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: int) -> list[tuple[int, str, Path]]:

@@ -3,15 +3,16 @@
     python training/pretrain.py --config configs/pretrain.yaml
     python training/pretrain.py --config configs/pretrain.yaml --data DATA
 
-The first makes the file that the package ships; its only check is on held-out generated classes, beside the plain
-descriptors. The second scores that metric on a labelled collection too, by the number of generated classes it is fitted
-to and with a few labels of it.
+The first makes the file that the package ships; its only check is on held-out families of generated classes, beside the
+plain descriptors. The second scores that metric on a labelled collection too, by the number of generated classes it is
+fitted to and with a few labels of it.
 """
 
 from __future__ import annotations
 
 import random
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -24,8 +25,11 @@ from igps.geometry.reading import MeshReading
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.nn.levels import TwoLevelHead
-from igps.shapes import GradedShapes, body_of, looks_alike
+from igps.shapes import GradedShapes, body_of, family_of, looks_alike
 from transfer import curve, few_labels, report, two_level_scores
+
+# Of two classes each part has a single direction, and its vectors are signs, which may cancel.
+_FEWEST = 3
 
 
 def pretrain(
@@ -33,7 +37,8 @@ def pretrain(
     n_classes: int = 240,
     n_bodies: int = 4,
     n_poses: int = 4,
-    n_held_out: int = 40,
+    n_parts: int = 3,
+    n_scored: int = 12,
     seed: int = 0,
     out: Path = PRETRAINED,
     cache_dir: Path | None = None,
@@ -42,15 +47,17 @@ def pretrain(
     figures: Path = Path("build"),
     n_workers: int | None = None,
 ) -> None:
-    """Generate shapes, fit the metric, save it, and print its scores.
+    """Generate shapes, check the metric on families that it was not fitted to, fit it to all, and save it.
 
     Args:
         root: folder of the generated meshes.
         n_classes, n_bodies, n_poses, seed: of `GradedShapes`.
-        n_held_out: classes to check on, drawn by the seed.
+        n_parts: into how many parts the families are dealt, by the seed. A class of a family that was fitted to is much
+            easier to tell than what a user has, so that whole families are held out.
+        n_scored: classes of each part to score, drawn by the seed.
         out: the file of parameters.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
-        plain: descriptors to score on the held-out classes beside the metric.
+        plain: descriptors to score on the same classes beside the metric.
         data: a labelled collection to measure the transfer on.
         figures: folder of pretrain.png, FT on `data` against the number of generated classes.
         n_workers: processes; all cores if not given.
@@ -65,45 +72,60 @@ def pretrain(
     generated = _usable(root, descriptor, cache_dir, n_workers)
     histograms, labels = describe(generated, descriptor, progress=True, n_workers=n_workers), generated.labels
     bodies = _numbers([body_of(name) for name in generated.files.names])
-    present = labels.unique().tolist()  # nearly all: see above
-    held_out = torch.isin(labels, torch.tensor(_drawn(present, n_held_out, seed)))
+    parts = _dealt([family_of(name) for name in generated.classes], n_parts, seed)
 
-    def fit(n: int, seed: int, among: Tensor = ~held_out) -> TwoLevelHead:
+    def fit(n: int, seed: int, among: Tensor) -> TwoLevelHead:
         """The metric, of n classes drawn by the seed."""
-        chosen = among & torch.isin(labels, torch.tensor(_drawn(labels[among].unique().tolist(), n, seed)))
+        chosen = torch.isin(labels, torch.tensor(_drawn(among.tolist(), n, seed)))
         return two_levels().fit(histograms[chosen], labels[chosen], descriptor.part_cells, bodies=bodies[chosen])
 
-    n_fitted = len(present) - n_held_out
-    head = fit(n_fitted, seed)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    save_pretrained(EmbeddedDescriptor(descriptor, head), out)
+    scored = [torch.isin(labels, torch.tensor(_drawn(part.tolist(), n_scored, seed))) for part in parts]
+    others = [torch.cat([*parts[:i], *parts[i + 1 :]]) for i in range(n_parts)]
 
-    where = torch.nonzero(held_out).flatten().tolist()
-    print(f"{n_held_out} held-out generated classes, {len(where)} shapes, by the labels of bodies and of classes:")
-    two_level_scores("pretrained", _distances(head, histograms[where]), labels[where], bodies[where])
+    def score(name: str, distances: Sequence[Tensor]) -> None:
+        two_level_scores(
+            name, [(d, labels[chosen], bodies[chosen]) for d, chosen in zip(distances, scored, strict=True)]
+        )
+
+    print(f"{n_parts} parts of the families, each scored by a metric that was fitted to the others:")
+    alike = torch.tensor([looks_alike(name) for name in generated.classes])
+    strangers = [among[~alike[among]] for among in others]
+    ways = [("pretrained", others, others)]
+    if min(len(among) for among in strangers) >= _FEWEST:
+        ways += [("without look-alikes", strangers, strangers), ("as many, with them", others, strangers)]
+    for name, among, like in ways:
+        heads = [fit(len(other), seed, one) for one, other in zip(among, like, strict=True)]
+        score(name, [_distances(head, histograms[where]) for head, where in zip(heads, scored, strict=True)])
     for name in plain:
         other = igps.descriptor(name)
-        some = _usable(root, other, cache_dir, n_workers, where)
-        described = describe(some, other, n_workers=n_workers)
-        two_level_scores(name, other.distances(described, described), labels[where], bodies[where])
-    alike = torch.tensor([looks_alike(name) for name in generated.classes])
-    strangers = ~held_out & ~alike[labels]
-    n_strangers = len(labels[strangers].unique())
-    both = (("without look-alikes", strangers), ("as many, with them", ~held_out)) if n_strangers > 1 else ()
-    for name, among in both:
-        fitted = fit(n_strangers, seed, among)
-        title = f"{name} ({n_strangers})"
-        two_level_scores(title, _distances(fitted, histograms[where]), labels[where], bodies[where])
+        described = [
+            describe(
+                _usable(root, other, cache_dir, n_workers, torch.nonzero(where).flatten().tolist()),
+                other,
+                n_workers=n_workers,
+            )
+            for where in scored
+        ]
+        score(name, [other.distances(one, one) for one in described])
+
+    everything = torch.arange(len(generated.classes))
+    head = fit(len(everything), seed, everything)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_pretrained(EmbeddedDescriptor(descriptor, head), out)
+    print(f"fitted to all {len(everything)} classes: {out}")
     if data is None:
         return
 
     real = _usable(data, descriptor, cache_dir, n_workers)
     found, classes = describe(real, descriptor, progress=True, n_workers=n_workers), real.labels
     report(str(data), found, classes, head)
+    unlike = everything[~alike]
+    both = (("without look-alikes", unlike), ("of all kinds", everything)) if len(unlike) >= _FEWEST else ()
     for name, among in both:
-        report(f"{data}, fitted to {n_strangers} classes, {name}", found, classes, fit(n_strangers, seed, among))
-    counts = [n for n in (10, 30, 100) if n < n_fitted] + [n_fitted]
-    curve(fit, counts, found, classes, figures / "pretrain.png")
+        title = f"{data}, fitted to {len(unlike)} classes {name}"
+        report(title, found, classes, fit(len(unlike), seed, among))
+    counts = [n for n in (10, 30, 100) if n < len(everything)] + [len(everything)]
+    curve(partial(fit, among=everything), counts, found, classes, figures / "pretrain.png")
     # Two of each class are left to find each other.
     for n in (n for n in (1, 3, 5) if n + 2 <= int(classes.bincount().min())):
         few_labels(n, found, classes, head, descriptor.part_cells)
@@ -123,8 +145,17 @@ def _usable(
     return data.usable(failures)
 
 
+def _dealt(families: Sequence[str], n_parts: int, seed: int) -> list[Tensor]:
+    """Numbers of the classes in each part, whole families at a time."""
+    names = sorted(set(families))
+    random.Random(seed).shuffle(names)
+    return [
+        torch.tensor([i for i, family in enumerate(families) if family in names[k::n_parts]]) for k in range(n_parts)
+    ]
+
+
 def _drawn(classes: Sequence[int], n: int, seed: int) -> list[int]:
-    return random.Random(seed).sample(sorted(classes), n)
+    return random.Random(seed).sample(sorted(classes), min(n, len(classes)))
 
 
 def _numbers(names: Sequence[str]) -> Tensor:

@@ -71,10 +71,15 @@ def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: Head, par
     print(f"{n} labels a class: {rows}")
 
 
-def two_level_scores(name: str, distances: Tensor, labels: Tensor, bodies: Tensor) -> None:
-    """Print the scores by the labels of bodies, and by those of classes."""
+def two_level_scores(name: str, parts: Sequence[tuple[Tensor, Tensor, Tensor]]) -> None:
+    """Print the mean scores of parts, each its distances, classes and bodies: by the bodies, and by the classes.
+
+    Beside the first tier stands how far the parts differ, as a standard deviation.
+    """
     rows = []
-    for level, of_level in (("body", bodies), ("class", labels)):
-        found = retrieval_scores(distances, of_level).mean()
-        rows.append(f"{level} " + " ".join(f"{key.upper()} {100 * found[key]:.1f}" for key in ("nn", "ft", "dcg")))
+    for level, place in (("body", 2), ("class", 1)):
+        found = [retrieval_scores(part[0], part[place]).mean() for part in parts]
+        words = [f"{key.upper()} {100 * mean(one[key] for one in found):.1f}" for key in ("nn", "ft", "dcg")]
+        words[1] += f" ± {100 * stdev(one['ft'] for one in found):.1f}"
+        rows.append(f"{level} " + " ".join(words))
     print(f"{name:<28}" + " | ".join(rows), flush=True)

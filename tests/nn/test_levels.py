@@ -83,7 +83,7 @@ def test_the_distance_is_the_cosine_of_the_classes_and_a_kernel_of_the_bodies(
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
     x, y = of_classes(histograms).double(), of_bodies(histograms).double()
     torch.testing.assert_close((vectors @ vectors.T).double(), 0.7 * x @ x.T + 0.3 * y @ y.T, atol=1e-5, rtol=0)
-    kernel = torch.exp(-torch.cdist(y, y, compute_mode="donot_use_mm_for_euclid_dist") / 0.4)
+    kernel = torch.exp(-torch.cdist(y, y, compute_mode="donot_use_mm_for_euclid_dist").square() / 0.4**2)
     expected = (1 - x @ x.T + 0.7 * (1 - kernel)) / 1.7
     torch.testing.assert_close(head.distances(vectors, vectors).double(), expected, atol=2e-3, rtol=0)
     assert kernel.min() < 0.1  # nor is it 1 throughout
@@ -143,9 +143,9 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
         LevelHead().fit(histograms, torch.arange(len(histograms)))
     with pytest.raises(RuntimeError, match="expected to be fitted first"):
         LevelHead()(histograms)
-    with pytest.raises(ValueError, match=r"reach, weight, share: .* got 0.0, 1.0 and 0.05"):
+    with pytest.raises(ValueError, match=r"reach, weight, share: .* got 0.0, 1.0 and 0.1"):
         TwoLevelHead(reach=0.0)
-    with pytest.raises(ValueError, match=r"one between 0 and 1, got 0.1, 1.0 and 1"):
+    with pytest.raises(ValueError, match=r"one between 0 and 1, got 0.15, 1.0 and 1"):
         TwoLevelHead(share=1)
     fitted = LevelHead().fit(histograms, classes)
     with pytest.raises(ValueError, match="expected 40 cells as in training, got 39"):

@@ -179,8 +179,9 @@ def test_ablation_prints_every_head_of_every_layout(root: Path) -> None:
 
 def test_pretraining_saves_a_metric_and_measures_it(root: Path, tmp_path: Path) -> None:
     out = run(
-        "pretrain.py", "--root", tmp_path / "generated", "--n_classes", 20, "--n_bodies", 2, "--n_poses", 2,
-        "--n_held_out", 4, "--cache_dir", root / "cache", "--data", root / "meshes", "--plain", '["interior"]',
+        "pretrain.py", "--root", tmp_path / "generated", "--n_classes", 27, "--n_bodies", 2, "--n_poses", 2,
+        "--n_parts", 2, "--n_scored", 4, "--cache_dir", root / "cache", "--data", root / "meshes",
+        "--plain", '["interior"]',
         "--out", tmp_path / "metric.safetensors", "--figures", tmp_path / "figures",
     )  # fmt: skip
     vectors = igps.describe(
@@ -189,9 +190,9 @@ def test_pretraining_saves_a_metric_and_measures_it(root: Path, tmp_path: Path) 
     )
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-4, rtol=0)
     assert (tmp_path / "figures" / "pretrain.png").stat().st_size > 5_000
-    assert "4 held-out generated classes" in out
-    assert re.search(r"interior +body NN \d+\.\d FT \d+\.\d", out)
-    assert "without look-alikes" in out
-    assert "  16 generated classes: FT" in out
+    assert "2 parts of the families" in out
+    assert re.search(r"interior +body NN \d+\.\d FT \d+\.\d ± \d+\.\d", out)
+    assert out.count("without look-alikes") == 2
+    assert "  27 generated classes: FT" in out
     assert "1 labels a class" in out
     assert "5 labels a class" not in out  # a single shape of each class would be left to score

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from igps.nn.heads import SizedByData, check_cells, checked_labels, means_of, square_roots
-from igps.retrieval.distances import cosine, euclidean
+from igps.retrieval.distances import cosine
 
 # Of a part so many principal directions are whitened; what is beyond them is discretisation
 _PRINCIPAL = 500
@@ -123,10 +123,11 @@ class TwoLevelHead(nn.Module):
     """Descriptions to unit vectors, and a distance of them by which a body's other poses come first, then its class.
 
     A vector is that of a `LevelHead` fitted to the labels of classes beside that of one fitted to the labels of bodies.
-    The cosine of the former orders the whole collection. The latter adds the kernel exp(−‖x − y‖ / reach), which counts
-    only between shapes that are nearly the same body: beyond its reach, where how different two bodies are says nothing
-    of their classes, it is silent. The cosine distance of the whole vector is nearly that of the classes, and serves
-    engines that know no other to find what is ranked by the distance then.
+    The cosine of the former orders the whole collection. The latter adds the kernel exp(−‖x − y‖² / reach²), which
+    counts only between shapes that are nearly the same body: beyond its reach, where how different two bodies are says
+    nothing of their classes, it is silent, and well within it, where poses lie, it is flat. The cosine distance of the
+    whole vector is nearly that of the classes, and serves engines that know no other to find what is ranked by the
+    distance then.
 
     Args:
         of_classes: head of the level of classes.
@@ -145,9 +146,9 @@ class TwoLevelHead(nn.Module):
         of_classes: LevelHead | None = None,
         of_bodies: LevelHead | None = None,
         *,
-        reach: float = 0.1,
+        reach: float = 0.15,
         weight: float = 1.0,
-        share: float = 0.05,
+        share: float = 0.1,
     ) -> None:
         super().__init__()
         if reach <= 0 or weight < 0 or not 0 < share < 1:
@@ -200,8 +201,8 @@ class TwoLevelHead(nn.Module):
         """(Q, D) and (G, D) vectors to (Q, G) distances from 0 to 2."""
         n = len(self.of_classes.joined)
         classes = cosine(queries[:, :n], gallery[:, :n])
-        bodies = euclidean(queries[:, n:], gallery[:, n:]) / self.share.sqrt()
-        kernel = torch.exp(-bodies / self.reach)
+        squares = 2 * cosine(queries[:, n:], gallery[:, n:])  # of unit vectors
+        kernel = torch.exp(-squares / self.reach.square())
         return (classes + self.weight * (1 - kernel)) / (1 + self.weight)
 
 

@@ -14,6 +14,6 @@ rods (how a body is bent), crossing, bodies, scans (what else happens to a surfa
 """
 
 from igps.shapes.benchmark import ArticulatedShapes, GeneratedShape
-from igps.shapes.graded import GradedShape, GradedShapes, body_of, looks_alike
+from igps.shapes.graded import GradedShape, GradedShapes, body_of, family_of, looks_alike
 
-__all__ = ["ArticulatedShapes", "GeneratedShape", "GradedShape", "GradedShapes", "body_of", "looks_alike"]
+__all__ = ["ArticulatedShapes", "GeneratedShape", "GradedShape", "GradedShapes", "body_of", "family_of", "looks_alike"]

@@ -280,9 +280,14 @@ def body_of(name: str) -> str:
     return name.rsplit("/", 1)[0]
 
 
+def family_of(label: str) -> str:
+    """The family of a class by its name: the kind of its bodies, or the template itself."""
+    return label.split("-")[0]
+
+
 def looks_alike(label: str) -> bool:
     """Whether a class, by its name, resembles one of SHREC'07 (see `igps.shapes.kinds`)."""
-    return label in LOOK_ALIKE_TEMPLATES or label.split("-")[0] in LOOK_ALIKE_FAMILIES
+    return label in LOOK_ALIKE_TEMPLATES or family_of(label) in LOOK_ALIKE_FAMILIES
 
 
 def _record_bodies(path: Path, names: list[str]) -> None:
