@@ -31,7 +31,6 @@ from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 from igps.parallel import on_threads
 from igps.shapes import GradedShapes, body_of
-from igps.shapes.kinds import body_classes
 
 SUFFIXES = {"triangles": ".off", "half": ".off", "motion": ".ply", "format": ".stl", "all": ".obj"}
 
@@ -67,7 +66,7 @@ def calibrate(
     shapes = _generated(root, descriptor, n_classes, seed, cache_dir, n_workers)
     bodies = np.array([body_of(name) for name in shapes.files.names])
     classes = np.array(shapes.files.labels)
-    is_rigid = np.isin(classes, _rigid_classes(seed))
+    is_rigid = np.isin(classes, _still(GradedShapes(n_classes, 4, 4, seed)))
 
     made = _copies(shapes, copies, n_copied, seed)
     copied = igps.SignatureDataset([path for _, _, path in made], shapes.config, cache_dir)
@@ -116,13 +115,14 @@ def calibrate(
     _print(calibration, of_same, of_others, made, to_copies)
 
 
-def _rigid_classes(seed: int) -> list[str]:
-    """Those whose bodies have the same shape in every pose."""
-    return [
-        one.name
-        for one in body_classes(seed)
-        if all(one.kind.motion(structure) == "rigid" for structure in one.structures)
-    ]
+def _still(shapes: GradedShapes) -> list[str]:
+    """The classes whose bodies do not bend: in the first pose of the first nothing has moved."""
+    found = []
+    for number, name in enumerate(shapes.class_names):
+        pose = shapes.pose(number * shapes.n_bodies * shapes.n_poses)
+        if np.abs(pose.bent - pose.rest).max() < 1e-6 * np.ptp(pose.rest, axis=0).max():
+            found.append(name)
+    return found
 
 
 def _generated(

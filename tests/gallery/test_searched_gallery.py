@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,11 @@ from igps.data.dataset import SignatureDataset
 from igps.gallery.gallery import Gallery, fingerprint
 from igps.geometry.signature import SignatureConfig
 from igps.nn.description import describe
+from igps.nn.descriptor import EmbeddedDescriptor
+from igps.nn.fitted import WhitenedHead
+from igps.nn.levels import TwoLevelHead
+from igps.retrieval.index import VectorIndex
+from igps.retrieval.search import SearchResult
 from own_descriptors import SMALL, small_interior
 
 pytest.importorskip("faiss")
@@ -69,6 +75,26 @@ def test_it_ranks_as_the_descriptor_does(dataset: SignatureDataset, root: Path, 
     assert [match.label for match in found] == [(dataset.files.labels or ())[i] for i in nearest]
     assert [match.path for match in found] == [dataset.files.paths[i].resolve() for i in nearest]
     np.testing.assert_allclose([match.distance for match in found], distances[nearest], rtol=2e-3, atol=1e-6)
+
+
+def test_more_are_ranked_where_the_cosine_is_not_the_distance(
+    dataset: SignatureDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    search = VectorIndex.search
+
+    def spied(index: VectorIndex, *arguments: object, **options: Any) -> SearchResult:
+        asked.append(options["candidates"])
+        return search(index, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(VectorIndex, "search", spied)
+    histograms = describe(dataset, small_interior())
+    two_levels = TwoLevelHead().fit(histograms, dataset.labels)
+    for number, head in enumerate((WhitenedHead().fit(histograms, dataset.labels), two_levels)):
+        descriptor = EmbeddedDescriptor(small_interior(), head)
+        gallery, _ = Gallery.build(tmp_path / f"{number}.igps", dataset, descriptor, n_workers=1)
+        gallery.nearest(descriptor.head(histograms), top=3)
+    assert asked[1] > asked[0] >= 512
 
 
 def test_adding_and_merging_are_building(dataset: SignatureDataset, root: Path, tmp_path: Path) -> None:

@@ -240,6 +240,8 @@ UNUSABLE: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray | None]], st
         lambda: (np.outer(np.linspace(0, 1, 30), [1, 2, 3]).astype(np.float32) + 5, None),
         "all 30 points are on one line",
     ),
+    "huge": (lambda: (1e200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])), "1e-30 to 1e\\+30 expected"),
+    "tiny": (lambda: (1e-200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])), "1e-30 to 1e\\+30 expected"),
     "nan": (lambda: (np.full((4, 3), np.nan), np.array([[0, 1, 2], [1, 2, 3]])), "NaN"),
     "nan cloud": (lambda: (np.full((40, 3), np.nan), None), "NaN"),
     "out of range": (lambda: (np.eye(3), np.array([[0, 1, 9], [0, 1, 2]])), "out of range"),

@@ -19,7 +19,7 @@ from igps.geometry.reading import MeshReading
 from igps.geometry.signature import SignatureConfig
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor
-from igps.retrieval.index import Entry, VectorIndex, check_alike, extend_index, merge_indices, write_index
+from igps.retrieval.index import CANDIDATES, Entry, VectorIndex, check_alike, extend_index, merge_indices, write_index
 
 # So many descriptions are in memory at once.
 _AT_ONCE = 256
@@ -103,7 +103,13 @@ class Gallery:
     def nearest(self, descriptions: Tensor, *, top: int = 10, exact: bool = False) -> list[list[Match]]:
         """For each of the descriptions (Q, ...) the meshes closest to it, closest first."""
         with torch.inference_mode():
-            found = self.index.search(descriptions, self.descriptor.distances, top=min(top, len(self)), exact=exact)
+            found = self.index.search(
+                descriptions,
+                self.descriptor.distances,
+                top=min(top, len(self)),
+                exact=exact,
+                candidates=_candidates(self.descriptor),
+            )
         return [
             [
                 Match(entry.name, entry.label, Path(entry.id), distance)
@@ -210,6 +216,12 @@ def fingerprint(descriptor: nn.Module) -> str:
         found.update(f"{name} {values.dtype} {tuple(values.shape)}\0".encode())
         found.update(values.numpy().tobytes())
     return found.hexdigest()[:32]
+
+
+def _candidates(descriptor: Descriptor) -> int:
+    """How many of the nearest vectors to rank: more where their cosine is only near the descriptor's distance."""
+    own = hasattr(getattr(descriptor, "head", None), "distances")
+    return 4 * CANDIDATES if own else CANDIDATES
 
 
 def _is_plain(value: Any) -> bool:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from igps.geometry.denoising import denoised, is_noisy
 from igps.geometry.hole_filling import with_small_holes_filled
-from igps.geometry.mesh import Mesh, MeshError, check_arrays
+from igps.geometry.mesh import Mesh, MeshError, check_arrays, check_size
 from igps.geometry.subdivision import subdivided
 from igps.geometry.tidying import tidied, welded, without_hidden
 from igps.geometry.union import united, without_walls
@@ -173,3 +173,4 @@ def _check_extent(vertices: NDArray[np.float64], faces: NDArray[np.int64], name:
     singular = np.linalg.svd(np.ptp(vertices[faces], axis=1).max(axis=0)[None], compute_uv=False)
     if singular[0] == 0:
         raise MeshError(f"{name}: all faces are in one point; a surface was expected. Check the file.")
+    check_size(vertices[faces].reshape(-1, 3), name)  # before squares of its lengths overflow or vanish

@@ -65,7 +65,7 @@ class Mesh:
         check_arrays(vertices, faces, self.name)
         faces = np.ascontiguousarray(faces, dtype=np.int64)
         _check_topology(faces, len(vertices), self.name, self.allow_open)
-        _check_size(vertices, self.name)
+        check_size(vertices, self.name)
         volume = signed_volume(vertices, faces)
         if abs(volume) <= _FLAT * diagonal(vertices) ** 3:
             raise MeshError(
@@ -133,7 +133,8 @@ def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
         )
 
 
-def _check_size(vertices: NDArray[np.float64], name: str) -> None:
+def check_size(vertices: NDArray[np.float64], name: str) -> None:
+    """Raise a MeshError where a surface is too small, too large or too far away to compute with."""
     with np.errstate(over="ignore"):
         length, distance = diagonal(vertices), float(np.abs(vertices).max())
     if not _SMALLEST <= length <= _LARGEST:
