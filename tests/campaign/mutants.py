@@ -45,6 +45,14 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
     {
         # `is` in place of `==`: both sides are truth values.
         ("src/igps/retrieval/metric.py", "if self.labels and (ids is None) == bool(self.ids):"),
+        # The sum over the other dimension: the matrix is symmetric.
+        ("src/igps/retrieval/reranking.py", "joins = (2 / 3 * half.sum(dim=1) <= inside.T) & members"),
+        # The other of two solvers of the same principal components: slower, or to rounding.
+        (
+            "src/igps/retrieval/vectors.py",
+            'found = PCA(n_kept, svd_solver="randomized" if n_kept < min(features.shape) else "full", '
+            "random_state=seed)",
+        ),
     }
 )
 

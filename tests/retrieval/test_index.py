@@ -177,6 +177,16 @@ def test_a_changed_entry_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
     assert sum(map(len, extend_index(tmp_path / "g.igps", ABOUT, batches(rows[200:], 200, "c")).parts)) < 1500
 
 
+def test_entries_that_were_replaced_do_not_count_as_many(tmp_path: Path) -> None:
+    """Fewer than 1,024 have no short vectors; those that a newer entry has replaced are not there any more."""
+    rows = units(1300)
+    write_index(tmp_path / "g.igps", ABOUT, "cosine", batches(rows[:900]))
+    changed = extend_index(tmp_path / "g.igps", ABOUT, batches(rows[900:1200], mark="b"))
+    assert len(changed) == 900
+    assert changed.vector_map is None
+    assert extend_index(tmp_path / "g.igps", ABOUT, batches(rows[:200], first=900)).vector_map is not None
+
+
 def test_an_index_of_something_else_is_refused(tmp_path: Path) -> None:
     write_index(tmp_path / "g.igps", ABOUT, "cosine", batches(units(10)))
     other = {"descriptor": "test", "signature": {"resolution": 20}}
