@@ -63,13 +63,14 @@ def main() -> None:
     """Compare the scores with those expected, or keep them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="the SHREC'07 meshes, with labels.csv")
-    parser.add_argument("--descriptors", nargs="+", choices=NAMES, default=list(NAMES), help="all of them by default")
+    parser.add_argument("--descriptors", nargs="+", choices=NAMES, help="those with expected scores by default")
     parser.add_argument("--cache_dir", type=Path, help="of signatures; the user's if not given")
     parser.add_argument("--n_workers", type=int, help="processes; all cores if not given")
     parser.add_argument("--write", action="store_true", help="keep the scores as those that are expected")
     arguments = parser.parse_args()
     expected: dict[str, Mapping[str, float]] = json.loads(EXPECTED.read_text()) if EXPECTED.exists() else {}
-    found = measure(arguments.folder, arguments.descriptors, arguments.cache_dir, arguments.n_workers)
+    names = arguments.descriptors or list(expected) or list(NAMES)
+    found = measure(arguments.folder, names, arguments.cache_dir, arguments.n_workers)
     for name, scores in found.items():
         print(f"{name:<28}" + "".join(f"{score} {value:<8g}" for score, value in scores.items()))
     if arguments.write:
