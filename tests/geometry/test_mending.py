@@ -242,6 +242,8 @@ UNUSABLE: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray | None]], st
     ),
     "huge": (lambda: (1e200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])), "1e-30 to 1e\\+30 expected"),
     "tiny": (lambda: (1e-200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])), "1e-30 to 1e\\+30 expected"),
+    "huge cloud": (lambda: (1e200 * np.random.default_rng(0).random((400, 3)), None), "1e-30 to 1e\\+30 expected"),
+    "tiny cloud": (lambda: (1e-200 * np.random.default_rng(0).random((400, 3)), None), "1e-30 to 1e\\+30 expected"),
     "nan": (lambda: (np.full((4, 3), np.nan), np.array([[0, 1, 2], [1, 2, 3]])), "NaN"),
     "nan cloud": (lambda: (np.full((40, 3), np.nan), None), "NaN"),
     "out of range": (lambda: (np.eye(3), np.array([[0, 1, 9], [0, 1, 2]])), "out of range"),

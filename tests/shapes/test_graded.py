@@ -177,7 +177,7 @@ def test_the_look_alikes_can_be_left_out() -> None:
 
 
 def test_the_other_generator_is_as_it_was() -> None:
-    """The shipped metric was fitted to its shapes: sums of coordinates as they were when that was done."""
+    """Tests and figures rest on its shapes: sums of coordinates as they were at first."""
     shapes = ArticulatedShapes(n_classes=24, n_per_class=2)
     found = [(len(shapes[i].vertices), len(shapes[i].faces)) for i in (0, 13, 24, 47)]
     assert found == COUNTS

@@ -70,7 +70,7 @@ def precompute(
 
 
 def part_of(files: MeshFiles, shard: str | None) -> MeshFiles:
-    """Every so manieth of the files, so that the shards 1/n to n/n have all, each once; all of them if None.
+    """Every n-th of the files, so that the shards 1/n to n/n have all, each once; all of them if None.
 
     Raises:
         ValueError: not two numbers, or the first not one of the second.

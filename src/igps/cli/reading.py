@@ -99,8 +99,8 @@ def chosen_dataset(
         needs: what the signatures satisfy, if that is known.
         cache_dir: folder where computed signatures are kept; the user's cache directory if not given.
         signature: parameters of the signatures.
-        mend: auto does the least that makes a body of each mesh, never refuses what is no body, always makes all
-            watertight, for collections of mixed quality.
+        mend: auto does the least that makes a body of each mesh, never refuses what is no body, always makes
+            watertight all that does not bound one body without crossing itself, for collections of mixed quality.
         component: largest keeps only the largest connected component of each mesh.
         paper, allow_open: see `FLAGS`.
 

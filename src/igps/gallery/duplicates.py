@@ -293,11 +293,10 @@ def _near_in_index(gallery: Gallery, limit: float, progress: bool) -> Iterator[t
         for positions, descriptions in index.batches():
             for position, description in zip(positions.tolist(), descriptions, strict=True):
                 top = min(_FIRST_TOP, len(index))
-                with torch.inference_mode():
-                    found = index.search(description[None], gallery.descriptor.distances, top=top)
-                    while float(found.distances[0, -1]) <= limit and top < len(index):
-                        top = min(4 * top, len(index))
-                        found = index.search(description[None], gallery.descriptor.distances, top=top)
+                found = gallery.search(description[None], top=top)
+                while float(found.distances[0, -1]) <= limit and top < len(index):
+                    top = min(4 * top, len(index))
+                    found = gallery.search(description[None], top=top)
                 for other, distance in zip(found.indices[0].tolist(), found.distances[0].tolist(), strict=True):
                     if numbers[position] < numbers[other] and distance <= limit:
                         yield numbers[position], numbers[other], distance

@@ -19,7 +19,10 @@ from igps.geometry.reading import MeshReading
 from igps.geometry.signature import SignatureConfig
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor
+from igps.nn.heads import distances_of
+from igps.retrieval.distances import cosine
 from igps.retrieval.index import CANDIDATES, Entry, VectorIndex, check_alike, extend_index, merge_indices, write_index
+from igps.retrieval.search import SearchResult
 
 # So many descriptions are in memory at once.
 _AT_ONCE = 256
@@ -102,14 +105,7 @@ class Gallery:
 
     def nearest(self, descriptions: Tensor, *, top: int = 10, exact: bool = False) -> list[list[Match]]:
         """For each of the descriptions (Q, ...) the meshes closest to it, closest first."""
-        with torch.inference_mode():
-            found = self.index.search(
-                descriptions,
-                self.descriptor.distances,
-                top=min(top, len(self)),
-                exact=exact,
-                candidates=_candidates(self.descriptor),
-            )
+        found = self.search(descriptions, top=top, exact=exact)
         return [
             [
                 Match(entry.name, entry.label, Path(entry.id), distance)
@@ -117,6 +113,16 @@ class Gallery:
             ]
             for indices, distances in zip(found.indices, found.distances, strict=True)
         ]
+
+    def search(self, descriptions: Tensor, *, top: int, exact: bool = False) -> SearchResult:
+        """The entries of the index closest to each of the descriptions (Q, ...), by the descriptor's own distance."""
+        # More are ranked where the cosine of the vectors is not the descriptor's distance, only near it.
+        head = getattr(self.descriptor, "head", None)
+        candidates = CANDIDATES if distances_of(head) is cosine else 4 * CANDIDATES
+        with torch.inference_mode():
+            return self.index.search(
+                descriptions, self.descriptor.distances, top=min(top, len(self)), exact=exact, candidates=candidates
+            )
 
     @classmethod
     def build(
@@ -216,12 +222,6 @@ def fingerprint(descriptor: nn.Module) -> str:
         found.update(f"{name} {values.dtype} {tuple(values.shape)}\0".encode())
         found.update(values.numpy().tobytes())
     return found.hexdigest()[:32]
-
-
-def _candidates(descriptor: Descriptor) -> int:
-    """How many of the nearest vectors to rank: more where their cosine is only near the descriptor's distance."""
-    own = hasattr(getattr(descriptor, "head", None), "distances")
-    return 4 * CANDIDATES if own else CANDIDATES
 
 
 def _is_plain(value: Any) -> bool:

@@ -165,6 +165,7 @@ def _check_cloud(vertices: NDArray[np.float64], name: str) -> None:
             f"{name}: {int((~finite).sum())} points have NaN or infinite coordinates, the first is point "
             f"{int(np.argmin(finite))}. Remove them or export the file again."
         )
+    check_size(points, name)
 
 
 def _check_extent(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from igps.nn.heads import Head, SizedByData, check_cells, checked_labels, means_of, square_roots
+from igps.nn.heads import Head, SizedByData, check_cells, checked_cells, checked_labels, means_of, square_roots
 
 
 class WhitenedHead(SizedByData):
@@ -75,9 +75,7 @@ class WhitenedHead(SizedByData):
     def centre(self, descriptions: Tensor, part_cells: Sequence[int] | None = None) -> Self:
         """Take the mean alone from histograms (N, ...), and damp nothing: for shapes without labels, or one a class."""
         roots = square_roots(descriptions)
-        cells = list(part_cells or (roots.shape[1],))
-        if min(cells) < 1 or sum(cells) != roots.shape[1]:
-            raise ValueError(f"part_cells: expected cells that add up to {roots.shape[1]}, got {cells}.")
+        cells = checked_cells(roots, part_cells)
         self.part_cells = torch.tensor(cells, device=roots.device)
         self.mean = roots.mean(dim=0)
         self.directions = roots.new_zeros(self.n_directions, roots.shape[1])

@@ -62,6 +62,14 @@ def check_cells(cells: Tensor, n_expected: int) -> None:
         raise ValueError(f"descriptions: expected {n_expected} cells as in training, got {cells.shape[1]}.")
 
 
+def checked_cells(cells: Tensor, part_cells: Sequence[int] | None) -> list[int]:
+    """How many of (N, cells) values each part has, all one part if None; a ValueError where they do not add up."""
+    found = list(part_cells or (cells.shape[1],))
+    if min(found) < 1 or sum(found) != cells.shape[1]:
+        raise ValueError(f"part_cells: expected cells that add up to {cells.shape[1]}, got {found}.")
+    return found
+
+
 def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
     """The labels (N,) on the device of the descriptions (N, ...); raises a ValueError if they are not aligned."""
     if labels.shape != descriptions.shape[:1]:

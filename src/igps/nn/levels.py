@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from igps.nn.heads import SizedByData, check_cells, checked_labels, means_of, square_roots
+from igps.nn.heads import SizedByData, check_cells, checked_cells, checked_labels, means_of, square_roots
 from igps.retrieval.distances import cosine
 
 # Of a part so many principal directions are whitened; what is beyond them is discretisation
@@ -67,9 +67,7 @@ class LevelHead(SizedByData):
         _, members = checked_labels(roots, labels).unique(return_inverse=True)
         if int(members.max()) + 1 == len(roots):
             raise ValueError("labels: expected a label of at least two shapes, got as many labels as shapes.")
-        cells = list(part_cells or (roots.shape[1],))
-        if min(cells) < 1 or sum(cells) != roots.shape[1]:
-            raise ValueError(f"part_cells: expected cells that add up to {roots.shape[1]}, got {cells}.")
+        cells = checked_cells(roots, part_cells)
         if self._parts is not None and not set(self._parts) <= set(range(len(cells))):
             raise ValueError(f"parts: expected some of 0 to {len(cells) - 1}, got {self._parts}.")
         self.part_cells = torch.tensor(cells, device=roots.device)
