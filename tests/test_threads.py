@@ -24,7 +24,7 @@ from igps.geometry.mesh import Mesh
 from igps.geometry.signature import SignatureConfig
 from igps.nn.metric import CorrectedDistance, MetricHead
 from igps.parallel import on_threads
-from igps.threads import cpu_quota, n_cores, n_threads, one_thread
+from igps.threads import Team, cpu_quota, n_cores, n_threads, one_thread
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 needs_affinity = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs an affinity to set")
@@ -355,3 +355,63 @@ def test_a_command_leaves_the_settings(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert "no meshes" in capsys.readouterr().err
     assert seen == [1]
     assert settings() == before
+
+
+@pytest.mark.parametrize("most", [1, 2, 5])
+def test_a_team_does_every_job_once_and_in_order(most: int) -> None:
+    done: list[int] = []
+
+    def square(number: int) -> tuple[int, int]:
+        done.append(number)
+        return number**2, n_threads() if threading.current_thread() is not threading.main_thread() else 1
+
+    with Team(most) as team:
+        for size in (0, 1, 3, 40, 2):
+            done.clear()
+            assert team.each(square, range(size)) == [(number**2, 1) for number in range(size)]
+            assert sorted(done) == list(range(size))
+
+
+def test_who_asks_a_team_works_beside_it(many_cores: None) -> None:
+    together = threading.Barrier(3, timeout=20)
+    with one_thread(), Team() as team:
+        assert team.n_threads == 3
+        names = team.each(lambda _: (together.wait(), threading.current_thread().name)[1], range(3))
+    assert len(set(names)) == 3
+    assert threading.current_thread().name in names
+
+
+def test_a_thread_of_a_team_that_is_not_let_run_delays_nobody() -> None:
+    released, held = threading.Event(), threading.Barrier(3, timeout=20)
+
+    def hold(_: int) -> None:
+        held.wait()
+        released.wait(20)
+
+    with Team(2) as team:
+        other = threading.Thread(target=lambda: team.each(hold, range(2)))
+        other.start()
+        held.wait()  # the other thread and the only one of the team have a job each
+        try:
+            assert team.each(abs, range(-3, 0)) == [3, 2, 1]
+        finally:
+            released.set()
+            other.join()
+
+
+def test_what_a_job_of_a_team_raises_is_raised_when_no_job_runs_any_more() -> None:
+    running = threading.Semaphore(0)
+
+    def fail(number: int) -> None:
+        if number == 0:
+            raise ValueError("the first")
+        threading.Event().wait(0.1)
+        running.release()
+
+    with Team(2) as team:
+        with pytest.raises(ValueError, match="the first"):
+            team.each(fail, range(4))
+        ended_jobs = running._value
+        threading.Event().wait(0.3)
+        assert running._value == ended_jobs
+        assert team.each(abs, [-1, -2]) == [1, 2]

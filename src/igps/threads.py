@@ -15,15 +15,17 @@ import os
 import re
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from threadpoolctl import ThreadpoolController
 
+Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 _PROC = Path("/proc/self")
@@ -65,6 +67,57 @@ def stay_on_one_thread() -> None:
     """As `one_thread`, but for the rest of this thread's life, and with no other beside it."""
     _present.most = 1
     _set_torch_threads(1)
+
+
+class Team:
+    """Threads that stay for a computation of many short steps, each of a few jobs.
+
+    To start threads for every step would take longer than the step. Who asks works too, and waits only for jobs that
+    another has begun: beside a busy process, whose core it is, a thread that is not let run delays nobody.
+
+    Args:
+        most: with the one that asks; as many as `n_threads` if None.
+    """
+
+    def __init__(self, most: int | None = None) -> None:
+        self.n_threads = max(1, n_threads() if most is None else most)
+        self._pool: ThreadPoolExecutor | None = None
+
+    def __enter__(self) -> Team:
+        if self.n_threads > 1:
+            self._pool = ThreadPoolExecutor(self.n_threads - 1, initializer=stay_on_one_thread)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+    def each(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
+        """The result of every job, in order; the function must release the interpreter's lock to gain from it."""
+        n_helpers = min(self.n_threads, len(jobs)) - 1
+        if self._pool is None or n_helpers < 1:
+            return [function(job) for job in jobs]
+        results: list[Any] = [None] * len(jobs)
+        waiting = iter(range(len(jobs)))
+
+        def work() -> None:
+            for number in waiting:  # the interpreter's lock gives each number to one thread
+                results[number] = function(jobs[number])
+
+        helpers = [self._pool.submit(work) for _ in range(n_helpers)]
+        try:
+            work()
+        finally:
+            begun = [helper for helper in helpers if not helper.cancel()]
+            wait(begun)
+        for helper in begun:
+            helper.result()
+        return results
+
+
+# One thread, for whoever needs no other
+ALONE = Team(1)
 
 
 def cpu_quota(proc: Path = _PROC) -> float | None:

@@ -16,6 +16,7 @@ from problems import Problem, cotangent_problem, torus
 from scipy import sparse
 from scipy.linalg import eigh
 
+from igps import threads
 from igps.geometry.laplacian import laplacian
 from igps.geometry.mesh import Mesh
 from igps.linalg import ConvergenceError, Spectrum, eigenpairs, eigensolver, krylov, lanczos
@@ -109,6 +110,26 @@ def test_more_copies_than_distinct_eigenvalues() -> None:
     assert_pairs(spectrum, problem)
 
 
+def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """10,242 vertices: several pieces of the basis, several subtrees."""
+    sphere = trimesh.creation.icosphere(subdivisions=5)
+    sphere.vertices *= 1, 0.8, 0.6
+    stiffness, mass, positions = cotangent_problem(sphere)
+    monkeypatch.setattr(threads, "n_cores", lambda: 8)
+    before = torch.get_num_threads()
+    spectra = []
+    try:
+        for n_threads in (1, 2, 5):
+            torch.set_num_threads(n_threads)
+            spectra.append(eigenpairs(stiffness, mass, 20, positions=positions))
+    finally:
+        torch.set_num_threads(before)
+    assert_pairs(spectra[0], (stiffness, mass, positions))
+    for other in spectra[1:]:
+        np.testing.assert_array_equal(other.eigenvalues, spectra[0].eigenvalues)
+        np.testing.assert_array_equal(other.eigenfunctions, spectra[0].eigenfunctions)
+
+
 def test_krylov_basis_keeps_its_promises(torus_problem: Problem) -> None:
     """Orthonormal rows, a projection that is the operator's, residuals that are the vectors'; also when widened."""
     stiffness, mass, positions = torus_problem
@@ -127,7 +148,7 @@ def test_krylov_basis_keeps_its_promises(torus_problem: Problem) -> None:
     torch.testing.assert_close(space._projected[1 : space.size + 1, 1 : space.size + 1], projected, atol=1e-12, rtol=0)
     ritz = space.ritz_pairs(300.0)
     largest = torch.argsort((ritz.eigenvalues - 300).abs())[:40]
-    values, vectors = space.eigenvectors(ritz, largest)
+    values, vectors = space.eigenvectors(ritz, largest, np.arange(len(mass)))
     actual = np.linalg.norm(matrix @ vectors - vectors * values, axis=0)
     actual *= torch.linalg.norm(ritz.coefficients[:, largest], dim=0).numpy()
     estimated = ritz.residuals[largest].numpy()
@@ -153,7 +174,7 @@ def test_a_shift_beside_an_eigenvalue_costs_no_orthogonality(
     torch.testing.assert_close(basis @ basis.T, torch.eye(len(basis), dtype=torch.float64), atol=1e-10, rtol=0)
     exact = torus_oracle[0] * area
     exact = np.sort(exact[np.abs(exact - shift).argsort()[:20]])
-    _, vectors = space.eigenvectors(ritz, torch.argsort((ritz.eigenvalues - shift).abs())[:20])
+    _, vectors = space.eigenvectors(ritz, torch.argsort((ritz.eigenvalues - shift).abs())[:20], np.arange(len(mass)))
     quotients = np.sort(np.einsum("vk,vk->k", vectors, matrix @ vectors))
     np.testing.assert_allclose(quotients, exact, rtol=1e-10)
 

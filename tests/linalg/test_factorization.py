@@ -16,6 +16,7 @@ from igps.linalg.direct import Factors, analyse
 from igps.linalg.factorization import Factorization, SingularMatrixError
 from igps.linalg.multifrontal import Factors as CompiledFactors
 from igps.linalg.symbolic import dissect
+from igps.threads import Team
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 
@@ -136,6 +137,19 @@ def test_solve_and_inertia_on_random_graphs(n: int) -> None:
     right = np.random.default_rng(n).normal(size=(n, 2))
     assert backward_error(dense, factors.solve(torch.from_numpy(right)).numpy(), right) < 10 * EPSILON
     assert factors.n_negative == (np.linalg.eigvalsh(dense) < 0).sum()
+
+
+def test_subtrees_solved_side_by_side() -> None:
+    """20,449 unknowns, eight subtrees: the residual is as of one, and a team changes no bit."""
+    matrix, places = grid_matrix(143)
+    factors = analyse(matrix, places).factorize(matrix, -20.0)
+    right = torch.from_numpy(np.random.default_rng(1).normal(size=(143**2, 5)))
+    solution = factors.solve(right)
+    residual = matrix @ solution.numpy() + 20 * solution.numpy() - right.numpy()
+    assert np.abs(residual).max() < 100 * EPSILON * abs(matrix).max() * float(solution.abs().max())
+    with Team(3) as team:
+        for _ in range(3):
+            assert torch.equal(factors.solve(right, team), solution)
 
 
 def test_coinciding_places_are_allowed() -> None:

@@ -13,6 +13,7 @@ from igps.compiled import is_available
 from igps.linalg import multifrontal
 from igps.linalg.factorization import factorize
 from igps.linalg.symbolic import Dissection, dissect
+from igps.threads import ALONE, Team
 
 
 class Factors(Protocol):
@@ -22,8 +23,8 @@ class Factors(Protocol):
     def n_negative(self) -> int:
         """Its number of negative eigenvalues."""
 
-    def solve(self, right_hand_sides: torch.Tensor) -> torch.Tensor:
-        """The solutions (V, b) for right-hand sides (V, b), float64."""
+    def solve(self, right_hand_sides: torch.Tensor, team: Team = ALONE) -> torch.Tensor:
+        """The solutions (V, b) for right-hand sides (V, b), float64; their bits do not depend on the team."""
 
 
 class Structure(Protocol):
@@ -34,6 +35,9 @@ class Structure(Protocol):
 
     def inertia(self, matrix: sparse.csr_array, shift: float = 0.0) -> int:
         """The number of negative eigenvalues of ``matrix − shift · I``."""
+
+    def arranged(self, matrix: sparse.csr_array) -> tuple[Structure, sparse.csr_array, np.ndarray]:
+        """The structure for unknowns that lie in memory as it uses them, such a matrix, and where each was (V,)."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,9 @@ class Batched:
 
     def inertia(self, matrix: sparse.csr_array, shift: float = 0.0) -> int:
         return factorize(self.dissection, matrix, shift).n_negative
+
+    def arranged(self, matrix: sparse.csr_array) -> tuple[Structure, sparse.csr_array, np.ndarray]:
+        return self, matrix, np.arange(matrix.shape[0])
 
 
 def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = 32) -> Structure:

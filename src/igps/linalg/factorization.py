@@ -37,6 +37,7 @@ from scipy import sparse
 
 from igps.linalg.checks import canonical, check_entries
 from igps.linalg.symbolic import Batch, Dissection
+from igps.threads import ALONE, Team
 
 # Fronts are added to their parents in chunks of so many matrix entries, to bound the memory for their indices.
 CHUNK_ENTRIES = 2**22
@@ -61,8 +62,11 @@ class Factorization:
     blocks: tuple[tuple[torch.Tensor, ...], ...]
     n_negative: int
 
-    def solve(self, right_hand_sides: torch.Tensor) -> torch.Tensor:
-        """The solutions (V, b) for right-hand sides (V, b), float64 on the device of the dissection."""
+    def solve(self, right_hand_sides: torch.Tensor, team: Team = ALONE) -> torch.Tensor:
+        """The solutions (V, b) for right-hand sides (V, b), float64 on the device of the dissection.
+
+        PyTorch does not release the interpreter's lock between its many small products: a team would not help.
+        """
         n_vertices, n_columns = right_hand_sides.shape
         vectors = right_hand_sides.new_zeros(n_vertices + 1, n_columns)  # the last row stands for padding and stays 0
         vectors[:n_vertices] = right_hand_sides

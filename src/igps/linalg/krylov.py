@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -11,6 +13,7 @@ from scipy.linalg import qr
 
 from igps.linalg.checks import ROUNDING
 from igps.linalg.direct import Factors
+from igps.threads import ALONE, Team
 
 # Below this, relative to what it came from, a pivot makes a Cholesky factor inaccurate
 CHOLESKY_QR_PIVOT = 1e-6
@@ -23,8 +26,10 @@ ROUND_PIVOT = 0.1
 SWEEP_EVERY, SWEEP_LOSS, SINGLE_LOSS = 2, 1e-7, 1e-8
 # Of a larger basis there is no copy in single precision, to save memory: 1 GiB
 MOST_SINGLE_ENTRIES = 2**28
-# Columns of a large basis that are turned into eigenvectors at once
+# Columns of the basis that are turned into eigenvectors at once
 COLUMNS_AT_ONCE = 8192
+# Columns of a piece of the basis, of which a thread computes with one at a time, and the most pieces
+PIECE, MOST_PIECES = 2**12, 8
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,8 @@ class Krylov:
     """Orthonormal basis of a block Krylov space of (A − σI)⁻¹, grown block by block, and the operator projected on it.
 
     Vectors are stored as rows, since products of the basis with a block are fastest so. The first row is the zero mode:
-    the others stay orthogonal to it, and the projected problem leaves it out.
+    the others stay orthogonal to it, and the projected problem leaves it out. The columns are cut into pieces, which a
+    team works on side by side; how many depends on their number alone, so that a team changes no bit.
     """
 
     def __init__(
@@ -68,18 +74,22 @@ class Krylov:
         block_size: int,
         capacity: int,
         generator: np.random.Generator,
+        team: Team = ALONE,
     ) -> None:
         self._factors = factors
+        self._team = team
         self._generator = generator
         self._block_size = block_size
         n_vertices = len(zero_mode)
-        self._memory = np.empty((capacity + 1, n_vertices))
-        self._basis = torch.from_numpy(self._memory)
+        self._pieces = _pieces(n_vertices, max(1, min(MOST_PIECES, n_vertices // PIECE)))
+        # of NumPy's memory a part can be given back; but it asks for huge pages, which may be slow to come
+        large = (capacity + 1) * n_vertices > MOST_SINGLE_ENTRIES
+        self._memory = np.empty((capacity + 1, n_vertices)) if large else np.empty((0, n_vertices))
+        self._basis = torch.from_numpy(self._memory) if large else _empty(capacity + 1, n_vertices)
         self._basis[0] = torch.from_numpy(zero_mode)
         # a copy in single precision, to be read in half the time
-        self._single: torch.Tensor | None = None
-        if self._basis.numel() <= MOST_SINGLE_ENTRIES:
-            self._single = torch.empty(capacity + 1, n_vertices, dtype=torch.float32)
+        self._single = None if large else torch.empty(capacity + 1, n_vertices, dtype=torch.float32)
+        if self._single is not None:
             self._single[0] = self._basis[0]
         self._projected = torch.zeros(capacity + 1, capacity + 1, dtype=torch.float64)
         # rows previous:current and current:stop of the basis are the last two blocks, the last not yet multiplied; rows
@@ -88,25 +98,37 @@ class Krylov:
         self._every = SWEEP_EVERY
         self._coupling = torch.empty(0, 0, dtype=torch.float64)
         # a random vector is mostly high frequencies: one application leaves what matters
-        self._append(self._orthonormal(self._apply(self._random(block_size)).T.contiguous(), near=1)[0], swept=True)
+        self._append(self._orthonormal(self._apply(self._random(block_size)), near=1)[0], swept=True)
 
     @property
     def size(self) -> int:
         """Dimension m of the projected problem."""
         return self._current - 1
 
+    @property
+    def loses_basis(self) -> bool:
+        """Whether the basis makes place for the eigenvectors."""
+        return self._single is None
+
     def expand(self) -> None:
         """Multiply the last block, and append what is new in the product as the next block."""
         last = slice(self._current, self._stop)
-        product = self._apply(self._basis[last])
         near = self._basis[self._previous : self._stop]
-        projection = near @ product
-        diagonal = projection[self._current - self._previous :]
-        product = product.T.contiguous()
-        quick = self._factor_quickly(torch.addmm(product, projection.T, near, alpha=-1), _longest(product))
+        product = self._apply(self._basis[last])
+        projection, squares = self._sums(
+            lambda piece: (near[:, piece] @ product[:, piece].T, (product[:, piece] ** 2).sum(1))
+        )
+        diagonal, scale = projection[self._current - self._previous :], math.sqrt(float(squares.max()))
+
+        def leave_new(piece: slice) -> tuple[torch.Tensor]:
+            new = product[:, piece].addmm_(projection.T, near[:, piece], alpha=-1)
+            return (new @ new.T,)
+
+        (remainder,) = self._sums(leave_new)
+        quick = self._factor_quickly(product, remainder, scale)
         if quick is None:
             self._sweep()
-        block, coupling = quick or self._orthonormal(product, near=self._previous)
+        block, coupling = quick or self._orthonormal(product, near=self._previous, scale=scale)
         self._projected[last, last] = (diagonal + diagonal.T) / 2
         self._previous, self._current = self._current, self._stop
         self._append(block, swept=quick is None)
@@ -138,57 +160,86 @@ class Krylov:
             below_shift=(theta < 0)[order],
         )
 
-    def eigenvectors(self, ritz: RitzPairs, index: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """Eigenvalues (K,) and eigenvectors (V, K) of the Ritz pairs with these indices; a large basis is lost."""
+    def eigenvectors(self, ritz: RitzPairs, index: torch.Tensor, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Eigenvalues (K,) and eigenvectors (V, K) of the Ritz pairs with these indices; see `loses_basis`.
+
+        Entry i of a vector becomes row ``order[i]``.
+        """
         coefficients = ritz.coefficients[:, index]
         coefficients /= torch.linalg.norm(coefficients, dim=0)
-        if self._single is None:
-            return ritz.eigenvalues[index].numpy(), self._combine_in_place(coefficients)
-        return ritz.eigenvalues[index].numpy(), (self._basis[1 : self._stop].T @ coefficients).numpy()
+        if self.loses_basis:
+            return ritz.eigenvalues[index].numpy(), self._combine_in_place(coefficients, order)
+        vectors = _empty(self._basis.shape[1], len(index)).numpy()
 
-    def _combine_in_place(self, coefficients: torch.Tensor) -> np.ndarray:
+        def combine(piece: slice) -> None:
+            vectors[order[piece]] = (self._basis[1 : self._stop, piece].T @ coefficients).numpy()
+
+        self._team.each(combine, self._small_pieces())
+        return ritz.eigenvalues[index].numpy(), vectors
+
+    def _combine_in_place(self, coefficients: torch.Tensor, order: np.ndarray) -> np.ndarray:
         """The basis times coefficients (m + b, K), as (V, K): never in memory beside the basis."""
         n_vertices, n_vectors = self._basis.shape[1], coefficients.shape[1]
-        pieces = [slice(start, start + COLUMNS_AT_ONCE) for start in range(0, n_vertices, COLUMNS_AT_ONCE)]
-        for piece in pieces:
+        for piece in self._small_pieces():
             self._basis[:n_vectors, piece] = coefficients.T @ self._basis[1 : self._stop, piece]
         rows = self._memory
         self._basis, self._memory = self._basis.new_empty(0, n_vertices), np.empty((0, n_vertices))
         # gives back what lies behind; no other array looks into it any more
         rows.resize((n_vectors, n_vertices), refcheck=False)
         vectors = np.empty((n_vertices, n_vectors))
-        for piece in pieces:
-            vectors[piece] = rows[:, piece].T
+        for piece in self._small_pieces():
+            vectors[order[piece]] = rows[:, piece].T
         return vectors
+
+    def _small_pieces(self) -> list[slice]:
+        n_vertices = self._basis.shape[1]
+        return _pieces(n_vertices, -(-n_vertices // COLUMNS_AT_ONCE))
 
     def _random(self, n_rows: int) -> torch.Tensor:
         return torch.from_numpy(self._generator.standard_normal((n_rows, self._basis.shape[1])))
 
     def _apply(self, block: torch.Tensor) -> torch.Tensor:
-        """The products (V, b) of the operator with b rows."""
-        return self._factors.solve(block.T)
+        """The products (b, V) of the operator with b rows."""
+        return self._factors.solve(block.T, self._team).T.contiguous()
+
+    def _sums(self, parts: Callable[[slice], tuple[torch.Tensor, ...]]) -> tuple[torch.Tensor, ...]:
+        """What each piece of the columns contributes, added in the order of the pieces."""
+        return tuple(torch.stack(part).sum(0) for part in zip(*self._team.each(parts, self._pieces), strict=True))
 
     def _append(self, block: torch.Tensor, *, swept: bool) -> None:
         stop = self._stop + len(block)
         if stop > len(self._basis):
             capacity = len(self._basis) * 3 // 2 + len(block)
             basis, projected = self._basis, self._projected
-            self._memory = np.empty((capacity, basis.shape[1]))
-            self._basis = torch.from_numpy(self._memory)
+            if self._single is None:
+                self._memory = np.empty((capacity, basis.shape[1]))
+                self._basis = torch.from_numpy(self._memory)
+            else:
+                self._basis = _empty(capacity, basis.shape[1])
             self._basis[: self._stop] = basis[: self._stop]
             if self._single is not None:
                 single, self._single = self._single, self._single.new_empty(capacity, basis.shape[1])
                 self._single[: self._swept] = single[: self._swept]
             self._projected = projected.new_zeros(capacity, capacity)
             self._projected[: self._stop, : self._stop] = projected[: self._stop, : self._stop]
-        self._basis[self._stop : stop] = block
+        new = self._basis[self._stop : stop]
+
+        def copy(piece: slice) -> None:
+            new[:, piece] = block[:, piece]
+
+        self._team.each(copy, self._pieces)
         self._stop = stop
         if swept:
             self._mark_swept()
 
     def _mark_swept(self) -> None:
-        if self._single is not None:
-            self._single[self._swept : self._stop] = self._basis[self._swept : self._stop]
+        rows = slice(self._swept, self._stop)
+
+        def copy(piece: slice) -> None:
+            if self._single is not None:
+                self._single[rows, piece] = self._basis[rows, piece]
+
+        self._team.each(copy, self._pieces)
         self._swept = self._stop
 
     def _sweep(self) -> float:
@@ -203,23 +254,42 @@ class Krylov:
         old, new = self._basis[: self._swept], self._basis[self._swept : self._stop]
         if not len(new):
             return 0.0
-        lost = old @ new.T.contiguous()
+        (lost,) = self._sums(lambda piece: (old[:, piece] @ new[:, piece].T.contiguous(),))
         largest = float(lost.abs().max())
-        if self._single is None or largest > SINGLE_LOSS:
-            new.addmm_(lost.T, old, alpha=-1)
-        else:
-            new.sub_(lost.T.float() @ self._single[: self._swept])
-        new.copy_(_inverse(torch.linalg.cholesky(new @ new.T)) @ new)
+        single = self._single if largest <= SINGLE_LOSS else None
+
+        def take_out(piece: slice) -> tuple[torch.Tensor]:
+            here = new[:, piece]
+            if single is None:
+                here.addmm_(lost.T, old[:, piece], alpha=-1)
+            else:
+                here.sub_(lost.T.float() @ single[: self._swept, piece])
+            return (here @ here.T,)
+
+        (squares,) = self._sums(take_out)
+        self._multiply(new, _inverse(torch.linalg.cholesky(squares)))
         self._mark_swept()
         return largest
 
-    def _orthonormal(self, block: torch.Tensor, near: int) -> tuple[torch.Tensor, torch.Tensor]:
+    def _multiply(self, rows: torch.Tensor, factor: torch.Tensor) -> None:
+        """In place, by a matrix (b, b) from the left."""
+
+        def multiply(piece: slice) -> None:
+            rows[:, piece] = factor @ rows[:, piece]
+
+        self._team.each(multiply, self._pieces)
+
+    def _orthonormal(
+        self, block: torch.Tensor, near: int, scale: float | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Rows Q orthonormal and orthogonal to the basis, and R with block = Qᵀ R + what the basis spans, by columns.
+
+        ``scale`` is how long the longest row was before something of the basis was taken from it.
 
         The recurrence says that only the basis from row ``near`` on contributes, the full pass after it sweeps out
         what rounding has left. Together that costs one product with the basis and one back.
         """
-        scale = _longest(block)
+        scale = float(torch.linalg.norm(block, dim=1).max()) if scale is None else scale
         first: torch.Tensor | None = None
         for rows in (self._basis[near : self._stop], self._basis[: self._stop]):
             block = torch.addmm(block, (rows @ block.T).T, rows, alpha=-1)
@@ -241,24 +311,35 @@ class Krylov:
             rows[torch.from_numpy(lost)] = self._random(int(lost.sum())) / math.sqrt(block.shape[1])
         return rows, torch.from_numpy(r[:, np.argsort(order)])
 
-    @staticmethod
-    def _factor_quickly(block: torch.Tensor, scale: float) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """As `_factor_rows`, once more where rounding asks for it; None if a pivot is small."""
-        first, failed = torch.linalg.cholesky_ex(block @ block.T)
+    def _factor_quickly(
+        self, block: torch.Tensor, squares: torch.Tensor, scale: float
+    ) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """As `_factor_rows` in place, given the rows' products; once more where rounding asks for it.
+
+        None, and the rows as they were, if a pivot is small.
+        """
+        first, failed = torch.linalg.cholesky_ex(squares)
         smallest, largest = torch.aminmax(torch.diagonal(first))
         if failed or not smallest > QUICK_PIVOT * scale:
             return None
-        block = _inverse(first) @ block
+        self._multiply(block, _inverse(first))
         if smallest > ROUND_PIVOT * largest:
             return block, first.T
-        second = torch.linalg.cholesky(block @ block.T)
-        return _inverse(second) @ block, second.T @ first.T
+        (squares,) = self._sums(lambda piece: (block[:, piece] @ block[:, piece].T,))
+        second = torch.linalg.cholesky(squares)
+        self._multiply(block, _inverse(second))
+        return block, second.T @ first.T
+
+
+def _pieces(size: int, number: int) -> list[slice]:
+    cuts = np.linspace(0, size, number + 1).astype(int).tolist()
+    return [slice(begin, end) for begin, end in pairwise(cuts)]
+
+
+def _empty(n_rows: int, n_columns: int) -> torch.Tensor:
+    return torch.empty(n_rows, n_columns, dtype=torch.float64)
 
 
 def _inverse(factor: torch.Tensor) -> torch.Tensor:
     """Of a lower triangular matrix."""
     return torch.linalg.solve_triangular(factor, torch.eye(len(factor), dtype=factor.dtype), upper=False)
-
-
-def _longest(rows: torch.Tensor) -> float:
-    return float(torch.linalg.norm(rows, dim=1).max())

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +15,7 @@ from scipy import sparse
 from igps.linalg.checks import ROUNDING
 from igps.linalg.direct import Factors, Structure, analyse
 from igps.linalg.krylov import Krylov
+from igps.threads import Team
 
 logger = logging.getLogger(__name__)
 
@@ -28,6 +32,8 @@ BASIS_PER_EIGENPAIR, BASIS_PER_EIGENPAIR_BELOW = 1.35, 2.35
 BASIS_BLOCKS, BASIS_BLOCKS_PER_DECADE, BASIS_BLOCKS_PER_DIGIT = {SMALL_BLOCK: 3.4, LARGE_BLOCK: 1.4}, 4.8, 1.0
 # The basis gives up at this multiple of what the pairs need, and so many vectors more
 BASIS_LIMIT, BASIS_LIMIT_BESIDES = 3, 600
+# Vertices from which a second thread pays
+TEAM_VERTICES = 2**13
 # How accurate the factorization must be, relative to the tolerance: the lowest modes see its error some 1000 times
 DEFECT = 2e-4
 # A gap this wide, relative to the eigenvalue, is taken at once; a multiplet has none, and the next gap is looked for
@@ -51,7 +57,9 @@ def lanczos(
 
     With the shift inside the spectrum it is fast. With the shift below, A − σI is definite: its factors are accurate.
     """
-    structure = analyse(matrix, positions)
+    # a solve reads and writes long vectors in the order of elimination: so they had better lie
+    structure, matrix, order = analyse(matrix, positions).arranged(matrix)
+    zero_mode = zero_mode[order]
     if inside:
         shift, factors = _factorize_inside(structure, matrix, zero_mode, n_eigenpairs, tolerance)
     else:
@@ -67,31 +75,36 @@ def lanczos(
     limit = min(limit, len(zero_mode) - 2 * block_size)
     n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
     generator = np.random.default_rng(seed)
-    krylov = Krylov(factors, zero_mode, block_size, first_look + 3 * block_size, generator)
-    while krylov.size < first_look:
-        krylov.expand()
-    while True:
-        ritz = krylov.ritz_pairs(shift)
-        found = ritz.leading(n_below, tolerance)
-        gap = gap_behind(ritz.eigenvalues[found], n_eigenpairs)
-        missing = False
-        if gap is not None:
-            n_found, bound = gap
-            n_present = structure.inertia(matrix, bound) - 1
-            if n_present == n_found:
-                return krylov.eigenvectors(ritz, found[:n_eigenpairs])
-            if n_present < n_found:
-                raise ConvergenceError(
-                    f"{n_found} eigenvalues found below {bound:.6g} / area, where there are {n_present}"
-                )
-            logger.debug("%d of %d eigenvalues found below %g", n_found, n_present, bound)
-            missing = True
-        if krylov.size > limit:
-            raise ConvergenceError(f"{len(found)} of {n_eigenpairs} eigenpairs after {krylov.size} basis vectors")
-        if missing or krylov.size > limit / 2:
-            krylov.widen()
-        for _ in range(2):
+    with Team(None if len(zero_mode) >= TEAM_VERTICES else 1) as team:
+        krylov = Krylov(factors, zero_mode, block_size, first_look + 3 * block_size, generator, team)
+        while krylov.size < first_look:
             krylov.expand()
+        while True:
+            ritz = krylov.ritz_pairs(shift)
+            found = ritz.leading(n_below, tolerance)
+            gap = gap_behind(ritz.eigenvalues[found], n_eigenpairs)
+            missing = False
+            if gap is not None:
+                n_found, bound = gap
+                # side by side, unless the basis must be kept in case that some are missing
+                vectors = partial(krylov.eigenvectors, ritz, found[:n_eigenpairs], order)
+                jobs: list[Callable[[], Any]] = [partial(structure.inertia, matrix, bound)]
+                n_negative, *pairs = team.each(_call, jobs if krylov.loses_basis else [*jobs, vectors])
+                n_present = n_negative - 1
+                if n_present == n_found:
+                    return pairs[0] if pairs else vectors()
+                if n_present < n_found:
+                    raise ConvergenceError(
+                        f"{n_found} eigenvalues found below {bound:.6g} / area, where there are {n_present}"
+                    )
+                logger.debug("%d of %d eigenvalues found below %g", n_found, n_present, bound)
+                missing = True
+            if krylov.size > limit:
+                raise ConvergenceError(f"{len(found)} of {n_eigenpairs} eigenpairs after {krylov.size} basis vectors")
+            if missing or krylov.size > limit / 2:
+                krylov.widen()
+            for _ in range(2):
+                krylov.expand()
 
 
 def _factorize_inside(
@@ -121,6 +134,10 @@ def _factorize_inside(
             break
     assert best is not None
     return best[2:]
+
+
+def _call(function: Callable[[], Any]) -> Any:
+    return function()
 
 
 def gap_behind(eigenvalues: torch.Tensor, n_eigenpairs: int) -> tuple[int, float] | None:

@@ -434,57 +434,84 @@ def _eliminate(
 
 
 @compiled()
-def _solve(
+def _forward(
+    nodes: tuple[int, int],
     right: np.ndarray,
+    order: np.ndarray,
+    first: np.ndarray,
+    children: np.ndarray,
+    start: np.ndarray,
+    parent_row: np.ndarray,
+    blocks: np.ndarray,
+    block_start: np.ndarray,
+    x: np.ndarray,
+    carried: np.ndarray,
+    carried_start: np.ndarray,
+    largest: int,
+    gemm: int,
+) -> None:
+    """The way up through a range of nodes: x, (V, b) flat, becomes D x; Eᵀ x is carried to the boundary's owners."""
+    b = right.shape[1]
+    rows = np.empty(largest * b)
+    tile = (max(1, min(b, 16)), SOLVE_TILE, SOLVE_TILE)
+    for n in range(nodes[0], nodes[1]):
+        n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
+        width, own = n_own + n_boundary, x[first[n] * b :]
+        for i in range(n_own):
+            for c in range(b):
+                own[i * b + c] = right[order[first[n] + i], c]
+        rows[: width * b] = 0.0
+        for side in range(2):
+            child = children[n, side]
+            if child < 0:
+                continue
+            source = carried[carried_start[child] * b :]
+            for k in range(start[child + 1] - start[child]):
+                i = parent_row[start[child] + k]
+                target = own[i * b :] if i < n_own else rows[i * b :]
+                for c in range(b):
+                    target[c] += source[k * b + c]
+        if n_own:
+            # D is symmetric: one product with the transposed block gives D x and Eᵀ x
+            shape = (b, width, n_own)
+            product(gemm, TRANSPOSED, shape, 1.0, own, b, blocks[block_start[n] :], width, 1.0, rows, b, tile)
+            own[: n_own * b] = rows[: n_own * b]
+        target = carried[carried_start[n] * b :]
+        target[: n_boundary * b] = rows[n_own * b : width * b]
+
+
+@compiled()
+def _backward(
+    nodes: tuple[int, int],
     order: np.ndarray,
     first: np.ndarray,
     start: np.ndarray,
     boundary: np.ndarray,
     blocks: np.ndarray,
     block_start: np.ndarray,
+    x: np.ndarray,
+    largest: int,
     gemm: int,
-) -> np.ndarray:
-    """Solutions (V, b) for right-hand sides (V, b)."""
-    n_vertices, b = right.shape
-    n_nodes = len(first) - 1
-    x = np.empty((n_vertices, b))
-    for i in range(n_vertices):
-        x[i] = right[order[i]]
-    flat = x.ravel()
-    largest = 1
-    for n in range(n_nodes):
-        largest = max(largest, start[n + 1] - start[n] + first[n + 1] - first[n])
-    carried = np.empty((largest, b))
-    flat_carried = carried.ravel()
+    solution: np.ndarray,
+) -> None:
+    """The way down through a range of nodes: x, (V, b) flat, becomes D x + E x_boundary, the solution (b, V)."""
+    b = len(solution)
+    known = np.empty(largest * b)
     tile = (max(1, min(b, 16)), SOLVE_TILE, SOLVE_TILE)
-    for n in range(n_nodes):
+    for n in range(nodes[1] - 1, nodes[0] - 1, -1):
         n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
-        if n_own == 0:
-            continue
-        width, own = n_own + n_boundary, flat[first[n] * b :]
-        # D is symmetric: one product with the transposed block gives D x and Eᵀ x
-        shape = (b, width, n_own)
-        product(gemm, TRANSPOSED, shape, 1.0, own, b, blocks[block_start[n] :], width, 0.0, flat_carried, b, tile)
-        own[: n_own * b] = flat_carried[: n_own * b]
-        for k in range(n_boundary):
-            j = boundary[start[n] + k]
+        own = x[first[n] * b :]
+        if n_own and n_boundary:
+            for k in range(n_boundary):
+                source = x[boundary[start[n] + k] * b :]
+                for c in range(b):
+                    known[k * b + c] = source[c]
+            block = blocks[block_start[n] + n_own :]
+            shape = (b, n_own, n_boundary)
+            product(gemm, NO, shape, 1.0, known, b, block, n_own + n_boundary, 1.0, own, b, tile)
+        for i in range(n_own):
             for c in range(b):
-                x[j, c] += carried[n_own + k, c]
-    for n in range(n_nodes - 1, -1, -1):
-        n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
-        if n_own == 0 or n_boundary == 0:
-            continue
-        for k in range(n_boundary):
-            j = boundary[start[n] + k]
-            for c in range(b):
-                carried[k, c] = x[j, c]
-        block, own = blocks[block_start[n] + n_own :], flat[first[n] * b :]
-        shape = (b, n_own, n_boundary)
-        product(gemm, NO, shape, 1.0, flat_carried, b, block, n_own + n_boundary, 1.0, own, b, tile)
-    solution = np.empty((n_vertices, b))
-    for i in range(n_vertices):
-        solution[order[i]] = x[i]
-    return solution
+                solution[c, order[first[n] + i]] = own[i * b + c]
 
 
 @compiled()
@@ -507,4 +534,4 @@ def _defects(
     return np.sqrt(squares), products
 
 
-dissect, tree, eliminate, solve, defects = _dissect, _tree, _eliminate, _solve, _defects
+dissect, tree, eliminate, forward, backward, defects = _dissect, _tree, _eliminate, _forward, _backward, _defects

@@ -6,7 +6,7 @@ it, and only the complements along one branch are kept. Pivot blocks of more tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -16,7 +16,10 @@ from scipy import sparse
 from igps.linalg.checks import canonical, check_entries
 from igps.linalg.factorization import SINGULAR, SingularMatrixError, invert
 from igps.linalg.ordering import checked_graph, nested_dissection
+from igps.threads import ALONE, Team
 
+# Unknowns from which a subtree is worth a thread of its own, and the most subtrees, as a power of two
+SUBTREE, MOST_SUBTREES = 2**12, 3
 # Own unknowns of a node above which its dense algebra is PyTorch's. OpenBLAS starts threads for LAPACK from 64 on.
 LARGE = 63
 
@@ -35,6 +38,10 @@ class Tree:
         block_start: (N + 1,) where each node's block [D E] starts among all blocks.
         update_start: (N,) where its complement starts among those that wait to be added.
         n_updates: entries of all complements that wait at the same time, at most.
+        subtrees: ranges of nodes that may be solved side by side.
+        above: the other nodes, as ranges, each behind its children.
+        carried_start: (N,) where the rows that a node adds to its boundary start among those that wait to be added.
+        n_carried: rows that wait at the same time, at most.
     """
 
     indptr: np.ndarray
@@ -49,6 +56,10 @@ class Tree:
     block_start: np.ndarray
     update_start: np.ndarray
     n_updates: int
+    subtrees: list[tuple[int, int]]
+    above: list[tuple[int, int]]
+    carried_start: np.ndarray
+    n_carried: int
 
     def factorize(self, matrix: sparse.csr_array, shift: float = 0.0) -> Factors:
         """Factorize ``matrix − shift · I``; arguments and errors are those of `factorization.factorize`."""
@@ -59,6 +70,15 @@ class Tree:
         """The number of negative eigenvalues of ``matrix − shift · I``."""
         one_block = np.empty(int(np.diff(self.block_start).max()))
         return self._eliminate(matrix, shift, one_block, np.zeros_like(self.block_start))
+
+    def arranged(self, matrix: sparse.csr_array) -> tuple[Tree, sparse.csr_array, np.ndarray]:
+        """The structure for unknowns in the order of elimination, such a matrix, and which each was before (V,)."""
+        matrix = canonical(matrix)
+        check_entries(matrix, self.indptr, self.indices)
+        matrix = sparse.csr_array(matrix[self.order][:, self.order])
+        matrix.sort_indices()
+        same = np.arange(len(self.order))
+        return replace(self, indptr=matrix.indptr, indices=matrix.indices, order=same, number=same), matrix, self.order
 
     def _eliminate(self, matrix: sparse.csr_array, shift: float, blocks: np.ndarray, block_start: np.ndarray) -> int:
         """Write the blocks; the number of negative eigenvalues."""
@@ -106,15 +126,35 @@ class Factors:
     blocks: np.ndarray
     n_negative: int
 
-    def solve(self, right_hand_sides: torch.Tensor) -> torch.Tensor:
-        """The solutions (V, b) for right-hand sides (V, b), float64."""
+    def solve(self, right_hand_sides: torch.Tensor, team: Team = ALONE) -> torch.Tensor:
+        """The solutions (V, b) for right-hand sides (V, b), float64, stored by columns."""
         from igps.linalg import loops
 
         tree, gemm = self.tree, int(_blas_and_lapack()[0])
-        right = np.ascontiguousarray(right_hand_sides.numpy())
-        return torch.from_numpy(
-            loops.solve(right, tree.order, tree.first, tree.start, tree.boundary, self.blocks, tree.block_start, gemm)
-        )
+        n_vertices, b = right_hand_sides.shape
+        right, solution = right_hand_sides.numpy(), torch.empty(b, n_vertices, dtype=torch.float64)
+        x, carried = (torch.empty(n * b, dtype=torch.float64).numpy() for n in (n_vertices, tree.n_carried))
+        largest = int((np.diff(tree.first) + np.diff(tree.start)).max())
+
+        def forward(nodes: tuple[int, int]) -> None:
+            loops.forward(
+                nodes, right, tree.order, tree.first, tree.children, tree.start, tree.parent_row, self.blocks,
+                tree.block_start, x, carried, tree.carried_start, largest, gemm,
+            )  # fmt: skip
+
+        def backward(nodes: tuple[int, int]) -> None:
+            loops.backward(
+                nodes, tree.order, tree.first, tree.start, tree.boundary, self.blocks, tree.block_start, x, largest,
+                gemm, solution.numpy(),
+            )  # fmt: skip
+
+        team.each(forward, tree.subtrees)
+        for nodes in tree.above:
+            forward(nodes)
+        for nodes in reversed(tree.above):
+            backward(nodes)
+        team.each(backward, tree.subtrees)
+        return solution.T
 
 
 def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = 32) -> Tree:
@@ -126,13 +166,11 @@ def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, 
     indptr, indices = (array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices))
     order, number, first, children, start, boundary, parent_row = loops.tree(node, 2**n_levels - 1, indptr, indices)
     n_own, n_boundary = np.diff(first), np.diff(start)
-    # when a node is eliminated, its children's complements are the last two that wait: its own takes their place
-    update_start = [0] * len(n_own)
-    top = n_updates = 0
-    for n, (child, size) in enumerate(zip(children[:, 0].tolist(), n_boundary.tolist(), strict=True)):
-        update_start[n] = top if child < 0 else update_start[child]
-        top = update_start[n] + size**2
-        n_updates = max(n_updates, top)
+    subtrees = _subtrees(n_levels, len(order))
+    inside = {node for begin, end in subtrees for node in range(begin, end)}
+    above = [(node, node + 1) for node in range(len(n_own)) if node not in inside]
+    update_start, n_updates = _stacks(children, n_boundary**2, [(0, len(n_own))])
+    carried_start, n_carried = _stacks(children, n_boundary, [*subtrees, *above])
     return Tree(
         indptr=indptr,
         indices=indices,
@@ -144,9 +182,43 @@ def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, 
         boundary=boundary,
         parent_row=parent_row,
         block_start=np.append(0, np.cumsum(n_own * (n_own + n_boundary))),
-        update_start=np.array(update_start, dtype=np.int64),
+        update_start=update_start,
         n_updates=n_updates,
+        subtrees=subtrees,
+        above=above,
+        carried_start=carried_start,
+        n_carried=n_carried,
     )
+
+
+def _subtrees(n_levels: int, n_unknowns: int) -> list[tuple[int, int]]:
+    """The ranges of nodes of a few large subtrees, in the order in which a full tree is numbered depth first.
+
+    They depend on the matrix alone, not on the threads that there are: neither do rounding errors.
+    """
+    depth = min(MOST_SUBTREES, n_levels - 1, max(0, int(n_unknowns / SUBTREE).bit_length()))
+    subtrees, begin = [], 0
+    for number in range(1, 2**depth + 1):
+        subtrees.append((begin, begin + 2 ** (n_levels - depth) - 1))
+        begin = subtrees[-1][1] + (number & -number).bit_length() - 1  # behind it come the nodes that it completes
+    return subtrees
+
+
+def _stacks(children: np.ndarray, sizes: np.ndarray, ranges: list[tuple[int, int]]) -> tuple[np.ndarray, int]:
+    """Where the result of each node starts, of these sizes, and the size of all; each range of nodes has its own place.
+
+    In a range, a node's result waits until its parent takes it: when a node is done, its children's results are the
+    last two that wait, and its own takes their place.
+    """
+    place, length, left = np.zeros(len(sizes), dtype=np.int64), sizes.tolist(), children[:, 0].tolist()
+    end = 0
+    for first, last in ranges:
+        top = end
+        for n in range(first, last):
+            place[n] = top if left[n] < first else place[left[n]]
+            top = int(place[n]) + length[n]
+            end = max(end, top)
+    return place, end
 
 
 def _eliminate_large(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor) -> int:
