@@ -26,13 +26,16 @@ import torch
 from numpy.typing import NDArray
 
 from igps.geometry.closed_forms import ListedRule, Surface, Tile, face_blocks, has_area
-from igps.geometry.far_field import ClusterMoments, HatMoments, HatTree, in_leaves, principal_axes
+from igps.geometry.far_field import Block, ClusterMoments, HatMoments, HatTree, in_leaves, principal_axes
+from igps.threads import Team
 
 logger = logging.getLogger(__name__)
 
 __all__ = ["extend", "mean_value_coordinates", "winding_number"]
 
 _BLOCK_BYTES = 256 * 2**20  # of dense weights at a time
+_ROWS = 2**13  # of the functions that are copied at a time
+_TEAM_VERTICES = 2**14  # from which a second thread pays
 _EXACT_RATIO = 1.1  # opening ratio that keeps the dense exact rule away from points near an edge, where it cancels
 _HAT_ERROR = 3.5e-3  # of the hats' moments at opening ratio 1; it falls with the third power
 _CLUSTER_ERROR = 2.2e-3  # of the clusters' moments a radius away from the cluster's ball; it falls with the third power
@@ -91,8 +94,8 @@ def extend(
     not have the accuracy, a finer approximation takes over, or the closed form. Neighbouring points share work, so that
     a value depends within the accuracy on the points beside it. ``dtype`` is that of the dense weights and of the
     product with the functions; None takes the cheapest that keeps
-    the accuracy. Memory beside arguments and result: at most 256 MiB of weights at a time, and three times the
-    functions.
+    the accuracy. Memory beside arguments and result: at most 256 MiB of weights at a time and thread, and three times
+    the functions.
 
     Raises:
         ValueError: a shape, an index or a value of an argument is invalid, or the weights of a point sum to zero.
@@ -114,7 +117,8 @@ def extend(
         raise ValueError("functions: expected finite values, got NaN or infinity")
     surface, order = _renumbered(surface)
     columns = torch.ones(len(order), values.shape[1] + 1, dtype=dtype, device=device)  # the last sums the weights
-    columns[:, :-1] = torch.as_tensor(values[order.cpu().numpy()])
+    for part, rows in zip(columns.split(_ROWS), order.cpu().split(_ROWS), strict=True):
+        part[:, :-1] = torch.as_tensor(values[rows.numpy()])
     out = np.empty((len(x), values.shape[1]))
     hats, listed = HatMoments.of(surface), ListedRule.of(surface)
     setting = _approximation(hats, x, accuracy)
@@ -357,22 +361,30 @@ def _approximate_sums(
     smaller one, so that hats near a point are never hidden in a cluster."""
     tree = HatTree.of(hats)
     clusters = ClusterMoments.of(tree, hats, columns)
-    rows = torch.empty(len(columns), dtype=torch.int64, device=points.device)
-    for block in tree.blocks(points, _GROUP, cluster_ratio):
+
+    def of_block(block: Block) -> list[tuple[torch.Tensor, torch.Tensor]]:
         terms = clusters.rows(block.clusters)
         n_terms, n_rows = len(terms), len(terms) + len(block.hats)
         values = columns.new_empty(n_rows, columns.shape[1])
         torch.index_select(clusters.sums, 0, terms, out=values[:n_terms])
         torch.index_select(columns, 0, block.hats, out=values[n_terms:])
-        rows.fill_(n_rows)  # a spare row of the weights, for the vertices in clusters
+        # a spare row of the weights, for the vertices in clusters
+        rows = torch.full((len(columns),), n_rows, dtype=torch.int64, device=points.device)
         rows[block.hats] = torch.arange(n_terms, n_rows, device=points.device)
+        sums = []
         for part in block.points.split(max(1, _BLOCK_BYTES // (n_rows * columns.dtype.itemsize))):
             x = points[part]
             weights = torch.zeros(n_rows + 1, len(x), dtype=columns.dtype, device=x.device)
             clusters.fill_terms(x, block.clusters, weights[:n_terms])
             hats.fill_weights(x, block.hats, weights[n_terms:-1])
             listed.replace(x, hats.near(x, ratio, block.hats), rows, weights)
-            yield part, weights[:-1].T @ values
+            sums.append((part, weights[:-1].T @ values))
+        return sums
+
+    pays = points.device.type == "cpu" and len(columns) >= _TEAM_VERTICES
+    with Team(None if pays else 1) as team:
+        for sums in team.each(of_block, list(tree.blocks(points, _GROUP, cluster_ratio))):
+            yield from sums
 
 
 def _normalised(values: torch.Tensor, totals: torch.Tensor) -> torch.Tensor:

@@ -89,7 +89,8 @@ def lanczos(
                 # side by side, unless the basis must be kept in case that some are missing
                 vectors = partial(krylov.eigenvectors, ritz, found[:n_eigenpairs], order)
                 jobs: list[Callable[[], Any]] = [partial(structure.inertia, matrix, bound)]
-                n_negative, *pairs = team.each(_call, jobs if krylov.loses_basis else [*jobs, vectors])
+                jobs += [] if krylov.loses_basis else [vectors]
+                n_negative, *pairs = team.each(_call, jobs)
                 n_present = n_negative - 1
                 if n_present == n_found:
                     return pairs[0] if pairs else vectors()
@@ -136,8 +137,8 @@ def _factorize_inside(
     return best[2:]
 
 
-def _call(function: Callable[[], Any]) -> Any:
-    return function()
+def _call(job: Callable[[], Any]) -> Any:
+    return job()
 
 
 def gap_behind(eigenvalues: torch.Tensor, n_eigenpairs: int) -> tuple[int, float] | None:
