@@ -115,10 +115,10 @@ class Krylov:
         last = slice(self._current, self._stop)
         near = self._basis[self._previous : self._stop]
         product = self._apply(self._basis[last])
-        projection, squares = self._sums(
-            lambda piece: (near[:, piece] @ product[:, piece].T, (product[:, piece] ** 2).sum(1))
+        projection, lengths = self._sums(
+            lambda piece: (near[:, piece] @ product[:, piece].T, torch.linalg.norm(product[:, piece], dim=1) ** 2)
         )
-        diagonal, scale = projection[self._current - self._previous :], math.sqrt(float(squares.max()))
+        diagonal, scale = projection[self._current - self._previous :], math.sqrt(float(lengths.max()))
 
         def leave_new(piece: slice) -> tuple[torch.Tensor]:
             new = product[:, piece].addmm_(projection.T, near[:, piece], alpha=-1)

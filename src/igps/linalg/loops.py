@@ -232,6 +232,27 @@ def _tree(
 
 
 @compiled()
+def _arranged(
+    indptr: np.ndarray, indices: np.ndarray, values: np.ndarray, order: np.ndarray, number: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A csr matrix whose row i and column i are those of ``order[i]`` before; its entries are sorted."""
+    new_indptr, new_indices = np.zeros_like(indptr), np.empty_like(indices)
+    new_values = np.empty_like(values)
+    end = 0
+    for i in range(len(order)):
+        begin = end
+        for k in range(indptr[order[i]], indptr[order[i] + 1]):
+            j, place = number[indices[k]], end
+            while place > begin and new_indices[place - 1] > j:
+                new_indices[place], new_values[place] = new_indices[place - 1], new_values[place - 1]
+                place -= 1
+            new_indices[place], new_values[place] = j, values[k]
+            end += 1
+        new_indptr[i + 1] = end
+    return new_indptr, new_indices, new_values
+
+
+@compiled()
 def _assemble(
     n: int,
     values: np.ndarray,
@@ -460,22 +481,34 @@ def _forward(
         for i in range(n_own):
             for c in range(b):
                 own[i * b + c] = right[order[first[n] + i], c]
-        rows[: width * b] = 0.0
+        # what the children carry: to own unknowns first, to those on the boundary behind the product
         for side in range(2):
             child = children[n, side]
-            if child < 0:
-                continue
-            source = carried[carried_start[child] * b :]
-            for k in range(start[child + 1] - start[child]):
-                i = parent_row[start[child] + k]
-                target = own[i * b :] if i < n_own else rows[i * b :]
-                for c in range(b):
-                    target[c] += source[k * b + c]
+            if child >= 0:
+                source, place = carried[carried_start[child] * b :], start[child]
+                k = 0
+                while k < start[child + 1] - place and parent_row[place + k] < n_own:
+                    i = parent_row[place + k]
+                    for c in range(b):
+                        own[i * b + c] += source[k * b + c]
+                    k += 1
         if n_own:
             # D is symmetric: one product with the transposed block gives D x and Eᵀ x
             shape = (b, width, n_own)
-            product(gemm, TRANSPOSED, shape, 1.0, own, b, blocks[block_start[n] :], width, 1.0, rows, b, tile)
+            product(gemm, TRANSPOSED, shape, 1.0, own, b, blocks[block_start[n] :], width, 0.0, rows, b, tile)
             own[: n_own * b] = rows[: n_own * b]
+        else:
+            rows[: width * b] = 0.0
+        for side in range(2):
+            child = children[n, side]
+            if child >= 0:
+                source, place = carried[carried_start[child] * b :], start[child]
+                k = start[child + 1] - place - 1
+                while k >= 0 and parent_row[place + k] >= n_own:
+                    i = parent_row[place + k]
+                    for c in range(b):
+                        rows[i * b + c] += source[k * b + c]
+                    k -= 1
         target = carried[carried_start[n] * b :]
         target[: n_boundary * b] = rows[n_own * b : width * b]
 
@@ -503,9 +536,9 @@ def _backward(
         own = x[first[n] * b :]
         if n_own and n_boundary:
             for k in range(n_boundary):
-                source = x[boundary[start[n] + k] * b :]
+                place = boundary[start[n] + k] * b
                 for c in range(b):
-                    known[k * b + c] = source[c]
+                    known[k * b + c] = x[place + c]
             block = blocks[block_start[n] + n_own :]
             shape = (b, n_own, n_boundary)
             product(gemm, NO, shape, 1.0, known, b, block, n_own + n_boundary, 1.0, own, b, tile)
@@ -534,4 +567,5 @@ def _defects(
     return np.sqrt(squares), products
 
 
-dissect, tree, eliminate, forward, backward, defects = _dissect, _tree, _eliminate, _forward, _backward, _defects
+dissect, tree, arranged, eliminate = _dissect, _tree, _arranged, _eliminate
+forward, backward, defects = _forward, _backward, _defects

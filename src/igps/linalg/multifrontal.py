@@ -19,7 +19,7 @@ from igps.linalg.ordering import checked_graph, nested_dissection
 from igps.threads import ALONE, Team
 
 # Unknowns from which a subtree is worth a thread of its own, and the most subtrees, as a power of two
-SUBTREE, MOST_SUBTREES = 2**12, 3
+SUBTREE, MOST_SUBTREES = 2**13, 3
 # Own unknowns of a node above which its dense algebra is PyTorch's. OpenBLAS starts threads for LAPACK from 64 on.
 LARGE = 63
 
@@ -73,12 +73,14 @@ class Tree:
 
     def arranged(self, matrix: sparse.csr_array) -> tuple[Tree, sparse.csr_array, np.ndarray]:
         """The structure for unknowns in the order of elimination, such a matrix, and which each was before (V,)."""
+        from igps.linalg import loops
+
         matrix = canonical(matrix)
         check_entries(matrix, self.indptr, self.indices)
-        matrix = sparse.csr_array(matrix[self.order][:, self.order])
-        matrix.sort_indices()
+        indptr, indices, data = loops.arranged(self.indptr, self.indices, matrix.data, self.order, self.number)
         same = np.arange(len(self.order))
-        return replace(self, indptr=matrix.indptr, indices=matrix.indices, order=same, number=same), matrix, self.order
+        structure = replace(self, indptr=indptr, indices=indices, order=same, number=same)
+        return structure, sparse.csr_array((data, indices, indptr), shape=matrix.shape), self.order
 
     def _eliminate(self, matrix: sparse.csr_array, shift: float, blocks: np.ndarray, block_start: np.ndarray) -> int:
         """Write the blocks; the number of negative eigenvalues."""
