@@ -155,6 +155,12 @@ def test_commands(
     for which in (index, tmp_path / "copy.igps"):
         command(monkeypatch, "query", wanted, "--index", which, "--top", 4, *cache)
         assert capsys.readouterr().out == expected
+    command(monkeypatch, "query", wanted, "--gallery", root, "--descriptor", INTERIOR, "--rerank", *cache, *SMALL)
+    reranked = capsys.readouterr().out
+    assert len(reranked.splitlines()) == 7
+    assert reranked.splitlines()[:5] != expected.splitlines()[:5]
+    command(monkeypatch, "query", wanted, "--index", index, "--rerank", *cache)
+    assert capsys.readouterr().out == reranked
     (root / "egg" / "0.off").unlink()
     command(monkeypatch, "query", wanted, "--index", index, "--top", 4, *cache)
     out = capsys.readouterr().out

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from igps.retrieval import euclidean, rerank, retrieval_scores
+from igps.retrieval import euclidean, rerank, rerank_found, retrieval_scores, search
 
 
 def by_hand(distances: list[list[float]], k: int, n_expanded: int, share: float) -> list[list[float]]:
@@ -51,7 +51,8 @@ def points() -> Tensor:
 def test_sets_and_sums_of_the_paper(k: int, n_expanded: int, share: float, points: Tensor) -> None:
     distances = euclidean(points, points)
     expected = torch.tensor(by_hand(distances.tolist(), k, n_expanded, share), dtype=torch.float64)
-    torch.testing.assert_close(rerank(distances, k, n_expanded, share), expected, atol=1e-10, rtol=0)
+    found = rerank(distances, k, n_expanded, share, keep_nearest=False)
+    torch.testing.assert_close(found, expected, atol=1e-10, rtol=0)
 
 
 def test_a_shape_is_its_own_nearest_among_equals(points: Tensor) -> None:
@@ -61,7 +62,30 @@ def test_a_shape_is_its_own_nearest_among_equals(points: Tensor) -> None:
     distances = (distances + distances.T) / 2
     for k in (3, 5):
         expected = torch.tensor(by_hand(distances.tolist(), k, 1, 0.3), dtype=torch.float64)
-        torch.testing.assert_close(rerank(distances, k, 1, 0.3), expected, atol=1e-10, rtol=0)
+        found = rerank(distances, k, 1, 0.3, keep_nearest=False)
+        torch.testing.assert_close(found, expected, atol=1e-10, rtol=0)
+
+
+@pytest.mark.parametrize("n_copies", [0, 8])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_nearest_stays_the_nearest(n_copies: int, dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(3)
+    points = torch.randn(60, 4, generator=generator, dtype=torch.float64)
+    points = torch.cat([points, *[points[:n_copies]] * 2])
+    own = euclidean(points, points).to(dtype).fill_diagonal_(0)
+    own = torch.minimum(own, own.T)
+    found, moved = rerank(own), rerank(own, keep_nearest=False)
+    torch.testing.assert_close(found, found.T, rtol=0, atol=0)
+    alone = own.clone().fill_diagonal_(torch.inf)
+    for i, row in enumerate(found.clone().fill_diagonal_(torch.inf)):
+        assert alone[i, row.argmin()] == alone[i].min()
+    if not n_copies:  # it does move without: else the test would not tell
+        assert (moved.fill_diagonal_(torch.inf).argmin(1) != alone.argmin(1)).any()
+    nearest = torch.zeros_like(own, dtype=torch.bool).scatter_(1, alone.argmin(1)[:, None], True)
+    if not n_copies:  # among equals, which is the nearest is not told
+        rest = ~(nearest | nearest.T).fill_diagonal_(True)
+        torch.testing.assert_close(found[rest], rerank(own, keep_nearest=False)[rest], rtol=0, atol=0)
+        assert found[nearest].max() < found[rest].min()
 
 
 def test_the_order_of_shapes_does_not_matter(points: Tensor) -> None:
@@ -82,6 +106,32 @@ def test_classes_that_scatter_are_found_better() -> None:
     before, after = (retrieval_scores(d, labels).mean()["ft"] for d in (plain, rerank(plain)))
     assert 0.5 < before < 0.8
     assert after > before + 0.1
+
+
+def test_a_query_with_all_that_there_is_ranks_as_the_collection_does(points: Tensor) -> None:
+    queries, gallery = points[:3], points[3:]
+    whole = search(queries, gallery, top=len(gallery), distance=euclidean)
+    found = rerank_found(queries, whole, lambda indices: gallery[indices], euclidean, top=5)
+    for i, query in enumerate(queries):
+        together = torch.cat([query[None], gallery])
+        expected = rerank(euclidean(together, together))[0, 1:]
+        assert found.indices[i].tolist() == expected.argsort()[:5].tolist()
+        torch.testing.assert_close(found.distances[i], expected.sort().values[:5], rtol=0, atol=1e-9)
+
+
+def test_a_query_is_put_in_order_by_its_nearest_alone() -> None:
+    """Of 240 points the nearest 60 tell as much as all do; the nearest 20 can only change places."""
+    generator = torch.Generator().manual_seed(1)
+    labels = torch.arange(12).repeat_interleave(20)
+    scattered = torch.randn(12, 1, 20, generator=generator) + torch.randn(12, 20, 20, generator=generator)
+    points, queries = scattered.flatten(0, 1), torch.arange(0, 240, 7)
+    precision = []
+    for n_near in (20, 60, 240):
+        near = search(points[queries], points, top=n_near, distance=euclidean)
+        found = rerank_found(points[queries], near, lambda indices: points[indices], euclidean, top=20)
+        precision.append(float((labels[found.indices] == labels[queries][:, None]).double().mean()))
+    assert precision[1] > precision[0] + 0.05
+    assert abs(precision[1] - precision[2]) < 0.05
 
 
 def test_few_shapes_and_equal_ones() -> None:

@@ -24,7 +24,7 @@ from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor
 from igps.report.sources import write_sources
 from igps.report.tables import scores_table
-from igps.retrieval import RetrievalScores, rank, retrieval_scores, search
+from igps.retrieval import N_RERANKED, RetrievalScores, rank, rerank_found, retrieval_scores, search
 from igps.retrieval import rerank as reranked_distances
 from igps.studies.comparison import pair_distances
 
@@ -117,6 +117,7 @@ def query(
     index: Path | None = None,
     top: int = 10,
     descriptor: str | None = None,
+    rerank: bool = False,
     **reading: Any,
 ) -> list[dict[str, Any]]:
     """List the meshes of a gallery that are most similar to one mesh.
@@ -128,6 +129,8 @@ def query(
         top: how many to list.
         descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own; if not given, that of the
             index, or pretrained.
+        rerank: put the nearest 200 in order by what neighbours they have in common (k-reciprocal re-ranking, without
+            labels); the distances listed are those of this order, without unit.
     """
     if top < 1:
         raise ValueError(f"top: expected at least 1, got {top}.")
@@ -137,7 +140,7 @@ def query(
         opened = Gallery(index, descriptor)
         reading = as_indexed(opened, reading)
         _, wanted, _ = _described([mesh], opened.descriptor, **{**reading, "n_workers": 1})
-        matches = opened.nearest(wanted, top=top)[0]
+        matches = opened.nearest(wanted, top=top, rerank=rerank)[0]
         rows = [(match.name, match.label, match.distance) for match in matches]
         missing = sum(not match.path.exists() for match in matches)
         _print_found(rows)
@@ -147,7 +150,11 @@ def query(
     chosen = descriptor_of(descriptor or "pretrained")
     _, wanted, _ = _described([mesh], chosen, **reading)
     dataset, descriptions, _ = _described(find_meshes(gallery), chosen, **reading)  # type: ignore[arg-type]
-    found = search(wanted, descriptions, top=min(top, len(dataset)), distance=chosen.distances)
+    n_found = min(top, len(dataset))
+    n_near = min(max(top, N_RERANKED), len(dataset)) if rerank else n_found
+    found = search(wanted, descriptions, top=n_near, distance=chosen.distances)
+    if rerank:
+        found = rerank_found(wanted, found, lambda indices: descriptions[indices], chosen.distances, top=n_found)
     names, labels = dataset.files.names, dataset.files.labels
     places = zip(found.indices[0].tolist(), found.distances[0].tolist(), strict=True)
     rows = [(names[i], None if labels is None else labels[i], distance) for i, distance in places]

@@ -22,6 +22,7 @@ from igps.nn.descriptor import Descriptor
 from igps.nn.heads import distances_of
 from igps.retrieval.distances import cosine
 from igps.retrieval.index import CANDIDATES, Entry, VectorIndex, check_alike, extend_index, merge_indices, write_index
+from igps.retrieval.reranking import N_RERANKED, rerank_found
 from igps.retrieval.search import SearchResult
 
 # So many descriptions are in memory at once.
@@ -36,7 +37,7 @@ class Match:
         name: in its collection.
         label: its class, if it is known.
         path: its file when it was indexed, which may have been moved since.
-        distance: from the query, by the descriptor's own distance.
+        distance: from the query, by the descriptor's own distance; or re-ranked, without unit.
     """
 
     name: str
@@ -86,7 +87,13 @@ class Gallery:
         return len(self.index)
 
     def query(
-        self, mesh: str | Path, *, top: int = 10, cache_dir: str | Path | None = None, exact: bool = False
+        self,
+        mesh: str | Path,
+        *,
+        top: int = 10,
+        cache_dir: str | Path | None = None,
+        exact: bool = False,
+        rerank: bool = False,
     ) -> list[Match]:
         """The meshes closest to that of a file, closest first.
 
@@ -95,17 +102,31 @@ class Gallery:
             top: how many; all if there are fewer.
             cache_dir: of Signatures; the user's cache directory if None.
             exact: compare with all, which takes long in a large index.
+            rerank: put the nearest in order by what neighbours they have in common, see `rerank_found`.
 
         Raises:
             MeshError: the mesh cannot be used.
         """
         dataset = SignatureDataset([mesh], self.config, cache_dir, reading=self.reading)
         descriptions, _ = describe_usable(dataset, self.descriptor, n_workers=1, strict=True)
-        return self.nearest(descriptions, top=top, exact=exact)[0]
+        return self.nearest(descriptions, top=top, exact=exact, rerank=rerank)[0]
 
-    def nearest(self, descriptions: Tensor, *, top: int = 10, exact: bool = False) -> list[list[Match]]:
-        """For each of the descriptions (Q, ...) the meshes closest to it, closest first."""
-        found = self.search(descriptions, top=top, exact=exact)
+    def nearest(
+        self, descriptions: Tensor, *, top: int = 10, exact: bool = False, rerank: bool = False
+    ) -> list[list[Match]]:
+        """For each of the descriptions (Q, ...) the meshes closest to it, closest first; options as of `query`."""
+        if rerank:
+            wide = self.search(descriptions, top=max(top, N_RERANKED), exact=exact)
+            with torch.inference_mode():
+                found = rerank_found(
+                    descriptions,
+                    wide,
+                    lambda positions: self.index.descriptions(positions.numpy()),
+                    self.descriptor.distances,
+                    top=min(top, len(self)),
+                )
+        else:
+            found = self.search(descriptions, top=top, exact=exact)
         return [
             [
                 Match(entry.name, entry.label, Path(entry.id), distance)

@@ -1,7 +1,7 @@
 """Tensors in, numbers out: distances between descriptors, rankings and retrieval scores."""
 
 from igps.retrieval.distances import Distance, chi_square, cosine, euclidean, hellinger
-from igps.retrieval.reranking import rerank
+from igps.retrieval.reranking import N_RERANKED, rerank, rerank_found
 from igps.retrieval.scores import (
     Labels,
     PrecisionRecallCurve,
@@ -12,6 +12,7 @@ from igps.retrieval.scores import (
 from igps.retrieval.search import SearchResult, rank, search
 
 __all__ = [
+    "N_RERANKED",
     "Distance",
     "Labels",
     "PrecisionRecallCurve",
@@ -24,6 +25,7 @@ __all__ = [
     "precision_recall_curve",
     "rank",
     "rerank",
+    "rerank_found",
     "retrieval_scores",
     "search",
 ]

@@ -2,24 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
+from igps.retrieval.distances import Distance
+from igps.retrieval.search import SearchResult, rank
 
-def rerank(distances: Tensor, n_neighbours: int = 20, n_expanded: int = 6, share: float = 0.3) -> Tensor:
+N_RERANKED = 200
+"""Nearest entries whose neighbourhoods among each other put those of a single query in order."""
+
+
+def rerank(
+    distances: Tensor, n_neighbours: int = 20, n_expanded: int = 6, share: float = 0.3, *, keep_nearest: bool = True
+) -> Tensor:
     """k-reciprocal re-ranking: shapes are close whose neighbours are the same (Zhong, Zheng, Cao and Li 2017).
 
     The neighbourhood of a shape are those among its k nearest that have it among theirs, joined by the neighbourhoods,
     of k/2, of its members where two thirds of those are in it already. Its members weigh exp(−d), d in units of the
     mean distance to the k nearest; the weights are averaged over the nearest shapes, and the Jaccard distance of two
     such neighbourhoods is mixed with the distance itself. The whole collection decides: a shape less, and the others
-    rank differently.
+    rank differently. What neighbours have in common tells which class a shape is of, less which body of it; so the
+    nearest of each stays its nearest.
 
     Args:
         distances: (N, N) of a collection to itself, symmetric, ≥ 0.
         n_neighbours: k, at most N − 1.
         n_expanded: nearest shapes, itself among them, that the weights are averaged over.
         share: of the distance itself, in units of its mean, in the sum.
+        keep_nearest: pairs of which one is the other's nearest come before all others, in their own order; the paper
+            leaves them where they fall.
 
     Returns:
         (N, N) distances ≥ 0, symmetric, 0 on the diagonal; without unit.
@@ -59,7 +72,47 @@ def rerank(distances: Tensor, n_neighbours: int = 20, n_expanded: int = 6, share
     jaccard = (jaccard + jaccard.T) / 2
     mean = own.sum() / (n * (n - 1))
     mixed = (1 - share) * jaccard.clamp_min(0) + share * own / mean.clamp_min(torch.finfo(own.dtype).tiny)
-    return mixed.fill_diagonal_(0).to(distances.dtype)
+    mixed.fill_diagonal_(0)
+    if keep_nearest:
+        _bring_forward(mixed, own, order[:, 1])
+    return mixed.to(distances.dtype)
+
+
+def rerank_found(
+    queries: Tensor, found: SearchResult, descriptions: Callable[[Tensor], Tensor], distance: Distance, *, top: int
+) -> SearchResult:
+    """The entries that each query found, put in order by `rerank` of the query and them: not of the whole collection.
+
+    Args:
+        queries: (Q, ...).
+        found: the nearest M entries of each, of which more than `top` are of use: `N_RERANKED`.
+        descriptions: those (M, ...) of entries (M,).
+        distance: that of the descriptions.
+        top: how many to return, at most M.
+
+    Returns:
+        re-ranked distances, without unit.
+    """
+    results = []
+    for query, entries in zip(queries, found.indices, strict=True):
+        together = torch.cat([query[None], descriptions(entries).to(query)])
+        own = distance(together, together)
+        own = torch.minimum(own, own.T).fill_diagonal_(0)  # the two differ by rounding
+        anew = rerank(own)[:1, 1:]
+        best = rank(anew)[:, :top]
+        results.append((entries[best[0].to(entries.device)], anew.gather(1, best)[0]))
+    return SearchResult(*(torch.stack(each) for each in zip(*results, strict=True)))
+
+
+def _bring_forward(mixed: Tensor, own: Tensor, nearest: Tensor) -> None:
+    """Make each shape's nearest by its own distances, (N,), its nearest by the mixed ones, in place."""
+    pairs = torch.zeros(mixed.shape, dtype=torch.bool, device=mixed.device).scatter_(1, nearest[:, None], True)
+    pairs = pairs | pairs.T
+    others = mixed[~pairs & (mixed > 0)]
+    least = others.min() if len(others) else mixed.new_ones(())
+    largest = own[pairs].max().clamp_min(torch.finfo(own.dtype).tiny)
+    # half of the least, so that single precision leaves no tie
+    mixed[pairs] = 0.5 * least * own[pairs] / largest
 
 
 def _reciprocal(order: Tensor, k: int) -> Tensor:
