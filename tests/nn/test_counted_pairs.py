@@ -9,6 +9,7 @@ from loops import Axis, cosines, distances, pair_histogram_by_loops
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from igps import threads
 from igps.compiled import is_available
 from igps.nn import counted_pairs
 from igps.nn.counted_pairs import can_count, count_pairs
@@ -90,3 +91,23 @@ def test_distances_that_cannot_be_told_are_refused() -> None:
     with pytest.raises(ValueError, match="points: expected distances that can be squared"):
         count_pairs(one_class, [(far, torch.tensor([0.5, 1.0]))])
     assert count_pairs(one_class, [(far / 10, torch.tensor([0.5, 1.0]))]).tolist() == [[0, 1]]
+
+
+def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """700 points, several blocks for each share."""
+    monkeypatch.setattr(threads, "n_cores", lambda: 8)
+    coordinates, points, directions, memberships = points_and_more(700)
+    centres, angles = torch.tensor(MANY).double(), torch.tensor(COSINES).double()
+    before = torch.get_num_threads()
+    histograms = []
+    try:
+        for n_threads in (1, 2, 5):
+            torch.set_num_threads(n_threads)
+            histograms.append(
+                count_pairs(memberships, [(coordinates, centres)], [(points, directions, angles, angles)])
+            )
+    finally:
+        torch.set_num_threads(before)
+    torch.testing.assert_close(histograms[0].sum(), torch.ones((), dtype=torch.float64))
+    assert torch.equal(histograms[0], histograms[1])
+    assert torch.equal(histograms[0], histograms[2])

@@ -12,10 +12,13 @@ from torch import Tensor
 from igps.compiled import is_available
 from igps.nn.pair_loops import add_features, add_pairs
 from igps.nn.precision import full_precision
+from igps.threads import Team
 
 # Values of all axes that are held at once: they stay in a core's second-level cache.
 _BLOCK = 2**18
 _MOST_COLUMNS = 2048
+# Of the blocks, which threads count side by side
+_SHARES = 4
 _TYPES = (torch.float32, torch.float64)
 
 
@@ -63,14 +66,15 @@ def count_pairs(
         raise ValueError("points: expected distances that can be squared, got larger ones; choose a larger unit.")
     turned = [[each[order].to(dtype).T.contiguous().numpy() for each in (p, n)] for p, n, *_ in oriented]
     n_points, n_classes = memberships.shape
-    total = torch.zeros(n_classes * (n_classes + 1) // 2, math.prod(shape) * 2 ** len(shape), dtype=torch.float64)
     of_axes = norms.numpy(), centres.numpy(), np.array(shape)
-    of_points = classes.numpy(), weights.numpy(), total.numpy()
     n_columns = min(n_points, _MOST_COLUMNS)
     n_rows = min(max(1, _BLOCK // (n_columns * len(shape))), n_columns)
-    with torch.autocast("cpu", enabled=False), full_precision():
-        for row in range(0, n_points, n_rows):
-            for column in range(row, n_points, n_columns):
+    blocks = [(row, column) for row in range(0, n_points, n_rows) for column in range(row, n_points, n_columns)]
+
+    def counted(blocks: Sequence[tuple[int, int]]) -> Tensor:
+        total = torch.zeros(n_classes * (n_classes + 1) // 2, math.prod(shape) * 2 ** len(shape), dtype=torch.float64)
+        with torch.autocast("cpu", enabled=False):
+            for row, column in blocks:
                 rows, columns = slice(row, row + n_rows), slice(column, column + n_columns)
                 n_kept = (min(n_rows, n_points - row), min(n_columns, n_points - column))
                 block = torch.empty(len(shape), *n_kept, dtype=dtype)
@@ -80,7 +84,13 @@ def count_pairs(
                 for k, (places, directions) in enumerate(turned):
                     first = len(located) + 3 * k
                     add_features(places, directions, row, column, values[first : first + 3])
-                add_pairs(values, *of_axes, row, column, *of_points)
+                add_pairs(values, *of_axes, row, column, classes.numpy(), weights.numpy(), total.numpy())
+        return total
+
+    # Each share has counts of its own, added in order: how many threads there are changes no bit.
+    shares = [blocks[k::_SHARES] for k in range(min(_SHARES, len(blocks)))]
+    with full_precision(), Team() as team:
+        total = torch.stack(team.each(counted, shares)).sum(dim=0)
     return _folded(total, shape) / (n_points * (n_points - 1) / 2)
 
 
