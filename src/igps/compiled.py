@@ -1,7 +1,7 @@
 """Loops that Numba compiles, where it is installed; whoever has one has another way for where it is not.
 
 Compiled code is kept on disk by Numba, so that a process pays for compiling once per machine and version. It releases
-the interpreter's lock and uses one thread: how many work side by side is for `igps.parallel` to say.
+the interpreter's lock and uses one thread: how many work side by side is for `igps.threads` to say.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ def eigenpairs(
 
     None is missing: their number is proved by inertia. The residual of each pair, ‖L φ − λ M φ‖ / λ in the norm of M⁻¹,
     is at most the tolerance, or as small as rounding allows, and then at most RESIDUAL_LIMIT. Within a multiplet the
-    basis is arbitrary. The result is the same for the same seed. It is computed on one thread.
+    basis is arbitrary. The result is the same for the same seed, to the bit with any number of threads.
 
     The matrices may come from any library, with the sign that makes the stiffness positive semi-definite.
 

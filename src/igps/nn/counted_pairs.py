@@ -1,4 +1,4 @@
-"""Histograms of pairs by compiled loops: in one pass for all axes, on one thread, without gradient."""
+"""Histograms of pairs by compiled loops: in one pass for all axes, without gradient."""
 
 from __future__ import annotations
 
