@@ -415,3 +415,18 @@ def test_what_a_job_of_a_team_raises_is_raised_when_no_job_runs_any_more() -> No
         threading.Event().wait(0.3)
         assert running._value == ended_jobs
         assert team.each(abs, [-1, -2]) == [1, 2]
+
+
+@pytest.mark.parametrize("inference", [True, False])
+def test_a_team_computes_in_the_mode_of_who_asks(inference: bool) -> None:
+    together = threading.Barrier(2, timeout=20)
+
+    def add(number: int) -> bool:
+        together.wait()
+        sums[number] += 1
+        return torch.is_inference_mode_enabled()
+
+    with torch.inference_mode(inference), Team(2) as team:
+        sums = torch.zeros(2)
+        assert team.each(add, range(2)) == [inference, inference]
+    assert sums.tolist() == [1, 1]

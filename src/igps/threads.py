@@ -105,7 +105,7 @@ class Team:
             for number in waiting:  # the interpreter's lock gives each number to one thread
                 results[number] = function(jobs[number])
 
-        helpers = [self._pool.submit(work) for _ in range(n_helpers)]
+        helpers = [self._pool.submit(_in_mode, torch.is_inference_mode_enabled(), work) for _ in range(n_helpers)]
         try:
             work()
         finally:
@@ -114,6 +114,12 @@ class Team:
         for helper in begun:
             helper.result()
         return results
+
+
+def _in_mode(inference: bool, function: Callable[[], None]) -> None:
+    """PyTorch keeps the mode of each thread, and lets no other mode change tensors that were made in inference mode."""
+    with torch.inference_mode(inference):
+        function()
 
 
 # One thread, for whoever needs no other
