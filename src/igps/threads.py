@@ -41,7 +41,7 @@ def n_cores() -> int:
 def n_threads() -> int:
     """Threads of Python that the present call may use: as many as cores, but no more than torch had before the call."""
     most = _present.most
-    return min(n_cores(), torch.get_num_threads()) if most is None else most
+    return min(n_cores(), _get_torch_threads()) if most is None else most
 
 
 @contextlib.contextmanager
@@ -53,7 +53,7 @@ def one_thread() -> Iterator[None]:
     """
     outside = _present.most
     _present.most = n_threads()
-    before = torch.get_num_threads()
+    before = _get_torch_threads()
     try:
         with _blas_on_one_thread():
             _set_torch_threads(1)
@@ -169,13 +169,19 @@ _present = _Present()
 _torch_threads = threading.Lock()
 
 
+def _get_torch_threads() -> int:
+    """Of this thread; where it has not computed yet, never what `_set_torch_threads` means for another."""
+    with _torch_threads:
+        return torch.get_num_threads()
+
+
 def _set_torch_threads(n: int) -> None:
     """For this thread alone.
 
     `torch.set_num_threads` also sets with how many a thread starts that computes for the first time. Another such
     thread sets that back.
     """
-    if torch.get_num_threads() == n:
+    if _get_torch_threads() == n:
         return
     with _torch_threads:
         of_new_threads = _in_new_thread(torch.get_num_threads)
