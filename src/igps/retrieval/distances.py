@@ -178,6 +178,10 @@ def square_root(values: Tensor) -> Tensor:
 
 
 def _unit(name: str, rows: Tensor) -> Tensor:
+    lengths = torch.linalg.vector_norm(rows, dim=1, keepdim=True)
+    limits = torch.finfo(rows.dtype)
+    if bool(((lengths > limits.tiny**0.25) & (lengths < limits.max**0.25)).all()):
+        return rows / lengths
     # By the largest entry first: the sum of squares of tiny or huge entries leaves the range of the dtype.
     largest = rows.detach().abs().amax(dim=1, keepdim=True)
     empty = (largest == 0).sum().item()
