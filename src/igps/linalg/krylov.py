@@ -116,7 +116,10 @@ class Krylov:
         near = self._basis[self._previous : self._stop]
         product = self._apply(self._basis[last])
         projection, lengths = self._sums(
-            lambda piece: (near[:, piece] @ product[:, piece].T, torch.linalg.norm(product[:, piece], dim=1) ** 2)
+            lambda piece: (
+                near[:, piece] @ product[:, piece].T.contiguous(),
+                torch.linalg.norm(product[:, piece], dim=1) ** 2,
+            )
         )
         diagonal, scale = projection[self._current - self._previous :], math.sqrt(float(lengths.max()))
 
@@ -206,10 +209,11 @@ class Krylov:
         """What each piece of the columns contributes, added in the order of the pieces."""
         return tuple(torch.stack(part).sum(0) for part in zip(*self._team.each(parts, self._pieces), strict=True))
 
-    def _append(self, block: torch.Tensor, *, swept: bool) -> None:
-        stop = self._stop + len(block)
+    def _room(self, n_rows: int) -> torch.Tensor:
+        """The rows of the basis behind the last, which a block is written to before it is appended."""
+        stop = self._stop + n_rows
         if stop > len(self._basis):
-            capacity = len(self._basis) * 3 // 2 + len(block)
+            capacity = len(self._basis) * 3 // 2 + n_rows
             basis, projected = self._basis, self._projected
             if self._single is None:
                 self._memory = np.empty((capacity, basis.shape[1]))
@@ -222,13 +226,13 @@ class Krylov:
                 self._single[: self._swept] = single[: self._swept]
             self._projected = projected.new_zeros(capacity, capacity)
             self._projected[: self._stop, : self._stop] = projected[: self._stop, : self._stop]
-        new = self._basis[self._stop : stop]
+        return self._basis[self._stop : stop]
 
-        def copy(piece: slice) -> None:
-            new[:, piece] = block[:, piece]
-
-        self._team.each(copy, self._pieces)
-        self._stop = stop
+    def _append(self, block: torch.Tensor, *, swept: bool) -> None:
+        room = self._room(len(block))
+        if block.data_ptr() != room.data_ptr():
+            room.copy_(block)
+        self._stop += len(block)
         if swept:
             self._mark_swept()
 
@@ -267,15 +271,18 @@ class Krylov:
             return (here @ here.T,)
 
         (squares,) = self._sums(take_out)
-        self._multiply(new, _inverse(torch.linalg.cholesky(squares)))
+        self._multiply(_inverse(torch.linalg.cholesky(squares)), new, new)
         self._mark_swept()
         return largest
 
-    def _multiply(self, rows: torch.Tensor, factor: torch.Tensor) -> None:
-        """In place, by a matrix (b, b) from the left."""
+    def _multiply(self, factor: torch.Tensor, rows: torch.Tensor, out: torch.Tensor) -> None:
+        """The product of a matrix (b, b) with rows (b, V), which ``out`` may be."""
 
         def multiply(piece: slice) -> None:
-            rows[:, piece] = factor @ rows[:, piece]
+            if out is rows:
+                rows[:, piece] = factor @ rows[:, piece]
+            else:
+                torch.mm(factor, rows[:, piece], out=out[:, piece])
 
         self._team.each(multiply, self._pieces)
 
@@ -314,21 +321,22 @@ class Krylov:
     def _factor_quickly(
         self, block: torch.Tensor, squares: torch.Tensor, scale: float
     ) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """As `_factor_rows` in place, given the rows' products; once more where rounding asks for it.
+        """As `_factor_rows`, in the room of the basis, given the rows' products; again where rounding asks for it.
 
-        None, and the rows as they were, if a pivot is small.
+        None if a pivot is small.
         """
         first, failed = torch.linalg.cholesky_ex(squares)
         smallest, largest = torch.aminmax(torch.diagonal(first))
         if failed or not smallest > QUICK_PIVOT * scale:
             return None
-        self._multiply(block, _inverse(first))
+        rows = self._room(len(block))
+        self._multiply(_inverse(first), block, rows)
         if smallest > ROUND_PIVOT * largest:
-            return block, first.T
-        (squares,) = self._sums(lambda piece: (block[:, piece] @ block[:, piece].T,))
+            return rows, first.T
+        (squares,) = self._sums(lambda piece: (rows[:, piece] @ rows[:, piece].T,))
         second = torch.linalg.cholesky(squares)
-        self._multiply(block, _inverse(second))
-        return block, second.T @ first.T
+        self._multiply(_inverse(second), rows, rows)
+        return rows, second.T @ first.T
 
 
 def _pieces(size: int, number: int) -> list[slice]:

@@ -32,8 +32,8 @@ BASIS_PER_EIGENPAIR, BASIS_PER_EIGENPAIR_BELOW = 1.35, 2.35
 BASIS_BLOCKS, BASIS_BLOCKS_PER_DECADE, BASIS_BLOCKS_PER_DIGIT = {SMALL_BLOCK: 3.4, LARGE_BLOCK: 1.4}, 4.8, 1.0
 # The basis gives up at this multiple of what the pairs need, and so many vectors more
 BASIS_LIMIT, BASIS_LIMIT_BESIDES = 3, 600
-# Vertices from which a second thread pays
-TEAM_VERTICES = 2**13
+# Numbers in the result from which a second thread pays
+TEAM_RESULT = 2**21
 # How accurate the factorization must be, relative to the tolerance: the lowest modes see its error some 1000 times
 DEFECT = 2e-4
 # A gap this wide, relative to the eigenvalue, is taken at once; a multiplet has none, and the next gap is looked for
@@ -75,7 +75,7 @@ def lanczos(
     limit = min(limit, len(zero_mode) - 2 * block_size)
     n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
     generator = np.random.default_rng(seed)
-    with Team(None if len(zero_mode) >= TEAM_VERTICES else 1) as team:
+    with Team(None if n_eigenpairs * len(zero_mode) >= TEAM_RESULT else 1) as team:
         krylov = Krylov(factors, zero_mode, block_size, first_look + 3 * block_size, generator, team)
         while krylov.size < first_look:
             krylov.expand()
