@@ -17,8 +17,8 @@ from igps.threads import Team
 # Values of all axes that are held at once: they stay in a core's second-level cache.
 _BLOCK = 2**18
 _MOST_COLUMNS = 2048
-# Of the blocks, which threads count side by side
-_SHARES = 4
+# Of the blocks, which threads count side by side; one where counts of its own for each share would take gigabytes
+_SHARES, _MOST_COUNTS = 4, 2**24
 _TYPES = (torch.float32, torch.float64)
 
 
@@ -69,10 +69,11 @@ def count_pairs(
     of_axes = norms.numpy(), centres.numpy(), np.array(shape)
     n_columns = min(n_points, _MOST_COLUMNS)
     n_rows = min(max(1, _BLOCK // (n_columns * len(shape))), n_columns)
+    counts_shape = n_classes * (n_classes + 1) // 2, math.prod(shape) * 2 ** len(shape)
     blocks = [(row, column) for row in range(0, n_points, n_rows) for column in range(row, n_points, n_columns)]
 
     def counted(blocks: Sequence[tuple[int, int]]) -> Tensor:
-        total = torch.zeros(n_classes * (n_classes + 1) // 2, math.prod(shape) * 2 ** len(shape), dtype=torch.float64)
+        total = torch.zeros(counts_shape, dtype=torch.float64)
         with torch.autocast("cpu", enabled=False):
             for row, column in blocks:
                 rows, columns = slice(row, row + n_rows), slice(column, column + n_columns)
@@ -88,9 +89,11 @@ def count_pairs(
         return total
 
     # Each share has counts of its own, added in order: how many threads there are changes no bit.
-    shares = [blocks[k::_SHARES] for k in range(min(_SHARES, len(blocks)))]
+    n_shares = min(_SHARES, len(blocks)) if math.prod(counts_shape) <= _MOST_COUNTS else 1
     with full_precision(), Team() as team:
-        total = torch.stack(team.each(counted, shares)).sum(dim=0)
+        total, *others = team.each(counted, [blocks[k::n_shares] for k in range(n_shares)])
+    for other in others:
+        total += other
     return _folded(total, shape) / (n_points * (n_points - 1) / 2)
 
 
