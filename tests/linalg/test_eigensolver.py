@@ -111,11 +111,20 @@ def test_more_copies_than_distinct_eigenvalues() -> None:
 
 
 def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """10,242 vertices: several pieces of the basis, several subtrees."""
+    """10,242 vertices: two pieces of the basis, two subtrees; and a team, though the result is small."""
     sphere = trimesh.creation.icosphere(subdivisions=5)
     sphere.vertices *= 1, 0.8, 0.6
     stiffness, mass, positions = cotangent_problem(sphere)
     monkeypatch.setattr(threads, "n_cores", lambda: 8)
+    monkeypatch.setattr(lanczos, "TEAM_RESULT", 0)
+    teams: list[int] = []
+
+    class Watched(threads.Team):
+        def __enter__(self) -> threads.Team:
+            teams.append(self.n_threads)
+            return super().__enter__()
+
+    monkeypatch.setattr(lanczos, "Team", Watched)
     before = torch.get_num_threads()
     spectra = []
     try:
@@ -124,6 +133,7 @@ def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
             spectra.append(eigenpairs(stiffness, mass, 20, positions=positions))
     finally:
         torch.set_num_threads(before)
+    assert teams == [1, 2, 5]
     assert_pairs(spectra[0], (stiffness, mass, positions))
     for other in spectra[1:]:
         np.testing.assert_array_equal(other.eigenvalues, spectra[0].eigenvalues)

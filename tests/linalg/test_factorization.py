@@ -140,7 +140,7 @@ def test_solve_and_inertia_on_random_graphs(n: int) -> None:
 
 
 def test_subtrees_solved_side_by_side() -> None:
-    """20,449 unknowns, eight subtrees: the residual is as of one, and a team changes no bit."""
+    """20,449 unknowns, four subtrees: the residual is as of one, and a team changes no bit."""
     matrix, places = grid_matrix(143)
     factors = analyse(matrix, places).factorize(matrix, -20.0)
     right = torch.from_numpy(np.random.default_rng(1).normal(size=(143**2, 5)))

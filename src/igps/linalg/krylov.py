@@ -82,13 +82,11 @@ class Krylov:
         self._block_size = block_size
         n_vertices = len(zero_mode)
         self._pieces = _pieces(n_vertices, max(1, min(MOST_PIECES, n_vertices // PIECE)))
-        # of NumPy's memory a part can be given back; but it asks for huge pages, which may be slow to come
-        large = (capacity + 1) * n_vertices > MOST_SINGLE_ENTRIES
-        self._memory = np.empty((capacity + 1, n_vertices)) if large else np.empty((0, n_vertices))
-        self._basis = torch.from_numpy(self._memory) if large else _empty(capacity + 1, n_vertices)
+        self._large = (capacity + 1) * n_vertices > MOST_SINGLE_ENTRIES
+        self._allocate(capacity + 1, n_vertices)
         self._basis[0] = torch.from_numpy(zero_mode)
         # a copy in single precision, to be read in half the time
-        self._single = None if large else torch.empty(capacity + 1, n_vertices, dtype=torch.float32)
+        self._single = None if self._large else torch.empty(capacity + 1, n_vertices, dtype=torch.float32)
         if self._single is not None:
             self._single[0] = self._basis[0]
         self._projected = torch.zeros(capacity + 1, capacity + 1, dtype=torch.float64)
@@ -100,6 +98,11 @@ class Krylov:
         # a random vector is mostly high frequencies: one application leaves what matters
         self._append(self._orthonormal(self._apply(self._random(block_size)), near=1)[0], swept=True)
 
+    def _allocate(self, n_rows: int, n_columns: int) -> None:
+        """A new basis. Of NumPy's memory a part can be given back; but it asks for huge pages, which may be slow."""
+        self._memory = np.empty((n_rows if self._large else 0, n_columns))
+        self._basis = torch.from_numpy(self._memory) if self._large else _empty(n_rows, n_columns)
+
     @property
     def size(self) -> int:
         """Dimension m of the projected problem."""
@@ -108,7 +111,7 @@ class Krylov:
     @property
     def loses_basis(self) -> bool:
         """Whether the basis makes place for the eigenvectors."""
-        return self._single is None
+        return self._large
 
     def expand(self) -> None:
         """Multiply the last block, and append what is new in the product as the next block."""
@@ -215,11 +218,7 @@ class Krylov:
         if stop > len(self._basis):
             capacity = len(self._basis) * 3 // 2 + n_rows
             basis, projected = self._basis, self._projected
-            if self._single is None:
-                self._memory = np.empty((capacity, basis.shape[1]))
-                self._basis = torch.from_numpy(self._memory)
-            else:
-                self._basis = _empty(capacity, basis.shape[1])
+            self._allocate(capacity, basis.shape[1])
             self._basis[: self._stop] = basis[: self._stop]
             if self._single is not None:
                 single, self._single = self._single, self._single.new_empty(capacity, basis.shape[1])
