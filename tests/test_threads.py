@@ -383,10 +383,12 @@ def test_who_asks_a_team_works_beside_it(many_cores: None) -> None:
 
 def test_a_thread_of_a_team_that_is_not_let_run_delays_nobody() -> None:
     released, held = threading.Event(), threading.Barrier(3, timeout=20)
+    ended_jobs: list[int] = []
 
-    def hold(_: int) -> None:
+    def hold(number: int) -> None:
         held.wait()
-        released.wait(20)
+        released.wait(10)
+        ended_jobs.append(number)
 
     with Team(2) as team:
         other = threading.Thread(target=lambda: team.each(hold, range(2)))
@@ -394,6 +396,7 @@ def test_a_thread_of_a_team_that_is_not_let_run_delays_nobody() -> None:
         held.wait()  # the other thread and the only one of the team have a job each
         try:
             assert team.each(abs, range(-3, 0)) == [3, 2, 1]
+            assert not ended_jobs
         finally:
             released.set()
             other.join()
