@@ -83,6 +83,18 @@ def test_the_nearest_of_many_are_those_of_all(tmp_path: Path, monkeypatch: pytes
     )
 
 
+def test_clusters_take_vectors_of_any_length(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zeros behind them, which FAISS wants to be quick, change no distance."""
+    monkeypatch.setattr(index_part, "_MOST_FLAT", 1000)
+    monkeypatch.setattr(index_part, "_PROBED", 4096)
+    rows = units(2000, width=21)
+    index = write_index(tmp_path / "g.igps", ABOUT, "cosine", batches(rows))
+    assert list(index.path.rglob("*.faiss"))
+    found = index.search(rows[:40], cosine, top=10, candidates=60)
+    exact = search(rows[:40], rows, top=10, distance=cosine)
+    torch.testing.assert_close(found.distances, exact.distances, rtol=0, atol=1e-6)
+
+
 def test_more_may_be_wanted_than_are_near(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(index_part, "_MOST_FLAT", 1000)
     monkeypatch.setattr(index_part, "_PROBED", 1)
