@@ -408,9 +408,38 @@ def test_json_has_no_numbers_that_json_does_not_know(
 
 
 def test_every_command_that_prints_a_table_has_json() -> None:
-    told = ("retrieve", "query", "compare", "robustness", "damage", "doctor", "demo")
-    for name in told:
-        assert get_type_hints(cli.COMMANDS[name])["return"] is not type(None), name
+    told = ("retrieve", "query", "compare", "robustness", "damage", "doctor", "demo", "duplicates", "distance")
+    figures = cli.COMMANDS["figure"]
+    assert isinstance(figures, dict)
+    for command in [*(cli.COMMANDS[name] for name in told), *figures.values()]:
+        assert get_type_hints(command)["return"] is not type(None), command
+
+
+def test_json_of_two_bodies_and_of_copies(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A body, its copy at twice the size, and another."""
+    ball, egg, larger = root / "ball" / "0.off", root / "egg" / "0.off", root / "egg" / "1.off"
+    for path in sorted(root.rglob("*.off")):
+        if path not in (ball, egg, larger):
+            path.unlink()
+    trimesh.load(egg, process=False).apply_scale(2).export(larger)
+    options = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", "--json"]
+    igps(monkeypatch, "duplicates", root, *options)
+    found = json.loads(capsys.readouterr().out)
+    assert found["groups"] == [["egg/0.off", "egg/1.off"]]
+    assert (found["n_files"], found["n_skipped"]) == (3, 0)
+    (pair,) = found["pairs"]
+    assert pair["files"] == ["egg/0.off", "egg/1.off"]
+    same = {}
+    for other in (larger, ball):
+        igps(monkeypatch, "distance", egg, other, *options)
+        printed = capsys.readouterr()
+        told = json.loads(printed.out)
+        assert told["meaning"] in printed.err  # the sentence, where progress goes
+        same[other] = told["same"]
+        assert (told["surfaces"] == pytest.approx(pair["distance"], abs=1e-6)) is (other == larger)
+    assert same == {larger: True, ball: False}
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])

@@ -204,14 +204,23 @@ class Gallery:
 
     @classmethod
     def merge(
-        cls, path: str | Path, others: Sequence[str | Path], descriptor: str | Descriptor | None = None
+        cls,
+        path: str | Path,
+        others: Sequence[str | Path],
+        descriptor: str | Descriptor | None = None,
+        *,
+        progress: bool = False,
     ) -> Gallery:
         """An index of the meshes of others, added to that at `path`, if there is one.
+
+        Args:
+            path, descriptor, progress: see `build`.
+            others: folders of the other indices.
 
         Raises:
             ValueError: they are of different descriptors or Signatures.
         """
-        merge_indices(path, others)
+        merge_indices(path, others, progress=progress)
         return cls(path, descriptor)
 
 

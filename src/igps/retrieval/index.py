@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from tqdm import tqdm
 
 from igps.retrieval.distances import Distance
 from igps.retrieval.index_part import (
@@ -230,8 +231,13 @@ def extend_index(path: str | Path, about: Mapping[str, Any], batches: Batches) -
     return _changed(before.path, dict(about), before.comparison, batches, keep=True)
 
 
-def merge_indices(path: str | Path, others: Sequence[str | Path]) -> VectorIndex:
+def merge_indices(path: str | Path, others: Sequence[str | Path], *, progress: bool = False) -> VectorIndex:
     """An index of the entries of others, which stay as they are; added to the one at `path`, if there is one.
+
+    Args:
+        path: its folder.
+        others: folders of the others.
+        progress: show a bar.
 
     Raises:
         ValueError: none is given, or they are not of the same kind.
@@ -244,8 +250,15 @@ def merge_indices(path: str | Path, others: Sequence[str | Path]) -> VectorIndex
     first = (there or opened)[0]
     for one in opened:
         check_alike(one, first.about)
-    batches = ((descriptions, one.entries(positions)) for one in opened for positions, descriptions in one.batches())
-    return _changed(path, first.about, first.comparison, batches, keep=bool(there))
+    with tqdm(total=sum(map(len, opened)), desc="entries", disable=not progress) as bar:
+
+        def batches() -> Batches:
+            for one in opened:
+                for positions, descriptions in one.batches():
+                    yield descriptions, one.entries(positions)
+                    bar.update(len(positions))
+
+        return _changed(path, first.about, first.comparison, batches(), keep=bool(there))
 
 
 def check_alike(index: VectorIndex, about: Mapping[str, Any]) -> None:
