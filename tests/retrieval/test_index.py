@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -81,6 +82,19 @@ def test_the_nearest_of_many_are_those_of_all(tmp_path: Path, monkeypatch: pytes
     torch.testing.assert_close(
         index.search(asked, chi_square, top=10, exact=True).distances, exact.distances, rtol=2e-3, atol=1e-6
     )
+
+
+def test_bars_tell_how_far_the_short_vectors_and_clusters_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(index_part, "_MOST_FLAT", 1000)
+    rows = histograms(3000)
+    write_index(tmp_path / "silent.igps", ABOUT, "chi_square", batches(rows))
+    assert capsys.readouterr() == ("", "")
+    write_index(tmp_path / "g.igps", ABOUT, "chi_square", batches(rows), progress=True)
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert re.findall(r"([\w ]+): 100%\|[^|]*\| (\d+)/", told.err) == [("short vectors", "3000"), ("clusters", "3000")]
 
 
 def test_more_may_be_wanted_than_are_near(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
