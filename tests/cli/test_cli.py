@@ -456,10 +456,19 @@ def test_completion_knows_commands_and_options(
     path = tmp_path / "script"
     path.write_text(script)
     subprocess.run([program, "-n", str(path)], check=True)
-    if shell == "bash":
+    typed = {
+        "igps rob": ["robustness"],
+        "igps figure p": ["pose", "potential"],
+        "igps index build --des": ["--descriptor"],
+        "igps doctor --js": ["--json"],
+        "igps retrieve --mend a": ["auto", "always"],
+    }
+    for line, expected in typed.items() if shell == "bash" else ():
+        words = line.split()
         ask = (
-            f"source {path}; COMP_WORDS=(igps rob); COMP_CWORD=1; "
-            + "$(complete -p igps | sed 's/.*-F \\([^ ]*\\).*/\\1/') igps rob igps; echo ${COMPREPLY[@]}"
+            f"source {path}; COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; "
+            + "$(complete -p igps | sed 's/.*-F \\([^ ]*\\).*/\\1/') "
+            + f"igps {words[-1]} {words[-2]}; echo ${{COMPREPLY[@]}}"
         )
         done = subprocess.run([program, "-c", ask], capture_output=True, text=True, check=True)
-        assert done.stdout.split() == ["robustness"]
+        assert done.stdout.split() == expected, line
