@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
 import json
 import os
 import re
@@ -30,7 +29,7 @@ README = PROJECT / "README.md"
 PAGES = [README, PROJECT / "CONTRIBUTING.md", *sorted((PROJECT / "docs").rglob("*.md"))]
 TEXT = {path.relative_to(PROJECT).as_posix(): path.read_text(encoding="utf-8") for path in PAGES}
 SCORES = ["nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map"]
-NOT_FOR_TESTS = {"pyFM"}  # modules that a page is about and the tests do not install
+WIDTH = 120  # of lines of prose
 
 
 @dataclass(frozen=True)
@@ -60,17 +59,10 @@ def run(folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
-def is_there(block: Block) -> bool:
-    """Whether all that a block imports is installed, of what the tests need not have."""
-    wanted = {name for name in NOT_FOR_TESTS if re.search(rf"^(?:from|import) {name}\b", block.text, re.MULTILINE)}
-    return all(importlib.util.find_spec(name) for name in wanted)
-
-
 def program(page: str, folder: Path) -> tuple[str, str]:
     """The blocks of a page as one program, those with a title written as files; and what it has to print.
 
-    Output that a page shows, in a text block after the code, must be printed next. A block that needs what is not
-    installed ends the program.
+    Output that a page shows, in a text block after the code, must be printed next.
     """
     code, expected = [], []
     for i, block in enumerate(blocks(page)):
@@ -78,8 +70,6 @@ def program(page: str, folder: Path) -> tuple[str, str]:
             (folder / block.title).write_text(block.text)
         elif block.language == "python":
             ast.parse(block.text)
-            if not is_there(block):
-                break
             code.append(block.text)
         elif block.language == "text" and i and blocks(page)[i - 1].language == "python":
             expected.append(block.text)
@@ -157,8 +147,7 @@ def test_the_descriptor_of_ones_own_runs_by_its_place(tmp_path: Path) -> None:
 @pytest.mark.parametrize("page", [page for page in TEXT if page != "README.md" and python(page)])
 def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page: str, tmp_path: Path) -> None:
     code, expected = program(page, tmp_path)
-    if not code:
-        pytest.skip(f"{page} begins with what is not installed")
+    assert code
     (tmp_path / "page.py").write_text(code)
     printed = run(tmp_path, "page.py")
     shown = iter(printed.splitlines())
@@ -309,6 +298,55 @@ def test_links_lead_somewhere(page: str) -> None:
         assert path.exists(), f"{page}: {target}"
         if anchor:
             assert anchor in anchors(path.read_text(encoding="utf-8")), f"{page}: {target}"
+
+
+def outside_code(page: str) -> list[str]:
+    """The lines of a page that are no code."""
+    return re.sub(r"^```.*?^```", "", TEXT[page], flags=re.DOTALL | re.MULTILINE).splitlines()
+
+
+@pytest.mark.parametrize("page", TEXT)
+def test_tables_are_whole_and_prose_is_wrapped(page: str) -> None:
+    """Each row of a table has as many cells as its head, and a rule below that; text has lines that can be read."""
+    head, place = 0, 0
+    for line in outside_code(page):
+        if not line.startswith("|"):
+            place = 0
+            assert "{{" not in line, f"{page}: {line}"
+            assert len(line) <= WIDTH, f"{page}: {line}"
+            continue
+        cells = len(re.findall(r"(?<!\\)\|", re.sub(r"`[^`]*`", "", line)))
+        head = cells if place == 0 else head
+        assert cells == head, f"{page}: {line}"
+        assert (re.fullmatch(r"[|:\- ]+", line) is not None) is (place == 1) or line.strip("| ") == "", (
+            f"{page}: {line}"
+        )
+        place += 1
+
+
+def table_rows(page: str, heading: str) -> dict[str, dict[str, str]]:
+    """Of the first table that follows a heading, the rows by their first name in code, and their cells by column."""
+    lines = outside_code(page)
+    start = next(i for i in range(lines.index(heading), len(lines)) if lines[i].startswith("|"))
+    columns = [cell.strip() for cell in lines[start].split("|")[1:-1]]
+    rows: dict[str, dict[str, str]] = {}
+    for line in lines[start + 2 :]:
+        if not line.startswith("|"):
+            break
+        cells = [cell.strip(" *") for cell in line.split("|")[1:-1]]
+        named = re.fullmatch(r"`(\w+)`", cells[0])
+        if named:
+            rows[named[1]] = dict(zip(columns, cells, strict=True))
+    return rows
+
+
+def test_the_figures_of_the_readme_are_those_of_the_comparison() -> None:
+    readme = table_rows("README.md", "## Which descriptor")
+    comparison = table_rows("docs/benchmarks/comparison.md", "## The named descriptors")
+    assert set(readme) == set(comparison) == {"interior", "gps", "multiscale", "rich", "pretrained"}
+    for name, row in readme.items():
+        for score in ("NN", "FT", "ST", "DCG"):
+            assert row[score] == comparison[name][score], name
 
 
 def test_pictures_are_small() -> None:

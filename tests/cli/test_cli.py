@@ -408,9 +408,38 @@ def test_json_has_no_numbers_that_json_does_not_know(
 
 
 def test_every_command_that_prints_a_table_has_json() -> None:
-    told = ("retrieve", "query", "compare", "robustness", "damage", "doctor", "demo")
-    for name in told:
-        assert get_type_hints(cli.COMMANDS[name])["return"] is not type(None), name
+    told = ("retrieve", "query", "compare", "robustness", "damage", "doctor", "demo", "duplicates", "distance")
+    figures = cli.COMMANDS["figure"]
+    assert isinstance(figures, dict)
+    for command in [*(cli.COMMANDS[name] for name in told), *figures.values()]:
+        assert get_type_hints(command)["return"] is not type(None), command
+
+
+def test_json_of_two_bodies_and_of_copies(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A body, its copy at twice the size, and another."""
+    ball, egg, larger = root / "ball" / "0.off", root / "egg" / "0.off", root / "egg" / "1.off"
+    for path in sorted(root.rglob("*.off")):
+        if path not in (ball, egg, larger):
+            path.unlink()
+    trimesh.load(egg, process=False).apply_scale(2).export(larger)
+    options = ["--cache_dir", tmp_path / "cache", "--n_workers", "1", "--json"]
+    igps(monkeypatch, "duplicates", root, *options)
+    found = json.loads(capsys.readouterr().out)
+    assert found["groups"] == [["egg/0.off", "egg/1.off"]]
+    assert (found["n_files"], found["n_skipped"]) == (3, 0)
+    (pair,) = found["pairs"]
+    assert pair["files"] == ["egg/0.off", "egg/1.off"]
+    same = {}
+    for other in (larger, ball):
+        igps(monkeypatch, "distance", egg, other, *options)
+        printed = capsys.readouterr()
+        told = json.loads(printed.out)
+        assert told["meaning"] in printed.err  # the sentence, where progress goes
+        same[other] = told["same"]
+        assert (told["surfaces"] == pytest.approx(pair["distance"], abs=1e-6)) is (other == larger)
+    assert same == {larger: True, ball: False}
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
@@ -427,10 +456,19 @@ def test_completion_knows_commands_and_options(
     path = tmp_path / "script"
     path.write_text(script)
     subprocess.run([program, "-n", str(path)], check=True)
-    if shell == "bash":
+    typed = {
+        "igps rob": ["robustness"],
+        "igps figure p": ["pose", "potential"],
+        "igps index build --des": ["--descriptor"],
+        "igps doctor --js": ["--json"],
+        "igps retrieve --mend a": ["auto", "always"],
+    }
+    for line, expected in typed.items() if shell == "bash" else ():
+        words = line.split()
         ask = (
-            f"source {path}; COMP_WORDS=(igps rob); COMP_CWORD=1; "
-            + "$(complete -p igps | sed 's/.*-F \\([^ ]*\\).*/\\1/') igps rob igps; echo ${COMPREPLY[@]}"
+            f"source {path}; COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; "
+            + "$(complete -p igps | sed 's/.*-F \\([^ ]*\\).*/\\1/') "
+            + f"igps {words[-1]} {words[-2]}; echo ${{COMPREPLY[@]}}"
         )
         done = subprocess.run([program, "-c", ask], capture_output=True, text=True, check=True)
-        assert done.stdout.split() == ["robustness"]
+        assert done.stdout.split() == expected, line

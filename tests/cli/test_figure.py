@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -145,8 +146,8 @@ def test_topology_measures_the_change_of_the_same_pairs(
 ) -> None:  # fmt: skip
     out = tmp_path / "topology.png"
     small = ["--n_eigenpairs", "30", "--resolution", "16"]
-    igps(monkeypatch, "figure", "topology", open_ring, "--out", out, *small)
-    printed = capsys.readouterr().out
+    igps(monkeypatch, "figure", "topology", open_ring, "--out", out, *small, "--json")
+    told, printed = capsys.readouterr()
     before = load_mesh(open_ring)
     a, b = facing_vertices(before)
     after = weld(before, a, b)
@@ -166,6 +167,12 @@ def test_topology_measures_the_change_of_the_same_pairs(
     eigenvalues = scipy.linalg.eigvalsh(stiffness.toarray(), np.diag(mass))[1:4]
     (row,) = re.findall(r"eigenvalues after: (.*)$", printed, re.MULTILINE)
     assert [float(x) for x in row.split(", ")] == pytest.approx(eigenvalues, rel=1e-3)
+    found = json.loads(told)
+    assert (found["genus"], found["n_samples"]) == ([0, 1], len(points))
+    shares = [np.mean(change < limit) for limit in (3, 10, 14)]
+    assert [found["changed_below"][limit] for limit in ("0.03", "0.1", "0.14")] == pytest.approx(shares, abs=2e-3)
+    assert found["largest_change"] == pytest.approx(change.max() / 100, rel=0.01)
+    assert found["first_eigenvalues"][1] == pytest.approx(eigenvalues, rel=1e-6)
 
     left, middle, right = drawn[0].axes
     heights = [patch.get_height() for patch in left.patches]
@@ -209,8 +216,8 @@ def test_potential_is_least_in_the_middle(
     slices: list[tuple[Any, ...]] = []
     draw = paper.draw_potential_slice
     monkeypatch.setattr(paper, "draw_potential_slice", lambda *args: (slices.append(args), draw(*args)))
-    igps(monkeypatch, "figure", "potential", path, "--out", out, "--n_eigenpairs", "40")
-    printed = capsys.readouterr().out
+    igps(monkeypatch, "figure", "potential", path, "--out", out, "--n_eigenpairs", "40", "--json")
+    told, printed = capsys.readouterr()
     (x, y), values, outline, centre, _ = slices[0]
     # The longest axis, y, is up and the next, z, to the right.
     np.testing.assert_allclose(np.abs(centre), [7, 6], atol=0.02)
@@ -224,6 +231,7 @@ def test_potential_is_least_in_the_middle(
     exact = np.linalg.norm(embedding(mesh, np.array([[5.0, 6.0, 7.0], [5.0, 7.5, 7.0]]), 40), axis=1)
     (least,) = re.findall(r"potential (\S+) at the barycentroid", printed)
     assert float(least) == pytest.approx(exact[0], rel=0.01)
+    assert json.loads(told)["least"] == pytest.approx(exact[0], rel=0.01)
     assert np.nanmin(values) == pytest.approx(exact[0], rel=0.01)
     j = int(np.argmin(np.abs(y - centre[1] - 1.5)))
     assert values[int(np.argmin(np.abs(x - centre[0]))), j] == pytest.approx(exact[1], rel=0.03)

@@ -473,7 +473,7 @@ def violations() -> Callable[[Any], list[dict[str, Any]]]:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness"])
+@pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness", "unlabelled"])
 def test_nothing_serious_for_accessibility(
     browser: Any, folder: Path, violations: Callable[[Any], list[dict[str, Any]]], scheme: str, kind: str
 ) -> None:

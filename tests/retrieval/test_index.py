@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -93,6 +94,19 @@ def test_clusters_take_vectors_of_any_length(tmp_path: Path, monkeypatch: pytest
     found = index.search(rows[:40], cosine, top=10, candidates=60)
     exact = search(rows[:40], rows, top=10, distance=cosine)
     torch.testing.assert_close(found.distances, exact.distances, rtol=0, atol=1e-6)
+
+
+def test_bars_tell_how_far_the_short_vectors_and_clusters_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(index_part, "_MOST_FLAT", 1000)
+    rows = histograms(3000)
+    write_index(tmp_path / "silent.igps", ABOUT, "chi_square", batches(rows))
+    assert capsys.readouterr() == ("", "")
+    write_index(tmp_path / "g.igps", ABOUT, "chi_square", batches(rows), progress=True)
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert re.findall(r"([\w ]+): 100%\|[^|]*\| (\d+)/", told.err) == [("short vectors", "3000"), ("clusters", "3000")]
 
 
 def test_more_may_be_wanted_than_are_near(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from igps.report.gallery import contact_sheet
-from igps.shapes import ArticulatedShapes, GeneratedShape
+from igps.shapes import ArticulatedShapes, GeneratedShape, GradedShapes
 from igps.shapes.solids import Arc, Box, Cone, Prism, Ring, Solid
 
 pytest.importorskip("skimage", reason="the extra 'shapes' is not installed")
@@ -223,6 +223,24 @@ def test_contact_sheet_shows_every_class(tmp_path: Path) -> None:
     assert all(bluish[i * width : (i + 1) * width].sum() > 1000 for i in range(4))
     with pytest.raises(ValueError, match="n_shown"):
         contact_sheet(shapes, tmp_path / "sheet.png", n_shown=3)
+
+
+def test_contact_sheet_shows_mirrored_shapes_right_side_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib", reason="the extra 'plot' is not installed")
+    shapes = GradedShapes(n_classes=3, n_bodies=1, n_poses=2, n_vertices=(1500, 1500))
+    assert {np.linalg.det(shapes[i].motion) > 0 for i in range(len(shapes))} == {True, False}  # some are mirrored
+    drawn: list[trimesh.Trimesh] = []
+    monkeypatch.setattr(
+        "igps.report.gallery.paint",
+        lambda axis, vertices, faces, colour: drawn.append(trimesh.Trimesh(vertices, faces, process=False)),
+    )
+    contact_sheet(shapes, tmp_path / "sheet.png", n_shown=2)
+    assert len(drawn) == len(shapes)
+    for i, body in enumerate(drawn):
+        shape = shapes[i]
+        volume = trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume
+        assert body.volume == pytest.approx(volume)
+        assert volume > 0
 
 
 @pytest.mark.parametrize(("module", "extra"), [("skimage.measure", "shapes"), ("matplotlib.figure", "plot")])

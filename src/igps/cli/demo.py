@@ -23,7 +23,7 @@ def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> dict[s
     shapes = ArticulatedShapes(n_classes=8, n_per_class=10)
     shapes.write(out / "shapes", progress=True)
     summary = retrieve(out / "shapes", out=out, cache_dir=out / "cache", n_workers=n_workers)
-    ranked_results(out / "shapes", out / "ranking.csv", out / "ranked.png")
+    ranked_results(out / "shapes", out / "ranking.csv", out / "ranked.png", progress=True)
     print(f"ranked results of one query per class: {out / 'ranked.png'}")
     report(out, n_workers=n_workers)
     return summary

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def duplicates(
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
-) -> None:
+) -> dict[str, Any]:
     """List the files that show the same body, whatever its scale, mirror image, triangles, detail or file format.
 
     Args:
@@ -60,9 +61,15 @@ def duplicates(
         out.parent.mkdir(parents=True, exist_ok=True)
         rows = [(str(n), name, str(found.paths[name])) for n, group in enumerate(found.groups, 1) for name in group]
         write_rows(out, ("group", "file", "path"), rows)
+    return {
+        "groups": [list(group) for group in found.groups],
+        "pairs": [{"files": list(pair), "distance": distance} for pair, distance in found.pairs.items()],
+        "n_files": found.n_files,
+        "n_skipped": n_skipped,
+    }
 
 
-def distance(meshes: list[Path], **reading: Any) -> None:
+def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
     """Tell how far two bodies are from each other, and what that means.
 
     Args:
@@ -73,13 +80,14 @@ def distance(meshes: list[Path], **reading: Any) -> None:
     chosen = descriptor_of(DESCRIPTOR)
     reading["strict"] = True
     dataset, _ = signatures(meshes, [chosen], **reading)
-    found, calibration = compared(dataset, DESCRIPTOR), Calibration.load()
+    found, calibration = compared(dataset, DESCRIPTOR, progress=True), Calibration.load()
     print(f"{found.distance:.4g} by {DESCRIPTOR}: {found.meaning}")
     told = "the same shape" if found.same else "not the same shape"
     print(
         f"surfaces laid onto each other: {found.surfaces:.2%} of the root of the area apart, {told} "
         f"(the same up to {calibration.same.distance:.2%})"
     )
+    return {"descriptor": DESCRIPTOR, **asdict(found)}
 
 
 def _print_groups(found: Duplicates, calibration: Calibration, poses: bool) -> None:

@@ -67,7 +67,7 @@ def topology(
     n_eigenpairs: int = 250,
     resolution: int = 32,
     mend: Mending = "auto",
-) -> None:
+) -> dict[str, Any]:
     """Weld two places of a body, and draw how its interior distances change (Rustamov 2010, figure 2).
 
     The weld is a triangular tube between two vertices, which adds one to the genus. The distances are those between the
@@ -86,7 +86,7 @@ def topology(
     if weld is not None and len(weld) != 2:
         raise ValueError(f"weld: expected the indices of two vertices, got {len(weld)}.")
     ends = None if weld is None else (weld[0], weld[1])
-    found = weld_change(load_mesh(mesh, MeshReading(mend)), ends, n_eigenpairs, resolution)
+    found = weld_change(load_mesh(mesh, MeshReading(mend)), ends, n_eigenpairs, resolution, progress=True)
 
     from igps.report.paper import draw_weld_change
 
@@ -102,6 +102,13 @@ def topology(
     for when, values in zip(("before", "after"), found.eigenvalues, strict=True):
         print(f"first eigenvalues {when}: " + ", ".join(f"{value:.4g}" for value in values[:3]))
     print(f"written to {out}")
+    return {
+        "genus": [_genus(one) for one in (found.before, found.after)],
+        "n_samples": found.n_samples,
+        "changed_below": {str(limit / 100): float(np.mean(found.change < limit / 100)) for limit in (3, 10, 14)},
+        "largest_change": float(found.change.max()),
+        "first_eigenvalues": [values[:3].tolist() for values in found.eigenvalues],
+    }
 
 
 def potential(
@@ -110,7 +117,7 @@ def potential(
     n_eigenpairs: int = 250,
     resolution: int = 32,
     mend: Mending = "auto",
-) -> None:
+) -> dict[str, Any]:
     """Draw the barycentroid potential of a body on a plane through its barycentroid (Rustamov 2010, section 4).
 
     The plane is spanned by the two longest principal axes of the vertices.
@@ -127,11 +134,12 @@ def potential(
 
     body = load_mesh(mesh, MeshReading(mend))
     body = Mesh(upright(body.vertices), body.faces, name=body.name)
-    found = potential_slice(body, n_eigenpairs, resolution)
+    found = potential_slice(body, n_eigenpairs, resolution, progress=True)
     draw_potential_slice(found.axes, found.values, found.section, found.barycentroid, out)
     print(f"{found.n_samples} interior samples, {n_eigenpairs} eigenpairs")
     print(f"potential {found.least:.4f} at the barycentroid, up to {found.largest:.4f} at the samples")
     print(f"written to {out}")
+    return {"n_samples": found.n_samples, "least": found.least, "largest": found.largest}
 
 
 def _genus(mesh: Mesh) -> int:

@@ -71,7 +71,7 @@ def index_merge(others: list[Path], out: Path) -> None:
         others: the indices, all of one descriptor.
         out: the index of all; where there is one already, they are added to it.
     """
-    _print_state(Gallery.merge(out, others), [])
+    _print_state(Gallery.merge(out, others, progress=True), [])
 
 
 def as_indexed(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from igps.cli.index import as_indexed
 from igps.cli.reading import signatures, write_notes, write_rows
@@ -59,10 +60,10 @@ def retrieve(
     dataset, descriptions, failures = _described(
         labelled_meshes(root), chosen, n_workers=n_workers, strict=strict, **reading
     )
-    distances = pair_distances(chosen, descriptions)
+    distances = pair_distances(chosen, descriptions, progress=True)
     scores = retrieval_scores(distances, dataset.files.labels or ())
     print(scores_table(scores))
-    reranked = reranked_distances(distances) if rerank else None
+    reranked = reranked_distances(distances, progress=True) if rerank else None
     scores_reranked = None if reranked is None else retrieval_scores(reranked, dataset.files.labels or ())
     if scores_reranked is not None:
         print(f"\nre-ranked by the whole collection, without its labels\n{scores_table(scores_reranked)}")
@@ -222,7 +223,7 @@ def _write_retrieval(
     with (out / "ranking.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["query", "rank", "model", "distance", "relevant"])
-        for i, order in enumerate(rank(distances)):
+        for i, order in enumerate(tqdm(rank(distances), desc="rankings")):
             for place, j in enumerate(order[others[i][order]].tolist(), 1):
                 row = [names[i], place, names[j], f"{float(distances[i, j]):.6g}", int(labels[i] == labels[j])]
                 writer.writerow(row)

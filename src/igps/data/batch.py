@@ -174,6 +174,17 @@ class SignatureBatch:
 def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mesh] | None = None) -> SignatureBatch:
     """Pad Signatures to a batch: the `collate_fn` of a `DataLoader` over a `SignatureDataset`.
 
+    Example:
+        Bodies differ in the number of their samples, of which the shorter are padded.
+
+        >>> import trimesh
+        >>> from igps.geometry.signature import SignatureConfig, compute_signature
+        >>> config, ball = SignatureConfig(n_eigenpairs=20), trimesh.creation.icosphere(subdivisions=2)
+        >>> bodies = [Mesh(ball.vertices * [1, 1, height], ball.faces) for height in (1, 2)]
+        >>> batch = collate([compute_signature(body, config) for body in bodies])
+        >>> tuple(batch.eigenvalues.shape), (batch.volume[1] / batch.volume[0]).item()
+        ((2, 20), 2.0)
+
     Args:
         items: N Signatures, with or without labels.
         meshes: their surfaces, for descriptors that need them.

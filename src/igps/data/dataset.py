@@ -49,6 +49,16 @@ class Failure:
 class SignatureDataset(Dataset[LabelledSignature]):
     """Signatures of mesh files, computed on first touch and cached on disk.
 
+    Example:
+        >>> import tempfile, trimesh
+        >>> ball = trimesh.creation.icosphere(subdivisions=2)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = ball.export(f"{folder}/ball.off")
+        ...     dataset = SignatureDataset(folder, SignatureConfig(n_eigenpairs=20), f"{folder}/cache")
+        ...     item = dataset[0]
+        >>> len(dataset), item.id, item.signature.eigenvalues.shape
+        (1, 'ball.off', (20,))
+
     Args:
         root_or_paths: a folder (see `find_meshes`), mesh files, or a `MeshFiles`.
         config: parameters of the Signatures; `SignatureConfig()` if None, with 250 eigenpairs. For one descriptor

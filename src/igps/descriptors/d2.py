@@ -33,7 +33,7 @@ class D2(BodyDescriptor):
     Args:
         function: "d2", "a3" or "d1".
         n_bins: equal bins of the histogram.
-        reach: distance over √area up to which bins tell distances apart; what lies beyond counts in the last.
+        reach: end of the last bin, a distance over √area; what lies beyond counts in the last.
         n_triples: random triples of samples for A3; 1024² in the source.
         seed: of these triples.
 

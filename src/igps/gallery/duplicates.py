@@ -132,7 +132,9 @@ def duplicates(
         if poses:
             found = iter([distance for _, _, distance in open_pairs])
         else:
-            found = on_threads(lambda one: surfaces.distance(one[0], one[1], limit), open_pairs, n_workers)
+            laid = on_threads(lambda one: surfaces.distance(one[0], one[1], limit), open_pairs, n_workers)
+            found = iter(tqdm(laid, desc="laid onto each other", total=len(open_pairs), leave=False,
+                              disable=not progress))  # fmt: skip
         for (i, j, _), distance in zip(open_pairs, found, strict=True):
             if distance <= limit and group.of(i) != group.of(j):
                 group.join(i, j)
@@ -152,6 +154,7 @@ def compared(
     descriptor: str | Descriptor = "pretrained",
     *,
     calibration: Calibration | None = None,
+    progress: bool = False,
 ) -> Comparison:
     """How far the two meshes of a dataset are from each other, and what that means.
 
@@ -159,6 +162,7 @@ def compared(
         dataset: of two files.
         descriptor: a calibrated one.
         calibration: of the descriptor; the one that is shipped if None.
+        progress: show a bar.
 
     Raises:
         ValueError: not two files, or the calibration is of another descriptor.
@@ -168,7 +172,7 @@ def compared(
         raise ValueError(f"dataset: expected two meshes to compare, got {len(dataset)}.")
     calibration, chosen = calibration or Calibration.load(), descriptor_of(descriptor)
     calibration.check(descriptor, chosen, dataset.config)
-    descriptions, _ = describe_usable(dataset, chosen, n_workers=1, strict=True)
+    descriptions, _ = describe_usable(dataset, chosen, n_workers=1, strict=True, progress=progress)
     with torch.inference_mode():
         distance = float(chosen.distances(descriptions[:1], descriptions[1:]))
     surfaces = surface_distance(*(surface_samples(dataset, i) for i in range(2)))

@@ -166,13 +166,13 @@ class Gallery:
             descriptor: a name, which the index remembers, or the descriptor itself, which has to be given again.
             n_workers: threads or processes that describe; all cores if None.
             strict: raise at the first mesh that cannot be described.
-            progress: show a bar.
+            progress: show bars.
         """
         chosen = descriptor_of(descriptor)
         failures: list[Failure] = []
         about = about_of(dataset.config, dataset.reading, descriptor)
         batches = _batches(dataset, chosen, {}, failures, n_workers, strict, progress)
-        write_index(path, about, chosen.comparison, batches)
+        write_index(path, about, chosen.comparison, batches, progress=progress)
         return cls(path, descriptor), failures
 
     @classmethod
@@ -199,19 +199,29 @@ class Gallery:
         index = VectorIndex(path)
         check_alike(index, about)
         known = index.marks([_id(one) for one in dataset.files.paths])
-        extend_index(path, about, _batches(dataset, chosen, known, failures, n_workers, strict, progress))
+        batches = _batches(dataset, chosen, known, failures, n_workers, strict, progress)
+        extend_index(path, about, batches, progress=progress)
         return cls(path, descriptor), failures
 
     @classmethod
     def merge(
-        cls, path: str | Path, others: Sequence[str | Path], descriptor: str | Descriptor | None = None
+        cls,
+        path: str | Path,
+        others: Sequence[str | Path],
+        descriptor: str | Descriptor | None = None,
+        *,
+        progress: bool = False,
     ) -> Gallery:
         """An index of the meshes of others, added to that at `path`, if there is one.
+
+        Args:
+            path, descriptor, progress: see `build`.
+            others: folders of the other indices.
 
         Raises:
             ValueError: they are of different descriptors or Signatures.
         """
-        merge_indices(path, others)
+        merge_indices(path, others, progress=progress)
         return cls(path, descriptor)
 
 

@@ -39,12 +39,19 @@ class MeshError(ValueError):
 class Mesh:
     """A triangle mesh that bounds a body, checked when made and trusted after.
 
+    Example:
+        >>> import trimesh
+        >>> box = trimesh.creation.box((1, 2, 3))
+        >>> mesh = Mesh(box.vertices, box.faces)
+        >>> round(mesh.volume, 6), round(mesh.area, 6), mesh.genus
+        (6.0, 22.0, 0)
+
     Args:
         vertices: (V, 3) positions, any length unit.
         faces: (F, 3) vertex indices, counter-clockwise seen from outside. A closed mesh that is inside out is turned,
             which `notes` records.
         name: what error messages call the mesh, usually its file.
-        allow_open: accept boundary edges; inside and outside are then told apart by the winding number.
+        allow_open: accept boundary edges; the winding number then decides what is inside.
         notes: what was done to the mesh on its way here, in words.
 
     Raises:

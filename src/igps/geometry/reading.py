@@ -41,7 +41,7 @@ class MeshReading:
             refuses what is no body; "always" makes every surface watertight that does not bound one body without
             crossing itself, for collections of mixed quality.
         component: "largest" keeps only the connected component of the largest area.
-        allow_open: accept open boundaries; inside and outside are then told apart by the winding number.
+        allow_open: accept open boundaries; the winding number then decides what is inside.
 
     Raises:
         ValueError: an unknown way to mend, or an unknown component.
@@ -63,6 +63,14 @@ def load_mesh(path: str | Path, reading: MeshReading = MeshReading(), *, least_v
     """Read a mesh file of any format that trimesh reads, or a cloud of points, and make a body of it.
 
     Polygons are cut into triangles. The vertices of a body keep their order and are not merged.
+
+    Example:
+        >>> import tempfile, trimesh
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = trimesh.creation.box((1, 2, 3)).export(f"{folder}/box.obj")
+        ...     mesh = load_mesh(f"{folder}/box.obj")
+        >>> len(mesh.vertices), round(mesh.volume, 6)
+        (8, 6.0)
 
     Args:
         path: the file.

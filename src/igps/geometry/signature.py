@@ -42,6 +42,10 @@ class SignatureConfig:
     each is the beginning of those with more, see `larger` and `Signature.beginning`; but for that their meshes must be
     the same, and one with fewer vertices than `least_vertices` is subdivided.
 
+    Example:
+        >>> SignatureConfig(n_eigenpairs=50).min_samples, SignatureConfig.paper().min_samples
+        (1000, 0)
+
     Args:
         n_eigenpairs: eigenpairs kept, without the constant one; None for as many as the descriptor needs that the
             Signature is for (see `Needs.completed`), 250 where there is none.

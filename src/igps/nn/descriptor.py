@@ -66,7 +66,26 @@ class Descriptor(nn.Module, ABC):
 
 
 class BodyDescriptor(Descriptor):
-    """A descriptor that looks at one body at a time, in NumPy; it has no gradient."""
+    """A descriptor that looks at one body at a time, in NumPy; it has no gradient.
+
+    Example:
+        >>> import trimesh
+        >>> from igps.data.batch import collate
+        >>> from igps.geometry.mesh import Mesh
+        >>> from igps.geometry.signature import SignatureConfig, compute_signature
+        >>> class Roundness(BodyDescriptor):
+        ...     name = "roundness"
+        ...
+        ...     def describe_body(self, body):
+        ...         return np.array([36 * np.pi * body.volume**2 / body.area**3])
+        ...
+        ...     def distances(self, queries, gallery):
+        ...         return (queries - gallery.T).abs()
+        >>> cube = trimesh.creation.box().subdivide().subdivide().subdivide()
+        >>> signature = compute_signature(Mesh(cube.vertices, cube.faces), SignatureConfig(n_eigenpairs=20))
+        >>> round(float(Roundness()(collate([signature]))), 4)  # π / 6; of a ball 1
+        0.5236
+    """
 
     @abstractmethod
     def describe_body(self, body: Body) -> NDArray[np.float32]:

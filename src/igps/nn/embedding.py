@@ -103,6 +103,13 @@ class SpectralEmbedding(nn.Module):
     A learned filter multiplies the weights of the kind by exp(s(log(λ·area))), s piecewise linear between knots and
     constant beyond them: it is non-negative, starts at the kind itself, and serves every shape whatever its K.
 
+    Example:
+        The commute time divides each eigenfunction by the root of its eigenvalue.
+
+        >>> functions, eigenvalues, area = torch.tensor([[[1.0, 3.0]]]), torch.tensor([[4.0, 9.0]]), torch.tensor([1.0])
+        >>> SpectralEmbedding()(functions, eigenvalues, area).tolist()
+        [[[0.5, 1.0]]]
+
     Args:
         kind, time, n_eigenpairs: see `spectral_embedding`.
         n_knots: parameters of the learned filter; 0 for a fixed one.

@@ -24,6 +24,14 @@ class WhitenedHead(SizedByData):
     The parts of a `HistogramDescriptor` may be treated one by one: each is whitened and brought to one length, so that
     the cosine distance is the mean of those of the parts.
 
+    Example:
+        >>> import torch
+        >>> histograms = torch.tensor([[0.9, 0.1, 0.0], [0.7, 0.3, 0.0], [0.1, 0.0, 0.9], [0.3, 0.0, 0.7]])
+        >>> classes = torch.tensor([0, 0, 1, 1])
+        >>> vectors = WhitenedHead().fit(histograms, classes)(histograms)
+        >>> (vectors @ vectors.T > 0.5).int().tolist()
+        [[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 1]]
+
     Args:
         n_directions: eigenvectors of W that are kept of each part, the largest.
         shrinkage: s; a large one leaves only the centring.
@@ -118,6 +126,14 @@ class KernelHead(SizedByData):
     The kernel is exp(−d/m), d the cosine distance of the whitened histograms, m its median between training shapes, and
     the mean of such kernels if there are several parts. It is regressed onto the indicators of the classes. The best
     there is here for classes that were trained on; for other classes use the `WhitenedHead`.
+
+    Example:
+        >>> import torch
+        >>> histograms = torch.tensor([[0.9, 0.1, 0.0], [0.7, 0.3, 0.0], [0.1, 0.0, 0.9], [0.3, 0.0, 0.7]])
+        >>> classes = torch.tensor([0, 0, 1, 1])
+        >>> head = KernelHead().fit(histograms, classes)
+        >>> head.classes[head(torch.tensor([[0.8, 0.1, 0.1]])).argmax(dim=1)].tolist()
+        [0]
 
     Args:
         whitened: the head below: one that is fitted already, such as that of `pretrained`, stays as it is, which serves

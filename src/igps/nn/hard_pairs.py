@@ -34,8 +34,8 @@ def pair_histogram(
     Args:
         embedding: (P, D) points; their Euclidean distances are counted.
         potential: (P,) non-negative.
-        distance_range: largest distance told apart.
-        potential_range: largest potential told apart.
+        distance_range: end of the last bin.
+        potential_range: end of the last class.
         n_classes: C.
         n_bins: B.
 

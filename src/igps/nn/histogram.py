@@ -28,6 +28,17 @@ class PairHistogram(nn.Module):
     every unordered pair of them. Axes of pairs are the other dimensions. Each unordered pair of distinct samples counts
     once; all cells of a body sum to 1. The paper's histogram is the product of a potential and an interior distance.
 
+    Example:
+        >>> import trimesh
+        >>> from igps.data.batch import collate
+        >>> from igps.geometry.mesh import Mesh
+        >>> from igps.geometry.signature import SignatureConfig, compute_signature
+        >>> ball = trimesh.creation.icosphere(subdivisions=2)
+        >>> signature = compute_signature(Mesh(ball.vertices, ball.faces), SignatureConfig(n_eigenpairs=20))
+        >>> histograms = PairHistogram()(collate([signature]))
+        >>> tuple(histograms.shape), round(float(histograms.sum()), 4)
+        ((1, 10, 64), 1.0)
+
     Args:
         axes: `PointAxis` and `PairAxis` modules, or names of `igps.nn.axes.AXES`; at least one of pairs. The class
             along the first axis of points changes slowest.

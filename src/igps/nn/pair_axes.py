@@ -97,7 +97,7 @@ class InteriorDistance(DistanceAxis):
 
     Args:
         n_bins: B.
-        reach: largest distance told apart; what lies beyond counts in the last bin.
+        reach: end of the last bin; what lies beyond counts in the last bin.
         embedding: other than the histogram's: for a second scale.
         learnable: whether the centres are parameters.
     """
@@ -122,7 +122,7 @@ class EuclideanDistance(DistanceAxis):
 
     Args:
         n_bins: B.
-        reach: largest distance told apart; what lies beyond counts in the last bin.
+        reach: end of the last bin; what lies beyond counts in the last bin.
         learnable: whether the centres are parameters.
     """
 

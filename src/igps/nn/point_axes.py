@@ -61,7 +61,7 @@ class Potential(PointAxis):
 
     Args:
         n_classes: C equal intervals of [0, `reach`], with their centres in the middle.
-        reach: largest potential told apart; what lies beyond counts in the last class.
+        reach: end of the last interval; what lies beyond counts in the last class.
         soft, learnable: see `PointAxis`.
     """
 

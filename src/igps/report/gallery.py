@@ -11,16 +11,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
 from igps.geometry.mesh import MeshError
 from igps.geometry.reading import MeshReading, load_mesh
 from igps.geometry.simplification import simplify
 from igps.report.drawing import BLUE, GREY, new_figure, paint
+from igps.shapes.graded import GradedShape
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from igps.shapes import ArticulatedShapes
+    from igps.shapes import ArticulatedShapes, GradedShapes
 
 # Blue for a hit and orange for a miss stay apart for every kind of colour vision (Okabe and Ito 2008).
 _RELEVANT, _IRRELEVANT, _QUERY = "#0072B2", "#D55E00", "#444444"
@@ -28,7 +30,7 @@ _RELEVANT, _IRRELEVANT, _QUERY = "#0072B2", "#D55E00", "#444444"
 _THUMBNAIL_VERTICES = 800
 
 
-def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8) -> None:
+def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progress: bool = False) -> None:
     """One row per class: its first mesh as the query, then the meshes ranked nearest to it.
 
     Args:
@@ -36,6 +38,7 @@ def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8) -> Non
         ranking: the ranking.csv that `igps retrieve` wrote.
         out: the PNG file.
         top: results in a row.
+        progress: show a bar.
     """
     results: dict[str, list[tuple[str, float, bool]]] = {}
     with ranking.open(newline="") as file:
@@ -48,7 +51,8 @@ def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8) -> Non
     queries = [first[label] for label in sorted(first)]
     figure = new_figure(1.25 * (top + 1), 1.45 * len(queries) + 0.6)
     axes = figure.subplots(len(queries), top + 1, squeeze=False)
-    for row_axes, query in zip(axes, queries, strict=True):
+    rows = zip(axes, queries, strict=True)
+    for row_axes, query in tqdm(rows, desc="ranked results", total=len(queries), disable=not progress):
         draw_mesh(row_axes[0], root / query)
         _frame(row_axes[0], f"query {query}", _QUERY)
         for axis, (model, distance, relevant) in zip(row_axes[1:], results[query], strict=False):
@@ -63,7 +67,7 @@ def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8) -> Non
     figure.savefig(out, dpi=110)
 
 
-def contact_sheet(shapes: ArticulatedShapes, path: str | Path, n_shown: int = 1) -> None:
+def contact_sheet(shapes: ArticulatedShapes | GradedShapes, path: str | Path, n_shown: int = 1) -> None:
     """Save a picture of the first shapes of every class, all turned the same way.
 
     Args:
@@ -75,17 +79,21 @@ def contact_sheet(shapes: ArticulatedShapes, path: str | Path, n_shown: int = 1)
         ValueError: `n_shown` is out of range.
         ImportError: matplotlib or scikit-image is missing.
     """
-    if not 1 <= n_shown <= shapes.n_per_class:
-        raise ValueError(f"n_shown: expected 1 to n_per_class={shapes.n_per_class}, got {n_shown}. Ask for fewer.")
-    chosen = [c * shapes.n_per_class + i for c in range(shapes.n_classes) for i in range(n_shown)]
+    n_per_class = len(shapes) // shapes.n_classes
+    if not 1 <= n_shown <= n_per_class:
+        raise ValueError(f"n_shown: expected 1 to {n_per_class}, the shapes of a class, got {n_shown}. Ask for fewer.")
+    chosen = [c * n_per_class + i for c in range(shapes.n_classes) for i in range(n_shown)]
     columns = min(len(chosen), max(4, math.ceil(math.sqrt(1.6 * len(chosen)))))
     rows = math.ceil(len(chosen) / columns)
     figure = new_figure(1.7 * columns, 1.85 * rows)
     view = Rotation.from_euler("zx", (-35, -70), degrees=True).as_matrix()  # from the left, in front and above
     for place, index in enumerate(chosen, 1):
         shape = shapes[index]
+        motion = shape.motion if isinstance(shape, GradedShape) else shape.rotation
         axis = figure.add_subplot(rows, columns, place)
-        paint(axis, shape.vertices @ shape.rotation @ view.T, shape.faces, BLUE)
+        # What mirrors a body turns its faces inside out
+        faces = shape.faces if np.linalg.det(motion) > 0 else shape.faces[:, ::-1]
+        paint(axis, shape.vertices @ motion @ view.T, faces, BLUE)
         axis.set_axis_off()
         axis.set_title(shape.name if n_shown > 1 else shape.label, fontsize=5, pad=1)
     figure.savefig(path, dpi=110)

@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from tqdm import tqdm
 
 from igps.retrieval.distances import Distance
 from igps.retrieval.index_part import (
@@ -202,7 +203,12 @@ class VectorIndex:
 
 
 def write_index(
-    path: str | Path, about: Mapping[str, Any], comparison: Comparison | None, batches: Batches
+    path: str | Path,
+    about: Mapping[str, Any],
+    comparison: Comparison | None,
+    batches: Batches,
+    *,
+    progress: bool = False,
 ) -> VectorIndex:
     """Build an index, in place of the one that is there.
 
@@ -211,15 +217,21 @@ def write_index(
         about: what its users want to know of it, for JSON.
         comparison: how the descriptions are compared; None where by neither of these: all will be compared.
         batches: at least one description.
+        progress: show bars of what is done once the descriptions are there.
 
     Raises:
         ValueError: nothing to index.
     """
-    return _changed(Path(path), dict(about), comparison, batches, keep=False)
+    return _changed(Path(path), dict(about), comparison, batches, keep=False, progress=progress)
 
 
-def extend_index(path: str | Path, about: Mapping[str, Any], batches: Batches) -> VectorIndex:
+def extend_index(
+    path: str | Path, about: Mapping[str, Any], batches: Batches, *, progress: bool = False
+) -> VectorIndex:
     """Add entries to an index. One of the id of an earlier one takes its place, unless its mark is the same.
+
+    Args:
+        path, about, batches, progress: see `write_index`.
 
     Raises:
         FileNotFoundError: there is no index.
@@ -227,11 +239,16 @@ def extend_index(path: str | Path, about: Mapping[str, Any], batches: Batches) -
     """
     before = VectorIndex(path)
     check_alike(before, about)
-    return _changed(before.path, dict(about), before.comparison, batches, keep=True)
+    return _changed(before.path, dict(about), before.comparison, batches, keep=True, progress=progress)
 
 
-def merge_indices(path: str | Path, others: Sequence[str | Path]) -> VectorIndex:
+def merge_indices(path: str | Path, others: Sequence[str | Path], *, progress: bool = False) -> VectorIndex:
     """An index of the entries of others, which stay as they are; added to the one at `path`, if there is one.
+
+    Args:
+        path: its folder.
+        others: folders of the others.
+        progress: show bars.
 
     Raises:
         ValueError: none is given, or they are not of the same kind.
@@ -244,8 +261,15 @@ def merge_indices(path: str | Path, others: Sequence[str | Path]) -> VectorIndex
     first = (there or opened)[0]
     for one in opened:
         check_alike(one, first.about)
-    batches = ((descriptions, one.entries(positions)) for one in opened for positions, descriptions in one.batches())
-    return _changed(path, first.about, first.comparison, batches, keep=bool(there))
+    with tqdm(total=sum(map(len, opened)), desc="entries", disable=not progress) as bar:
+
+        def batches() -> Batches:
+            for one in opened:
+                for positions, descriptions in one.batches():
+                    yield descriptions, one.entries(positions)
+                    bar.update(len(positions))
+
+        return _changed(path, first.about, first.comparison, batches(), keep=bool(there), progress=progress)
 
 
 def check_alike(index: VectorIndex, about: Mapping[str, Any]) -> None:
@@ -266,7 +290,7 @@ def _flat(about: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _changed(
-    path: Path, about: dict[str, Any], comparison: Comparison | None, batches: Batches, keep: bool
+    path: Path, about: dict[str, Any], comparison: Comparison | None, batches: Batches, keep: bool, progress: bool
 ) -> VectorIndex:
     path.mkdir(parents=True, exist_ok=True)
     strangers = sorted(found.name for found in path.iterdir() if not found.name.startswith(_OURS))
@@ -279,7 +303,7 @@ def _changed(
             with _locked(path / _LOCK):
                 _remove_abandoned(path)
                 manifest = _manifest(path) if keep else None
-                _commit(path, staged, n, shape, about, comparison, manifest)
+                _commit(path, staged, n, shape, about, comparison, manifest, progress)
         finally:
             shutil.rmtree(staged, ignore_errors=True)
             staged.with_suffix(".lock").unlink(missing_ok=True)
@@ -313,6 +337,7 @@ def _commit(
     about: dict[str, Any],
     comparison: Comparison | None,
     before: dict[str, Any] | None,
+    progress: bool,
 ) -> None:
     """Under the lock: the staged part joins those of the manifest, and a new manifest takes the place of the old."""
     if shape is None:
@@ -337,7 +362,7 @@ def _commit(
         if n_joined == 1 and group[0] is not added and len(group[0].removed) < _MOST_REMOVED * len(group[0]):
             listed.append(group[0])
             continue
-        listed.append(_written(path, group, vector_map))
+        listed.append(_written(path, group, vector_map, progress))
     map_name = None
     if vector_map is not None:
         map_name = before["map"]["file"] if index is not None and vector_map is index.vector_map and before else None
@@ -417,7 +442,7 @@ def _joined_sizes(counts: Sequence[int]) -> list[int]:
     return [n for n, _ in groups]
 
 
-def _written(path: Path, group: Sequence[Part], vector_map: VectorMap | None) -> Part:
+def _written(path: Path, group: Sequence[Part], vector_map: VectorMap | None, progress: bool) -> Part:
     """One part of the entries of several that are left, with vectors."""
     folder = path / f"{_PART}{secrets.token_hex(8)}"
     n_cells = group[0].n_cells
@@ -433,7 +458,7 @@ def _written(path: Path, group: Sequence[Part], vector_map: VectorMap | None) ->
         writer.finish()
         n = writer.n
     if vector_map is not None:
-        add_vectors(Part(folder, n, n_cells), vector_map)
+        add_vectors(Part(folder, n, n_cells), vector_map, progress=progress)
     flush(folder)
     return Part(folder, n, n_cells, vector_map)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from igps.retrieval.vectors import VectorMap
 
@@ -99,26 +100,33 @@ class PartWriter:
         self._entries.close()
 
 
-def add_vectors(part: Part, vector_map: VectorMap, seed: int = 0) -> None:
+def add_vectors(part: Part, vector_map: VectorMap, seed: int = 0, *, progress: bool = False) -> None:
     """Write the short vectors of a part that has none yet, and what finds the nearest among many of them."""
     if vector_map.changes:
-        with (part.folder / _VECTORS).open("wb") as file:
+        with (
+            (part.folder / _VECTORS).open("wb") as file,
+            tqdm(total=len(part), desc="short vectors", disable=not progress) as bar,
+        ):
             for rows in part.chunks():
                 file.write(vector_map(part.descriptions(rows)).astype("<f4").data)
+                bar.update(len(rows))
     n_numbers = len(vector_map.components) if vector_map.components is not None else part.n_cells
     if len(part) > _MOST_FLAT:
-        _write_clusters(part.folder, vectors_of(part.folder, len(part), n_numbers, vector_map), seed)
+        _write_clusters(part.folder, vectors_of(part.folder, len(part), n_numbers, vector_map), seed, progress)
 
 
-def _write_clusters(folder: Path, vectors: NDArray[np.float32], seed: int) -> None:
+def _write_clusters(folder: Path, vectors: NDArray[np.float32], seed: int, progress: bool) -> None:
     faiss = import_faiss()
     n_clusters = 2 ** round(np.log2(4 * np.sqrt(len(vectors))))
     index = faiss.index_factory(-(-vectors.shape[1] // _STEP) * _STEP, f"IVF{n_clusters},SQ8")
     index.cp.seed, index.cp.niter = seed + 1, _ROUNDS
     chosen = np.random.default_rng(seed).choice(len(vectors), min(len(vectors), _TRAINED_ON * n_clusters), False)
-    index.train(_widened(vectors[np.sort(chosen)], index.d))
-    for i in range(0, len(vectors), 16 * _ROWS_AT_ONCE):
-        index.add(_widened(vectors[i : i + 16 * _ROWS_AT_ONCE], index.d))
+    with tqdm(total=len(vectors), desc="clusters", disable=not progress) as bar:
+        index.train(_widened(vectors[np.sort(chosen)], index.d))
+        for i in range(0, len(vectors), 16 * _ROWS_AT_ONCE):
+            rows = vectors[i : i + 16 * _ROWS_AT_ONCE]
+            index.add(_widened(rows, index.d))
+            bar.update(len(rows))
     index.nprobe = _PROBED
     faiss.write_index(index, str(folder / _NEAREST))
 

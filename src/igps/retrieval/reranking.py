@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from igps.retrieval.distances import Distance
 from igps.retrieval.search import SearchResult, rank
@@ -15,7 +16,13 @@ N_RERANKED = 200
 
 
 def rerank(
-    distances: Tensor, n_neighbours: int = 20, n_expanded: int = 6, share: float = 0.3, *, keep_nearest: bool = True
+    distances: Tensor,
+    n_neighbours: int = 20,
+    n_expanded: int = 6,
+    share: float = 0.3,
+    *,
+    keep_nearest: bool = True,
+    progress: bool = False,
 ) -> Tensor:
     """k-reciprocal re-ranking: shapes are close whose neighbours are the same (Zhong, Zheng, Cao and Li 2017).
 
@@ -33,6 +40,7 @@ def rerank(
         share: of the distance itself, in units of its mean, in the sum.
         keep_nearest: pairs of which one is the other's nearest come before all others, in their own order; the paper
             leaves them where they fall.
+        progress: show a bar.
 
     Returns:
         (N, N) distances ≥ 0, symmetric, 0 on the diagonal; without unit.
@@ -67,7 +75,8 @@ def rerank(
     weights = members * torch.exp(-own / near)
     weights /= weights.sum(dim=1, keepdim=True)
     weights = weights[order[:, : min(n_expanded, n)]].mean(dim=1)
-    smaller = torch.stack([torch.minimum(row, weights).sum(dim=1) for row in weights])
+    rows = tqdm(weights, desc="re-ranked", disable=not progress)
+    smaller = torch.stack([torch.minimum(row, weights).sum(dim=1) for row in rows])
     jaccard = 1 - smaller / (2 - smaller)
     jaccard = (jaccard + jaccard.T) / 2
     mean = own.sum() / (n * (n - 1))

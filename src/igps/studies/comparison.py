@@ -81,7 +81,7 @@ def compare(
         descriptors: in the order of the results.
         n_workers: processes that describe; all cores if None.
         strict: raise at the first mesh that cannot be described instead of listing it.
-        progress: show a bar.
+        progress: show bars.
 
     Raises:
         ValueError: the meshes have no classes, two descriptors one name, or the signatures lack what one needs.
@@ -108,7 +108,7 @@ def compare(
             found[number] = outcome
             while n_done < len(descriptors) and all(n_done * n + i in found for i in range(n)):
                 mine = [found.pop(n_done * n + i) for i in range(n)]
-                yield _result(descriptors[n_done], dataset, mine)
+                yield _result(descriptors[n_done], dataset, mine, progress)
                 n_done += 1
 
 
@@ -124,7 +124,9 @@ def check_descriptors(descriptors: Sequence[Descriptor], dataset: SignatureDatas
         descriptor.needs.check_config(dataset.config)
 
 
-def _result(descriptor: Descriptor, dataset: SignatureDataset, outcomes: Sequence[Description | Failure]) -> Result:
+def _result(
+    descriptor: Descriptor, dataset: SignatureDataset, outcomes: Sequence[Description | Failure], progress: bool
+) -> Result:
     described = [i for i, outcome in enumerate(outcomes) if isinstance(outcome, Description)]
     descriptions = [outcome for outcome in outcomes if isinstance(outcome, Description)]
     labels = [dataset.files.labels[i] for i in described] if dataset.files.labels else []
@@ -132,7 +134,8 @@ def _result(descriptor: Descriptor, dataset: SignatureDataset, outcomes: Sequenc
     try:
         if not descriptions:
             raise ValueError("no mesh could be described.")
-        distances = pair_distances(descriptor, torch.from_numpy(np.stack([one.values for one in descriptions])))
+        values = torch.from_numpy(np.stack([one.values for one in descriptions]))
+        distances = pair_distances(descriptor, values, progress=progress)
         scores = retrieval_scores(distances, labels)
     except Exception as reason:  # the other descriptors go on
         error = f"{type(reason).__name__}: {reason}"
@@ -149,8 +152,22 @@ def _result(descriptor: Descriptor, dataset: SignatureDataset, outcomes: Sequenc
     )
 
 
-def pair_distances(descriptor: Descriptor, descriptions: Tensor) -> Tensor:
-    """(N, N) distances of (N, ...) descriptions, by blocks of queries: some need memory for every entry of a pair."""
+def pair_distances(descriptor: Descriptor, descriptions: Tensor, *, progress: bool = False) -> Tensor:
+    """(N, N) distances of (N, ...) descriptions, by blocks of queries: some need memory for every entry of a pair.
+
+    Args:
+        descriptor: whose distances they are.
+        descriptions: (N, ...).
+        progress: show a bar.
+    """
     rows = max(1, _BLOCK_ENTRIES // max(1, descriptions.numel()))
-    with torch.inference_mode(), one_thread():
-        return torch.cat([descriptor.distances(block, descriptions).cpu() for block in descriptions.split(rows)])
+    blocks = []
+    with (
+        torch.inference_mode(),
+        one_thread(),
+        tqdm(total=len(descriptions), desc=f"distances by {descriptor.name}", disable=not progress) as bar,
+    ):
+        for block in descriptions.split(rows):
+            blocks.append(descriptor.distances(block, descriptions).cpu())
+            bar.update(len(block))
+    return torch.cat(blocks)

@@ -10,6 +10,7 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
+from tqdm import tqdm
 
 from igps.data.dataset import SignatureDataset
 from igps.geometry.coordinates import extend
@@ -28,6 +29,8 @@ from igps.threads import one_thread
 
 # Cells along the longest side of a slice: finer than a picture can show.
 _SLICE_RESOLUTION = 300
+# In which it is computed, so that a bar moves
+_SLICE_PARTS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +92,12 @@ class WeldChange:
 
 @one_thread()
 def weld_change(
-    body: Mesh, ends: tuple[int, int] | None = None, n_eigenpairs: int = 250, resolution: int = 32
+    body: Mesh,
+    ends: tuple[int, int] | None = None,
+    n_eigenpairs: int = 250,
+    resolution: int = 32,
+    *,
+    progress: bool = False,
 ) -> WeldChange:
     """Rustamov 2010, figure 2: interior distances before and after two places are joined by a triangular tube.
 
@@ -98,18 +106,27 @@ def weld_change(
         ends: vertices of the weld; two that face each other across a narrow gap if None, see `facing_vertices`.
         n_eigenpairs: of the embedding.
         resolution: voxels along the longest side, one sample each.
+        progress: show a bar.
 
     Raises:
         ValueError: fewer than two samples.
     """
-    after = weld(body, *(ends or facing_vertices(body)))
-    points = interior_samples(body, resolution)
-    if len(points) < 2:
-        raise ValueError(f"resolution: one interior sample of {body.name} makes no pair. Raise it.")
-    spectra = [_spectrum(one, n_eigenpairs) for one in (body, after)]
-    first, second = (pdist(_embed(one, spectrum, points)) for one, spectrum in zip((body, after), spectra, strict=True))
-    eigenvalues = (spectra[0].eigenvalues, spectra[1].eigenvalues)
-    return WeldChange(body, after, len(points), np.abs(second / first - 1), eigenvalues)
+    with tqdm(total=6, desc="steps", disable=not progress) as bar:
+        after = weld(body, *(ends or facing_vertices(body)))
+        bar.update()
+        points = interior_samples(body, resolution)
+        bar.update()
+        if len(points) < 2:
+            raise ValueError(f"resolution: one interior sample of {body.name} makes no pair. Raise it.")
+        eigenvalues, distances = [], []
+        for one in (body, after):
+            spectrum = _spectrum(one, n_eigenpairs)
+            eigenvalues.append(spectrum.eigenvalues)
+            bar.update()
+            distances.append(pdist(_embed(one, spectrum, points)))
+            bar.update()
+    change = np.abs(distances[1] / distances[0] - 1)
+    return WeldChange(body, after, len(points), change, (eigenvalues[0], eigenvalues[1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,27 +153,36 @@ class PotentialSlice:
 
 
 @one_thread()
-def potential_slice(body: Mesh, n_eigenpairs: int = 250, resolution: int = 32) -> PotentialSlice:
+def potential_slice(
+    body: Mesh, n_eigenpairs: int = 250, resolution: int = 32, *, progress: bool = False
+) -> PotentialSlice:
     """The potential on the horizontal plane through the barycentroid of a body.
 
     Args:
         body: turned as it is to be cut.
         n_eigenpairs: of the embedding.
         resolution: voxels along the longest side, near the best of which the barycentroid is searched.
+        progress: show a bar.
     """
-    samples = interior_samples(body, resolution)
-    x, y, _ = grid_axes(body, _SLICE_RESOLUTION)
-    spectrum = _spectrum(body, n_eigenpairs)
-    of_samples = np.linalg.norm(_embed(body, spectrum, samples), axis=1)
-    coarse = samples[int(np.argmin(of_samples))]
-    around = _around(body, coarse, np.ptp(body.vertices, axis=0).max() / resolution)
-    of_around = np.linalg.norm(_embed(body, spectrum, around), axis=1)
-    centre = around[int(np.argmin(of_around))]
-    inside = inside_grid(body, (x, y, centre[2:]))[:, :, 0]
-    i, j = np.nonzero(inside)
-    points = np.stack([x[i], y[j], np.full(len(i), centre[2])], axis=1)
-    values = np.full(inside.shape, np.nan)
-    values[i, j] = np.linalg.norm(_embed(body, spectrum, points), axis=1)
+    with tqdm(total=3 + _SLICE_PARTS, desc="steps", disable=not progress) as bar:
+        samples = interior_samples(body, resolution)
+        x, y, _ = grid_axes(body, _SLICE_RESOLUTION)
+        spectrum = _spectrum(body, n_eigenpairs)
+        bar.update()
+        of_samples = np.linalg.norm(_embed(body, spectrum, samples), axis=1)
+        bar.update()
+        coarse = samples[int(np.argmin(of_samples))]
+        around = _around(body, coarse, np.ptp(body.vertices, axis=0).max() / resolution)
+        of_around = np.linalg.norm(_embed(body, spectrum, around), axis=1)
+        bar.update()
+        centre = around[int(np.argmin(of_around))]
+        inside = inside_grid(body, (x, y, centre[2:]))[:, :, 0]
+        i, j = np.nonzero(inside)
+        points = np.stack([x[i], y[j], np.full(len(i), centre[2])], axis=1)
+        values = np.full(inside.shape, np.nan)
+        for part in np.array_split(np.arange(len(points)), _SLICE_PARTS):
+            values[i[part], j[part]] = np.linalg.norm(_embed(body, spectrum, points[part]), axis=1)
+            bar.update()
     return PotentialSlice(
         axes=(x, y),
         values=values,

@@ -1,0 +1,26 @@
+"""A picture of one shape of each class that `pretrained` was fitted to: python docs/classes_picture.py OUT.png
+
+It takes minutes, and needs matplotlib, pillow, and the extras of the generator.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import yaml
+from PIL import Image
+
+from igps.report.gallery import contact_sheet
+from igps.shapes import GradedShapes
+
+WIDTH = 1400  # pixels
+
+fitted_to = yaml.safe_load(Path("configs/pretrain.yaml").read_text())
+shapes = GradedShapes(*(fitted_to[name] for name in ("n_classes", "n_bodies", "n_poses", "seed")))
+out = Path(sys.argv[1])
+contact_sheet(shapes, out)
+picture = Image.open(out).convert("RGB")
+picture = picture.resize((WIDTH, round(WIDTH * picture.height / picture.width)), Image.Resampling.LANCZOS)
+picture.quantize(64, dither=Image.Dither.NONE).save(out, optimize=True)
+print(f"{out}: {out.stat().st_size // 1000} kB")

@@ -1,0 +1,109 @@
+"""What takes long shows a bar on standard error, with the time left, and leaves standard output to the results."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from igps.cli import main
+from own_descriptors import SMALL
+
+INTERIOR = "own_descriptors:small_interior"
+# Such as "signatures: 100%|█████| 4/4 [00:03<00:00,  1.2it/s]": share, how many of how many, time taken and left
+BAR = re.compile(r"([\w -]+): +(\d+)%\|[^|]*\| (\d+)/(\d+) \[\d\d:\d\d<(?:\d\d:\d\d|\?),")
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Two balls and two long eggs."""
+    for label, ratio in (("ball", 1.0), ("egg", 2.2)):
+        for i in range(2):
+            body = trimesh.creation.icosphere(subdivisions=2)
+            body.vertices *= [1.0, 1.0 + 0.06 * i, ratio]
+            path = tmp_path / "meshes" / label / f"{i}.off"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            body.export(path)
+    return tmp_path / "meshes"
+
+
+def bars(text: str) -> dict[str, tuple[int, int]]:
+    """Of each bar by name, where it stood last and where it ends."""
+    return {name.strip(): (int(done), int(total)) for name, _, done, total in BAR.findall(text)}
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        ("retrieve ROOT --descriptor INTERIOR --out OUT --rerank --report SMALL",
+         {"signatures": 4, "descriptions": 4, "distances by interior": 4, "re-ranked": 4, "rankings": 4,
+          "pictures": 4}),
+        ("compare ROOT --descriptors INTERIOR SMALL",
+         {"signatures": 4, "descriptions": 4, "distances by interior": 4}),
+        ("extract ROOT --out OUT.npz --descriptor INTERIOR SMALL", {"signatures": 4, "descriptions": 4}),
+        ("query MESH --gallery ROOT --descriptor INTERIOR SMALL", {"signatures": 4, "descriptions": 4}),
+        ("precompute ROOT --descriptors INTERIOR SMALL", {"signatures": 4}),
+        ("index build ROOT --out OUT.igps --descriptor INTERIOR SMALL", {"signatures": 4, "descriptions": 4}),
+        ("figure pose ROOT --out OUT.png SMALL", {"signatures": 4, "descriptions": 4}),
+        ("figure topology MESH --weld 0 3 --out OUT.png --n_eigenpairs 20 --resolution 10", {"steps": 6}),
+        ("figure potential MESH --out OUT.png --n_eigenpairs 20 --resolution 10", {"steps": 7}),
+        ("robustness MESH OTHER --descriptors INTERIOR SMALL", {"signatures": 2, "altered meshes": None}),
+        ("damage ROOT --descriptors INTERIOR --damages noise SMALL", {"signatures": 4, "altered meshes": 8}),
+        ("doctor ROOT --n_workers 1", {"files": 4}),
+        ("distance MESH OTHER --n_workers 1", {"signatures": 2, "descriptions": 2}),
+        ("duplicates ROOT --n_workers 1", {"signatures": 4, "surfaces": 4, "compared": 4}),
+    ],
+    ids=lambda value: value.split(" ROOT")[0].split(" MESH")[0] if isinstance(value, str) else "",
+)  # fmt: skip
+def test_a_bar_tells_how_far_it_is_and_what_time_is_left(
+    command: str,
+    expected: dict[str, int | None],
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The bars have the names, and the ends that the number of files sets, and they reach them."""
+    words = {
+        "ROOT": str(root), "MESH": str(root / "egg" / "0.off"), "OTHER": str(root / "ball" / "1.off"),
+        "INTERIOR": INTERIOR, "SMALL": " ".join(SMALL), "OUT": str(tmp_path / "out"),
+    }  # fmt: skip
+    line = re.sub(r"\b(ROOT|MESH|OTHER|INTERIOR|SMALL|OUT)\b", lambda match: words[match[0]], command)
+    reads_signatures = not command.startswith(("figure topology", "figure potential", "doctor"))
+    cache = ["--cache_dir", str(tmp_path / "cache")] if reads_signatures else []
+    monkeypatch.setattr(sys, "argv", ["igps", *line.split(), *cache])
+    main()
+    printed = capsys.readouterr()
+    shown = bars(printed.err)
+    assert {name for name in expected if name not in shown} == set(), printed.err
+    assert all(done == total for done, total in shown.values())
+    assert {name: shown[name][1] for name, total in expected.items() if total is not None} == {
+        name: total for name, total in expected.items() if total is not None
+    }
+    assert not bars(printed.out)
+
+
+def test_merging_indices_shows_a_bar(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = ["--cache_dir", str(tmp_path / "cache"), *SMALL]
+    for name in ("ball", "egg"):
+        build = ["index", "build", str(root / name), "--out", str(tmp_path / f"{name}.igps"), "--descriptor", INTERIOR]
+        monkeypatch.setattr(sys, "argv", ["igps", *build, *small])
+        main()
+    capsys.readouterr()
+    both = [str(tmp_path / f"{name}.igps") for name in ("ball", "egg")]
+    monkeypatch.setattr(sys, "argv", ["igps", "index", "merge", *both, "--out", str(tmp_path / "all.igps")])
+    main()
+    assert bars(capsys.readouterr().err)["entries"] == (4, 4)
+
+
+def test_the_library_is_silent_unless_asked(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from igps.geometry.reading import load_mesh
+    from igps.studies.paper import weld_change
+
+    weld_change(load_mesh(root / "egg" / "0.off"), (0, 3), n_eigenpairs=20, resolution=10)
+    assert capsys.readouterr() == ("", "")
