@@ -64,9 +64,13 @@ class SampleBatch:
             kept[i, : len(chosen)] = True
         index, kept = index.to(self.mask.device), kept.to(self.mask.device)
 
+        n_shapes, longest = self.mask.shape
+        rows = (index + longest * torch.arange(n_shapes, device=index.device)[:, None]).flatten()
+        missing = ~kept if not bool(kept.all()) else None
+
         def take(values: Tensor) -> Tensor:
-            over_rest = (..., *[None] * (values.ndim - 2))
-            return values.gather(1, index[over_rest].expand(-1, -1, *values.shape[2:])) * kept[over_rest]
+            taken = values.flatten(0, 1).index_select(0, rows).unflatten(0, (n_shapes, n_kept))
+            return taken if missing is None else taken.masked_fill_(missing[(..., *[None] * (values.ndim - 2))], 0)
 
         attributes = {name: take(values) for name, values in self.attributes.items()}
         return SampleBatch(take(self.points), take(self.eigenfunctions), kept, attributes)
