@@ -20,6 +20,11 @@ _TABLE_PER_CENTRE = 16
 _FEW_CENTRES = 12
 # Numbers that a compiled loop takes at once, at most.
 _VECTOR = 32
+# A whole pair and its share in one integer: the shares of so many pairs do not reach the count, nor is a digit lost of
+# a share of single precision, but in the first interval.
+_SHARE, _PAIR, _MOST_PACKED = 2**24, 2**44, 2**18
+# Pairs that follow each other often fall into the same cell. In turn into so many copies of it, none waits for another.
+_LANES = 4
 # Where a product and its sum may be rounded once, not twice.
 _CONTRACTED: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 
@@ -62,10 +67,12 @@ def add_pairs(
     # Of the row, or of rows in the same classes: by the class of the other end, whose first cell is its home.
     sums = np.zeros((n_classes * n_cells, n_corners))
     by_class = sums.reshape((n_classes, n_cells * n_corners))
-    home = classes[:, column : column + n_columns] * np.int32(n_cells)
+    home = (classes[:, column : column + n_columns] * n_cells).astype(np.int32)
     shares = np.empty((n_axes, n_columns), values.dtype)
     features = np.empty((4, n_columns), values.dtype)
-    cells, interval = np.empty((2, n_columns), np.int32)
+    cells, interval = np.empty(n_columns, np.int32), np.empty(n_columns, np.int32)
+    packs = n_axes == 1 and values.itemsize == 4 and n_rows * n_columns <= _MOST_PACKED and are_whole(weights)
+    packed = np.zeros((n_classes * n_cells if packs else 0) * _LANES, np.int64)
     lowest, highest = no_cells(n_cells, n_members)
     for i in range(n_rows):
         point = row + i
@@ -76,6 +83,7 @@ def add_pairs(
             for m in range(n_members):
                 same &= classes[m, point] == classes[m, point - 1] and weights[m, point] == weights[m, point - 1]
             if not same:
+                unpack(packed, sums)
                 flush(
                     by_class,
                     lowest * n_corners,
@@ -117,7 +125,10 @@ def add_pairs(
                 lowest, highest = min(lowest, cell[j]), max(highest, cell[j])
         for m in range(n_members):
             begin, weight = home[m, first:], weights[m, column + first :]
-            if n_axes == 1:
+            if packs:
+                place_whole_pairs(cells[start:], home[m, start:], shares[0, start:], interval[start:])
+                share_whole_pairs(cell, interval[first:], packed)
+            elif n_axes == 1:
                 share_one_axis(cell, begin, shares[0, first:], weight, sums)
             elif n_axes == 2:
                 share_two_axes(cell, begin, shares[0, first:], shares[1, first:], weight, sums, 0)
@@ -125,6 +136,7 @@ def add_pairs(
                 share_four_axes(cell, begin, shares, first, weight, sums)
             else:
                 share_axes(cell, begin, shares, first, weight, sums)
+    unpack(packed, sums)
     flush(
         by_class,
         lowest * n_corners,
@@ -319,6 +331,41 @@ def locate(
         cell[j] = cell[j] * width + k
     for j in range(len(values)):
         share[j] = min(max(share[j], none), one)
+
+
+@compiled(error_model="numpy")
+def are_whole(weights: NDArray[np.float64]) -> bool:
+    """Whether all points belong to one class each."""
+    return len(weights) == 1 and weights.min() == 1
+
+
+@compiled(error_model="numpy")
+def place_whole_pairs(
+    cell: NDArray[np.int32], home: NDArray[np.int32], share: NDArray[Any], parts: NDArray[np.int32]
+) -> None:
+    """Add its home to the cell of each pair (n,), and fill in its share (n,) as an integer."""
+    for j in range(len(cell)):
+        cell[j] = (cell[j] + home[j]) * np.int32(_LANES) + np.int32(j % _LANES)
+        parts[j] = np.int32(share[j] * share.dtype.type(_SHARE))
+
+
+@compiled(error_model="numpy")
+def share_whole_pairs(cell: NDArray[np.int32], parts: NDArray[np.int32], packed: NDArray[np.int64]) -> None:
+    """`share_one_axis` of pairs that weigh 1, into integers (cells,): one store for both corners, and no rounding."""
+    for j in range(len(cell)):
+        packed[np.uint32(cell[j])] += _PAIR + np.int64(parts[j])
+
+
+@compiled(error_model="numpy")
+def unpack(packed: NDArray[np.int64], sums: NDArray[np.float64]) -> None:
+    """Move what was packed to the sums (cells, 2)."""
+    for c in range(len(packed) // _LANES):
+        pairs = packed[_LANES * c : _LANES * (c + 1)]
+        both = pairs.sum()
+        beyond = (both % _PAIR) / _SHARE
+        sums[c, 0] = both // _PAIR - beyond
+        sums[c, 1] = beyond
+        pairs[:] = 0
 
 
 @compiled(**_CONTRACTED)
