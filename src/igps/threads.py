@@ -40,8 +40,10 @@ def n_cores() -> int:
 
 def n_threads() -> int:
     """Threads of Python that the present call may use: as many as cores, but no more than torch had before the call."""
-    most = _present.most
-    return min(n_cores(), _get_torch_threads()) if most is None else most
+    if _present.most is not None:
+        return _present.most
+    most = _get_torch_threads()
+    return min(n_cores(), most) if most > 1 else most  # how many cores there are is asked of files
 
 
 @contextlib.contextmanager

@@ -328,6 +328,8 @@ def test_read_only_and_single_precision_input_is_accepted_and_kept() -> None:
         ({"functions": np.ones(8)}, "functions: expected shape"),
         ({"functions": np.ones((7, 2))}, "functions: expected shape"),
         ({"functions": np.full((8, 2), np.nan)}, "functions: expected finite"),
+        ({"functions": np.array([[1.0, np.inf]] * 4 + [[1.0, -np.inf]] * 4)}, "functions: expected finite"),
+        ({"divisors": np.ones(3)}, "divisors: expected one for each of 2 functions"),
         ({"accuracy": 0.0}, "accuracy: expected"),
         ({"accuracy": float("nan")}, "accuracy: expected"),
         ({"dtype": torch.float16}, "dtype: expected"),
@@ -338,6 +340,22 @@ def test_invalid_arguments_are_named(change: dict[str, object], message: str) ->
     arguments = {"vertices": vertices, "faces": faces, "functions": np.ones((8, 2)), "points": np.zeros((1, 3))}
     with pytest.raises(ValueError, match=message):
         extend(**(arguments | change))
+
+
+@pytest.mark.parametrize("accuracy", [None, 1e-3])
+def test_functions_are_divided_on_the_way(accuracy: float | None) -> None:
+    mesh = bumpy_sphere(3)
+    generator = np.random.default_rng(5)
+    functions, points = generator.standard_normal((len(mesh[0]), 4)), generator.uniform(-0.4, 0.4, (30, 3))
+    divisors = np.array([0.5, 1.0, 3.0, 7.0])
+    result = extend(*mesh, functions, points, divisors=divisors, accuracy=accuracy)
+    assert np.array_equal(result, extend(*mesh, functions / divisors, points, accuracy=accuracy))
+
+
+def test_finite_functions_may_sum_to_infinity() -> None:
+    vertices, faces = cube()
+    huge = np.full((8, 2), 3e38, dtype=np.float32)
+    assert extend(vertices, faces, huge, np.zeros((1, 3))) == pytest.approx(3e38, rel=1e-6)
 
 
 def test_weights_without_a_sum_raise() -> None:

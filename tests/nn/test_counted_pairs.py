@@ -50,7 +50,7 @@ def test_histogram_is_the_sum_of_hats_over_all_pairs(
     if rows_and_columns is not None:
         n_rows, n_columns = rows_and_columns
         monkeypatch.setattr(counted_pairs, "_MOST_COLUMNS", n_columns)
-        monkeypatch.setattr(counted_pairs, "_BLOCK", n_rows * n_columns * (len(layouts) + 3 * n_oriented))
+        monkeypatch.setattr(counted_pairs, "_BLOCK", n_rows * n_columns * len(layouts))
     chosen = [(place, torch.tensor(layout).double()) for place, layout in zip(places, layouts, strict=True)]
     angles = torch.tensor(COSINES).double()
     result = count_pairs(memberships, chosen, [(points, directions, angles, angles)] * n_oriented)
@@ -67,6 +67,41 @@ def test_single_precision_is_summed_in_double() -> None:
     assert result.sum() == pytest.approx(1, abs=1e-7)
     expected = count_pairs(memberships.double(), [(coordinates.double(), torch.tensor(MANY).double())])
     np.testing.assert_allclose(result, expected, atol=1e-7)
+
+
+def test_oriented_points_of_several_numbers_of_dimensions_side_by_side() -> None:
+    """Points on a line, in space and in five dimensions: a single histogram with and one without its distances."""
+    generator = torch.Generator().manual_seed(8)
+    memberships, angles = torch.ones(11, 1).double(), torch.tensor([-0.6, 0.5]).double()
+    places = [torch.randn(11, width, generator=generator, dtype=torch.float64) for width in (1, 3, 5)]
+    ways = [normalize(torch.randn(11, p.shape[1], generator=generator, dtype=torch.float64), dim=1) for p in places]
+    chosen = [(places[2], torch.tensor(FEW).double())]
+    for axes in ([], chosen):
+        expected: list[Axis] = [(distances(place), centres.tolist()) for place, centres in axes]
+        for p, n in zip(places, ways, strict=True):
+            expected += [(value, angles.tolist()) for value in cosines(p, n)]
+        result = count_pairs(memberships, axes, [(p, n, angles, angles) for p, n in zip(places, ways, strict=True)])
+        np.testing.assert_allclose(result, pair_histogram_by_loops(memberships, expected), atol=1e-12)
+
+
+@pytest.mark.parametrize("centres", [EQUAL, MANY])
+def test_whole_pairs_of_single_precision_are_as_those_of_double(centres: list[float]) -> None:
+    """Points in one class each are counted in integers, several classes, and many alike side by side."""
+    generator = torch.Generator().manual_seed(6)
+    points = torch.randn(2300, 3, generator=generator).sort(dim=0).values * 0.4
+    memberships = torch.nn.functional.one_hot(torch.randint(3, (2300,), generator=generator), 3).double()
+    result = count_pairs(memberships, [(points, torch.tensor(centres))])
+    expected = count_pairs(memberships, [(points.double(), torch.tensor(centres))])
+    np.testing.assert_allclose(result, expected, atol=1e-8)
+
+
+@pytest.mark.parametrize(("spread", "bin_of_all"), [(0.0, 0), (1e4, 4)])
+def test_a_block_of_pairs_that_all_fall_into_one_bin(spread: float, bin_of_all: int) -> None:
+    """As many as are ever counted at once in one integer, with the largest share and with none."""
+    points = torch.arange(1.0, 2401.0)[:, None] * spread
+    expected = torch.zeros(1, 5, dtype=torch.float64)
+    expected[0, bin_of_all] = 1
+    assert torch.equal(count_pairs(torch.ones(2400, 1), [(points, torch.tensor(EQUAL))]), expected)
 
 
 def test_serves_what_needs_no_gradient_on_the_cpu() -> None:

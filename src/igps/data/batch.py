@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,9 +65,13 @@ class SampleBatch:
             kept[i, : len(chosen)] = True
         index, kept = index.to(self.mask.device), kept.to(self.mask.device)
 
+        n_shapes, longest = self.mask.shape
+        rows = (index + longest * torch.arange(n_shapes, device=index.device)[:, None]).flatten()
+        missing = ~kept if not bool(kept.all()) else None
+
         def take(values: Tensor) -> Tensor:
-            over_rest = (..., *[None] * (values.ndim - 2))
-            return values.gather(1, index[over_rest].expand(-1, -1, *values.shape[2:])) * kept[over_rest]
+            taken = values.flatten(0, 1).index_select(0, rows).unflatten(0, (n_shapes, n_kept))
+            return taken if missing is None else taken.masked_fill_(missing[(..., *[None] * (values.ndim - 2))], 0)
 
         attributes = {name: take(values) for name, values in self.attributes.items()}
         return SampleBatch(take(self.points), take(self.eigenfunctions), kept, attributes)
@@ -214,27 +219,30 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
 
 
 def _pad_samples(samples: Sequence[Samples]) -> SampleBatch:
-    n_shapes, longest = len(samples), max(len(s) for s in samples)
-    eigenfunctions = torch.zeros(n_shapes, longest, max(s.eigenfunctions.shape[1] for s in samples))
-    points = torch.zeros(n_shapes, longest, 3)
-    mask = torch.zeros(n_shapes, longest, dtype=torch.bool)
     names = set(samples[0].attributes)
-    attributes = {
-        name: torch.zeros(n_shapes, longest, *samples[0].attributes[name].shape[1:]) for name in sorted(names)
-    }
-    for i, s in enumerate(samples):
+    for s in samples:
         if set(s.attributes) != names:
             raise ValueError(
                 f"items: all must carry the same sample attributes, got {sorted(names)} and {sorted(s.attributes)}."
             )
-        n_points, n_eigenpairs = s.eigenfunctions.shape
-        eigenfunctions[i, :n_points, :n_eigenpairs] = torch.from_numpy(s.eigenfunctions)
+    return SampleBatch(
         # Centred before the cast, or a shape far from the origin would lose its digits.
-        points[i, :n_points] = torch.from_numpy(s.points - s.points.mean(axis=0)).float()
-        mask[i, :n_points] = True
-        for name, values in s.attributes.items():
-            attributes[name][i, :n_points] = torch.from_numpy(values)
-    return SampleBatch(points, eigenfunctions, mask, attributes)
+        points=_padded([s.points - s.points.mean(axis=0) for s in samples]),
+        eigenfunctions=_padded([s.eigenfunctions for s in samples]),
+        mask=pad_sequence([torch.ones(len(s), dtype=torch.bool) for s in samples], batch_first=True),
+        attributes={name: _padded([s.attributes[name] for s in samples]) for name in sorted(names)},
+    )
+
+
+def _padded(arrays: Sequence[NDArray[Any]]) -> Tensor:
+    """(N, ...) float32 copies of N arrays, with zeros up to the largest size along each dimension."""
+    shape = [max(sizes) for sizes in zip(*(array.shape for array in arrays), strict=True)]
+    same = all(list(array.shape) == shape for array in arrays)
+    # Zeros that nobody will see would take as long as the copy.
+    padded = (torch.empty if same else torch.zeros)(len(arrays), *shape)
+    for into, array in zip(padded, arrays, strict=True):
+        into[tuple(slice(n) for n in array.shape)] = torch.from_numpy(array)
+    return padded
 
 
 def _samples_of(batch: SampleBatch, i: int, n_eigenpairs: int) -> Samples:

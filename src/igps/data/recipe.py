@@ -9,6 +9,7 @@ import os
 import socket
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from igps.data.cache import SignatureCache
@@ -145,13 +146,21 @@ class Recipe:
 
     def _key(self, path: Path, content: bytes, config: SignatureConfig, mended: bool) -> str:
         # The suffix chooses the reader, so the same bytes under another suffix are another mesh.
-        reading: list[object] = [path.suffix.lower(), asdict(self.reading)]
-        if mended:
-            reading.append({"mending_version": MENDING_VERSION})
-        parameters = json.dumps([reading, config.as_dict()], sort_keys=True)
-        key = hashlib.sha256(parameters.encode() + b"\0")
+        versions = config.ALGORITHM_VERSION, MENDING_VERSION if mended else None
+        parameters = _parameters(path.suffix.lower(), self.reading, config, versions)
+        key = hashlib.sha256(parameters + b"\0")
         key.update(content)  # not joined with them: the file may be large
         return key.hexdigest()
+
+
+@lru_cache
+def _parameters(suffix: str, reading: MeshReading, config: SignatureConfig, versions: tuple[int, int | None]) -> bytes:
+    """What a key depends on beside the content of the file, the same for thousands of files."""
+    algorithm, mending = versions
+    how: list[object] = [suffix, asdict(reading)]
+    if mending is not None:
+        how.append({"mending_version": mending})
+    return json.dumps([how, {**config.as_dict(), "algorithm_version": algorithm}], sort_keys=True).encode()
 
 
 def version() -> str:

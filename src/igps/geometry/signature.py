@@ -312,7 +312,9 @@ def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str,
 def _interior(mesh: Mesh, spectrum: Spectrum, points: NDArray[np.float64], config: SignatureConfig) -> Samples:
     # The accuracy is that of interior distances, which are those between rows of eigenfunctions so weighted.
     roots = np.sqrt(spectrum.eigenvalues)
-    values = extend(mesh.vertices, mesh.faces, spectrum.eigenfunctions / roots, points, accuracy=config.accuracy)
+    values = extend(
+        mesh.vertices, mesh.faces, spectrum.eigenfunctions, points, divisors=roots, accuracy=config.accuracy
+    )
     values *= roots
     order = np.argsort(places(values, spectrum.eigenvalues, mesh.area, crowding(points)), kind="stable")
     points, values = points[order], values[order]

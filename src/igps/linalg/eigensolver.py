@@ -48,6 +48,8 @@ logger = logging.getLogger(__name__)
 N_GUARDS = 16
 # The largest residual that rounding may excuse
 RESIDUAL_LIMIT = 1e-4
+# Of the eigenvectors, that change their places together
+ROWS_AT_ONCE = 2**12
 # Up to here a dense solver is as fast, or the basis would fill most of the space
 DENSE_VERTICES, DENSE_VERTICES_PER_EIGENPAIR = 1000, 4
 
@@ -171,7 +173,10 @@ def _solve(
             eigenvalues = eigenvalues + correction
             order = np.argsort(eigenvalues, kind="stable")
             if (order[1:] < order[:-1]).any():  # in a multiplet
-                eigenvalues, vectors = eigenvalues[order], vectors[:, order]
+                eigenvalues = eigenvalues[order]
+                for start in range(0, len(vectors), ROWS_AT_ONCE):  # a second copy of all may take gigabytes
+                    rows = vectors[start : start + ROWS_AT_ONCE]
+                    rows[:] = rows[:, order]
             return eigenvalues, vectors, residual
         except (ConvergenceError, SingularMatrixError, np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
             if solver is solvers[-1]:

@@ -455,6 +455,18 @@ def _eliminate(
 
 
 @compiled()
+def _add_row(into: np.ndarray, at: int, source: np.ndarray, of: int, b: int) -> None:
+    """Add row ``of`` of one flat array to row ``at`` of another, rows of b numbers each."""
+    # An unsigned index is one that need not be counted from the end.
+    begin, origin = np.uint64(at * b), np.uint64(of * b)
+    for c in range(np.uint64(b)):
+        into[begin + c] += source[origin + c]
+
+
+add_row = _add_row.dispatcher
+
+
+@compiled()
 def _forward(
     nodes: tuple[int, int],
     right: np.ndarray,
@@ -479,8 +491,9 @@ def _forward(
         n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
         width, own = n_own + n_boundary, x[first[n] * b :]
         for i in range(n_own):
-            for c in range(b):
-                own[i * b + c] = right[order[first[n] + i], c]
+            place = np.uint64(order[first[n] + i])
+            for c in range(np.uint64(b)):
+                own[np.uint64(i * b) + c] = right[place, c]
         # what the children carry: to own unknowns first, to those on the boundary behind the product
         for side in range(2):
             child = children[n, side]
@@ -488,9 +501,7 @@ def _forward(
                 source, place = carried[carried_start[child] * b :], start[child]
                 k = 0
                 while k < start[child + 1] - place and parent_row[place + k] < n_own:
-                    i = parent_row[place + k]
-                    for c in range(b):
-                        own[i * b + c] += source[k * b + c]
+                    add_row(own, parent_row[place + k], source, k, b)
                     k += 1
         if n_own:
             # D is symmetric: one product with the transposed block gives D x and Eᵀ x
@@ -505,9 +516,7 @@ def _forward(
                 source, place = carried[carried_start[child] * b :], start[child]
                 k = start[child + 1] - place - 1
                 while k >= 0 and parent_row[place + k] >= n_own:
-                    i = parent_row[place + k]
-                    for c in range(b):
-                        rows[i * b + c] += source[k * b + c]
+                    add_row(rows, parent_row[place + k], source, k, b)
                     k -= 1
         target = carried[carried_start[n] * b :]
         target[: n_boundary * b] = rows[n_own * b : width * b]
@@ -536,15 +545,16 @@ def _backward(
         own = x[first[n] * b :]
         if n_own and n_boundary:
             for k in range(n_boundary):
-                place = boundary[start[n] + k] * b
-                for c in range(b):
-                    known[k * b + c] = x[place + c]
+                to, place = np.uint64(k * b), np.uint64(boundary[start[n] + k]) * np.uint64(b)
+                for c in range(np.uint64(b)):
+                    known[to + c] = x[place + c]
             block = blocks[block_start[n] + n_own :]
             shape = (b, n_own, n_boundary)
             product(gemm, NO, shape, 1.0, known, b, block, n_own + n_boundary, 1.0, own, b, tile)
         for i in range(n_own):
-            for c in range(b):
-                solution[c, order[first[n] + i]] = own[i * b + c]
+            place = np.uint64(order[first[n] + i])
+            for c in range(np.uint64(b)):
+                solution[c, place] = own[np.uint64(i * b) + c]
 
 
 @compiled()

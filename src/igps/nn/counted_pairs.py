@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from igps.compiled import is_available
-from igps.nn.pair_loops import add_features, add_pairs
+from igps.nn.pair_loops import add_pairs
 from igps.nn.precision import full_precision
 from igps.threads import Team
 
@@ -60,32 +60,32 @@ def count_pairs(
     for k, along in enumerate(layout):
         centres[k, : len(along)] = along.detach()
     order, classes, weights = _members(memberships.detach())
-    located = [_centred(points[order].to(dtype)) for points, _ in distances]
+    located = [_centred(points.detach().index_select(0, order).to(dtype)) for points, _ in distances]
     norms = torch.stack([points.square().sum(dim=1) for points in located]) if located else torch.zeros(0, 0).to(dtype)
     if not bool((norms < torch.finfo(dtype).max / 8).all()):
         raise ValueError("points: expected distances that can be squared, got larger ones; choose a larger unit.")
-    turned = [[each[order].to(dtype).T.contiguous().numpy() for each in (p, n)] for p, n, *_ in oriented]
+    n_dimensions = [points.shape[1] for points, *_ in oriented]
+    turned = torch.zeros(len(oriented), 2, max(n_dimensions, default=0), len(order), dtype=dtype)
+    for into, (points, directions, *_) in zip(turned, oriented, strict=True):
+        into[0, : points.shape[1]], into[1, : points.shape[1]] = points[order].T, directions[order].T
     n_points, n_classes = memberships.shape
-    of_axes = norms.numpy(), centres.numpy(), np.array(shape)
+    of_axes = norms.numpy(), turned.numpy(), np.array(n_dimensions, np.int64), centres.numpy(), np.array(shape)
+    of_points = classes.numpy(), weights.numpy()
     n_columns = min(n_points, _MOST_COLUMNS)
-    n_rows = min(max(1, _BLOCK // (n_columns * len(shape))), n_columns)
+    n_rows = min(max(1, _BLOCK // (n_columns * max(1, len(located)))), n_columns)
     counts_shape = n_classes * (n_classes + 1) // 2, math.prod(shape) * 2 ** len(shape)
     blocks = [(row, column) for row in range(0, n_points, n_rows) for column in range(row, n_points, n_columns)]
 
     def counted(blocks: Sequence[tuple[int, int]]) -> Tensor:
         total = torch.zeros(counts_shape, dtype=torch.float64)
+        room, counts = torch.empty(len(located) * n_rows * n_columns, dtype=dtype), total.numpy()
         with torch.autocast("cpu", enabled=False):
             for row, column in blocks:
-                rows, columns = slice(row, row + n_rows), slice(column, column + n_columns)
                 n_kept = (min(n_rows, n_points - row), min(n_columns, n_points - column))
-                block = torch.empty(len(shape), *n_kept, dtype=dtype)
-                for k, points in enumerate(located):
-                    torch.mm(points[rows], points[columns].T, out=block[k])
-                values = block.numpy()
-                for k, (places, directions) in enumerate(turned):
-                    first = len(located) + 3 * k
-                    add_features(places, directions, row, column, values[first : first + 3])
-                add_pairs(values, *of_axes, row, column, classes.numpy(), weights.numpy(), total.numpy())
+                products = room[: len(located) * math.prod(n_kept)].view(-1, *n_kept)
+                for points, product in zip(located, products, strict=True):
+                    torch.mm(points[row : row + n_rows], points[column : column + n_columns].T, out=product)
+                add_pairs(products.numpy(), *of_axes, row, column, *of_points, counts)
         return total
 
     # Each share has counts of its own, added in order: how many threads there are changes no bit.
@@ -100,7 +100,10 @@ def count_pairs(
 def _members(memberships: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """(P,) an order that has points of the same classes side by side; these classes (M, P), and the weights."""
     n_members = max(1, int((memberships > 0).sum(dim=1).max()))
-    weights, classes = memberships.double().topk(n_members, dim=1)
+    if n_members == 1:
+        weights, classes = memberships.double().max(dim=1, keepdim=True)
+    else:
+        weights, classes = memberships.double().topk(n_members, dim=1)
     leading = torch.where(weights > 0, classes, 0)
     key = torch.zeros(len(leading), dtype=torch.int64)
     for column in leading.T:
@@ -112,8 +115,11 @@ def _members(memberships: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _centred(points: Tensor) -> Tensor:
     # Coordinates that padding left at 0 would only change how products are rounded. The centre keeps digits in the
     # squared distances.
-    points = points[:, (points != 0).any(dim=0)]
-    return points - points.mean(dim=0)
+    mean = points.mean(dim=0)
+    if not bool(mean.all()):  # a column of zeros among them, perhaps
+        points = points[:, (points != 0).any(dim=0)]
+        mean = points.mean(dim=0)
+    return points - mean
 
 
 def _folded(total: Tensor, shape: Sequence[int]) -> Tensor:

@@ -119,10 +119,12 @@ class PairHistogram(nn.Module):
         view = views.of(self.samples, self.n_samples, self.n_training_samples)
         values = [one.values(view, self.embedding) for one in self.point_axes]
         pairs = [one.pairs(view, self.embedding) for one in self.pair_axes]
+        # Where nothing is padding, nothing need be copied.
+        present = [slice(None) if bool(real.all()) else real for real in view.samples.mask]
         return torch.stack(
             [
                 self._of_shape([value[i, real] for value in values], [one.of_shape(i, real) for one in pairs])
-                for i, real in enumerate(view.samples.mask)
+                for i, real in enumerate(present)
             ]
         )
 

@@ -30,7 +30,7 @@ class Distances:
     centres: Tensor
     equal: bool
 
-    def of_shape(self, i: int, real: Tensor) -> Distances:
+    def of_shape(self, i: int, real: Tensor | slice) -> Distances:
         """Those of one shape."""
         return Distances(self.points[i, real], self.centres, self.equal)
 
@@ -51,7 +51,7 @@ class OrientedPoints:
     towards: Tensor
     between: Tensor
 
-    def of_shape(self, i: int, real: Tensor) -> OrientedPoints:
+    def of_shape(self, i: int, real: Tensor | slice) -> OrientedPoints:
         """Those of one shape."""
         return OrientedPoints(self.points[i, real], self.directions[i, real], self.towards, self.between)
 

@@ -1,10 +1,9 @@
 """Loops over pairs of points that Numba compiles: what `igps.nn.counted_pairs` counts with.
 
 A block of pairs has rows and columns: row i is point ``row + i``, column j point ``column + j`` with row ≤ column, and
-counted are the pairs whose second point comes after the first, each unordered pair once. Every axis of the histogram
-has a plane of values of the block. A pair is sorted into the cell of the centres below its values, and shared out
-between the corners of that cell, two an axis: what belongs to the next cell is kept beside the cell's own, where one
-store reaches both.
+counted are the pairs whose second point comes after the first, each unordered pair once. A pair is sorted into the cell
+of the centres below its values, and shared out between the corners of that cell, two an axis: what belongs to the next
+cell is kept beside the cell's own, where one store reaches both.
 """
 
 from __future__ import annotations
@@ -19,49 +18,23 @@ from igps.compiled import compiled
 # Entries for each centre in the table from a value to its interval.
 _TABLE_PER_CENTRE = 16
 _FEW_CENTRES = 12
-
-
-@compiled(error_model="numpy")
-def add_features(points: NDArray[Any], directions: NDArray[Any], row: int, column: int, features: NDArray[Any]) -> None:
-    """Fill the planes (3, I, J) of a block with the `point_pair_features` of its pairs.
-
-    Args:
-        points: (D, P).
-        directions: (D, P) of length 1.
-        row, column: see above.
-        features: the larger and the smaller cosine to the line, and that between the directions.
-    """
-    _, n_rows, n_columns = features.shape
-    squared = np.empty(n_columns, features.dtype)
-    least, most = features.dtype.type(-1), features.dtype.type(1)
-    for i in range(n_rows):
-        start = max(row + i + 1 - column, 0)
-        n_pairs = n_columns - start
-        length = squared[:n_pairs]
-        here, there, between = features[0, i, start:], features[1, i, start:], features[2, i, start:]
-        length[:] = 0
-        here[:] = 0
-        there[:] = 0
-        between[:] = 0
-        for d in range(len(points)):
-            x, n = points[d, row + i], directions[d, row + i]
-            others, their_directions = points[d, column + start :], directions[d, column + start :]
-            for j in range(n_pairs):
-                line = others[j] - x
-                length[j] += line * line
-                here[j] += n * line
-                there[j] -= their_directions[j] * line
-                between[j] += n * their_directions[j]
-        for j in range(n_pairs):
-            inverse = most / np.sqrt(length[j]) if length[j] > 0 else features.dtype.type(0)
-            a, b = min(max(here[j] * inverse, least), most), min(max(there[j] * inverse, least), most)
-            here[j], there[j] = max(a, b), min(a, b)
+# Numbers that a compiled loop takes at once, at most.
+_VECTOR = 32
+# A whole pair and its share in one integer: the shares of so many pairs do not reach the count, nor is a digit lost of
+# a share of single precision, but in the first interval.
+_SHARE, _PAIR, _MOST_PACKED = 2**24, 2**44, 2**18
+# Pairs that follow each other often fall into the same cell. In turn into so many copies of it, none waits for another.
+_LANES = 4
+# Where a product and its sum may be rounded once, not twice.
+_CONTRACTED: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 
 
 @compiled(error_model="numpy")
 def add_pairs(
     values: NDArray[Any],
     norms: NDArray[Any],
+    oriented: NDArray[Any],
+    n_dimensions: NDArray[np.int64],
     centres: NDArray[Any],
     n_centres: NDArray[np.int64],
     row: int,
@@ -73,8 +46,10 @@ def add_pairs(
     """Count a block of pairs.
 
     Args:
-        values: (K, I, J) of each axis; of an axis of distances the inner products of the points.
-        norms: (K', P) squared lengths of the points, of the axes of distances, which are the first.
+        values: (K', I, J) inner products of the points of each axis of distances, which come first; overwritten.
+        norms: (K', P) squared lengths of these points.
+        oriented: (S, 2, D, P) points, and their directions, whose `line_features` are three axes each.
+        n_dimensions: (S,) how many of the D they have.
         centres: (K, B) ascending, of each axis its own number of them.
         n_centres: (K,).
         row, column: see above.
@@ -82,27 +57,33 @@ def add_pairs(
         weights: (M, P) of them, descending; 0 where a point belongs to fewer.
         total: (C(C+1)/2, cells·2^K) to add to; of the corners the last axis alternates fastest.
     """
-    n_axes, n_rows, n_columns = values.shape
+    n_distances, n_rows, n_columns = values.shape
+    n_axes = len(n_centres)
     n_corners = 1 << n_axes
     n_cells = total.shape[1] // n_corners
     n_classes = int(np.sqrt(2.0 * len(total)))
     n_members = len(classes)
     inverse, below, per_length, most = tables(centres, n_centres)
-    # Of the row, or of rows in the same classes: by the class of the other end.
+    # Of the row, or of rows in the same classes: by the class of the other end, whose first cell is its home.
     sums = np.zeros((n_classes * n_cells, n_corners))
     by_class = sums.reshape((n_classes, n_cells * n_corners))
+    home = (classes[:, column : column + n_columns] * n_cells).astype(np.int32)
     shares = np.empty((n_axes, n_columns), values.dtype)
-    cells, interval, member = np.empty((3, n_columns), np.int32)
-    lowest, highest = n_cells, -1
+    features = np.empty((4, n_columns), values.dtype)
+    cells, interval = np.empty(n_columns, np.int32), np.empty(n_columns, np.int32)
+    packs = n_axes == 1 and values.itemsize == 4 and n_rows * n_columns <= _MOST_PACKED and are_whole(weights)
+    packed = np.zeros((n_classes * n_cells if packs else 0) * _LANES, np.int64)
+    lowest, highest = no_cells(n_cells, n_members)
     for i in range(n_rows):
         point = row + i
-        other = max(point + 1, column)
-        n_pairs = column + n_columns - other
+        first = max(point + 1 - column, 0)
+        start = whole_vectors(first, n_columns)
         if i > 0:
             same = True
             for m in range(n_members):
                 same &= classes[m, point] == classes[m, point - 1] and weights[m, point] == weights[m, point - 1]
             if not same:
+                unpack(packed, sums)
                 flush(
                     by_class,
                     lowest * n_corners,
@@ -111,30 +92,51 @@ def add_pairs(
                     weights[:, point - 1],
                     total,
                 )
-                lowest, highest = n_cells, -1
-        cell = cells[:n_pairs]
-        cell[:] = 0
+                lowest, highest = no_cells(n_cells, n_members)
+        cells[start:] = 0
         for k in range(n_axes):
-            value, n = values[k, i, other - column :], n_centres[k]
-            if k < len(norms):
-                distances(value, norms[k, point], norms[k, other:])
+            n, cell, share = n_centres[k], cells[start:], shares[k, start:]
+            if k < n_distances:
+                value = values[k, i, start:]
+                distances(value, norms[k, point], norms[k, column + start :])
+            else:
+                s, feature = divmod(k - n_distances, 3)
+                if feature == 0:
+                    # Slices of rows, one by one: of a slice of them all it would not be known that they have no gaps.
+                    line_features(
+                        oriented[s, 0],
+                        oriented[s, 1],
+                        n_dimensions[s],
+                        point,
+                        column + start,
+                        features[0, start:],
+                        features[1, start:],
+                        features[2, start:],
+                        features[3, start:],
+                    )
+                value = features[1 + feature, start:]
             if most[k] == 0:
-                locate_equal(value, centres[k, 0], inverse[k, 0], n, cell, shares[k])
+                locate_equal(value, centres[k, 0], inverse[k, 0], n, cell, share)
             else:
-                locate(value, centres[k, :n], inverse[k], below[k], per_length[k], most[k], interval, cell, shares[k])
-        for j in range(n_pairs):
-            lowest, highest = min(lowest, cell[j]), max(highest, cell[j])
+                locate(value, centres[k, :n], inverse[k], below[k], per_length[k], most[k], interval, cell, share)
+        cell = cells[first:]
+        if n_members > 1:
+            for j in range(len(cell)):
+                lowest, highest = min(lowest, cell[j]), max(highest, cell[j])
         for m in range(n_members):
-            for j in range(n_pairs):
-                member[j] = cell[j] + classes[m, other + j] * n_cells
-            if n_axes == 1:
-                share_one_axis(member[:n_pairs], shares[0], weights[m, other:], sums)
+            begin, weight = home[m, first:], weights[m, column + first :]
+            if packs:
+                place_whole_pairs(cells[start:], home[m, start:], shares[0, start:], interval[start:])
+                share_whole_pairs(cell, interval[first:], packed)
+            elif n_axes == 1:
+                share_one_axis(cell, begin, shares[0, first:], weight, sums)
             elif n_axes == 2:
-                share_two_axes(member[:n_pairs], shares[0], shares[1], weights[m, other:], sums, 0)
+                share_two_axes(cell, begin, shares[0, first:], shares[1, first:], weight, sums, 0)
             elif n_axes == 4:
-                share_four_axes(member[:n_pairs], shares, weights[m, other:], sums)
+                share_four_axes(cell, begin, shares, first, weight, sums)
             else:
-                share_axes(member[:n_pairs], shares, weights[m, other:], sums)
+                share_axes(cell, begin, shares, first, weight, sums)
+    unpack(packed, sums)
     flush(
         by_class,
         lowest * n_corners,
@@ -143,6 +145,81 @@ def add_pairs(
         weights[:, row + n_rows - 1],
         total,
     )
+
+
+@compiled(error_model="numpy")
+def no_cells(n_cells: int, n_members: int) -> tuple[int, int]:
+    """The lowest and the highest cell counted in, before any is.
+
+    Of points in one class each so many rows are counted together that to look for these two would take longer than to
+    add up cells that have nothing.
+    """
+    return (n_cells, -1) if n_members > 1 else (0, n_cells - 1)
+
+
+@compiled(error_model="numpy")
+def whole_vectors(first: int, n_columns: int) -> int:
+    """The column from which to work, so that it is by whole vectors: what is left over takes longer than one."""
+    return max(0, n_columns - (n_columns - first + _VECTOR - 1) // _VECTOR * _VECTOR)
+
+
+@compiled(error_model="numpy")
+def line_features(
+    points: NDArray[Any],
+    directions: NDArray[Any],
+    n_dimensions: int,
+    at: int,
+    others: int,
+    length: NDArray[Any],
+    here: NDArray[Any],
+    there: NDArray[Any],
+    between: NDArray[Any],
+) -> None:
+    """The `point_pair_features` of a point with n others that follow each other.
+
+    Args:
+        points: (D, P).
+        directions: (D, P) of length 1.
+        n_dimensions: how many of the D they have.
+        at: number of the point.
+        others: of the first of the others.
+        length: (n,) room, for the squared lengths of the lines from it to them.
+        here, there: (n,) to fill: the larger and the smaller cosine to the line.
+        between: (n,) to fill: the cosine between the directions.
+    """
+    least, none, most = here.dtype.type(-1), here.dtype.type(0), here.dtype.type(1)
+    n = len(length)
+    if n_dimensions == 3:  # all three coordinates at once, but few arrays in a loop: of many it makes no vectors
+        x, y, z = points[0, at], points[1, at], points[2, at]
+        u, v, w = directions[0, at], directions[1, at], directions[2, at]
+        xs, ys, zs = points[0, others:], points[1, others:], points[2, others:]
+        us, vs, ws = directions[0, others:], directions[1, others:], directions[2, others:]
+        for j in range(n):
+            a, b, c = xs[j] - x, ys[j] - y, zs[j] - z
+            length[j] = a * a + b * b + c * c
+            here[j] = u * a + v * b + w * c
+        for j in range(n):
+            there[j] = us[j] * (x - xs[j]) + vs[j] * (y - ys[j]) + ws[j] * (z - zs[j])
+        for j in range(n):
+            between[j] = u * us[j] + v * vs[j] + w * ws[j]
+    else:
+        length[:] = 0
+        here[:] = 0
+        there[:] = 0
+        between[:] = 0
+        for d in range(n_dimensions):
+            x, u = points[d, at], directions[d, at]
+            xs, us = points[d, others:], directions[d, others:]
+            for j in range(n):
+                line = xs[j] - x
+                length[j] += line * line
+                here[j] += u * line
+                there[j] -= us[j] * line
+                between[j] += u * us[j]
+    for j in range(n):
+        inverse = most / np.sqrt(length[j]) if length[j] > none else none
+        a, b = min(max(here[j] * inverse, least), most), min(max(there[j] * inverse, least), most)
+        here[j], there[j] = max(a, b), min(a, b)
 
 
 @compiled(error_model="numpy")
@@ -257,23 +334,71 @@ def locate(
 
 
 @compiled(error_model="numpy")
-def share_one_axis(
-    cell: NDArray[np.int32], share: NDArray[Any], weights: NDArray[np.float64], sums: NDArray[np.float64]
-) -> None:
-    """Add pairs (n,) of one row, of weights (n,), to the sums (cells, 2).
-
-    Of a weight w and a share s one corner gets w·s and the other w − w·s, which rounding makes no less than 0.
-    """
-    for j in range(len(cell)):
-        into = sums[cell[j]]
-        beyond = weights[j] * share[j]
-        into[0] += weights[j] - beyond
-        into[1] += beyond
+def are_whole(weights: NDArray[np.float64]) -> bool:
+    """Whether all points belong to one class each."""
+    return len(weights) == 1 and weights.min() == 1
 
 
 @compiled(error_model="numpy")
+def place_whole_pairs(
+    cell: NDArray[np.int32], home: NDArray[np.int32], share: NDArray[Any], parts: NDArray[np.int32]
+) -> None:
+    """Add its home to the cell of each pair (n,), and fill in its share (n,) as an integer."""
+    for j in range(len(cell)):
+        cell[j] = (cell[j] + home[j]) * np.int32(_LANES) + np.int32(j % _LANES)
+        parts[j] = np.int32(share[j] * share.dtype.type(_SHARE))
+
+
+@compiled(error_model="numpy")
+def share_whole_pairs(cell: NDArray[np.int32], parts: NDArray[np.int32], packed: NDArray[np.int64]) -> None:
+    """`share_one_axis` of pairs that weigh 1, into integers (cells,): one store for both corners, and no rounding."""
+    for j in range(len(cell)):
+        packed[np.uint32(cell[j])] += _PAIR + np.int64(parts[j])
+
+
+@compiled(error_model="numpy")
+def unpack(packed: NDArray[np.int64], sums: NDArray[np.float64]) -> None:
+    """Move what was packed to the sums (cells, 2)."""
+    for c in range(len(packed) // _LANES):
+        pairs = packed[_LANES * c : _LANES * (c + 1)]
+        both = pairs.sum()
+        beyond = (both % _PAIR) / _SHARE
+        sums[c, 0] = both // _PAIR - beyond
+        sums[c, 1] = beyond
+        pairs[:] = 0
+
+
+@compiled(**_CONTRACTED)
+def share_one_axis(
+    cell: NDArray[np.int32],
+    home: NDArray[np.int32],
+    share: NDArray[Any],
+    weights: NDArray[np.float64],
+    sums: NDArray[np.float64],
+) -> None:
+    """Add pairs of one row to the sums (cells, 2).
+
+    Of a weight w and a share s one corner gets w·s and the other w − w·s, which rounding makes no less than 0.
+
+    Args:
+        cell: (n,) of the centres below the values.
+        home: (n,) first of the cells of the class of the other end.
+        share: (n,) along the axis.
+        weights: (n,) of the other ends.
+        sums: see above.
+    """
+    for j in range(len(cell)):
+        # An unsigned index is one that need not be counted from the end.
+        into = np.uint32(cell[j] + home[j])
+        beyond = weights[j] * share[j]
+        sums[into, 0] += weights[j] - beyond
+        sums[into, 1] += beyond
+
+
+@compiled(**_CONTRACTED)
 def share_two_axes(
     cell: NDArray[np.int32],
+    home: NDArray[np.int32],
     first: NDArray[Any],
     second: NDArray[Any],
     weights: NDArray[np.float64],
@@ -282,32 +407,45 @@ def share_two_axes(
 ) -> None:
     """`share_one_axis` of the shares along two axes, into four corners from one on."""
     for j in range(len(cell)):
-        add_quarters(weights[j], np.float64(first[j]), np.float64(second[j]), sums[cell[j]], at)
+        into = np.uint32(cell[j] + home[j])
+        before, side, beyond, corner = quarters(weights[j], np.float64(first[j]), np.float64(second[j]))
+        sums[into, at] += before
+        sums[into, at + 1] += side
+        sums[into, at + 2] += beyond
+        sums[into, at + 3] += corner
 
 
-@compiled(error_model="numpy")
+@compiled(**_CONTRACTED)
 def share_four_axes(
-    cell: NDArray[np.int32], shares: NDArray[Any], weights: NDArray[np.float64], sums: NDArray[np.float64]
+    cell: NDArray[np.int32],
+    home: NDArray[np.int32],
+    shares: NDArray[Any],
+    first: int,
+    weights: NDArray[np.float64],
+    sums: NDArray[np.float64],
 ) -> None:
-    """`share_one_axis` of the shares (4, n) along four axes: a distance and three cosines."""
+    """`share_one_axis` of the shares along four axes, (4, n) from the first on: a distance and three cosines."""
+    one, two, three, four = shares[0, first:], shares[1, first:], shares[2, first:], shares[3, first:]
     for j in range(len(cell)):
-        into = sums[cell[j]]
-        c, d = np.float64(shares[2, j]), np.float64(shares[3, j])
-        beyond = weights[j] * shares[0, j]
-        before = weights[j] - beyond
-        corner = beyond * shares[1, j]
-        side = before * shares[1, j]
-        add_quarters(before - side, c, d, into, 0)
-        add_quarters(side, c, d, into, 4)
-        add_quarters(beyond - corner, c, d, into, 8)
-        add_quarters(corner, c, d, into, 12)
+        into = np.uint32(cell[j] + home[j])
+        inner = quarters(1.0, np.float64(three[j]), np.float64(four[j]))
+        a, b, c, d = quarters(weights[j], np.float64(one[j]), np.float64(two[j]))
+        add_corners(sums, into, 0, a, inner)
+        add_corners(sums, into, 4, b, inner)
+        add_corners(sums, into, 8, c, inner)
+        add_corners(sums, into, 12, d, inner)
 
 
 @compiled(error_model="numpy")
 def share_axes(
-    cell: NDArray[np.int32], shares: NDArray[Any], weights: NDArray[np.float64], sums: NDArray[np.float64]
+    cell: NDArray[np.int32],
+    home: NDArray[np.int32],
+    shares: NDArray[Any],
+    first: int,
+    weights: NDArray[np.float64],
+    sums: NDArray[np.float64],
 ) -> None:
-    """`share_one_axis` of the shares (K, n) along any number of axes from two on."""
+    """`share_one_axis` of the shares along any number of axes from two on, (K, n) from the first on."""
     n_outer = len(shares) - 2
     rest = np.empty(len(cell))
     for corner in range(1 << n_outer):
@@ -316,24 +454,32 @@ def share_axes(
         for k in range(n_outer):
             if corner >> (n_outer - 1 - k) & 1:
                 for j in range(len(cell)):
-                    rest[j] *= shares[k, j]
+                    rest[j] *= shares[k, first + j]
             else:
                 for j in range(len(cell)):
-                    rest[j] -= rest[j] * shares[k, j]
-        share_two_axes(cell, shares[n_outer], shares[n_outer + 1], rest, sums, 4 * corner)
+                    rest[j] -= rest[j] * shares[k, first + j]
+        share_two_axes(cell, home, shares[n_outer, first:], shares[n_outer + 1, first:], rest, sums, 4 * corner)
 
 
-@compiled(error_model="numpy")
-def add_quarters(weight: float, first: float, second: float, into: NDArray[np.float64], at: int) -> None:
-    """Share a weight between the four corners of two axes."""
+@compiled(**_CONTRACTED)
+def quarters(weight: float, first: float, second: float) -> tuple[float, float, float, float]:
+    """A weight shared out between the four corners of two axes, none of them less than 0."""
     beyond = weight * first
     before = weight - beyond
     corner = beyond * second
     side = before * second
-    into[at] += before - side
-    into[at + 1] += side
-    into[at + 2] += beyond - corner
-    into[at + 3] += corner
+    return before - side, side, beyond - corner, corner
+
+
+@compiled(**_CONTRACTED)
+def add_corners(
+    sums: NDArray[np.float64], cell: Any, at: int, weight: float, parts: tuple[float, float, float, float]
+) -> None:
+    """Add a weight to a cell's four corners from one on, in parts."""
+    sums[cell, at] += weight * parts[0]
+    sums[cell, at + 1] += weight * parts[1]
+    sums[cell, at + 2] += weight * parts[2]
+    sums[cell, at + 3] += weight * parts[3]
 
 
 @compiled(error_model="numpy")
