@@ -31,7 +31,7 @@ from igps.threads import Team
 
 logger = logging.getLogger(__name__)
 
-__all__ = ["extend", "mean_value_coordinates", "winding_number"]
+__all__ = ["Extension", "extend", "mean_value_coordinates", "winding_number"]
 
 _BLOCK_BYTES = 256 * 2**20  # of dense weights at a time
 _ROWS = 2**10  # of the functions that are copied at a time: with what is made of them they fit into a cache
@@ -102,51 +102,88 @@ def extend(
     Raises:
         ValueError: a shape, an index or a value of an argument is invalid, or the weights of a point sum to zero.
     """
-    if accuracy is not None and not 0 < accuracy < 1:
-        raise ValueError(f"accuracy: expected None (exact) or a relative error in (0, 1), got {accuracy}")
-    if dtype is None:
-        dtype = torch.float32 if accuracy is not None and accuracy >= _FLOAT32_ACCURACY else torch.float64
-    if dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
-    surface, x = _prepare(vertices, faces, points, device)
-    values = np.asarray(functions)
-    if values.ndim != 2 or len(values) != len(surface.vertices):
-        raise ValueError(
-            f"functions: expected shape (V, K) with V = {len(surface.vertices)} vertices, got {values.shape}; "
-            "give one row per vertex"
-        )
-    with np.errstate(over="ignore", invalid="ignore"):
-        # A finite sum is one of finite values, and is read off many times faster.
-        finite = bool(np.isfinite(values.sum())) or bool(np.isfinite(values).all())
-    if not finite:
-        raise ValueError("functions: expected finite values, got NaN or infinity")
-    if divisors is not None and np.shape(divisors) != values.shape[1:]:
-        raise ValueError(
-            f"divisors: expected one for each of {values.shape[1]} functions, got shape {np.shape(divisors)}"
-        )
-    surface, order = _renumbered(surface)
-    columns = torch.ones(len(order), values.shape[1] + 1, dtype=dtype, device=device)  # the last sums the weights
-    for part, rows in zip(columns.split(_ROWS), order.cpu().split(_ROWS), strict=True):
-        taken = values[rows.numpy()]
-        part[:, :-1] = torch.as_tensor(taken if divisors is None else taken / divisors)
-    out = np.empty((len(x), values.shape[1]))
-    hats, listed = HatMoments.of(surface), ListedRule.of(surface)
-    setting = _approximation(hats, x, accuracy)
-    for attempt in range(_ATTEMPTS + 1):
-        for rows, sums in _weighted_sums(surface, hats, listed, columns, x, setting):
-            out[rows.cpu().numpy()] = _normalised(sums[:, :-1], sums[:, -1:]).cpu().numpy()
-        if setting is None or accuracy is None:
-            break
-        error = _sampled_error(hats, listed, columns, x, out, accuracy)
-        if error <= accuracy:
-            break
-        finer = None if attempt + 1 == _ATTEMPTS else 0.5 * setting * accuracy / error
-        setting = _approximation(hats, x, finer)
-        logger.info(
-            "mean value coordinates: error %.1e in place of %.1e, evaluated again %s",
-            error, accuracy, "exactly" if setting is None else f"with {setting:.1e}",
-        )  # fmt: skip
-    return out
+    extension = Extension(vertices, faces, functions, divisors=divisors, accuracy=accuracy, device=device, dtype=dtype)
+    return extension(points)
+
+
+class Extension:
+    """Functions on a surface, to be extended to points: `extend` in two steps, between which the functions may go.
+
+    Args:
+        vertices, faces, functions, divisors, accuracy, device, dtype: see `extend`.
+
+    Raises:
+        ValueError: a shape, an index or a value of an argument is invalid.
+    """
+
+    def __init__(
+        self,
+        vertices: NDArray[np.floating],
+        faces: NDArray[np.integer],
+        functions: NDArray[np.floating],
+        *,
+        divisors: NDArray[np.floating] | None = None,
+        accuracy: float | None = None,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        if accuracy is not None and not 0 < accuracy < 1:
+            raise ValueError(f"accuracy: expected None (exact) or a relative error in (0, 1), got {accuracy}")
+        if dtype is None:
+            dtype = torch.float32 if accuracy is not None and accuracy >= _FLOAT32_ACCURACY else torch.float64
+        if dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
+        surface, _ = _prepare(vertices, faces, np.zeros((0, 3)), device)
+        values = np.asarray(functions)
+        if values.ndim != 2 or len(values) != len(surface.vertices):
+            raise ValueError(
+                f"functions: expected shape (V, K) with V = {len(surface.vertices)} vertices, got {values.shape}; "
+                "give one row per vertex"
+            )
+        with np.errstate(over="ignore", invalid="ignore"):
+            # A finite sum is one of finite values, and is read off many times faster.
+            finite = bool(np.isfinite(values.sum())) or bool(np.isfinite(values).all())
+        if not finite:
+            raise ValueError("functions: expected finite values, got NaN or infinity")
+        if divisors is not None and np.shape(divisors) != values.shape[1:]:
+            raise ValueError(
+                f"divisors: expected one for each of {values.shape[1]} functions, got shape {np.shape(divisors)}"
+            )
+        self._surface, order = _renumbered(surface)
+        self._columns = torch.ones(
+            len(order), values.shape[1] + 1, dtype=dtype, device=device
+        )  # the last sums the weights
+        for part, rows in zip(self._columns.split(_ROWS), order.cpu().split(_ROWS), strict=True):
+            taken = values[rows.numpy()]
+            part[:, :-1] = torch.as_tensor(taken if divisors is None else taken / divisors)
+        self._vertices, self._faces, self._accuracy = vertices, faces, accuracy
+
+    def __call__(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(P, K) of points (P, 3).
+
+        Raises:
+            ValueError: points of another shape, or the weights of one sum to zero.
+        """
+        surface, columns, accuracy = self._surface, self._columns, self._accuracy
+        x = torch.as_tensor(_scaled(self._vertices, self._faces, points)[2], device=columns.device)
+        out = np.empty((len(x), columns.shape[1] - 1))
+        hats, listed = HatMoments.of(surface), ListedRule.of(surface)
+        setting = _approximation(hats, x, accuracy)
+        for attempt in range(_ATTEMPTS + 1):
+            for rows, sums in _weighted_sums(surface, hats, listed, columns, x, setting):
+                out[rows.cpu().numpy()] = _normalised(sums[:, :-1], sums[:, -1:]).cpu().numpy()
+            if setting is None or accuracy is None:
+                break
+            error = _sampled_error(hats, listed, columns, x, out, accuracy)
+            if error <= accuracy:
+                break
+            finer = None if attempt + 1 == _ATTEMPTS else 0.5 * setting * accuracy / error
+            setting = _approximation(hats, x, finer)
+            logger.info(
+                "mean value coordinates: error %.1e in place of %.1e, evaluated again %s",
+                error, accuracy, "exactly" if setting is None else f"with {setting:.1e}",
+            )  # fmt: skip
+        return out
 
 
 def winding_number(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps.geometry.attributes import AttributeName, check_attributes, interior_attributes, surface_attributes
-from igps.geometry.coordinates import extend
+from igps.geometry.coordinates import Extension
 from igps.geometry.laplacian import Backend, laplacian
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.ordering import crowding, places, shares_around
@@ -260,8 +260,18 @@ def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Sign
         )
     points = interior_samples(mesh, config.resolution, config.min_samples)
     spectrum, notes = _spectrum(mesh, config)
-    interior = _interior(mesh, spectrum, points, config)
     surface = _surface(mesh, spectrum, config)
+    # The accuracy is that of interior distances, which are those between rows of eigenfunctions so weighted.
+    extension = Extension(
+        mesh.vertices,
+        mesh.faces,
+        spectrum.eigenfunctions,
+        divisors=np.sqrt(spectrum.eigenvalues),
+        accuracy=config.accuracy,
+    )
+    eigenvalues, residual = spectrum.eigenvalues, spectrum.residual
+    del spectrum  # of a large mesh the eigenfunctions fill more memory than all else
+    interior = _interior(mesh, extension, eigenvalues, points, config)
     for where, samples in (("interior", interior), ("surface", surface)):
         if not np.isfinite(samples.eigenfunctions).all():
             raise MeshError(
@@ -269,7 +279,7 @@ def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Sign
                 "ill-shaped: pass backend='robust', or remesh."
             )
     return Signature(
-        eigenvalues=spectrum.eigenvalues,
+        eigenvalues=eigenvalues,
         interior=interior,
         surface=surface,
         area=mesh.area,
@@ -277,7 +287,7 @@ def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Sign
         config=config,
         name=mesh.name,
         notes=(*mesh.notes, *notes),
-        residual=spectrum.residual,
+        residual=residual,
     )
 
 
@@ -309,14 +319,17 @@ def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str,
         return spectrum, (note,)
 
 
-def _interior(mesh: Mesh, spectrum: Spectrum, points: NDArray[np.float64], config: SignatureConfig) -> Samples:
-    # The accuracy is that of interior distances, which are those between rows of eigenfunctions so weighted.
-    roots = np.sqrt(spectrum.eigenvalues)
-    values = extend(
-        mesh.vertices, mesh.faces, spectrum.eigenfunctions, points, divisors=roots, accuracy=config.accuracy
-    )
-    values *= roots
-    order = np.argsort(places(values, spectrum.eigenvalues, mesh.area, crowding(points)), kind="stable")
+def _interior(
+    mesh: Mesh,
+    extension: Extension,
+    eigenvalues: NDArray[np.float64],
+    points: NDArray[np.float64],
+    config: SignatureConfig,
+) -> Samples:
+    """Those at the points, by the extension of eigenfunctions over the roots of their eigenvalues."""
+    values = extension(points)
+    values *= np.sqrt(eigenvalues)
+    order = np.argsort(places(values, eigenvalues, mesh.area, crowding(points)), kind="stable")
     points, values = points[order], values[order]
     return Samples(points, np.asarray(values, dtype=np.float32), interior_attributes(mesh, points, config.attributes))
 
