@@ -64,6 +64,13 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
     {
         # `is` in place of `==`: both sides are truth values.
         ("src/igps/retrieval/metric.py", "if self.labels and (ids is None) is bool(self.ids):"),
+        # Centres at equal distances are taken for unequal ones, which only costs time.
+        ("src/igps/nn/pair_loops.py", "gap = (last - first) + (n - 1)"),
+        # One point more, which is no member of the class: its weight is zero.
+        (
+            "src/igps/nn/soft_pairs.py",
+            "member = slice(first, last + 2) if last - first < len(index) else index",
+        ),
         # The sum over the other dimension: the matrix is symmetric.
         ("src/igps/retrieval/reranking.py", "joins = (2 / 3 * half.sum(dim= 0) <= inside.T) & members"),
         # Exact principal components in place of approximate ones, which are only faster; of all, either is exact.
