@@ -11,8 +11,11 @@ import time
 import traceback
 import warnings
 from collections import Counter
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -21,14 +24,19 @@ from outcome import Row
 from reference import confirm
 
 from igps import MeshError, MeshReading, SignatureConfig, compute_signature, load_mesh
+from igps.geometry import mending
 from igps.geometry.reading import Component
 from igps.geometry.simplification import simplify
+from igps.geometry.watertight import watertight
 from igps.linalg.lanczos import ConvergenceError
 from igps.parallel import Failed, Limits, run
 
 SEED = 13
 CONFIG = SignatureConfig(n_eigenpairs=6, resolution=9, min_samples=0, n_surface_samples=40)
 MANY_VERTICES = 1000
+# The surfaces are small, and a coarse grid shows as much of them as the ordinary one of 96 cells, in a tenth of the
+# time. One file in so many is mended on the ordinary one nevertheless.
+COARSE, ORDINARY_EACH = 32, 10
 # A case takes a tenth of a second, the first one of a process some seconds. What takes longer than this hangs, on a
 # machine that has ten times as much to do beside as well.
 SECONDS = 300.0
@@ -66,7 +74,8 @@ def judge(broken: Broken, folder: Path, number: int) -> Verdict:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of overflow in readers, among others; the numbers are checked
         try:
-            mesh = load_mesh(path, reading)
+            with _grid(number):
+                mesh = load_mesh(path, reading)
             if len(mesh.vertices) > MANY_VERTICES:  # mending may make many
                 mesh = simplify(mesh, MANY_VERTICES)
             signature = compute_signature(mesh, CONFIG)
@@ -98,6 +107,13 @@ def _reading(number: int) -> tuple[MeshReading, bool]:
     allow_open = number % 3 == 1
     mend = ("never", "auto", "never", "auto", "never", "auto", "never", "always")[number % 8]
     return MeshReading(mend=mend, component=component, allow_open=allow_open), mend != "never" or bool(component)  # type: ignore[arg-type]
+
+
+def _grid(number: int) -> AbstractContextManager[object]:
+    """While it lasts, what is made watertight is so on the grid of this file's number."""
+    if number % ORDINARY_EACH == 0:
+        return nullcontext()
+    return patch.object(mending, "watertight", partial(watertight, resolution=COARSE))
 
 
 def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:

@@ -18,6 +18,8 @@ from retrieving import Command, is_python_worker, partials, table, write_shapes
 SEED = 13
 N_PROCESSES = 8
 N_KILLED = 4
+# Kills of workers in one run: each costs the start of another process, as much as all that there is to compute.
+N_STRUCK = 3
 _DAY = 24 * 3600
 # A run of twelve small shapes takes seconds, and a worker ends at once; on a machine that has much to do, longer.
 _PATIENCE = 600.0
@@ -65,6 +67,11 @@ class _Run:
     def table(self):  # type: ignore[no-untyped-def]
         return table(self.out)
 
+    def blames_mesh(self) -> bool:
+        """Whether a mesh was given up because its worker was killed twice."""
+        failures = self.out / "failures.csv"
+        return failures.exists() and "killed, twice" in failures.read_text()
+
     def said(self) -> str:
         return self.out.with_suffix(".log").read_text()[-300:]
 
@@ -87,22 +94,24 @@ def _workers(folder: Path, expected: object, n_kills: int, seconds: float) -> Ro
         generator = np.random.default_rng([SEED, 0, number])
         run = _Run(folder, f"worker-{number}")
         command = run.command(2)
-        moment = time.monotonic() + generator.uniform(0, seconds)
-        struck = False
-        while command.status() is None and time.monotonic() < moment + _PATIENCE:
+        begun = time.monotonic()
+        moments = np.sort(generator.uniform(0, seconds, min(N_STRUCK, n_kills - killed))).tolist()
+        while command.status() is None and time.monotonic() < begun + seconds + _PATIENCE:
             workers = [pid for pid in command.children() if is_python_worker(pid)]
-            if not struck and time.monotonic() >= moment and workers:
+            if moments and time.monotonic() >= begun + moments[0] and workers:
                 struck = _kill(int(generator.choice(workers)))
+                moments = moments[struck:]
                 killed += struck
             time.sleep(0.01)
         if command.status() is None:
             os.kill(command.pid, signal.SIGKILL)
             command.wait()
-            missed.append(f"worker {number}: the run hangs after its worker was killed")
-        # Killed while it starts, a worker says nothing of a mesh: the command then blames the machine.
+            missed.append(f"worker {number}: the run hangs after a worker was killed")
         elif command.status() == 0 and run.table() == expected:
             same += 1
-        elif command.status() == 2 and "igps:" in run.said() and "Traceback" not in run.said():
+        # Killed twice while it starts, a worker says nothing of a mesh, and the command blames the machine; killed
+        # twice with one mesh, it blames the mesh.
+        elif (command.status() == 2 and "igps:" in run.said() and "Traceback" not in run.said()) or run.blames_mesh():
             asked += 1
         else:
             missed.append(
@@ -115,7 +124,7 @@ def _workers(folder: Path, expected: object, n_kills: int, seconds: float) -> Ro
         "a worker",
         killed,
         _TARGET,
-        f"{same} runs went on to the same table, {asked} said to run again, {len(missed)} wrong",
+        f"{same} runs went on to the same table, {asked} said what to do, {len(missed)} wrong",
         missed,
         seconds=time.monotonic() - start,
     )

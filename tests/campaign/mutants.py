@@ -3,6 +3,7 @@
 Cosmic Ray's operators (comparisons, arithmetic, numbers, loops, returns ...) make the faults, in copies of the tree.
 The tests of a room are run once on the sound code, which tells what each calls and how long it takes. A fault is shown
 to the tests that call the function it is in, the shortest first, until one fails; then to the others of the module.
+Each run of tests is a fork of a process that has imported PyTorch and the rest already, but nothing of the library.
 `python tests/campaign/mutants.py --number 20` lists those that no test noticed, with what was changed.
 """
 
@@ -10,28 +11,33 @@ from __future__ import annotations
 
 import argparse
 import ast
+import compileall
+import contextlib
 import difflib
 import functools
+import importlib
 import json
+import multiprocessing
 import os
-import queue
 import resource
 import shutil
-import subprocess
+import signal
 import sys
 import tempfile
 import time
+import types
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from outcome import Row, table
 
-from igps.parallel import n_cores
-
-ROOT = Path(__file__).parents[2]
+# Nothing here imports the library: each process of tests is forked from this one, and imports it with a fault in it.
+HERE = Path(__file__).parent.resolve()
+ROOT = HERE.parents[1]
 ROOMS = ("geometry", "nn", "retrieval")
 SEED = 13
 # Of the faults that are tried, so many are to be noticed by a test.
@@ -40,11 +46,31 @@ TARGET = 0.9
 # a busy machine does not change; a test that waits for nothing at all is ended after an hour.
 _SECONDS, _TIMES = 120, 5
 _HOUR = 3600
+# What takes seconds to import, and starts no threads that a fork would lose.
+_HEAVY = (
+    *("torch", "torch._dynamo", "torch.nn.functional", "torchmetrics", "pytorch_lightning", "jsonargparse"),
+    *(
+        "scipy.sparse.linalg",
+        "scipy.spatial",
+        "scipy.ndimage",
+        "scipy.stats",
+        "scipy.optimize",
+        "sklearn.decomposition",
+    ),
+    *("trimesh", "networkx", "igl", "skimage.measure", "sklearn.decomposition", "numba", "hypothesis", "pytest"),
+)
 # Faults that are none, after reading them one by one: the module and the line as the fault leaves it.
 EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
     {
         # `is` in place of `==`: both sides are truth values.
         ("src/igps/retrieval/metric.py", "if self.labels and (ids is None) is bool(self.ids):"),
+        # Centres at equal distances are taken for unequal ones, which only costs time.
+        ("src/igps/nn/pair_loops.py", "gap = (last - first) + (n - 1)"),
+        # One point more, which is no member of the class: its weight is zero.
+        (
+            "src/igps/nn/soft_pairs.py",
+            "member = slice(first, last + 2) if last - first < len(index) else index",
+        ),
         # The sum over the other dimension: the matrix is symmetric.
         ("src/igps/retrieval/reranking.py", "joins = (2 / 3 * half.sum(dim= 0) <= inside.T) & members"),
         # Exact principal components in place of approximate ones, which are only faster; of all, either is exact.
@@ -193,103 +219,159 @@ def difference(mutant: Mutant) -> tuple[int, str, str]:
     return 0, "", ""
 
 
-def is_noticed(mutant: Mutant, copy: Path, calls: Calls) -> bool:
-    """Whether a test fails, or hangs, with the fault in the copy of the tree."""
-    target = copy / mutant.path
-    whole = target.read_text()
+def is_noticed(mutant: Mutant, plan: Sequence[tuple[list[str], float]]) -> bool:
+    """Whether a test fails, or hangs, with the fault in this process's copy of the tree.
+
+    Args:
+        mutant: the fault.
+        plan: tests to run, some and then others, and the seconds that they take on the sound code.
+    """
+    target = _place() / mutant.path
+    whole, stamp = target.read_bytes(), target.stat()
     target.write_text(mutated(mutant))
     try:
-        for some in calls.of(mutant):
-            run = _run(some, copy, calls.seconds(some))
-            if run is None or run.returncode not in (0, 5):
-                return True
-        return False
+        return any(_run(some, seconds) not in (0, 5) for some, seconds in plan)
     finally:
-        target.write_text(whole)
+        target.write_bytes(whole)
+        # What Python compiled of it counts again.
+        os.utime(target, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
 
 
-def called(room: str, copy: Path, folder: Path) -> tuple[Calls, list[str]]:
+def called(room: str) -> tuple[Calls, list[str]]:
     """What the tests of a room do, and which of them fail on the sound code."""
-    report = folder / f"{room}.json"
-    run = _run([f"tests/{room}"], copy, _HOUR, ("-p", "called"), report)
-    if run is None or run.returncode not in (0, 1):
-        said = "nothing" if run is None else f"{run.stdout[-500:]}{run.stderr[-500:]}"
-        raise RuntimeError(f"tests/{room}: pytest does not come to its end on the sound code; it says {said}")
+    report = _place().with_name(f"{room}.json")
+    status = _run([f"tests/{room}"], _HOUR, ("-p", "called"), report)
+    if status not in (0, 1):
+        said = report.with_suffix(".log").read_text()[-1000:]
+        raise RuntimeError(f"tests/{room}: pytest ends with {status} on the sound code; it says {said}")
     found = json.loads(report.read_text())
     tests = {name: (test["seconds"], frozenset(test["functions"])) for name, test in found["tests"].items()}
     return Calls(tests, frozenset(found["shared"])), found["failed"]
 
 
 def _run(
-    tests: Sequence[str], copy: Path, seconds: float, plugins: Sequence[str] = ("-x",), report: Path | None = None
-) -> subprocess.CompletedProcess[str] | None:
-    """pytest on the copy of the tree, the tests in the order given; None, or ended by a signal, if it took too long."""
-    # The copy comes first on the path, so that it is what the tests import.
-    path = os.pathsep.join([str(copy / "src"), str(Path(__file__).parent), *(one for one in sys.path if one)])
-    environment = {**os.environ, "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
-    environment["IGPS_CAMPAIGN_CALLED"] = str(report)
-    limit = int(_SECONDS + _TIMES * seconds)
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *plugins, *tests]
+    tests: Sequence[str], seconds: float, plugins: Sequence[str] = ("-x",), report: Path | None = None
+) -> int | None:
+    """pytest's exit status on this process's copy of the tree, the tests in the order given.
+
+    None, or minus the signal that ended it, if it took too long.
+    """
+    deadline = time.monotonic() + _HOUR + seconds
+    pid = os.fork()
+    if pid == 0:
+        _become_pytest([*plugins, *tests], int(_SECONDS + _TIMES * seconds), report)
     try:
-        return subprocess.run(
-            command,
-            cwd=copy,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=_HOUR + seconds,
-            check=False,
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (limit, limit)),
-        )
-    except subprocess.TimeoutExpired:
+        while time.monotonic() < deadline:
+            ended, status = os.waitpid(pid, os.WNOHANG)
+            if ended:
+                return os.waitstatus_to_exitcode(status)
+            time.sleep(0.02)
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
         return None
+    finally:
+        with contextlib.suppress(ProcessLookupError):  # processes of the tests that outlive them
+            os.killpg(pid, signal.SIGKILL)
+
+
+def _become_pytest(arguments: Sequence[str], limit: int, report: Path | None) -> None:
+    status = 70
+    try:
+        os.setsid()
+        resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
+        place = _place()
+        os.chdir(place)
+        log = os.open(report.with_suffix(".log") if report else os.devnull, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        for stream in (1, 2):
+            os.dup2(log, stream)
+        # The copy comes first on the path, so that it is what the tests and their processes import.
+        sys.path[:] = dict.fromkeys([str(place), str(place / "src"), str(HERE), *(one for one in sys.path if one)])
+        os.environ["PYTHONPATH"] = os.pathsep.join(sys.path[1:])
+        os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+        os.environ["IGPS_CAMPAIGN_CALLED"] = str(report)
+        sys.dont_write_bytecode = True
+        importlib.invalidate_caches()
+        # Workers import the main module, which is to be none of the campaign's.
+        sys.argv, sys.modules["__main__"] = ["pytest"], types.ModuleType("__main__")
+        import pytest
+
+        status = int(pytest.main(["-q", "-p", "no:cacheprovider", *arguments]))
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+
+
+_places: list[Path] = []
+
+
+def _settle(places: Any) -> None:
+    """A process takes one of the copies of the tree."""
+    _places[:] = [places.get()]
+
+
+def _place() -> Path:
+    return _places[0]
+
+
+def _warm() -> None:
+    """Import what takes long, for every process that is forked from this one."""
+    if early := [name for name in sys.modules if name.partition(".")[0] == "igps"]:
+        raise RuntimeError(f"{early[0]} is imported already: tests in forked processes would see no fault")
+    os.environ["OMP_NUM_THREADS"] = "1"
+    for name in _HEAVY:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
 
 
 def campaign(number: int, rooms: Sequence[str] = ROOMS) -> list[Row]:
     """So many faults of each room, as many at once as there are cores."""
+    _warm()
+    n_processes = len(os.sched_getaffinity(0))
+    context = multiprocessing.get_context("fork")
     with tempfile.TemporaryDirectory(prefix="igps-campaign-") as folder:
-        copies: queue.SimpleQueue[Path] = queue.SimpleQueue()
-        for i in range(n_cores()):
-            copies.put(_copy(Path(folder) / str(i)))
-
-        def in_a_copy(work, *arguments):  # type: ignore[no-untyped-def]
-            copy = copies.get()
-            try:
-                return work(*arguments, copy)
-            finally:
-                copies.put(copy)
-
-        with ThreadPoolExecutor(n_cores()) as pool:
+        places = context.SimpleQueue()
+        first = _copy(Path(folder) / "0")
+        compileall.compile_dir(first / "src", quiet=2)
+        for i in range(n_processes):
+            places.put(first if i == 0 else shutil.copytree(first, Path(folder) / str(i)))
+        with ProcessPoolExecutor(n_processes, context, _settle, (places,)) as pool:
             # Of tests that fail on the sound code every fault would be noticed.
-            sound = pool.map(lambda room: in_a_copy(lambda copy: called(room, copy, Path(folder))), rooms)
-            calls = dict(zip(rooms, sound, strict=True))
-            return [_row(room, number, *calls[room], pool, in_a_copy) for room in rooms]
+            sound = dict(zip(rooms, pool.map(called, rooms), strict=True))
+            return [_row(room, number, *sound[room], pool) for room in rooms]
 
 
 def _copy(place: Path) -> Path:
     for name in ("src", "tests", "training", "configs"):
         shutil.copytree(ROOT / name, place / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "Makefile"):
-        shutil.copy(ROOT / name, place / name)
+        shutil.copy2(ROOT / name, place / name)
     return place
 
 
-def _row(room: str, number: int, calls: Calls, failed: list[str], pool: ThreadPoolExecutor, in_a_copy) -> Row:  # type: ignore[no-untyped-def]
+def _attempt(mutant: Mutant, plan: Sequence[tuple[list[str], float]]) -> bool:
+    begun = time.monotonic()
+    noticed = is_noticed(mutant, plan)
+    line, before, after = difference(mutant)
+    verdict = "noticed " if noticed else "SURVIVES"
+    print(f"{verdict} {time.monotonic() - begun:4.0f} s {mutant.path}:{line}  {before}  ->  {after}", flush=True)
+    return noticed
+
+
+def _row(room: str, number: int, calls: Calls, failed: list[str], pool: Executor) -> Row:
     start = time.monotonic()
     missed = [f"{name} fails on the sound code" for name in failed]
     if not calls.tests:
         missed.append(f"tests/{room}: there are no tests, and so no fault of {room} was tried")
     mutants = sample(number, [room]) if calls.tests else []
 
-    def attempt(mutant: Mutant) -> bool:
-        begun = time.monotonic()
-        noticed = bool(in_a_copy(lambda copy: is_noticed(mutant, copy, calls)))
-        line, before, after = difference(mutant)
-        verdict = "noticed " if noticed else "SURVIVES"
-        print(f"{verdict} {time.monotonic() - begun:4.0f} s {mutant.path}:{line}  {before}  ->  {after}", flush=True)
-        return noticed
-
-    survivors = [mutant for mutant, noticed in zip(mutants, pool.map(attempt, mutants), strict=True) if not noticed]
+    plans = [[(some, calls.seconds(some)) for some in calls.of(mutant)] for mutant in mutants]
+    noticed = pool.map(_attempt, mutants, plans)
+    survivors = [mutant for mutant, seen in zip(mutants, noticed, strict=True) if not seen]
     known = [mutant for mutant in survivors if (str(mutant.path), difference(mutant)[2]) in EQUIVALENT]
     notes = []
     for mutant in survivors:

@@ -118,6 +118,16 @@ def test_body_too_thin_for_the_grid() -> None:
         interior_samples(as_mesh(sheet, "sheet"), resolution=2)
 
 
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(("depth", "n_inside"), [(5e-6, 16 * 16), (5e-7, 0)])
+def test_surface_is_as_thick_where_the_grid_has_one_layer(axis: int, depth: float, n_inside: int) -> None:
+    # The cell centres of a plate lie so many cells below its two faces; closer than 1e-6 cells is on the surface.
+    extents = np.roll([2 * depth / 16, 1.0, 1.0], axis)
+    axes = grid_axes(plate := as_mesh(trimesh.creation.box(extents)), 16)
+    assert len(axes[axis]) == 1
+    assert inside_grid(plate, axes).sum() == n_inside
+
+
 @pytest.mark.parametrize(("resolution", "min_samples", "name"), [(0, 0, "resolution"), (4, -1, "min_samples")])
 def test_bad_arguments(blob: Mesh, resolution: int, min_samples: int, name: str) -> None:
     with pytest.raises(ValueError, match=name):

@@ -214,6 +214,22 @@ def test_entries_that_were_replaced_do_not_count_as_many(tmp_path: Path) -> None
     assert extend_index(tmp_path / "g.igps", ABOUT, batches(rows[:200], first=900)).vector_map is not None
 
 
+def test_descriptions_of_one_size_and_two_shapes_are_refused(tmp_path: Path) -> None:
+    both = [*batches(units(10)), *batches(units(10).reshape(10, 4, 4), first=10)]
+    with pytest.raises(ValueError, match=r"expected shape \(16,\) as before, got \(4, 4\)"):
+        write_index(tmp_path / "g.igps", ABOUT, "cosine", both)
+    assert not (tmp_path / "g.igps" / "manifest.json").exists()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows opens no folders")
+def test_files_and_their_folder_are_written_to_the_disk_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "part").write_text("part")
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda handle: synced.append(os.fstat(handle).st_ino))
+    index_part.flush(tmp_path)
+    assert sorted(synced) == sorted(path.stat().st_ino for path in (tmp_path, tmp_path / "part"))
+
+
 def test_an_index_of_something_else_is_refused(tmp_path: Path) -> None:
     write_index(tmp_path / "g.igps", ABOUT, "cosine", batches(units(10)))
     other = {"descriptor": "test", "signature": {"resolution": 20}}

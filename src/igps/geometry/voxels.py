@@ -160,12 +160,18 @@ def _scan(
     before = -np.cumsum(at, axis=0)[:-1]
 
     touched = np.zeros(size, dtype=bool)
-    cell = x_axis[1] - x_axis[0] if len(x_axis) > 1 else np.ptp(vertices, axis=0).max()
+    cell = _cell(axes, vertices)
     for neighbour in (position - 1, position):
         clipped = np.clip(neighbour, 0, len(x_axis) - 1)
         close = np.abs(x_axis[clipped] - crossing) < _ON_SURFACE * cell
         touched[clipped[close], column[close], row[segment][close]] = True
     return after, before, touched[:-1]
+
+
+def _cell(axes: tuple[NDArray[np.float64], ...], vertices: NDArray[np.float64]) -> float:
+    """The grid's cell: the first axis tells it, or where that has one point, as across a flat body, the next does."""
+    steps = (float(axis[1] - axis[0]) for axis in axes if len(axis) > 1)
+    return next(steps, float(np.ptp(vertices, axis=0).max()))
 
 
 def _ranges(first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
