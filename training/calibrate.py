@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 import igps
 from igps.descriptors.pretrained import PRETRAINED, pretrained
 from igps.gallery.calibration import CALIBRATION, KINDS, Calibration, quantiles, threshold_between, told_of
-from igps.gallery.duplicates import distance_if_alike, surface_samples
+from igps.gallery.duplicates import Surfaces, distance_if_alike
 from igps.gallery.gallery import fingerprint
 from igps.geometry.alignment import SurfaceSamples
 from igps.geometry.disturbances import move, remesh, scale, simplified
@@ -90,9 +90,9 @@ def calibrate(
     by_kind |= {kind: distances[pairs] for kind, pairs in of_kind.items()}
     near = 2 * float(by_kind["copies"].max())
 
-    samples = [surface_samples(shapes, k) for k in range(len(shapes))]
-    samples_of_copies = [surface_samples(copied, k) for k in range(len(copied))]
-    same = [(samples[k], one) for k, one in zip(originals, samples_of_copies, strict=True)]
+    surfaces, surfaces_of_copies = Surfaces(shapes), Surfaces(copied)
+    samples = [surfaces.samples(k) for k in range(len(shapes))]
+    same = [(samples[k], surfaces_of_copies.samples(n)) for n, k in enumerate(originals)]
     same += [(samples[a], samples[b]) for a, b in zip(i[rigid_poses], j[rigid_poses], strict=True)]
     # The hard ones tell the rate: other poses of bodies that bend, and other bodies of the class.
     others = np.flatnonzero(of_kind["poses"] | of_kind["bodies"])

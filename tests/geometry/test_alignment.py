@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -75,6 +77,39 @@ def test_what_is_round_in_every_direction_but_for_its_bumps_is_found_in_any_plac
     body = bumpy(0.15)
     again = moved(body, 7, mirror=True, scale=2.0)
     assert surface_distance(body, again) < 0.1 * surface_distance(body, bumpy(0.0, seed=3))
+
+
+def rough(amplitude: float, n: int, seed: int) -> tuple[Array, Array]:
+    """Points and normals of an ellipsoid that is ruffled along one axis, by waves much shorter than a patch."""
+    axes, wave = np.array([1.0, 0.7, 0.45]), 0.02
+    directions = even_directions(n, seed)
+    smooth = directions / axes
+    steepness = np.linalg.norm(smooth, axis=1, keepdims=True)
+    phase = 2 * np.pi * (directions * axes)[:, :1] / wave
+    points = directions * axes + amplitude * np.cos(phase) * smooth / steepness
+    return points, smooth / steepness
+
+
+def test_lost_relief_cancels_where_another_shape_does_not() -> None:
+    """What goes in and out within a patch of ten samples, by a root mean square of amplitude/√2."""
+    amplitude, area = 0.01, 6.1
+    plain, ruffled = (SurfaceSamples.of(*rough(a, 2000, seed), area) for a, seed in ((0.0, 1), (amplitude, 2)))
+    high = amplitude / np.sqrt(2) / np.sqrt(area)
+    lost = surface_distance(plain, ruffled)
+    assert lost < 0.55 * high
+    # The same height, all of it outward in one half of the body and inward in the other.
+    shifted, normals = rough(0.0, 2000, 3)
+    turned = shifted * [1, 1, 1] + 2 * high * np.sqrt(area) * normals * np.sin(3 * shifted[:, :1])
+    assert surface_distance(plain, SurfaceSamples.of(turned, normals, area)) > 2 * lost
+
+
+def test_more_samples_tell_more() -> None:
+    """Between few samples a curved surface leaves their tangent planes; between many it hardly does."""
+    axes = (1.0, 0.6, 0.4)
+    many = ellipsoid(axes, 30_000, seed=3)
+    few = [ellipsoid(axes, 300, seed) for seed in (1, 2)]
+    detailed = [replace(one, detail=lambda: many) for one in few]
+    assert surface_distance(*detailed) < 0.2 * surface_distance(*few)
 
 
 def test_thin_sheets_of_other_widths_are_told_apart() -> None:

@@ -8,8 +8,8 @@ about the same distances from each other, or in an index, whose descriptions are
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 
@@ -25,16 +25,22 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.gallery.calibration import Calibration
 from igps.gallery.gallery import Gallery
 from igps.geometry.alignment import SurfaceSamples, surface_distance
+from igps.geometry.attributes import AttributeName, surface_attributes
 from igps.geometry.mesh import MeshError
+from igps.geometry.sampling import surface_points
+from igps.geometry.signature import Signature
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor
 from igps.parallel import Failed, on_threads
 from igps.retrieval.distances import Distance, euclidean
 
-# Rows of distances, pairs whose surfaces are compared, and samples of surfaces, in memory at once.
-_ROWS, _PAIRS, _SURFACES = 256, 256, 512
+# Rows of distances, pairs whose surfaces are compared, samples of surfaces, and many samples, in memory at once.
+_ROWS, _PAIRS, _SURFACES, _DETAILED = 256, 256, 512, 64
+# Samples of a surface where two are near: neighbours are then four times as close as among those of a Signature.
+_N_DETAILED = 32_000
 # Pairs as near as copies are asked for among so many of an index, then among ever more.
 _FIRST_TOP = 32
+_NORMALS: AttributeName = "surface_direction"
 # What sampling adds to the difference of the profiles of one surface: between copies, it is up to 0.01.
 _PROFILE_NOISE = 0.02
 # Copies differ by up to 0.045 in the logarithms of their extents; what differs by more is not laid onto each other.
@@ -126,7 +132,7 @@ def duplicates(
     group = _Groups(len(dataset))
     names = dataset.files.names
     pairs: dict[tuple[str, str], float] = {}
-    surfaces = _Surfaces(dataset)
+    surfaces = Surfaces(dataset)
     while some := list(islice(near, _PAIRS)):
         open_pairs = [(i, j, distance) for i, j, distance in some if group.of(i) != group.of(j)]
         if poses:
@@ -175,26 +181,8 @@ def compared(
     descriptions, _ = describe_usable(dataset, chosen, n_workers=1, strict=True, progress=progress)
     with torch.inference_mode():
         distance = float(chosen.distances(descriptions[:1], descriptions[1:]))
-    surfaces = surface_distance(*(surface_samples(dataset, i) for i in range(2)))
+    surfaces = surface_distance(*map(Surfaces(dataset).samples, range(2)))
     return Comparison(distance, surfaces, calibration.words(distance), surfaces <= calibration.same.distance)
-
-
-def surface_samples(dataset: SignatureDataset, index: int) -> SurfaceSamples:
-    """Those of a mesh's Signature.
-
-    Raises:
-        MeshError: the mesh cannot be used.
-        ValueError: the Signatures have no directions of the surface.
-    """
-    signature = dataset[index].signature
-    if "surface_direction" not in signature.surface.attributes:
-        raise ValueError(
-            f"attributes: expected 'surface_direction' among those of the surface samples, got "
-            f"{sorted(signature.surface.attributes)}. Name it in SignatureConfig(attributes=...)."
-        )
-    return SurfaceSamples.of(
-        signature.surface.points, signature.surface.attributes["surface_direction"], signature.area
-    )
 
 
 def distance_if_alike(one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0) -> float:
@@ -204,32 +192,79 @@ def distance_if_alike(one: SurfaceSamples, other: SurfaceSamples, *, enough: flo
     return surface_distance(one, other, enough=enough, hopeless=_HOPELESS)
 
 
-class _Surfaces:
-    """The samples of surfaces of a dataset, the last used of them in memory."""
+class Surfaces:
+    """The samples of surfaces of a dataset, the last used of them in memory.
+
+    Args:
+        dataset: of meshes, whose Signatures give few samples; many are drawn from the mesh where they are asked for.
+
+    Attributes:
+        failures: of meshes that could not be read, by index.
+    """
 
     def __init__(self, dataset: SignatureDataset) -> None:
         self.failures: dict[int, Failure] = {}
         self._dataset = dataset
-        self._samples = lru_cache(_SURFACES)(self._read)
+        self._last = lru_cache(_SURFACES)(self.samples)
+        self._detailed = lru_cache(_DETAILED)(self._detail)
+
+    def samples(self, i: int) -> SurfaceSamples:
+        """Those of one.
+
+        Raises:
+            MeshError: the mesh cannot be used; so does their `detail`.
+            ValueError: the Signatures have no directions of the surface.
+        """
+        signature = self._signature(i)
+        found = SurfaceSamples.of(signature.surface.points, signature.surface.attributes[_NORMALS], signature.area)
+        return replace(found, detail=partial(self._detailed, i))
 
     def distance(self, i: int, j: int, enough: float) -> float:
         """That of two; infinite where they cannot be the same, or one cannot be read."""
-        one, other = self._samples(i), self._samples(j)
-        if one is None or other is None:
+        try:
+            return distance_if_alike(self._last(i), self._last(j), enough=enough)
+        except MeshError:
             return float("inf")
-        return distance_if_alike(one, other, enough=enough)
 
     def profile(self, i: int) -> NDArray[np.float64] | None:
         """That of one; None where it cannot be read."""
-        samples = self._read(i)
-        return None if samples is None else samples.profile
-
-    def _read(self, i: int) -> SurfaceSamples | None:
         try:
-            return surface_samples(self._dataset, i)
-        except MeshError as error:
-            self.failures[i] = self._dataset.failure(i, Failed(str(error)))
+            return self.samples(i).profile
+        except MeshError:
             return None
+
+    def _detail(self, i: int) -> SurfaceSamples:
+        """Many samples of one, about the origin of the few."""
+        signature = self._signature(i)
+        try:
+            mesh = self._dataset.mesh(i)
+        except MeshError as error:
+            self._keep(i, error)
+            raise
+        few = signature.surface
+        drawn = surface_points(mesh, _N_DETAILED, self._dataset.config.seed)
+        # With the few among them, so that a surface is no distance from itself.
+        points = np.concatenate([few.points, drawn.positions])
+        normals = np.concatenate(
+            [few.attributes[_NORMALS], surface_attributes(mesh, drawn.face, (_NORMALS,))[_NORMALS]]
+        )
+        return SurfaceSamples.of(points, normals, signature.area, few.points.mean(axis=0))
+
+    def _signature(self, i: int) -> Signature:
+        try:
+            signature = self._dataset[i].signature
+        except MeshError as error:
+            self._keep(i, error)
+            raise
+        if _NORMALS not in signature.surface.attributes:
+            raise ValueError(
+                f"attributes: expected {_NORMALS!r} among those of the surface samples, got "
+                f"{sorted(signature.surface.attributes)}. Name it in SignatureConfig(attributes=...)."
+            )
+        return signature
+
+    def _keep(self, i: int, error: MeshError) -> None:
+        self.failures[i] = self._dataset.failure(i, Failed(str(error)))
 
 
 class _Groups:
@@ -261,7 +296,7 @@ def _described(
     """Descriptions, or where there is no descriptor the profiles of the surfaces, and what has none."""
     if descriptor is not None:
         return describe_usable(dataset, descriptor, n_workers=n_workers, progress=progress)
-    surfaces = _Surfaces(dataset)
+    surfaces = Surfaces(dataset)
     profiled = on_threads(surfaces.profile, range(len(dataset)), n_workers)
     found = list(tqdm(profiled, desc="surfaces", total=len(dataset), disable=not progress))
     profiles = [one for one in found if one is not None]

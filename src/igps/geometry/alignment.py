@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,9 @@ _AMBIGUOUS = 1.1
 _N_ROTATIONS = 300
 _N_PROFILE = 1000
 _N_SCORED, _N_COARSE, _N_FINE = 60, 250, 1000
-_N_TRIED, _COARSE_STEPS, _FINE_STEPS = 6, 15, 8
+_N_TRIED, _COARSE_STEPS, _FINE_STEPS, _LAST_STEPS = 12, 15, 8, 10
+# Neighbouring samples whose offsets are averaged.
+_PATCH = 10
 _MOST_SCALED = math.log(1.1)
 
 
@@ -36,20 +38,36 @@ class SurfaceSamples:
     Args:
         points: (P, 3) without unit.
         normals: (P, 3) outward, of length 1.
+        detail: gives many more samples of the surface, about the same origin and in the same unit, where they can be
+            had; it is asked for where surfaces are near.
     """
 
     points: Array
     normals: Array
+    detail: Callable[[], SurfaceSamples] | None = None
 
     @classmethod
-    def of(cls, points: Array, normals: NDArray[np.floating], area: float) -> SurfaceSamples:
-        """Those of points (P, 3), length, and outward normals (P, 3) of a surface of an area, length²."""
+    def of(
+        cls, points: Array, normals: NDArray[np.floating], area: float, origin: Array | None = None
+    ) -> SurfaceSamples:
+        """Those of points (P, 3), length, and outward normals (P, 3) of a surface of an area, length².
+
+        Args:
+            points, normals, area: of the samples, and of the surface.
+            origin: (3,) where the origin is put; the mean of the points if None.
+        """
         if points.shape != normals.shape or points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
             raise ValueError(
                 f"points, normals: expected both (P, 3) with P ≥ 4, got {tuple(points.shape)} and "
                 f"{tuple(normals.shape)}."
             )
-        return cls((points - points.mean(axis=0)) / math.sqrt(area), np.asarray(normals, dtype=np.float64))
+        origin = points.mean(axis=0) if origin is None else origin
+        return cls((points - origin) / math.sqrt(area), np.asarray(normals, dtype=np.float64))
+
+    @cached_property
+    def tree(self) -> KDTree:
+        """Finds the nearest of them."""
+        return KDTree(_with_normals(self))
 
     @property
     def extents(self) -> Array:
@@ -75,12 +93,14 @@ class SurfaceSamples:
 def surface_distance(
     one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, hopeless: float = math.inf
 ) -> float:
-    """Root mean square distance of two surfaces laid onto each other, over √area, the mean of both directions.
+    """How far apart two surfaces laid onto each other stay, over √area: root mean square of patches, of both ways.
 
     One is moved, turned, perhaps mirrored, and scaled by up to a tenth (their areas are equal already), from many
-    starts, by iterated closest points to tangent planes (Chen and Medioni 1992; Besl and McKay 1992). A sample is as
-    far from the other surface as from the plane of the nearest sample there whose normal agrees, and farther by what it
-    lies off to the side of that sample, beyond the gaps between samples.
+    starts, by iterated closest points to tangent planes (Chen and Medioni 1992; Besl and McKay 1992). The offset of a
+    sample is that to the plane of the nearest sample of the other surface whose normal agrees, and beside it what it
+    lies off to the side of that sample, beyond the gaps between samples. Offsets are averaged over patches of ten
+    neighbours, a twentieth of √area across: relief that a coarser mesh has lost, and the roughness of triangles, go in
+    and out and cancel, where another shape or pose moves whole patches.
 
     Args:
         one, other: samples of the surfaces.
@@ -91,56 +111,59 @@ def surface_distance(
     Returns:
         Without unit; symmetric but for where the search ends.
     """
-    target = _Target(other)
     best = math.inf
-    ways = [_principal_starts(one, other)]
-    if min(_least_step(one), _least_step(other)) < _AMBIGUOUS:
-        ways.append(_uniform_starts())
-    for starts in ways:
-        scored = _subset(one, _N_SCORED)
-        order = np.argsort(target.scores(scored, starts), kind="stable")[:_N_TRIED]
+    is_ambiguous = min(_least_step(one), _least_step(other)) < _AMBIGUOUS
+    for starts in (_principal_starts(one, other), _uniform_starts()):
+        order = np.argsort(_scores(_subset(one, _N_SCORED), other, starts), kind="stable")[:_N_TRIED]
         coarse = sorted(
-            (_fitted(_subset(one, _N_COARSE), target, _Placing(starts[i]), _COARSE_STEPS) for i in order),
+            (_fitted(_subset(one, _N_COARSE), other, _Placing(starts[i]), _COARSE_STEPS) for i in order),
             key=lambda found: found[0],
         )
-        for far, placing in coarse[:2]:
-            if far > hopeless:
-                best = min(best, far)
-                continue
-            _, placing = _fitted(_subset(one, _N_FINE), target, placing, _FINE_STEPS)
-            placed = placing(one)
-            there, back = target.distances(placed), _Target(placed).distances(other)
-            # In units of the mean of both, so that neither is favoured.
-            best = min(best, float(np.sqrt((np.mean(there**2) + np.mean(back**2)) / 2)) / math.sqrt(placing.scale))
-            if best <= enough:
-                return best
+        if coarse[0][0] > hopeless:
+            best = min(best, coarse[0][0])
+        else:
+            fine = [_fitted(_subset(one, _N_FINE), other, placing, _FINE_STEPS) for _, placing in coarse[:2]]
+            best = min(best, _apart(one, other, min(fine, key=lambda found: found[0])[1]))
+        # A body may be nearly its own mirror image: near is not yet the nearest.
+        if best <= enough or (best > hopeless and not is_ambiguous):
+            break
     return best
 
 
-class _Target:
-    """Where the nearest sample of a surface is found."""
+def _apart(one: SurfaceSamples, other: SurfaceSamples, placing: _Placing) -> float:
+    """Root mean square of the patches of either, each laid onto all that is known of the other."""
+    squares = []
+    for samples, target, way in ((one, other, placing), (other, one, placing.inverse())):
+        finest = target if target.detail is None else target.detail()
+        _, fitted = _fitted(samples, finest, way, _LAST_STEPS)
+        placed = fitted(samples)
+        neighbours = placed.tree.query(_with_normals(placed), k=min(_PATCH, len(placed.points)))[1]
+        means = _offsets(placed, finest)[neighbours].mean(axis=1)
+        # In units of the mean of both, so that neither is favoured.
+        squares.append(np.einsum("ni,ni->n", means, means).mean() / fitted.scale)
+    return math.sqrt(sum(squares) / 2)
 
-    def __init__(self, surface: SurfaceSamples) -> None:
-        self.surface = surface
-        self.tree = KDTree(_with_normals(surface))
 
-    def nearest(self, samples: SurfaceSamples) -> NDArray[np.intp]:
-        return self.tree.query(_with_normals(samples))[1]
+def _offsets(samples: SurfaceSamples, target: SurfaceSamples) -> Array:
+    """(P, 3) from each sample to the surface of the target."""
+    found = _nearest(samples, target)
+    steps, normals = target.points[found] - samples.points, target.normals[found]
+    across = np.einsum("ni,ni->n", steps, normals)[:, None] * normals
+    aside = steps - across
+    length = np.linalg.norm(aside, axis=1, keepdims=True)
+    return across + aside * np.maximum(1 - _GAP * target.gap / np.maximum(length, 1e-12), 0)
 
-    def distances(self, samples: SurfaceSamples) -> Array:
-        """(P,) of each sample from the surface."""
-        found = self.nearest(samples)
-        steps = samples.points - self.surface.points[found]
-        across = np.einsum("ni,ni->n", steps, self.surface.normals[found])
-        aside = np.sqrt(np.maximum(np.einsum("ni,ni->n", steps, steps) - across**2, 0))
-        return np.hypot(across, np.maximum(aside - _GAP * self.surface.gap, 0))
 
-    def scores(self, samples: SurfaceSamples, starts: Array) -> Array:
-        """(S,) how badly each of the starts (S, 3, 3) lays the samples."""
-        points, normals = (np.einsum("sij,nj->sni", starts, one) for one in (samples.points, samples.normals))
-        placed = SurfaceSamples(points.reshape(-1, 3), normals.reshape(-1, 3))
-        far, _ = self.tree.query(_with_normals(placed))
-        return np.square(far).reshape(len(starts), -1).mean(axis=1)
+def _nearest(samples: SurfaceSamples, target: SurfaceSamples) -> NDArray[np.intp]:
+    return np.asarray(target.tree.query(_with_normals(samples))[1])
+
+
+def _scores(samples: SurfaceSamples, target: SurfaceSamples, starts: Array) -> Array:
+    """(S,) how badly each of the starts (S, 3, 3) lays the samples."""
+    points, normals = (np.einsum("sij,nj->sni", starts, one) for one in (samples.points, samples.normals))
+    placed = SurfaceSamples(points.reshape(-1, 3), normals.reshape(-1, 3))
+    far, _ = target.tree.query(_with_normals(placed))
+    return np.asarray(np.square(far).reshape(len(starts), -1).mean(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +177,9 @@ class _Placing:
     def __call__(self, samples: SurfaceSamples) -> SurfaceSamples:
         return SurfaceSamples(self.scale * samples.points @ self.turn.T + self.shift, samples.normals @ self.turn.T)
 
+    def inverse(self) -> _Placing:
+        return _Placing(self.turn.T, -self.turn.T @ np.broadcast_to(self.shift, 3) / self.scale, 1 / self.scale)
+
     def then(self, step: Array) -> _Placing:
         """After a further small rotation vector, shift and logarithm of a scale, (7,)."""
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
@@ -164,13 +190,13 @@ class _Placing:
         )
 
 
-def _fitted(samples: SurfaceSamples, target: _Target, placing: _Placing, n_steps: int) -> tuple[float, _Placing]:
-    """Root mean square distance to the tangent planes, and the placing that the steps end at."""
+def _fitted(samples: SurfaceSamples, target: SurfaceSamples, placing: _Placing, n_steps: int) -> tuple[float, _Placing]:
+    """Root mean square of the offsets, and the placing that the steps end at."""
     for _ in range(n_steps):
         placed = placing(samples)
-        found = target.nearest(placed)
-        normals = target.surface.normals[found]
-        across = np.einsum("ni,ni->n", target.surface.points[found] - placed.points, normals)
+        found = _nearest(placed, target)
+        normals = target.normals[found]
+        across = np.einsum("ni,ni->n", target.points[found] - placed.points, normals)
         along = np.einsum("ni,ni->n", placed.points, normals)
         columns = np.column_stack([np.cross(placed.points, normals), normals, along])
         square = columns.T @ columns
@@ -180,7 +206,8 @@ def _fitted(samples: SurfaceSamples, target: _Target, placing: _Placing, n_steps
         placing = placing.then(step)
         if np.abs(step).max() < 1e-5:
             break
-    return float(np.sqrt(np.mean(target.distances(placing(samples)) ** 2))), placing
+    offsets = _offsets(placing(samples), target)
+    return float(np.sqrt(np.einsum("ni,ni->n", offsets, offsets).mean())), placing
 
 
 def _with_normals(samples: SurfaceSamples) -> Array:
