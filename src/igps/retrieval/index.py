@@ -167,8 +167,12 @@ class VectorIndex:
     def descriptions(self, positions: NDArray[np.int64]) -> Tensor:
         """(N, ...) descriptions of the positions (N,)."""
         of_part = np.searchsorted(self._starts, positions, side="right") - 1
+        numbers = np.unique(of_part)
+        if len(numbers) == 1:  # most are in the largest part
+            rows = self.parts[numbers[0]].descriptions(positions - self._starts[numbers[0]])
+            return torch.from_numpy(rows).reshape(-1, *self.shape)
         rows = np.empty((len(positions), _cells(self.shape)), dtype=np.float32)
-        for number in np.unique(of_part):
+        for number in numbers:
             here = of_part == number
             rows[here] = self.parts[number].descriptions(positions[here] - self._starts[number])
         return torch.from_numpy(rows).reshape(-1, *self.shape)
