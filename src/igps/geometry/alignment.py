@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 _NORMAL = 0.1
 # Steps between neighbouring samples within which another sample of the same surface is looked for.
 _GAP = 2.5
-# Principal axes whose extents differ by a smaller factor are ambiguous: other starts are tried beside them.
+# Principal axes whose extents differ by a smaller factor are ambiguous: other starts are tried even where those from
+# the axes are hopeless.
 _AMBIGUOUS = 1.1
 _N_ROTATIONS = 300
 _N_PROFILE = 1000
@@ -78,8 +79,9 @@ class SurfaceSamples:
     def profile(self) -> Array:
         """(64,) quantiles of the distances between samples, without unit.
 
-        The root mean square difference of two surfaces' profiles is at most twice their distance, however they are
-        laid, but for what the sampling adds: distances between corresponding points differ by no more than both moved.
+        The root mean square difference of two surfaces' profiles is at most twice that of their offsets, however they
+        are laid, but for what the sampling adds: distances between corresponding points differ by no more than both
+        moved. Relief that goes in and out, which `surface_distance` averages away, hardly moves a quantile either.
         """
         distances = pdist(_subset(self, _N_PROFILE).points)
         return np.quantile(distances, (np.arange(64) + 0.5) / 64)
