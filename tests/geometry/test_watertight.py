@@ -286,3 +286,21 @@ def test_what_is_no_surface_is_refused() -> None:
 def test_a_body_between_the_points_of_the_grid_is_refused_by_name() -> None:
     with pytest.raises(MeshError, match=r"wire\.off: no point of the grid lies in the body"):
         marched(np.ones((4, 4, 4), dtype=np.float32), "wire.off")
+
+
+def test_no_point_of_the_field_is_nearly_on_the_surface(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Marching cubes would make slivers there: whatever lies nearer is moved to a fiftieth of a cell, on its side."""
+    fields: list[NDArray[np.float32]] = []
+    level_set = module.level_set
+
+    def kept(*arguments: object) -> NDArray[np.float32]:
+        fields.append(level_set(*arguments))  # type: ignore[arg-type]
+        return fields[-1]
+
+    monkeypatch.setattr(module, "level_set", kept)
+    watertight(*arrays(ball()), name="ball")
+    (field,) = fields
+    smallest = np.abs(field).min()
+    assert smallest == pytest.approx(0.02, rel=1e-6)
+    # Of a smooth distance a fiftieth of a cell on either side of the surface holds many points.
+    assert (np.abs(field) <= 0.0200001).sum() > 50

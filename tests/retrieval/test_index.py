@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from scipy.spatial.distance import cdist
 from scipy.stats import spearmanr
 
 from igps.retrieval import chi_square, cosine, index_part, search
+from igps.retrieval import index as index_module
 from igps.retrieval.index import Entry, VectorIndex, extend_index, merge_indices, write_index
 from igps.retrieval.vectors import VectorMap
 
@@ -269,6 +271,22 @@ def test_every_damaged_file_is_told_in_a_sentence(tmp_path: Path, monkeypatch: p
         assert "\n" not in str(raised.value)
         path.write_bytes(content)
         VectorIndex(index.path)
+
+
+def test_parts_that_vanish_again_and_again_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each reading finds another manifest whose parts are gone: after some the index counts as damaged."""
+    write_index(tmp_path / "g.igps", ABOUT, "cosine", batches(units(10)))
+    manifest, n_read = index_module._manifest, iter(range(1000))
+
+    def another(path: Path) -> dict[str, Any]:
+        found = manifest(path)
+        assert found is not None
+        found["parts"][0]["folder"] = f"part-{next(n_read)}"
+        return found
+
+    monkeypatch.setattr(index_module, "_manifest", another)
+    with pytest.raises(ValueError, match=r"g\.igps: the index is damaged"):
+        VectorIndex(tmp_path / "g.igps")
 
 
 def _answers(path: Path) -> list[list[str]]:
