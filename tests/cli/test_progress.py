@@ -7,10 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
-import trimesh
 
 from igps.cli import main
-from own_descriptors import SMALL
+from own_descriptors import SMALL, write_egg
 
 INTERIOR = "own_descriptors:small_interior"
 # Such as "signatures: 100%|█████| 4/4 [00:03<00:00,  1.2it/s]": share, how many of how many, time taken and left
@@ -20,13 +19,9 @@ BAR = re.compile(r"([\w -]+): +(\d+)%\|[^|]*\| (\d+)/(\d+) \[\d\d:\d\d<(?:\d\d:\
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """Two balls and two long eggs."""
-    for label, ratio in (("ball", 1.0), ("egg", 2.2)):
-        for i in range(2):
-            body = trimesh.creation.icosphere(subdivisions=2)
-            body.vertices *= [1.0, 1.0 + 0.06 * i, ratio]
-            path = tmp_path / "meshes" / label / f"{i}.off"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            body.export(path)
+    for label, heights in (("ball", (1.0, 1.1)), ("egg", (2.2, 2.4))):
+        for i, height in enumerate(heights):
+            write_egg(tmp_path / "meshes" / label / f"{i}.off", height, subdivisions=2)
     return tmp_path / "meshes"
 
 

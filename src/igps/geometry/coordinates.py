@@ -19,6 +19,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -158,6 +159,11 @@ class Extension:
             part[:, :-1] = torch.as_tensor(taken if divisors is None else taken / divisors)
         self._vertices, self._faces, self._accuracy = vertices, faces, accuracy
 
+    @cached_property
+    def _rules(self) -> tuple[HatMoments, ListedRule]:
+        """Made when they are asked for, when the functions of a large surface may have gone."""
+        return HatMoments.of(self._surface), ListedRule.of(self._surface)
+
     def __call__(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """(P, K) of points (P, 3).
 
@@ -165,9 +171,9 @@ class Extension:
             ValueError: points of another shape, or the weights of one sum to zero.
         """
         surface, columns, accuracy = self._surface, self._columns, self._accuracy
+        hats, listed = self._rules
         x = torch.as_tensor(_scaled(self._vertices, self._faces, points)[2], device=columns.device)
         out = np.empty((len(x), columns.shape[1] - 1))
-        hats, listed = HatMoments.of(surface), ListedRule.of(surface)
         setting = _approximation(hats, x, accuracy)
         for attempt in range(_ATTEMPTS + 1):
             for rows, sums in _weighted_sums(surface, hats, listed, columns, x, setting):

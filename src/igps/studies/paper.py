@@ -13,7 +13,7 @@ from scipy.spatial.distance import pdist
 from tqdm import tqdm
 
 from igps.data.dataset import SignatureDataset
-from igps.geometry.coordinates import extend
+from igps.geometry.coordinates import Extension
 from igps.geometry.laplacian import laplacian
 from igps.geometry.mesh import Mesh
 from igps.geometry.voxels import grid_axes, inside_grid, interior_samples
@@ -123,7 +123,7 @@ def weld_change(
             spectrum = _spectrum(one, n_eigenpairs)
             eigenvalues.append(spectrum.eigenvalues)
             bar.update()
-            distances.append(pdist(_embed(one, spectrum, points)))
+            distances.append(pdist(_embedding(one, spectrum)(points)))
             bar.update()
     change = np.abs(distances[1] / distances[0] - 1)
     return WeldChange(body, after, len(points), change, (eigenvalues[0], eigenvalues[1]))
@@ -167,13 +167,13 @@ def potential_slice(
     with tqdm(total=3 + _SLICE_PARTS, desc="steps", disable=not progress) as bar:
         samples = interior_samples(body, resolution)
         x, y, _ = grid_axes(body, _SLICE_RESOLUTION)
-        spectrum = _spectrum(body, n_eigenpairs)
+        embedding = _embedding(body, _spectrum(body, n_eigenpairs))
         bar.update()
-        of_samples = np.linalg.norm(_embed(body, spectrum, samples), axis=1)
+        of_samples = np.linalg.norm(embedding(samples), axis=1)
         bar.update()
         coarse = samples[int(np.argmin(of_samples))]
         around = _around(body, coarse, np.ptp(body.vertices, axis=0).max() / resolution)
-        of_around = np.linalg.norm(_embed(body, spectrum, around), axis=1)
+        of_around = np.linalg.norm(embedding(around), axis=1)
         bar.update()
         centre = around[int(np.argmin(of_around))]
         inside = inside_grid(body, (x, y, centre[2:]))[:, :, 0]
@@ -181,7 +181,7 @@ def potential_slice(
         points = np.stack([x[i], y[j], np.full(len(i), centre[2])], axis=1)
         values = np.full(inside.shape, np.nan)
         for part in np.array_split(np.arange(len(points)), _SLICE_PARTS):
-            values[i[part], j[part]] = np.linalg.norm(_embed(body, spectrum, points[part]), axis=1)
+            values[i[part], j[part]] = np.linalg.norm(embedding(points[part]), axis=1)
             bar.update()
     return PotentialSlice(
         axes=(x, y),
@@ -198,10 +198,10 @@ def _spectrum(mesh: Mesh, n_eigenpairs: int) -> Spectrum:
     return eigenpairs(*laplacian(mesh), n_eigenpairs, positions=mesh.vertices)
 
 
-def _embed(mesh: Mesh, spectrum: Spectrum, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P, K) commute-time embedding of points in the body."""
-    values = extend(mesh.vertices, mesh.faces, spectrum.eigenfunctions, points, accuracy=1e-3)
-    return values / np.sqrt(spectrum.eigenvalues)
+def _embedding(mesh: Mesh, spectrum: Spectrum) -> Extension:
+    """Of points (P, 3) in the body: their commute-time embedding (P, K)."""
+    roots = np.sqrt(spectrum.eigenvalues)
+    return Extension(mesh.vertices, mesh.faces, spectrum.eigenfunctions, divisors=roots, accuracy=1e-3)
 
 
 def _around(mesh: Mesh, point: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
