@@ -112,6 +112,32 @@ def test_more_samples_tell_more() -> None:
     assert surface_distance(*detailed) < 0.2 * surface_distance(*few)
 
 
+def wheel(thinned: float, seed: int) -> SurfaceSamples:
+    """A flat body with five bumps around it, one of them higher; fewer samples at either end of a diameter.
+
+    Its principal axes follow the samples, and not the bumps, at whatever angle the diameter has.
+    """
+    z, angle = np.random.default_rng(seed).uniform([-0.3, 0], [0.3, 2 * np.pi], size=(6000, 2)).T
+    bumps = np.cos(5 * angle) * (1 + np.exp(-20 * (1 - np.cos(angle))))
+    slope = np.gradient(bumps[np.argsort(angle)], np.sort(angle))[np.argsort(np.argsort(angle))]
+    radius, turning = 1 + 0.06 * bumps, 0.06 * slope
+    points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+    normals = np.column_stack(
+        [radius * np.cos(angle) + turning * np.sin(angle), radius * np.sin(angle) - turning * np.cos(angle), 0 * z]
+    )
+    kept = (np.abs(np.cos(angle - thinned)) < 0.6) | (np.arange(len(z)) % 4 == 0)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return SurfaceSamples.of(points[kept], normals[kept], 4.0)
+
+
+def test_axes_that_mislead_are_not_trusted() -> None:
+    """From the axes the bumps fall onto each other, but the high one onto a low one: near, and not the nearest."""
+    one, other = wheel(0.0, 1), wheel(2 * np.pi / 5, 2)
+    steps = [samples.extents[1:] / samples.extents[:-1] for samples in (one, other)]
+    assert min(map(min, steps)) > 1.1
+    assert surface_distance(one, other) < 0.05 * one.gap
+
+
 def test_thin_sheets_of_other_widths_are_told_apart() -> None:
     """Every sample of the smaller one lies in the planes of the larger: what lies off to the side must count."""
 
