@@ -18,8 +18,9 @@ MODULES = sorted(
 )
 
 
-def test_there_are_examples() -> None:
-    assert len(MODULES) >= 5
+@pytest.mark.parametrize("name", igps.__all__)
+def test_every_public_name_has_an_example(name: str) -> None:
+    assert ">>> " in (getattr(igps, name).__doc__ or "")
 
 
 @pytest.mark.parametrize("name", MODULES)

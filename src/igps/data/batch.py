@@ -125,6 +125,15 @@ class Body:
 class SignatureBatch:
     """N Signatures, padded so that no descriptor changes by it.
 
+    Example:
+        >>> import trimesh
+        >>> from igps.geometry.signature import SignatureConfig, compute_signature
+        >>> bodies = [trimesh.creation.icosphere(subdivisions=2), trimesh.creation.capsule(height=2.0, radius=0.5)]
+        >>> config = SignatureConfig(n_eigenpairs=20)
+        >>> batch = collate([compute_signature(Mesh(body.vertices, body.faces), config) for body in bodies])
+        >>> len(batch), [body.area for body in batch.bodies()] == batch.area.tolist()
+        (2, True)
+
     Args:
         eigenvalues: (N, K) float64, 1/length²; infinite where padded, so that every spectral weight is zero there.
         interior: interior samples.

@@ -36,6 +36,15 @@ class SignatureDataModule(LightningDataModule):
 
     A checkpoint knows the data, for `load_from_checkpoint`, if they were made from a configuration.
 
+    Example:
+        >>> import tempfile
+        >>> from igps import ArticulatedShapes
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ArticulatedShapes(3, 5, n_vertices=600).write(folder)
+        ...     data = SignatureDataModule(folder, n_train=3, n_validation=1)
+        >>> len(data.split.train), len(data.split.validation), len(data.split.test)
+        (6, 3, 6)
+
     Args:
         root: a folder that tells classes, see `find_meshes`.
         protocol: "seen" splits each class, "unseen" splits the classes.

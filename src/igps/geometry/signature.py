@@ -178,6 +178,15 @@ class Signature:
 
     The eigenfunctions are kept unscaled, so that every spectral embedding can be chosen without computing them again.
 
+    Example:
+        >>> import trimesh
+        >>> ball = trimesh.creation.icosphere(subdivisions=3)
+        >>> signature = compute_signature(Mesh(ball.vertices, ball.faces), SignatureConfig(n_eigenpairs=20))
+        >>> signature.interior.eigenfunctions.shape[1], signature.surface.points.shape
+        (20, (2000, 3))
+        >>> bool(np.linalg.norm(signature.barycentroid) < 0.1)  # of the ball's radius
+        True
+
     Args:
         eigenvalues: (K,) float64 ascending, 1/length², without the zero of the constant eigenfunction.
         interior: P voxel centres inside the body, eigenfunctions extended by mean value coordinates.

@@ -32,6 +32,18 @@ def describe(
 
     Signatures that are not cached are computed on the way; `dataset.precompute()` does that on all cores.
 
+    Example:
+        >>> import tempfile, trimesh
+        >>> from igps import SignatureConfig, descriptor
+        >>> interior = descriptor("interior")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = trimesh.creation.icosphere(subdivisions=2).export(f"{folder}/ball.off")
+        ...     _ = trimesh.creation.capsule(height=3.0, radius=0.5).export(f"{folder}/pill.off")
+        ...     config = interior.needs.completed(SignatureConfig())
+        ...     histograms = describe(SignatureDataset(folder, config, f"{folder}/cache"), interior)
+        >>> len(histograms), interior.distances(histograms, histograms).argmin(dim=1).tolist()
+        (2, [0, 1])
+
     Args:
         dataset: N meshes.
         descriptor: a `Descriptor`, or any module from `SignatureBatch` to (N, ...).

@@ -29,6 +29,26 @@ class Descriptor(nn.Module, ABC):
     A descriptor of your own defines `describe`, its `name`, and where the defaults do not fit its `needs` and
     `distances`. All commands take it as `--descriptor package.module:NAME`, all functions as an object.
 
+    Example:
+        >>> import trimesh
+        >>> from igps.data.batch import collate
+        >>> from igps.geometry.mesh import Mesh
+        >>> from igps.geometry.signature import SignatureConfig, compute_signature
+        >>> from igps.retrieval.distances import euclidean
+        >>> class Spectrum(Descriptor):  # eigenvalues times the area (Reuter et al. 2006)
+        ...     name = "spectrum"
+        ...     invariant_to = ("motion", "scale", "pose")
+        ...
+        ...     def describe(self, batch):
+        ...         return (batch.eigenvalues[:, :10] * batch.area[:, None]).float()
+        ...
+        ...     def distances(self, queries, gallery):
+        ...         return euclidean(queries, gallery)
+        >>> ball = trimesh.creation.icosphere(subdivisions=3)
+        >>> signature = compute_signature(Mesh(ball.vertices, ball.faces), SignatureConfig(n_eigenpairs=20))
+        >>> (Spectrum()(collate([signature])) / (4 * torch.pi)).round().int().tolist()  # n (n + 1), 2n + 1 times
+        [[2, 2, 2, 6, 6, 6, 6, 6, 12, 12]]
+
     Attributes:
         name: by which it is asked for and listed.
         source: author, year.
@@ -103,6 +123,11 @@ class HistogramDescriptor(Descriptor):
     Several are flattened and joined into one histogram of sum 1, in which each part has the same share, and in a part
     each of its histograms. The χ² distance is then the mean of those of the parts. Embeddings that are the same module,
     and samples that are the same subset, are computed once for all.
+
+    Example:
+        >>> two = HistogramDescriptor([PairHistogram(), PairHistogram(["interior_distance"])], name="two")
+        >>> two.part_cells, two.distances(torch.eye(3)[:1], torch.eye(3)).tolist()
+        ((640, 64), [[0.0, 1.0, 1.0]])
 
     Args:
         histograms: one `PairHistogram`; or the parts, each one or several of them.

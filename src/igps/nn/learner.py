@@ -35,6 +35,27 @@ class RetrievalLearner(LightningModule):
     Validation and test log the retrieval scores of the whole distance, each shape against all others of its part. With
     a distance that has no head there is nothing to train, and `Trainer.test` gives the plain descriptor's scores.
 
+    Example:
+        >>> import tempfile
+        >>> from pytorch_lightning import Trainer
+        >>> from igps import ArticulatedShapes, HistogramDescriptor, PairHistogram, SignatureConfig, SignatureDataModule
+        >>> from igps.nn.metric import CorrectedDistance, MetricHead
+        >>> learner = RetrievalLearner(HistogramDescriptor(PairHistogram()), CorrectedDistance(MetricHead()))
+        >>> trainer = Trainer(
+        ...     max_epochs=1, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
+        ...     enable_model_summary=False,
+        ... )
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ArticulatedShapes(2, 4, n_vertices=600).write(f"{folder}/shapes")
+        ...     data = SignatureDataModule(
+        ...         f"{folder}/shapes", n_train=2, n_validation=0, config=SignatureConfig(n_eigenpairs=50),
+        ...         cache_dir=f"{folder}/cache",
+        ...     )
+        ...     trainer.fit(learner, data)
+        ...     scores = trainer.test(learner, data, verbose=False)[0]
+        >>> sorted(scores)
+        ['test_adr', 'test_adr_self', 'test_dcg', 'test_e', 'test_ft', 'test_map', 'test_nn', 'test_st']
+
     Args:
         descriptor: a `Descriptor`, or any module from `SignatureBatch` to histograms (N, ...).
         distance: between descriptions; its head is trained.
