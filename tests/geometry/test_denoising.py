@@ -78,6 +78,36 @@ def test_passes_follow_the_noise(ratio: float, subdivisions: int) -> None:
     assert np.degrees(np.arccos(cosines.clip(-1, 1))).mean() < 4.5
 
 
+@pytest.mark.parametrize("sections", [200, 256])
+@pytest.mark.parametrize("steps", [3, 5])
+def test_turned_parts_of_thin_triangles_come_back(steps: int, sections: int) -> None:
+    """Rims of many corners, far apart: noise as wide as a triangle crumples them. The clean part is the oracle."""
+    random = np.random.default_rng(steps)
+    ends, radii = np.cumsum(random.uniform(0.2, 1, steps)), random.uniform(0.15, 0.5, steps)
+    corners = [(r, z) for k, r in enumerate(radii) for z in (ends[k - 1] if k else 0, ends[k])]
+    profile = [(0, 0), *corners, (0, ends[-1])]
+    turned = trimesh.creation.revolve(np.array(profile), sections=sections)
+    part = Mesh(np.asarray(turned.vertices), np.asarray(turned.faces))
+    rough = noise(part, 0.002, seed=steps)
+    assert not is_noisy(part.vertices, part.faces)
+    assert is_noisy(rough.vertices, rough.faces)
+    smooth = Mesh(denoised(rough.vertices, rough.faces), part.faces)
+    assert abs(smooth.area - part.area) < 0.25 * (rough.area - part.area)
+    assert smooth.volume == pytest.approx(part.volume, rel=0.01)
+    # Steps between rims stay sharp: no corner has moved farther than the noise moved it.
+    moved = np.linalg.norm(smooth.vertices - part.vertices, axis=1)
+    assert np.quantile(moved, 0.95) < np.quantile(np.linalg.norm(rough.vertices - part.vertices, axis=1), 0.95)
+
+
+def test_a_knurled_knob_is_no_noise() -> None:
+    """Teeth go up and down from vertex to vertex as noise does, but their flanks are planes."""
+    knob = trimesh.creation.revolve(np.array([(0, 0), (1, 0), (1, 1), (0, 1)]), sections=600)
+    vertices = np.array(knob.vertices)
+    tooth = np.rint(np.arctan2(vertices[:, 1], vertices[:, 0]) / (2 * np.pi) * 600).astype(int) % 2
+    vertices[:, :2] *= (1 + 0.01 * tooth)[:, None]
+    assert not is_noisy(vertices, np.asarray(knob.faces))
+
+
 def test_noise_of_a_smooth_shape_is_next_to_none(sphere: Mesh) -> None:
     assert noise_over_edge(sphere.vertices, sphere.faces) < 0.01
     assert noise_over_edge(3 * sphere.vertices, sphere.faces) == pytest.approx(
