@@ -97,6 +97,14 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         ("src/igps/nn/pair_loops.py", "inverse = np.ones((n_axes, most_centres + 1), centres.dtype)"),
         # A product into an array that is given is never cast.
         ("src/igps/nn/counted_pairs.py", 'with torch.autocast("cpu", enabled=True):'),
+        # No resolution is larger than the finest: one that is asked for is refused before, one that grows is cut.
+        ("src/igps/geometry/voxels.py", "if min_samples == 0 or resolution == finest:"),
+        # Nothing compares two of them.
+        ("src/igps/geometry/sampling.py", "@dataclass(frozen=True, eq=True)"),
+        # NumPy takes every negative length for the one that is not known.
+        ("src/igps/geometry/subdivision.py", "order = (np.arange(3) + np.reshape(turn, (- 2, 1)) + first) % 3"),
+        # By how much one ring of a patch is turned against the next.
+        ("src/igps/geometry/hole_filling.py", "disc.append(_circle((np.arange(size) + ring / 3) / size, radius))"),
         # Below zero there is only rounding.
         (
             "src/igps/retrieval/reranking.py",
