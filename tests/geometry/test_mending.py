@@ -74,6 +74,16 @@ def test_holes_are_filled_where_the_surface_was(sphere: Mesh) -> None:
     assert length.max() < 3 * np.median(length)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_holes_that_touch_are_filled_one_by_one(sphere: Mesh, seed: int) -> None:
+    """Rims that meet in a vertex are taken apart: after it, each edge has two faces again."""
+    kept = np.ones(len(sphere.faces), dtype=bool)
+    kept[np.random.default_rng(seed).choice(len(kept), len(kept) // 20, replace=False)] = False
+    _, faces = with_small_holes_filled(sphere.vertices, sphere.faces[kept], [])
+    _, counts = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    assert (counts == 2).all()
+
+
 def test_a_patch_has_as_many_vertices_as_its_rim_asks_for(sphere: Mesh) -> None:
     """Those of a disc of radius r = n / 2π steps that are one step apart: about π r² = n² / 4π."""
     away = np.linalg.norm(sphere.vertices - sphere.vertices[0], axis=1)
