@@ -4,7 +4,8 @@
 
 makes the calibration that the package ships: how far apart copies of a body are (other triangles, half of them, scaled,
 mirrored and turned, another file format, and all of that), poses of a body, bodies of a class, and classes; and from
-which distance on two files are not the same. The bodies are those of another seed than pretrain.py's.
+which distance on two files are not the same. To tell a part from one that is a little longer, bodies are lengthened by
+2 % of the root of their area too. The bodies are those of another seed than pretrain.py's.
 """
 
 from __future__ import annotations
@@ -21,10 +22,9 @@ from numpy.typing import NDArray
 
 import igps
 from igps.descriptors.pretrained import PRETRAINED, pretrained
-from igps.gallery.calibration import CALIBRATION, KINDS, Calibration, quantiles, threshold_between, told_of
+from igps.gallery.calibration import CALIBRATION, FINEST, KINDS, Calibration, quantiles, threshold_between, told_of
 from igps.gallery.duplicates import Surfaces, distance_if_alike
 from igps.gallery.gallery import fingerprint
-from igps.geometry.alignment import SurfaceSamples
 from igps.geometry.disturbances import move, remesh, scale, simplified
 from igps.geometry.mesh import Mesh
 from igps.nn.description import describe
@@ -32,7 +32,11 @@ from igps.nn.descriptor import Descriptor
 from igps.parallel import on_threads
 from igps.shapes import GradedShapes, body_of
 
-SUFFIXES = {"triangles": ".off", "half": ".off", "motion": ".ply", "format": ".stl", "all": ".obj"}
+SUFFIXES = {"triangles": ".off", "half": ".off", "motion": ".ply", "format": ".stl", "all": ".obj", "longer": ".off"}
+"""Of the files: what was done to the body, and the format. What was made longer is no copy."""
+
+LENGTHENED = 0.02
+"""By how much of √area."""
 
 
 def calibrate(
@@ -76,11 +80,12 @@ def calibrate(
     failed = {failure.path for failure in failures}
     made = [one for one in made if one[2] not in failed]
     copied, originals = copied.usable(failures), [i for i, _, _ in made]
+    is_copy = np.array([way != "longer" for _, way, _ in made])
 
     described, of_copies = (describe(one, descriptor, n_workers=n_workers) for one in (shapes, copied))
     with torch.inference_mode():
         distances = descriptor.distances(described, described).numpy()
-        to_copies = descriptor.distances(described[originals], of_copies).diagonal().numpy()
+        to_copies = descriptor.distances(described[originals], of_copies).diagonal().numpy()[is_copy]
     i, j = np.triu_indices(len(shapes), 1)
     distances = distances[i, j]
     of_body, of_class = bodies[i] == bodies[j], classes[i] == classes[j]
@@ -90,29 +95,31 @@ def calibrate(
     by_kind |= {kind: distances[pairs] for kind, pairs in of_kind.items()}
     near = 2 * float(by_kind["copies"].max())
 
-    surfaces, surfaces_of_copies = Surfaces(shapes), Surfaces(copied)
-    samples = [surfaces.samples(k) for k in range(len(shapes))]
-    same = [(samples[k], surfaces_of_copies.samples(n)) for n, k in enumerate(originals)]
-    same += [(samples[a], samples[b]) for a, b in zip(i[rigid_poses], j[rigid_poses], strict=True)]
+    surfaces, surfaces_of_copies = (_Measured(one, n_workers) for one in (shapes, copied))
+    made_of = [(surfaces, k, surfaces_of_copies, n) for n, k in enumerate(originals)]
+    within = [(surfaces, a, surfaces, b) for a, b in zip(i, j, strict=True)]
     # The hard ones tell the rate: other poses of bodies that bend, and other bodies of the class.
     others = np.flatnonzero(of_kind["poses"] | of_kind["bodies"])
-    of_same = np.array(list(on_threads(_apart, same, n_workers)))
-    of_others = np.array(list(on_threads(_apart, [(samples[i[k]], samples[j[k]]) for k in others], n_workers)))
+    same = [pair for pair, one in zip(made_of, is_copy, strict=True) if one]
+    same += [within[k] for k in np.flatnonzero(rigid_poses)]
+    longer = [pair for pair, one in zip(made_of, is_copy, strict=True) if not one]
+    of_same, of_others, of_longer = (_apart(pairs, n_workers) for pairs in (same, [within[k] for k in others], longer))
 
     calibration = Calibration(
         "pretrained",
         fingerprint(descriptor),
         told_of(shapes.config),
         f"{len(set(classes))} classes of GradedShapes({n_classes}, seed={seed}), {len(set(bodies))} bodies, "
-        f"{len(shapes)} poses, {len(copied)} copies",
+        f"{len(shapes)} poses, {is_copy.sum()} copies, {len(longer)} that are longer",
         {kind: quantiles(by_kind[kind]) for kind in KINDS},
         {kind: len(by_kind[kind]) for kind in KINDS},
         near,
-        threshold_between(of_same, of_others, rate),
+        threshold_between(of_same[:, 0], of_others[:, 0], rate),
+        threshold_between(of_same[:, 1], np.concatenate([of_others[:, 1], of_longer[:, 1]]), rate),
         threshold_between(np.concatenate([by_kind["copies"], by_kind["poses"]]), by_kind["bodies"], pose_rate),
     )
     calibration.save(out)
-    _print(calibration, of_same, of_others, made, to_copies)
+    _print(calibration, of_same, of_others, of_longer, [way for _, way, _ in made if way != "longer"], to_copies)
 
 
 def _still(shapes: GradedShapes) -> list[str]:
@@ -138,14 +145,17 @@ def _generated(
 
 
 def _copies(shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: int) -> list[tuple[int, str, Path]]:
-    """Of the first pose of bodies, one copy by all ways at once and one by one of them: which shape, way and file."""
+    """Of the first pose of bodies, one copy by all ways at once, one by one of them, and what is longer.
+
+    Which shape, way and file.
+    """
     first: dict[str, int] = {}
     for i, name in enumerate(shapes.files.names):
         first.setdefault(body_of(name), i)
     chosen = [(body, i) for body, i in sorted(first.items()) if int(body.rsplit("/", 1)[1]) < n_bodies]
     made = []
     for number, (body, i) in enumerate(chosen):
-        for way in ("all", tuple(SUFFIXES)[number % 4]):
+        for way in ("all", tuple(SUFFIXES)[number % 4], "longer"):
             path = folder / way / f"{body.replace('/', '-')}{SUFFIXES[way]}"
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -156,7 +166,15 @@ def _copies(shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: in
 
 
 def _copy(mesh: Mesh, way: str, seed: int) -> Mesh:
-    if way in ("triangles", "all"):
+    if way == "longer":
+        # What lies beyond a plane across it moves away from it; what the plane cuts is stretched.
+        random = np.random.default_rng(seed)
+        normal = random.normal(size=3)
+        normal /= np.linalg.norm(normal)
+        height = mesh.vertices @ normal
+        beyond = height > np.quantile(height, random.uniform(0.3, 0.7))
+        mesh = replace(mesh, vertices=mesh.vertices + np.outer(beyond * LENGTHENED * math.sqrt(mesh.area), normal))
+    if way in ("triangles", "all", "longer"):
         mesh = remesh(mesh)
     if way in ("half", "all"):
         mesh = simplified(mesh, 0.5)
@@ -166,31 +184,51 @@ def _copy(mesh: Mesh, way: str, seed: int) -> Mesh:
     return mesh
 
 
-def _apart(pair: tuple[SurfaceSamples, SurfaceSamples]) -> float:
-    return distance_if_alike(*pair)
+class _Measured:
+    """Samples and coarseness of surfaces, each taken once."""
+
+    def __init__(self, dataset: igps.SignatureDataset, n_workers: int | None) -> None:
+        surfaces = Surfaces(dataset)
+        self.samples = [surfaces.samples(k) for k in range(len(dataset))]
+        self.coarseness = list(on_threads(surfaces.coarseness, range(len(dataset)), n_workers))
+
+
+def _apart(pairs: list[tuple[_Measured, int, _Measured, int]], n_workers: int | None) -> NDArray[np.float64]:
+    """(N, 2) how far apart the surfaces of pairs are; and that over what their levels of detail leave open."""
+
+    def one(pair: tuple[_Measured, int, _Measured, int]) -> tuple[float, float]:
+        first, i, second, j = pair
+        apart = distance_if_alike(first.samples[i], second.samples[j])
+        return apart, apart / max(first.coarseness[i], second.coarseness[j], FINEST)
+
+    return np.array(list(on_threads(one, pairs, n_workers)))
 
 
 def _print(
     calibration: Calibration,
     same: NDArray[np.float64],
     others: NDArray[np.float64],
-    made: list[tuple[int, str, Path]],
+    longer: NDArray[np.float64],
+    ways: list[str],
     to_copies: NDArray[np.float64],
 ) -> None:
     print(calibration.made_of)
     for way in SUFFIXES:
-        rows = np.array([k for k, (_, of, _) in enumerate(made) if of == way], dtype=np.int64)
+        rows = np.array([k for k, of in enumerate(ways) if of == way], dtype=np.int64)
         if len(rows):
-            largest = f"distance ≤ {to_copies[rows].max():.4f}, surfaces ≤ {same[rows].max():.2%}"
+            surfaces, detail = same[rows].max(axis=0)
+            largest = (
+                f"distance ≤ {to_copies[rows].max():.4f}, surfaces ≤ {surfaces:.2%}, {detail:.1f} times coarseness"
+            )
             print(f"{way:>10}: {len(rows)} copies, {largest}")
-    rigid = same[len(made) :]
-    print(
-        f"poses of rigid bodies: {len(rigid)}, surfaces 99 % ≤ {np.quantile(rigid, 0.99):.2%}, all ≤ {rigid.max():.2%}"
-    )
-    print(f"others: {len(others)}, the nearest surfaces {', '.join(f'{one:.2%}' for one in np.sort(others)[:8])}")
+    for name, found in (("poses of rigid bodies", same[len(ways) :]), ("others", others), ("longer", longer)):
+        for column, unit in enumerate(("of √area", "times coarseness")):
+            levels = 0, 0.001, 0.01, 0.1, 0.5, 0.99, 1
+            few = ", ".join(f"{one:.4g}" for one in np.quantile(found[:, column], levels, method="higher"))
+            print(f"{name}: {len(found)}, {unit}: least, 0.1 %, 1 %, 10 %, 50 %, 99 %, largest: {few}")
     for kind in KINDS:
         print(f"{kind:>10}: {calibration.n_pairs[kind]} pairs, median {calibration.distances[kind][11]:.4f}")
-    print(f"near {calibration.near:.4f}\nsame {calibration.same}\npose {calibration.pose}")
+    print(f"near {calibration.near:.4f}\nsame {calibration.same}\ndetail {calibration.detail}\npose {calibration.pose}")
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ def calibration(drawn: dict[str, np.ndarray]) -> Calibration:
         dict.fromkeys(KINDS, 5000),
         1.0,
         threshold,
+        replace(threshold, distance=6.0),
         threshold,
     )
 
@@ -103,6 +104,14 @@ def test_it_holds_for_its_descriptor_its_parameters_and_its_signatures(calibrati
         replace(calibration, model="0").check("same", Same(), CONFIG)
     with pytest.raises(ValueError, match=r"resolution: expected 32, as of .* got 16\. Leave it"):
         calibration.check("same", Same(), replace(CONFIG, resolution=16))
+
+
+@pytest.mark.parametrize(
+    ("coarseness", "limit"), [(0.0, 0.00006), (0.001, 0.006), (0.02, 0.12), (1.0, 0.5), (np.inf, 0.5)]
+)
+def test_what_is_coarse_may_be_farther_apart(calibration: Calibration, coarseness: float, limit: float) -> None:
+    """Six times the coarseness, of which there is a least, and never more than any copies are."""
+    assert calibration.limit(coarseness) == pytest.approx(limit)
 
 
 def test_what_is_saved_is_loaded(calibration: Calibration, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from igps.cli import COMMANDS, main
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
 from igps.gallery.calibration import Calibration, told_of
-from igps.gallery.duplicates import compared, duplicates
+from igps.gallery.duplicates import Surfaces, compared, duplicates
 from igps.gallery.gallery import Gallery, fingerprint
 from igps.geometry.signature import SignatureConfig
 from own_descriptors import Same
@@ -115,6 +115,33 @@ def test_copies_are_grouped_and_neither_poses_nor_siblings(dataset: SignatureDat
     assert max(found.pairs.values()) <= Calibration.load().same.distance
 
 
+def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path: Path) -> None:
+    """One half moves on by a hundredth: as far as coarse copies are apart, and much farther than fine ones.
+
+    A coarse copy would be near to both, and join them.
+    """
+    fine = bar(5)
+    longer = fine.copy()
+    longer.vertices += np.outer(fine.vertices[:, 0] > 0, [0.01 * fine.area**0.5, 0, 0])
+    for name, body in (("one", fine), ("copy", copied(fine, 3, 2.0)), ("longer", longer)):
+        body.export(tmp_path / f"{name}.off")
+    dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
+    assert grouped(duplicates(dataset, n_workers=1).groups) == {frozenset({"one.off", "copy.off"})}
+    names = dataset.files.names
+    apart = compared(dataset.subset([names.index("one.off"), names.index("longer.off")]))
+    assert apart.limit < apart.surfaces < Calibration.load().same.distance
+
+
+def test_coarseness_of_a_ball_falls_with_the_area_of_its_triangles(tmp_path: Path) -> None:
+    """Chords of a circle lie off it by the square of their length: four times as many triangles, a quarter as far."""
+    for subdivisions in (3, 4, 5):
+        ball(subdivisions).export(tmp_path / f"{subdivisions}.off")
+    surfaces = Surfaces(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"))
+    coarse, middle, fine = (surfaces.coarseness(i) for i in range(3))
+    assert 3 < coarse / middle < 5.3
+    assert 3 < middle / fine < 5.3
+
+
 def test_poses_are_grouped_by_the_descriptor_alone(dataset: SignatureDataset) -> None:
     """A descriptor that sees no difference takes all for poses of one body; their surfaces still tell."""
     shipped = Calibration.load()
@@ -177,7 +204,7 @@ def test_the_commands(
     command(monkeypatch, "distance", root / "bar.off", root / "bar.ply", *options)
     *_, by_descriptor, by_surfaces = capsys.readouterr().out.splitlines()
     assert "pairs of different classes" in by_descriptor
-    assert ", the same shape (the same up to " in by_surfaces
+    assert ", the same shape (at their level of detail, the same up to " in by_surfaces
     command(monkeypatch, "distance", root / "bar.off", root / "bent.off", *options)
     assert "not the same shape" in capsys.readouterr().out
 

@@ -80,12 +80,12 @@ def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
     chosen = descriptor_of(DESCRIPTOR)
     reading["strict"] = True
     dataset, _ = signatures(meshes, [chosen], **reading)
-    found, calibration = compared(dataset, DESCRIPTOR, progress=True), Calibration.load()
+    found = compared(dataset, DESCRIPTOR, progress=True)
     print(f"{found.distance:.4g} by {DESCRIPTOR}: {found.meaning}")
     told = "the same shape" if found.same else "not the same shape"
     print(
-        f"surfaces laid onto each other: {found.surfaces:.2%} of the root of the area apart, {told} "
-        f"(the same up to {calibration.same.distance:.2%})"
+        f"surfaces laid onto each other: {found.surfaces:.3%} of the root of the area apart, {told} "
+        f"(at their level of detail, the same up to {found.limit:.3%})"
     )
     return {"descriptor": DESCRIPTOR, **asdict(found)}
 
@@ -94,7 +94,7 @@ def _print_groups(found: Duplicates, calibration: Calibration, poses: bool) -> N
     for number, group in enumerate(found.groups, 1):
         print(f"group {number}: " + "  ".join(group))
     n_alike = sum(map(len, found.groups))
-    threshold, what = (calibration.pose, "poses") if poses else (calibration.same, "copies")
+    threshold, what = (calibration.pose, "poses") if poses else (calibration.detail, "copies")
     print(
         f"{n_alike} of {found.n_files} files in {len(found.groups)} groups; of generated bodies, {threshold.n_found} "
         f"of {threshold.n_same} pairs of {what} are found, and {threshold.n_false} of {threshold.n_other} others taken "

@@ -32,6 +32,9 @@ LEVELS = (0.0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, *(i / 10 for i in range(1,
 """Shares of pairs whose greatest distance is kept."""
 
 
+FINEST = 1e-5
+"""A smaller coarseness counts as this, of √area: flat faces lose nothing with half of their triangles."""
+
 _DEPENDS_ON = ("algorithm_version", "resolution", "min_samples", "n_surface_samples")
 
 
@@ -71,7 +74,9 @@ class Calibration:
         distances: of each of `KINDS` the quantiles at `LEVELS` of the descriptor's distance.
         n_pairs: of each of `KINDS`, how many pairs.
         near: the descriptor's distance beyond which no pair is looked at: twice the largest between copies.
-        same: of `surface_distance`: up to it two files show the same body in the same shape.
+        same: of `surface_distance`: up to it two files may show the same body in the same shape.
+        detail: of the same over the larger of the two `coarseness`, which leaves open what a surface's level of detail
+            has lost: up to it they do.
         pose: of the descriptor's distance: up to it they show poses of one body.
     """
 
@@ -83,6 +88,7 @@ class Calibration:
     n_pairs: Mapping[str, int]
     near: float
     same: Threshold
+    detail: Threshold
     pose: Threshold
 
     def share_closer(self, kind: str, distance: float) -> float:
@@ -101,6 +107,14 @@ class Calibration:
             side, share = ("closer", 1 - closer) if closer < 0.5 else ("farther", closer)
             told.append(f"{side} than {_percent(share)} {words}")
         return ", ".join(told)
+
+    def limit(self, coarseness: float) -> float:
+        """The `surface_distance` up to which two files show the same body in the same shape.
+
+        Args:
+            coarseness: the larger of the two, see `igps.gallery.duplicates.Surfaces.coarseness`.
+        """
+        return min(self.same.distance, self.detail.distance * max(coarseness, FINEST))
 
     def check(self, descriptor: str | Descriptor, module: Descriptor, config: SignatureConfig) -> None:
         """Raise a ValueError unless this is the calibration of a descriptor and of Signatures.
@@ -140,7 +154,7 @@ class Calibration:
         """
         try:
             found: dict[str, Any] = json.loads(Path(path).read_text())
-            one = cls(**{**found, "same": Threshold(**found["same"]), "pose": Threshold(**found["pose"])})
+            one = cls(**found | {name: Threshold(**found[name]) for name in ("same", "detail", "pose")})
             if any(len(one.distances[kind]) != len(LEVELS) for kind in KINDS):
                 raise ValueError("other quantiles")
         except (ValueError, KeyError, TypeError) as error:

@@ -1,12 +1,14 @@
 """Files that show the same body, whatever its scale, mirror image, triangulation, level of detail or file format.
 
 Two surfaces are laid onto each other, which tells the same shape from another pose and from a sibling. How far apart
-they may be is calibrated on generated bodies, see `Calibration`. That is done for those alone whose samples lie at
+they may be is calibrated on generated bodies, see `Calibration`: as much as their levels of detail explain, which half
+of their own triangles tells. That is done for those alone whose samples lie at
 about the same distances from each other, or in an index, whose descriptions are near.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -24,9 +26,10 @@ from igps.data.sources import MeshFiles
 from igps.descriptors import descriptor as descriptor_of
 from igps.gallery.calibration import Calibration
 from igps.gallery.gallery import Gallery
-from igps.geometry.alignment import SurfaceSamples, surface_distance
+from igps.geometry.alignment import SurfaceSamples, distance_in_place, surface_distance
 from igps.geometry.attributes import AttributeName, surface_attributes
-from igps.geometry.mesh import MeshError
+from igps.geometry.disturbances import simplified
+from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.sampling import surface_points
 from igps.geometry.signature import Signature
 from igps.nn.description import describe_usable
@@ -76,12 +79,14 @@ class Comparison:
     Args:
         distance: by the descriptor.
         surfaces: of their surfaces laid onto each other, root mean square over √area.
+        limit: up to which `surfaces` is that of the same shape, at their levels of detail.
         meaning: of the distance, in words.
         same: whether they are the same body in the same shape.
     """
 
     distance: float
     surfaces: float
+    limit: float
     meaning: str
     same: bool
 
@@ -138,7 +143,7 @@ def duplicates(
         if poses:
             found = iter([distance for _, _, distance in open_pairs])
         else:
-            laid = on_threads(lambda one: surfaces.distance(one[0], one[1], limit), open_pairs, n_workers)
+            laid = on_threads(lambda one: surfaces.distance(one[0], one[1], calibration), open_pairs, n_workers)
             found = iter(tqdm(laid, desc="laid onto each other", total=len(open_pairs), leave=False,
                               disable=not progress))  # fmt: skip
         for (i, j, _), distance in zip(open_pairs, found, strict=True):
@@ -181,14 +186,15 @@ def compared(
     descriptions, _ = describe_usable(dataset, chosen, n_workers=1, strict=True, progress=progress)
     with torch.inference_mode():
         distance = float(chosen.distances(descriptions[:1], descriptions[1:]))
-    surfaces = surface_distance(*map(Surfaces(dataset).samples, range(2)))
-    return Comparison(distance, surfaces, calibration.words(distance), surfaces <= calibration.same.distance)
+    surfaces = Surfaces(dataset)
+    apart, limit = surface_distance(*map(surfaces.samples, range(2))), surfaces.limit(0, 1, calibration)
+    return Comparison(distance, apart, limit, calibration.words(distance), apart <= limit)
 
 
 def distance_if_alike(one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0) -> float:
     """`surface_distance`, infinite where the extents of the two tell that they are not the same."""
     if np.abs(np.log(one.extents / other.extents)).max() > _MOST_STRETCHED:
-        return float("inf")
+        return math.inf
     return surface_distance(one, other, enough=enough, hopeless=_HOPELESS)
 
 
@@ -207,6 +213,7 @@ class Surfaces:
         self._dataset = dataset
         self._last = lru_cache(_SURFACES)(self.samples)
         self._detailed = lru_cache(_DETAILED)(self._detail)
+        self._coarseness = lru_cache(None)(self.coarseness)
 
     def samples(self, i: int) -> SurfaceSamples:
         """Those of one.
@@ -219,12 +226,39 @@ class Surfaces:
         found = SurfaceSamples.of(signature.surface.points, signature.surface.attributes[_NORMALS], signature.area)
         return replace(found, detail=partial(self._detailed, i))
 
-    def distance(self, i: int, j: int, enough: float) -> float:
-        """That of two; infinite where they cannot be the same, or one cannot be read."""
+    def coarseness(self, i: int) -> float:
+        """How far one is from itself with half of the vertices, over √area: what its level of detail leaves open.
+
+        Infinite where no half of it is a body.
+
+        Raises:
+            MeshError: the mesh cannot be used.
+            ImportError: libigl is not installed.
+        """
+        samples, mesh = self._last(i), self._mesh(i)
         try:
-            return distance_if_alike(self._last(i), self._last(j), enough=enough)
+            half = simplified(mesh, 0.5)
         except MeshError:
-            return float("inf")
+            return math.inf
+        few, many = (self._drawn(i, half, n) for n in (len(samples.points), _N_DETAILED))
+        return distance_in_place(samples, replace(few, detail=lambda: many))
+
+    def distance(self, i: int, j: int, calibration: Calibration) -> float:
+        """That of two; infinite where they are not the same, or one cannot be read."""
+        try:
+            one, other = self._last(i), self._last(j)
+            apart = distance_if_alike(one, other, enough=calibration.same.distance)
+            if apart > calibration.same.distance:
+                return math.inf
+            if apart > (limit := self.limit(i, j, calibration)):
+                apart = distance_if_alike(one, other, enough=limit)
+            return apart if apart <= limit else math.inf
+        except MeshError:
+            return math.inf
+
+    def limit(self, i: int, j: int, calibration: Calibration) -> float:
+        """How far two may be apart and the same, see `Calibration.limit`; raises as `coarseness` does."""
+        return calibration.limit(max(self._coarseness(i), self._coarseness(j)))
 
     def profile(self, i: int) -> NDArray[np.float64] | None:
         """That of one; None where it cannot be read."""
@@ -235,20 +269,23 @@ class Surfaces:
 
     def _detail(self, i: int) -> SurfaceSamples:
         """Many samples of one, about the origin of the few."""
+        few, many = self._last(i), self._drawn(i, self._mesh(i), _N_DETAILED)
+        # With the few among them, so that a surface is no distance from itself.
+        return SurfaceSamples(np.concatenate([few.points, many.points]), np.concatenate([few.normals, many.normals]))
+
+    def _drawn(self, i: int, mesh: Mesh, n: int) -> SurfaceSamples:
+        """So many samples of a mesh, about the origin and in the unit of those of one."""
         signature = self._signature(i)
+        drawn = surface_points(mesh, n, self._dataset.config.seed)
+        normals = surface_attributes(mesh, drawn.face, (_NORMALS,))[_NORMALS]
+        return SurfaceSamples.of(drawn.positions, normals, signature.area, signature.surface.points.mean(axis=0))
+
+    def _mesh(self, i: int) -> Mesh:
         try:
-            mesh = self._dataset.mesh(i)
+            return self._dataset.mesh(i)
         except MeshError as error:
             self._keep(i, error)
             raise
-        few = signature.surface
-        drawn = surface_points(mesh, _N_DETAILED, self._dataset.config.seed)
-        # With the few among them, so that a surface is no distance from itself.
-        points = np.concatenate([few.points, drawn.positions])
-        normals = np.concatenate(
-            [few.attributes[_NORMALS], surface_attributes(mesh, drawn.face, (_NORMALS,))[_NORMALS]]
-        )
-        return SurfaceSamples.of(points, normals, signature.area, few.points.mean(axis=0))
 
     def _signature(self, i: int) -> Signature:
         try:
