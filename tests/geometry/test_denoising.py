@@ -99,6 +99,16 @@ def test_turned_parts_of_thin_triangles_come_back(steps: int, sections: int) -> 
     assert np.quantile(moved, 0.95) < np.quantile(np.linalg.norm(rough.vertices - part.vertices, axis=1), 0.95)
 
 
+@pytest.mark.parametrize("scale", [1e-200, 1e200])
+def test_the_unit_of_length_does_not_matter(scale: float) -> None:
+    ring = trimesh.creation.annulus(0.2, 0.5, 1, sections=512)
+    part = Mesh(np.asarray(ring.vertices), np.asarray(ring.faces))
+    rough = noise(part, 0.002, seed=1)
+    assert not is_noisy(scale * part.vertices, part.faces)
+    assert is_noisy(scale * rough.vertices, part.faces)
+    assert denoised(scale * rough.vertices, part.faces) / scale == pytest.approx(denoised(rough.vertices, part.faces))
+
+
 def test_a_knurled_knob_is_no_noise() -> None:
     """Teeth go up and down from vertex to vertex as noise does, but their flanks are planes."""
     knob = trimesh.creation.revolve(np.array([(0, 0), (1, 0), (1, 1), (0, 1)]), sections=600)
