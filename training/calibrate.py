@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 
 import igps
 from igps.descriptors.pretrained import PRETRAINED, pretrained
-from igps.gallery.calibration import CALIBRATION, FINEST, KINDS, Calibration, quantiles, threshold_between, told_of
+from igps.gallery.calibration import (
+    CALIBRATION,
+    FINEST,
+    KINDS,
+    Calibration,
+    quantiles,
+    threshold_at,
+    threshold_between,
+    told_of,
+)
 from igps.gallery.duplicates import Surfaces, distance_if_alike
 from igps.gallery.gallery import fingerprint
 from igps.geometry.disturbances import move, remesh, scale, simplified
@@ -115,7 +124,7 @@ def calibrate(
         {kind: len(by_kind[kind]) for kind in KINDS},
         near,
         threshold_between(of_same[:, 0], of_others[:, 0], rate),
-        threshold_between(of_same[:, 1], np.concatenate([of_others[:, 1], of_longer[:, 1]]), rate),
+        threshold_at(of_same[:, 1], np.concatenate([of_others[:, 1], of_longer[:, 1]]), rate),
         threshold_between(np.concatenate([by_kind["copies"], by_kind["poses"]]), by_kind["bodies"], pose_rate),
     )
     calibration.save(out)

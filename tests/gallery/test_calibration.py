@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 from igps.descriptors import descriptor
-from igps.gallery.calibration import KINDS, LEVELS, Calibration, Threshold, quantiles, threshold_between, told_of
+from igps.gallery.calibration import (
+    KINDS,
+    LEVELS,
+    Calibration,
+    Threshold,
+    quantiles,
+    threshold_at,
+    threshold_between,
+    told_of,
+)
 from igps.gallery.gallery import fingerprint
 from igps.geometry.signature import SignatureConfig
 from own_descriptors import Same
@@ -94,6 +103,14 @@ def test_where_they_overlap_the_rate_decides() -> None:
     assert found.false_rate == pytest.approx(0.01)
     # No larger one is allowed.
     assert sum(one <= np.nextafter(sorted(other)[30], 9) for one in other) == 31
+
+
+def test_a_threshold_may_be_as_large_as_the_rate_allows() -> None:
+    """Of ten others one in ten is allowed: all up to the second nearest, and not that one."""
+    found = threshold_at([1.0, 2.0, 7.5], np.arange(5.0, 15.0), 0.1)
+    assert found.distance == pytest.approx(6.0)
+    assert found.distance < 6.0
+    assert (found.n_false, found.n_other, found.n_found, found.n_same) == (1, 10, 2, 3)
 
 
 def test_it_holds_for_its_descriptor_its_parameters_and_its_signatures(calibration: Calibration) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -183,11 +184,22 @@ def threshold_between(same: ArrayLike, other: ArrayLike, rate: float) -> Thresho
         other: of pairs that are not.
         rate: of false pairs, at most.
     """
-    same, other = np.sort(np.asarray(same, dtype=np.float64)), np.sort(np.asarray(other, dtype=np.float64))
-    n_allowed = int(rate * len(other))
-    first_refused = other[n_allowed]
-    distance = float(np.sqrt(same[-1] * first_refused)) if same[-1] < first_refused else float(
-        np.nextafter(first_refused, 0))  # fmt: skip
+    largest, refused = float(np.max(same)), _first_refused(other, rate)
+    return _counted(math.sqrt(largest * refused) if largest < refused else math.nextafter(refused, 0), same, other)
+
+
+def threshold_at(same: ArrayLike, other: ArrayLike, rate: float) -> Threshold:
+    """As large a threshold as the rate of false pairs allows; arguments as for `threshold_between`."""
+    return _counted(math.nextafter(_first_refused(other, rate), 0), same, other)
+
+
+def _first_refused(other: ArrayLike, rate: float) -> float:
+    other = np.sort(np.asarray(other, dtype=np.float64))
+    return float(other[int(rate * len(other))])
+
+
+def _counted(distance: float, same: ArrayLike, other: ArrayLike) -> Threshold:
+    same, other = np.asarray(same), np.asarray(other)
     return Threshold(distance, len(other), int((other <= distance).sum()), len(same), int((same <= distance).sum()))
 
 

@@ -28,7 +28,7 @@ _N_PROFILE = 1000
 _N_SCORED, _N_COARSE, _N_FINE = 60, 250, 1000
 _N_TRIED, _COARSE_STEPS, _FINE_STEPS, _LAST_STEPS = 12, 15, 8, 10
 # By so much are samples of the same surface nearer to each other after the fine steps than after the coarse ones.
-_FINER = 3
+_FINER = 1.5
 # Neighbouring samples whose offsets are averaged.
 _PATCH = 10
 _MOST_SCALED = math.log(1.1)
@@ -110,7 +110,8 @@ def surface_distance(
         one, other: samples of the surfaces.
         enough: a distance that ends the search: a smaller one is not looked for.
         hopeless: a distance beyond which it matters no more how far apart they are: where few samples are farther
-            after many steps, no more are taken; nor all that there are, where more samples are farther than a third.
+            after many steps, no more are taken; nor all that there are, where more samples are farther than two thirds
+            of it.
 
     Returns:
         Without unit; symmetric but for where the search ends.
