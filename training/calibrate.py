@@ -105,21 +105,24 @@ def calibrate(
     near = 2 * float(by_kind["copies"].max())
 
     surfaces, surfaces_of_copies = (_Measured(one, n_workers) for one in (shapes, copied))
-    made_of = [(surfaces, k, surfaces_of_copies, n) for n, k in enumerate(originals)]
-    within = [(surfaces, a, surfaces, b) for a, b in zip(i, j, strict=True)]
+
+    def among(chosen: NDArray[np.bool_]) -> list[_Pair]:
+        return [(surfaces, i[k], surfaces, j[k]) for k in np.flatnonzero(chosen)]
+
+    def of_made(chosen: NDArray[np.bool_]) -> list[_Pair]:
+        return [(surfaces, originals[n], surfaces_of_copies, n) for n in np.flatnonzero(chosen)]
+
     # The hard ones tell the rate: other poses of bodies that bend, and other bodies of the class.
-    others = np.flatnonzero(of_kind["poses"] | of_kind["bodies"])
-    same = [pair for pair, one in zip(made_of, is_copy, strict=True) if one]
-    same += [within[k] for k in np.flatnonzero(rigid_poses)]
-    longer = [pair for pair, one in zip(made_of, is_copy, strict=True) if not one]
-    of_same, of_others, of_longer = (_apart(pairs, n_workers) for pairs in (same, [within[k] for k in others], longer))
+    others = among(of_kind["poses"] | of_kind["bodies"])
+    pairs = of_made(is_copy) + among(rigid_poses), others, of_made(~is_copy)
+    of_same, of_others, of_longer = (_apart(some, n_workers) for some in pairs)
 
     calibration = Calibration(
         "pretrained",
         fingerprint(descriptor),
         told_of(shapes.config),
         f"{len(set(classes))} classes of GradedShapes({n_classes}, seed={seed}), {len(set(bodies))} bodies, "
-        f"{len(shapes)} poses, {is_copy.sum()} copies, {len(longer)} that are longer",
+        f"{len(shapes)} poses, {is_copy.sum()} copies, {len(of_longer)} that are longer",
         {kind: quantiles(by_kind[kind]) for kind in KINDS},
         {kind: len(by_kind[kind]) for kind in KINDS},
         near,
@@ -176,13 +179,7 @@ def _copies(shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: in
 
 def _copy(mesh: Mesh, way: str, seed: int) -> Mesh:
     if way == "longer":
-        # What lies beyond a plane across it moves away from it; what the plane cuts is stretched.
-        random = np.random.default_rng(seed)
-        normal = random.normal(size=3)
-        normal /= np.linalg.norm(normal)
-        height = mesh.vertices @ normal
-        beyond = height > np.quantile(height, random.uniform(0.3, 0.7))
-        mesh = replace(mesh, vertices=mesh.vertices + np.outer(beyond * LENGTHENED * math.sqrt(mesh.area), normal))
+        mesh = _lengthened(mesh, seed)
     if way in ("triangles", "all", "longer"):
         mesh = remesh(mesh)
     if way in ("half", "all"):
@@ -191,6 +188,16 @@ def _copy(mesh: Mesh, way: str, seed: int) -> Mesh:
         mirrored = replace(mesh, vertices=mesh.vertices * [-1.0, 1.0, 1.0], faces=mesh.faces[:, ::-1])
         mesh = move(scale(mirrored, math.exp(np.random.default_rng(seed).uniform(-3, 3))), seed)
     return mesh
+
+
+def _lengthened(mesh: Mesh, seed: int) -> Mesh:
+    """What lies beyond a plane across it moves away from the plane; what the plane cuts is stretched."""
+    random = np.random.default_rng(seed)
+    normal = random.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    height = mesh.vertices @ normal
+    beyond = height > np.quantile(height, random.uniform(0.3, 0.7))
+    return replace(mesh, vertices=mesh.vertices + np.outer(beyond * LENGTHENED * math.sqrt(mesh.area), normal))
 
 
 class _Measured:
@@ -202,10 +209,13 @@ class _Measured:
         self.coarseness = list(on_threads(surfaces.coarseness, range(len(dataset)), n_workers))
 
 
-def _apart(pairs: list[tuple[_Measured, int, _Measured, int]], n_workers: int | None) -> NDArray[np.float64]:
+_Pair = tuple[_Measured, int, _Measured, int]
+
+
+def _apart(pairs: list[_Pair], n_workers: int | None) -> NDArray[np.float64]:
     """(N, 2) how far apart the surfaces of pairs are; and that over what their levels of detail leave open."""
 
-    def one(pair: tuple[_Measured, int, _Measured, int]) -> tuple[float, float]:
+    def one(pair: _Pair) -> tuple[float, float]:
         first, i, second, j = pair
         apart = distance_if_alike(first.samples[i], second.samples[j])
         return apart, apart / max(first.coarseness[i], second.coarseness[j], FINEST)

@@ -1,9 +1,9 @@
 """Files that show the same body, whatever its scale, mirror image, triangulation, level of detail or file format.
 
-Two surfaces are laid onto each other, which tells the same shape from another pose and from a sibling. How far apart
-they may be is calibrated on generated bodies, see `Calibration`: as much as their levels of detail explain, which half
-of their own triangles tells. That is done for those alone whose samples lie at
-about the same distances from each other, or in an index, whose descriptions are near.
+Two surfaces are laid onto each other, which tells the same shape from another pose and from a sibling. That is done for
+those alone whose samples lie at about the same distances from each other, or in an index, whose descriptions are near.
+They may be as far apart as their levels of detail explain: some times as far as the coarser of the two is from itself
+with half of its vertices. How many times is calibrated on generated bodies, see `Calibration`.
 """
 
 from __future__ import annotations
@@ -244,13 +244,14 @@ class Surfaces:
         return distance_in_place(samples, replace(few, detail=lambda: many))
 
     def distance(self, i: int, j: int, calibration: Calibration) -> float:
-        """That of two; infinite where they are not the same, or one cannot be read."""
+        """That of two, over √area; infinite where they are not the same, or one cannot be read."""
         try:
             one, other = self._last(i), self._last(j)
             apart = distance_if_alike(one, other, enough=calibration.same.distance)
             if apart > calibration.same.distance:
                 return math.inf
             if apart > (limit := self.limit(i, j, calibration)):
+                # The search has ended at what was near enough: the nearest may be within the limit.
                 apart = distance_if_alike(one, other, enough=limit)
             return apart if apart <= limit else math.inf
         except MeshError:

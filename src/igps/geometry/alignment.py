@@ -27,7 +27,8 @@ _N_ROTATIONS = 300
 _N_PROFILE = 1000
 _N_SCORED, _N_COARSE, _N_FINE = 60, 250, 1000
 _N_TRIED, _COARSE_STEPS, _FINE_STEPS, _LAST_STEPS = 12, 15, 8, 10
-# By so much are samples of the same surface nearer to each other after the fine steps than after the coarse ones.
+# After the fine steps, what is farther than the hopeless distance over this is hopeless. With 0.03 for that, copies of
+# generated bodies are within 0.0033 then, well below 0.02; those of thin wires come near it.
 _FINER = 1.5
 # Neighbouring samples whose offsets are averaged.
 _PATCH = 10
@@ -137,7 +138,7 @@ def surface_distance(
 
 
 def distance_in_place(one: SurfaceSamples, other: SurfaceSamples) -> float:
-    """`surface_distance` of two that lie on each other already, but for a small step."""
+    """`surface_distance`, without unit, of two that lie on each other already, but for a small step."""
     return _apart(one, other, _Placing(np.eye(3)))
 
 
