@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from igps.data.batch import collate
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
+from igps.gallery.gallery import kept_as
 from igps.geometry.mesh import Mesh
 from igps.geometry.reading import MeshReading
 from igps.geometry.signature import SignatureConfig, compute_signature
-from igps.nn.description import describe
+from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor, HistogramDescriptor
 
 try:
@@ -107,7 +108,8 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         else:
             dataset = SignatureDataset(shapes, config, self.cache_dir, reading=self.reading)
             dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
-            features = describe(dataset, chosen, n_workers=self.n_workers)
+            kept = kept_as(self.descriptor, chosen)
+            features, _ = describe_usable(dataset, chosen, kept_as=kept, n_workers=self.n_workers, strict=True)
         cells = features.flatten(1)
         rooted = self.square_root and isinstance(chosen, HistogramDescriptor)
         return (cells.sqrt() if rooted else cells).numpy()

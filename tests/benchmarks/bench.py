@@ -13,6 +13,7 @@ import contextlib
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -409,6 +410,9 @@ def shrec07(data: Path | None) -> dict[str, Figure]:
             reference = retrieve(name, "--cache", f"{name} before", then)
             figures[f"shrec07_{name}"] = Figure(seconds, "s", reference, f"commit {BEFORE}", reference / seconds)
         figures["shrec07_warm"] = within(10, retrieve("interior", "--cache_dir", "interior"), "interior")
+        shutil.rmtree(Path(folder) / "interior" / "descriptions")
+        again = retrieve("interior", "--cache_dir", "interior")
+        figures["shrec07_described"] = within(20, again, "interior, signatures alone from the cache")
     return figures
 
 

@@ -130,6 +130,24 @@ def test_gps_is_another_descriptor_on_the_same_cache(
     assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 6
 
 
+def test_a_second_run_describes_nothing_and_leaves_the_same_table(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(name: str) -> dict[str, bytes]:
+        arguments = ["--descriptor", "d2", "--out", tmp_path / name, "--cache_dir", tmp_path / "cache", *SMALL]
+        igps(monkeypatch, "retrieve", root, *arguments)
+        return {path.name: path.read_bytes() for path in (tmp_path / name).glob("*.[cj]s*")}
+
+    first = run("first")
+    assert {"scores.json", "ranking.csv"} <= first.keys()
+
+    def describe_one(job: object) -> None:
+        raise AssertionError("described again")
+
+    monkeypatch.setattr("igps.nn.description._describe_one", describe_one)
+    assert run("second") == first
+
+
 def test_only_the_eigenpairs_that_are_needed_are_computed(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,7 +162,7 @@ def test_only_the_eigenpairs_that_are_needed_are_computed(
 
     def computed(cache: str) -> set[int]:
         found = set()
-        for file in (tmp_path / cache).rglob("*.safetensors"):
+        for file in (tmp_path / cache).glob("??/*.safetensors"):
             with safe_open(file, framework="numpy") as opened:
                 found.add(len(opened.get_tensor("eigenvalues")))
         return found

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -198,3 +199,92 @@ def test_descriptions_that_are_not_finite_are_failures(dataset: SignatureDataset
     values, failures = describe_usable(dataset, Broken(), n_workers=1)
     assert values.shape == (3, 1)
     assert "0.off: the description has entries that are not finite" in failures[0].error
+
+
+class Counting(HistogramDescriptor):
+    """Remembers which bodies it was asked for."""
+
+    def __init__(self) -> None:
+        super().__init__(PairHistogram(["interior_distance"], SpectralEmbedding(n_eigenpairs=12)))
+        self.asked: list[str] = []
+
+    def describe(self, batch: SignatureBatch) -> Tensor:
+        self.asked += [body.id for body in batch.bodies()]
+        return super().describe(batch)
+
+
+def asked(dataset: SignatureDataset, kept_as: str | None = "one") -> tuple[list[str], Tensor]:
+    descriptor = Counting()
+    values, failures = describe_usable(dataset, descriptor, kept_as=kept_as, n_workers=1)
+    assert failures == []
+    return [Path(name).stem for name in descriptor.asked], values
+
+
+@pytest.fixture
+def fresh(tmp_path: Path) -> SignatureDataset:
+    for i in range(3):
+        body = trimesh.creation.icosphere(subdivisions=2)
+        body.vertices *= [1.0, 1.0 + 0.2 * i, 1.5]
+        body.export(tmp_path / f"{i}.off")
+    return SignatureDataset(sorted(tmp_path.glob("*.off")), CONFIG, tmp_path / "cache")
+
+
+def test_what_has_been_described_is_not_described_again(fresh: SignatureDataset) -> None:
+    names, values = asked(fresh)
+    assert names == ["0", "1", "2"]
+    again, same = asked(fresh)
+    assert again == []
+    assert torch.equal(same, values)
+    # Of a part, in another order, and beside what is new.
+    assert asked(fresh.subset([2, 0]))[0] == []
+    assert torch.equal(asked(fresh.subset([2, 0]))[1], values[[2, 0]])
+
+
+def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDataset) -> None:
+    paths = fresh.files.paths
+    _, values = asked(fresh)
+    assert asked(fresh, kept_as="other words")[0] == ["0", "1", "2"]
+    assert asked(fresh, kept_as=None)[0] == ["0", "1", "2"]
+    more = SignatureDataset(paths, replace(CONFIG, n_eigenpairs=14), fresh.recipe.cache_dir)
+    assert asked(more)[0] == ["0", "1", "2"]
+    with_own = SignatureDataset(paths, CONFIG, fresh.recipe.cache_dir, point_functions={"height": lambda x: x[:, 2]})
+    assert asked(with_own)[0] == asked(with_own)[0] == ["0", "1", "2"]
+    body = trimesh.creation.icosphere(subdivisions=2)
+    body.vertices *= [2.0, 0.7, 0.5]
+    body.export(paths[1])
+    names, other = asked(fresh)
+    assert names == ["1"]
+    assert torch.equal(other[[0, 2]], values[[0, 2]])
+    assert not torch.equal(other[1], values[1])
+
+
+def test_damaged_descriptions_are_made_again(fresh: SignatureDataset, caplog: pytest.LogCaptureFixture) -> None:
+    _, values = asked(fresh)
+    first, second, _ = sorted((fresh.recipe.cache_dir / "descriptions").rglob("*.safetensors"))
+    content = bytearray(first.read_bytes())
+    content[-1] ^= 1
+    first.write_bytes(content)
+    second.write_bytes(second.read_bytes()[:-8])
+    names, again = asked(fresh)
+    assert len(names) == 2
+    assert torch.equal(again, values)
+    assert caplog.text.count("cached description is not usable") == 2
+    assert asked(fresh)[0] == []
+
+
+def test_where_descriptions_cannot_be_kept_they_are_made(
+    fresh: SignatureDataset, caplog: pytest.LogCaptureFixture
+) -> None:
+    fresh.recipe.cache_dir.mkdir()
+    (fresh.recipe.cache_dir / "descriptions").write_text("in the way")
+    for _ in range(2):
+        assert asked(fresh)[0] == ["0", "1", "2"]
+    assert caplog.text.count("descriptions are not kept") == 2
+
+
+def test_failures_are_not_kept(fresh: SignatureDataset) -> None:
+    for refused in ("1.off", "2.off"):
+        values, failures = describe_usable(fresh, Area(refused=refused), kept_as="area", n_workers=1)
+        assert len(values) + len(failures) == 3
+        # What was refused at first is described the second time, and what is kept is not refused any more.
+        assert [Path(failure.id).name for failure in failures] == (["1.off"] if refused == "1.off" else [])

@@ -20,7 +20,7 @@ from igps.cli.report import report as write_report
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import MeshFiles, find_meshes, labelled_meshes
 from igps.descriptors import descriptor as descriptor_of
-from igps.gallery.gallery import Gallery
+from igps.gallery.gallery import Gallery, kept_as
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor
 from igps.report.sources import write_sources
@@ -58,7 +58,7 @@ def retrieve(
     check_report(report, out)
     chosen = descriptor_of(descriptor)
     dataset, descriptions, failures = _described(
-        labelled_meshes(root), chosen, n_workers=n_workers, strict=strict, **reading
+        labelled_meshes(root), descriptor, n_workers=n_workers, strict=strict, **reading
     )
     distances = pair_distances(chosen, descriptions, progress=True)
     scores = retrieval_scores(distances, dataset.files.labels or ())
@@ -98,7 +98,7 @@ def extract(
         descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
     """
     source = meshes[0] if len(meshes) == 1 else meshes
-    dataset, descriptions, failures = _described(source, descriptor_of(descriptor), **reading)
+    dataset, descriptions, failures = _described(source, descriptor, **reading)
     features = descriptions.numpy()
     arrays: dict[str, Any] = {"features": features, "names": np.array(dataset.files.names)}
     if dataset.files.labels is not None:
@@ -148,9 +148,10 @@ def query(
         if missing:
             print(f"{missing} of these {len(matches)} files are no longer where they were when they were indexed.")
         return _as_rows(rows)
-    chosen = descriptor_of(descriptor or "pretrained")
-    _, wanted, _ = _described([mesh], chosen, **reading)
-    dataset, descriptions, _ = _described(find_meshes(gallery), chosen, **reading)  # type: ignore[arg-type]
+    descriptor = descriptor or "pretrained"
+    chosen = descriptor_of(descriptor)
+    _, wanted, _ = _described([mesh], descriptor, **reading)
+    dataset, descriptions, _ = _described(find_meshes(gallery), descriptor, **reading)  # type: ignore[arg-type]
     n_found = min(top, len(dataset))
     n_near = min(max(top, N_RERANKED), len(dataset)) if rerank else n_found
     found = search(wanted, descriptions, top=n_near, distance=chosen.distances)
@@ -179,14 +180,17 @@ def _as_rows(rows: Sequence[tuple[str, str | None, float]]) -> list[dict[str, An
 
 def _described(
     source: Path | Sequence[Path] | MeshFiles,
-    descriptor: Descriptor,
+    descriptor: str | Descriptor,
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
 ) -> tuple[SignatureDataset, Tensor, list[Failure]]:
     """The meshes that could be used, their descriptions, and the failures of the others."""
-    dataset, unread = signatures(source, [descriptor], n_workers=n_workers, strict=strict, **reading)
-    descriptions, undescribed = describe_usable(dataset, descriptor, n_workers=n_workers, strict=strict, progress=True)
+    module = descriptor_of(descriptor)
+    dataset, unread = signatures(source, [module], n_workers=n_workers, strict=strict, **reading)
+    descriptions, undescribed = describe_usable(
+        dataset, module, kept_as=kept_as(descriptor, module), n_workers=n_workers, strict=strict, progress=True
+    )
     return dataset.usable(undescribed), descriptions, [*unread, *undescribed]
 
 

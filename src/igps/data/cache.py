@@ -1,4 +1,4 @@
-"""A content-addressed store of Signatures on disk, one safetensors file each."""
+"""A content-addressed store of Signatures and descriptions on disk, one safetensors file each."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import os
 import secrets
 import time
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
@@ -20,12 +22,12 @@ from igps.geometry.signature import Samples, Signature, SignatureConfig
 
 logger = logging.getLogger(__name__)
 
-_FORMAT = "igps-signature-1"
 _ROOMS = ("interior", "surface")
 _PARTIAL = ".partial"
 # A file still being written after so many seconds was left by a process that was killed: a write takes well below one.
 _ABANDONED = 24 * 3600
 T = TypeVar("T")
+Read = TypeVar("Read")
 
 
 def default_cache_dir() -> Path:
@@ -33,62 +35,82 @@ def default_cache_dir() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "igps"
 
 
-class SignatureCache:
-    """Signatures by key, shared safely by any number of processes.
+class FileCache(ABC, Generic[T]):
+    """Values by key, shared safely by any number of processes.
 
     A file is written beside its place and moved there in one step, so that a reader sees all of it or nothing. What a
-    killed run leaves of one is removed a day later, see `remove_abandoned`. Two processes that compute the same
-    Signature write the same bytes. Who may read folders and files is for the umask to say.
+    killed run leaves of one is removed a day later, see `remove_abandoned`. Two processes that compute the same value
+    write the same bytes. Who may read folders and files is for the umask to say.
 
     Args:
         directory: made if it is missing.
+
+    Attributes:
+        what: the values are, in a word.
+        file_format: name and version of the files' format.
     """
+
+    what: ClassVar[str]
+    file_format: ClassVar[str]
 
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(directory)
+
+    @staticmethod
+    @abstractmethod
+    def _encode(value: T) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        """Arrays and metadata of a value."""
+
+    @staticmethod
+    @abstractmethod
+    def _decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> T:
+        """The value of arrays and metadata; raises a ValueError, KeyError or TypeError if they make none."""
 
     def path(self, key: str) -> Path:
         """The file of a key, in one of 256 folders."""
         return self.directory / key[:2] / f"{key}.safetensors"
 
     def __contains__(self, key: str) -> bool:
-        """Whether a Signature is stored under `key`, by the file's header and length."""
+        """Whether a value is stored under `key`, by the file's header and length."""
         return self._read(key, lambda file, metadata: True) is not None
 
-    def get(self, key: str) -> Signature | None:
-        """The Signature stored under `key`, or None if there is none or it cannot be trusted, which is logged."""
-        return self._read(key, _decode)
+    def get(self, key: str) -> T | None:
+        """The value stored under `key`, or None if there is none or it cannot be trusted, which is logged."""
+        return self._read(key, self._checked)
 
-    def _read(self, key: str, read: Callable[[Any, Mapping[str, str]], T]) -> T | None:
+    def _checked(self, file: Any, metadata: Mapping[str, str]) -> T:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no Mapping: it cannot be iterated)
+        # Files of before there was one are as good as any.
+        if metadata.get("checksum", "unknown") not in ("unknown", _checksum(tensors, metadata)):
+            raise ValueError("its content is damaged: it does not have the checksum that it was written with")
+        return self._decode(tensors, metadata)
+
+    def _read(self, key: str, read: Callable[[Any, Mapping[str, str]], Read]) -> Read | None:
         path = self.path(key)
         try:
             with safe_open(path, framework="numpy") as file:
                 metadata = file.metadata() or {}
-                if metadata.get("format") != _FORMAT or metadata.get("key") != key:
-                    raise ValueError(f"not a {_FORMAT} file of this key")
+                if metadata.get("format") != self.file_format or metadata.get("key") != key:
+                    raise ValueError(f"not a {self.file_format} file of this key")
                 return read(file, metadata)
         except FileNotFoundError:
             return None
         except (SafetensorError, ValueError, KeyError, TypeError, OSError) as error:
-            logger.warning("%s: cached signature is not usable (%s); it is computed again", path, error)
+            logger.warning("%s: cached %s is not usable (%s); it is computed again", path, self.what, error)
             return None
 
-    def notes(self, key: str) -> tuple[str, ...]:
-        """What was done to the mesh of the Signature under `key`, in words; nothing if there is none."""
-        return self._read(key, lambda file, metadata: tuple(json.loads(metadata["notes"]))) or ()
-
-    def put(self, key: str, signature: Signature) -> None:
-        """Store a Signature under `key`."""
+    def put(self, key: str, value: T) -> None:
+        """Store a value under `key`."""
         path = self.path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
-        tensors, metadata = _encode(signature)
+        tensors, metadata = self._encode(value)
         metadata["checksum"] = _checksum(tensors, metadata)
         _remove_abandoned(path.parent.glob(f"*{_PARTIAL}"))
         # By an ordinary open: files that tempfile or safetensors make are for their owner alone, whatever the umask.
         temporary = path.with_name(f"{key}.{os.getpid()}-{secrets.token_hex(8)}{_PARTIAL}")
         try:
             with open(temporary, "xb") as file:
-                file.write(_ordered(save(tensors, metadata={"format": _FORMAT, "key": key, **metadata})))
+                file.write(_ordered(save(tensors, metadata={"format": self.file_format, "key": key, **metadata})))
             self._move(temporary, key)
         except BaseException as error:
             temporary.unlink(missing_ok=True)
@@ -102,7 +124,7 @@ class SignatureCache:
             os.replace(temporary, self.path(key))
         except PermissionError:
             # Some file systems replace no file that another process holds open. Where that process was first with the
-            # same Signature, its file serves as well.
+            # same value, its file serves as well.
             if key not in self:
                 raise
             temporary.unlink()
@@ -110,6 +132,87 @@ class SignatureCache:
     def remove_abandoned(self) -> None:
         """Remove what killed processes left of files that they were writing, a day after."""
         _remove_abandoned(self.directory.glob(f"*/*{_PARTIAL}"))
+
+
+class SignatureCache(FileCache[Signature]):
+    """Signatures by key, see `FileCache`."""
+
+    what = "signature"
+    file_format = "igps-signature-1"
+
+    def notes(self, key: str) -> tuple[str, ...]:
+        """What was done to the mesh of the Signature under `key`, in words; nothing if there is none."""
+        return self._read(key, lambda file, metadata: tuple(json.loads(metadata["notes"]))) or ()
+
+    @staticmethod
+    def _encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        tensors: dict[str, np.ndarray] = {"eigenvalues": signature.eigenvalues}
+        for room in _ROOMS:
+            samples: Samples = getattr(signature, room)
+            tensors[f"{room}.points"] = samples.points
+            tensors[f"{room}.eigenfunctions"] = samples.eigenfunctions
+            for name, values in samples.attributes.items():
+                tensors[f"{room}.attributes.{name}"] = values
+        scalars = {
+            "area": signature.area,
+            "volume": signature.volume,
+            "config": signature.config.as_dict(),
+            "name": signature.name,
+            "notes": signature.notes,
+            "residual": signature.residual,
+        }
+        # safetensors writes the buffer as it lies in memory.
+        contiguous = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
+        return contiguous, {name: json.dumps(value) for name, value in scalars.items()}
+
+    @staticmethod
+    def _decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Signature:
+        config: dict[str, Any] = json.loads(metadata["config"])
+        if config.pop("algorithm_version") != SignatureConfig.ALGORITHM_VERSION:
+            raise ValueError("made by another version of the algorithm")
+        config["attributes"] = tuple(config["attributes"])
+        rooms = {}
+        for room in _ROOMS:
+            prefix = f"{room}.attributes."
+            attributes = {
+                name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)
+            }
+            rooms[room] = Samples(tensors[f"{room}.points"], tensors[f"{room}.eigenfunctions"], attributes)
+            if len(rooms[room].points) != len(rooms[room].eigenfunctions):
+                raise ValueError(f"{room} points and eigenfunctions differ in number")
+        return Signature(
+            eigenvalues=tensors["eigenvalues"],
+            interior=rooms["interior"],
+            surface=rooms["surface"],
+            area=json.loads(metadata["area"]),
+            volume=json.loads(metadata["volume"]),
+            config=SignatureConfig(**config),
+            name=json.loads(metadata["name"]),
+            notes=tuple(json.loads(metadata["notes"])),
+            residual=json.loads(metadata.get("residual", "NaN")),
+        )
+
+
+class DescriptionCache(FileCache[NDArray[np.float32]]):
+    """Descriptions by key, beside the Signatures in a folder of their own, see `FileCache`.
+
+    Args:
+        directory: that of the Signatures.
+    """
+
+    what = "description"
+    file_format = "igps-description-1"
+
+    def __init__(self, directory: str | Path) -> None:
+        super().__init__(Path(directory) / "descriptions")
+
+    @staticmethod
+    def _encode(value: NDArray[np.float32]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        return {"values": np.ascontiguousarray(value)}, {}
+
+    @staticmethod
+    def _decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> NDArray[np.float32]:
+        return tensors["values"]
 
 
 def _remove_abandoned(partials: Iterable[Path]) -> None:
@@ -141,53 +244,3 @@ def _checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) ->
         checksum = zlib.crc32(f"{name} {tensor.dtype.str} {tensor.shape}\0".encode(), checksum)
         checksum = zlib.crc32(np.ascontiguousarray(tensor).data, checksum)
     return f"{checksum:08x}"
-
-
-def _encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    tensors: dict[str, np.ndarray] = {"eigenvalues": signature.eigenvalues}
-    for room in _ROOMS:
-        samples: Samples = getattr(signature, room)
-        tensors[f"{room}.points"] = samples.points
-        tensors[f"{room}.eigenfunctions"] = samples.eigenfunctions
-        for name, values in samples.attributes.items():
-            tensors[f"{room}.attributes.{name}"] = values
-    scalars = {
-        "area": signature.area,
-        "volume": signature.volume,
-        "config": signature.config.as_dict(),
-        "name": signature.name,
-        "notes": signature.notes,
-        "residual": signature.residual,
-    }
-    # safetensors writes the buffer as it lies in memory.
-    contiguous = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
-    return contiguous, {name: json.dumps(value) for name, value in scalars.items()}
-
-
-def _decode(file: Any, metadata: Mapping[str, str]) -> Signature:
-    tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no Mapping: it cannot be iterated)
-    # Files of before there was one are as good as any.
-    if metadata.get("checksum", "unknown") not in ("unknown", _checksum(tensors, metadata)):
-        raise ValueError("its content is damaged: it does not have the checksum that it was written with")
-    config: dict[str, Any] = json.loads(metadata["config"])
-    if config.pop("algorithm_version") != SignatureConfig.ALGORITHM_VERSION:
-        raise ValueError("made by another version of the algorithm")
-    config["attributes"] = tuple(config["attributes"])
-    rooms = {}
-    for room in _ROOMS:
-        prefix = f"{room}.attributes."
-        attributes = {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
-        rooms[room] = Samples(tensors[f"{room}.points"], tensors[f"{room}.eigenfunctions"], attributes)
-        if len(rooms[room].points) != len(rooms[room].eigenfunctions):
-            raise ValueError(f"{room} points and eigenfunctions differ in number")
-    return Signature(
-        eigenvalues=tensors["eigenvalues"],
-        interior=rooms["interior"],
-        surface=rooms["surface"],
-        area=json.loads(metadata["area"]),
-        volume=json.loads(metadata["volume"]),
-        config=SignatureConfig(**config),
-        name=json.loads(metadata["name"]),
-        notes=tuple(json.loads(metadata["notes"])),
-        residual=json.loads(metadata.get("residual", "NaN")),
-    )

@@ -148,6 +148,17 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """
         return self._recipe.key(self.files.paths[index])
 
+    def cached_keys(self) -> list[str | None]:
+        """What in the cache serves each mesh, None where nothing does; of files that are known, without reading them.
+
+        None as well of those with point functions, which no key covers.
+        """
+        if self._point_functions:
+            return [None] * len(self)
+        ready = KnownFiles(self._recipe).ready(self.files.paths)
+        served = (self._served(i) if path not in ready else ready[path] for i, path in enumerate(self.files.paths))
+        return [None if one is None else one.key for one in served]
+
     def notes(self, index: int) -> tuple[str, ...]:
         """What was done to a mesh on its way to its cached Signature, in words."""
         return self._recipe.notes(self.files.paths[index])

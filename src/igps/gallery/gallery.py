@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from igps.data.dataset import Failure, SignatureDataset
+from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
 from igps.geometry.mesh import MeshError
 from igps.geometry.reading import MeshReading
@@ -27,6 +30,8 @@ from igps.retrieval.search import SearchResult
 
 # So many descriptions are in memory at once.
 _AT_ONCE = 256
+# The packages that descriptions are computed with.
+_COMPUTE_WITH = "torch", "numpy", "scipy", "numba", "libigl"
 
 
 @dataclass(frozen=True)
@@ -253,6 +258,37 @@ def fingerprint(descriptor: nn.Module) -> str:
         found.update(f"{name} {values.dtype} {tuple(values.shape)}\0".encode())
         found.update(values.numpy().tobytes())
     return found.hexdigest()[:32]
+
+
+def kept_as(descriptor: str | Descriptor, module: Descriptor) -> str | None:
+    """All that descriptions depend on beside Signatures, in words, see `igps.nn.description.describe_usable`.
+
+    Name and parameters of the descriptor, the library's code, and the versions of what that computes with.
+
+    Args:
+        descriptor: as it was asked for. None is returned for all that is not one of the library's by its name: what
+            code there is to one of your own is not known.
+        module: the descriptor itself.
+    """
+    return f"{descriptor} {fingerprint(module)} {_code()}" if descriptor in NAMES else None
+
+
+@cache
+def _code() -> str:
+    """A checksum of the library's sources, and versions."""
+    package = Path(__file__).parents[1]
+    found = hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        found.update(f"{source.relative_to(package).as_posix()}\0".encode())
+        found.update(source.read_bytes())
+    return " ".join((found.hexdigest()[:32], *(f"{name} {_version(name)}" for name in _COMPUTE_WITH)))
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "none"
 
 
 def _is_plain(value: Any) -> bool:

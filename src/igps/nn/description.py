@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
+import logging
 import time
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,10 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from igps.data.cache import DescriptionCache
 from igps.data.dataset import Failure, SignatureDataset
 from igps.geometry.mesh import MeshError
 from igps.nn.descriptor import BodyDescriptor, Descriptor
 from igps.parallel import Failed, n_cores, on_threads, one_thread, run
+
+logger = logging.getLogger(__name__)
 
 
 def describe(
@@ -79,6 +85,7 @@ def describe_usable(
     dataset: SignatureDataset,
     descriptor: Descriptor,
     *,
+    kept_as: str | None = None,
     n_workers: int | None = None,
     strict: bool = False,
     progress: bool = False,
@@ -88,6 +95,8 @@ def describe_usable(
     Args:
         dataset: N meshes.
         descriptor: what describes them.
+        kept_as: all that descriptions depend on beside Signatures, in words. What has been described under the same
+            words is read from the cache, all else kept there. None to describe all.
         n_workers: see `describe`.
         strict: raise at the first mesh that cannot be described.
         progress: show a bar.
@@ -97,26 +106,62 @@ def describe_usable(
         ValueError: the signatures lack what the descriptor needs.
     """
     _check(descriptor, dataset)
-    found: dict[int, Tensor] = {}
+    kept = None if kept_as is None else _Kept(dataset, kept_as)
+    found = {} if kept is None else kept.found()
     failures: dict[int, Failure] = {}
+    missing = [i for i in range(len(dataset)) if i not in found]
     if isinstance(descriptor, BodyDescriptor):
-        outcomes = describe_each([(descriptor, dataset, i) for i in range(len(dataset))], n_workers)
+        outcomes = describe_each([(descriptor, dataset, i) for i in missing], n_workers)
     else:
-        outcomes = _each_on_threads(dataset, descriptor, n_workers)
+        outcomes = _each_on_threads(dataset.subset(missing), descriptor, n_workers)
     with (
         evaluation_mode(descriptor),
-        tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar,
+        tqdm(desc="descriptions", total=len(dataset), initial=len(found), disable=not progress) as bar,
         contextlib.closing(outcomes),
     ):
-        for i, outcome in outcomes:
+        for number, outcome in outcomes:
             bar.update()
+            i = missing[number]
             if isinstance(outcome, Description):
-                found[i] = torch.from_numpy(outcome.values)
+                found[i] = outcome.values
+                if kept is not None:
+                    kept.keep(i, outcome.values)
                 continue
             if strict or len(failures) + 1 == len(dataset):
                 raise MeshError(outcome.error)
             failures[i] = outcome
-    return torch.stack([found[i] for i in sorted(found)]), [failures[i] for i in sorted(failures)]
+    values = torch.from_numpy(np.stack([found[i] for i in sorted(found)]))
+    return values, [failures[i] for i in sorted(failures)]
+
+
+class _Kept:
+    """The descriptions of a dataset that are in its cache; done without where the cache cannot be written."""
+
+    def __init__(self, dataset: SignatureDataset, kept_as: str) -> None:
+        self._dataset, self._kept_as = dataset, kept_as
+        self._cache = DescriptionCache(dataset.recipe.cache_dir)
+        self._cache.remove_abandoned()
+        self._is_writable = True
+
+    def found(self) -> dict[int, NDArray[np.float32]]:
+        keys = enumerate(self._dataset.cached_keys())
+        values = {i: self._cache.get(self._key(served)) for i, served in keys if served is not None}
+        return {i: one for i, one in values.items() if one is not None}
+
+    def keep(self, i: int, values: NDArray[np.float32]) -> None:
+        # Asked again: describing it may have put its Signature there.
+        (served,) = self._dataset.subset([i]).cached_keys()
+        if served is None or not self._is_writable:
+            return
+        try:
+            self._cache.put(self._key(served), values)
+        except OSError as error:
+            logger.warning("%s: descriptions are not kept (%s)", self._cache.directory, error)
+            self._is_writable = False
+
+    def _key(self, served: str) -> str:
+        config = json.dumps(self._dataset.config.as_dict(), sort_keys=True)
+        return hashlib.sha256(f"{self._kept_as}\0{served}\0{config}".encode()).hexdigest()
 
 
 @dataclass(frozen=True, eq=False)
