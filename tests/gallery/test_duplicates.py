@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 import os
 import re
 import shlex
@@ -132,8 +133,41 @@ def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path: Path) -> No
     assert apart.limit < apart.surfaces < Calibration.load().same.distance
 
 
+def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path: Path) -> None:
+    """It is near enough to both, as coarse as it is, and belongs to the nearer one."""
+    fine = bar(5)
+    longer = fine.copy()
+    longer.vertices += np.outer(fine.vertices[:, 0] > 0, [0.01 * fine.area**0.5, 0, 0])
+    for name, body in (("one", fine), ("longer", longer), ("coarse", copied(bar(3), 3, 2.0))):
+        body.export(tmp_path / f"{name}.off")
+    dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
+    coarse, longer_one, one = range(3)
+    surfaces, calibration = Surfaces(dataset), Calibration.load()
+    assert surfaces.distance(coarse, one, calibration) < surfaces.distance(coarse, longer_one, calibration) < math.inf
+    found = duplicates(dataset, n_workers=1)
+    assert grouped(found.groups) == {frozenset({"one.off", "coarse.off"})}
+    assert list(found.pairs) == [("one.off", "coarse.off")]
+
+
+def test_handles_tell_bodies_apart_however_near_they_are(tmp_path: Path) -> None:
+    """But not where mending may have made them, or closed them."""
+    ring = trimesh.creation.torus(1.0, 0.3, 40, 20)
+    cut = ring.submesh([~np.isin(np.arange(len(ring.faces)), ring.vertex_faces[5])], append=True, repair=False)
+    for name, body in (("ball", ball(3)), ("cut", cut), ("ring", ring), ("turned", copied(ring, 1, 3.0))):
+        body.export(tmp_path / f"{name}.off")
+    dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
+    a_ball, a_cut, a_ring, turned = range(4)
+    surfaces, calibration = Surfaces(dataset), Calibration.load()
+    assert any(note.startswith("filled") for note in dataset.mesh(a_cut).notes)
+    assert surfaces.limit(a_ball, a_ring, calibration) == 0
+    assert surfaces.limit(a_ring, turned, calibration) > 0
+    assert surfaces.limit(a_ball, a_cut, calibration) > 0
+    assert not compared(dataset.subset([a_ball, a_ring])).same
+    assert grouped(duplicates(dataset, n_workers=1).groups) == {frozenset({"ring.off", "turned.off", "cut.off"})}
+
+
 def test_coarseness_of_a_ball_falls_with_the_area_of_its_triangles(tmp_path: Path) -> None:
-    """Chords of a circle lie off it by the square of their length: four times as many triangles, a quarter as far."""
+    """The middle of its neighbours lies off a vertex by the square of their distance: a quarter with edges of half."""
     for subdivisions in (3, 4, 5):
         ball(subdivisions).export(tmp_path / f"{subdivisions}.off")
     surfaces = Surfaces(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"))

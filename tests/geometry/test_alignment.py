@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from igps.geometry.alignment import SurfaceSamples, surface_distance
+from igps.geometry.alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
 
 Array = NDArray[np.float64]
 
@@ -103,13 +104,41 @@ def test_lost_relief_cancels_where_another_shape_does_not() -> None:
     assert surface_distance(plain, SurfaceSamples.of(turned, normals, area)) > 2 * lost
 
 
-def test_more_samples_tell_more() -> None:
-    """Between few samples a curved surface leaves their tangent planes; between many it hardly does."""
+def triangles(axes: tuple[float, float, float], subdivisions: int) -> tuple[Array, NDArray[np.int64]]:
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return np.asarray(ball.vertices * axes), np.asarray(ball.faces)
+
+
+def test_the_surface_itself_tells_more_than_samples() -> None:
+    """Few samples of a curved surface leave their tangent planes; the surface leaves what its triangles do."""
     axes = (1.0, 0.6, 0.4)
-    many = ellipsoid(axes, 30_000, seed=3)
+    vertices, faces = triangles(axes, 5)
     few = [ellipsoid(axes, 300, seed) for seed in (1, 2)]
-    detailed = [replace(one, detail=lambda: many) for one in few]
-    assert surface_distance(*detailed) < 0.2 * surface_distance(*few)
+    with_surface = [replace(one, surface=lambda: TriangleSurface(vertices, faces)) for one in few]
+    assert surface_distance(*with_surface) < 0.05 * surface_distance(*few)
+
+
+def test_nearest_points_of_a_surface() -> None:
+    """Against trimesh's loop over all triangles, and above the middle of each face, where its normal stands."""
+    vertices, faces = triangles((1.0, 0.6, 0.4), 2)
+    surface, body = TriangleSurface(vertices, faces), trimesh.Trimesh(vertices, faces, process=False)
+    anywhere = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    expected, _, _ = trimesh.proximity.closest_point_naive(body, anywhere)
+    np.testing.assert_allclose(surface.nearest(SurfaceSamples(anywhere, anywhere))[0], expected, atol=1e-12)
+    above = body.triangles_center + 0.01 * body.face_normals
+    points, normals = surface.nearest(SurfaceSamples(above, body.face_normals))
+    np.testing.assert_allclose(points, body.triangles_center, atol=1e-12)
+    np.testing.assert_allclose(normals, body.face_normals, atol=1e-9)
+
+
+def test_in_place_nothing_is_moved() -> None:
+    """A ball and itself moved by h along a line: h/√3, the root mean square of h·cos θ; laid onto itself, nothing."""
+    vertices, faces = triangles((1.0, 1.0, 1.0), 5)
+    step = np.array([0.0, 0.0, 0.02])
+    ball = replace(ellipsoid((1.0, 1.0, 1.0)), surface=lambda: TriangleSurface(vertices, faces))
+    beside = SurfaceSamples(ball.points + step, ball.normals, lambda: TriangleSurface(vertices + step, faces))
+    assert offset_in_place(ball, TriangleSurface(vertices + step, faces)) == pytest.approx(0.02 / np.sqrt(3), rel=0.03)
+    assert surface_distance(ball, beside) < 1e-4
 
 
 def wheel(thinned: float, seed: int) -> SurfaceSamples:

@@ -23,6 +23,22 @@ def test_areas_and_normals(blob: Mesh) -> None:
     np.testing.assert_allclose(surface.vertex_normals(blob.vertices, blob.faces), normals, atol=1e-12)
 
 
+def test_the_mean_of_neighbours_is_that_of_a_loop(blob: Mesh) -> None:
+    expected = np.empty_like(blob.vertices)
+    for i, neighbours in enumerate(as_trimesh(blob).vertex_neighbors):
+        beside = blob.vertices[neighbours]
+        weights = 1 / np.square(beside - blob.vertices[i]).sum(axis=1)
+        expected[i] = weights @ beside / weights.sum()
+    np.testing.assert_allclose(surface.mean_of_neighbours(blob.vertices, blob.faces), expected, rtol=1e-9)
+
+
+def test_a_neighbour_in_the_same_place_is_the_mean(blob: Mesh) -> None:
+    vertices, (a, b, _) = blob.vertices.copy(), blob.faces[0]
+    vertices[a] = vertices[b]
+    found = surface.mean_of_neighbours(vertices, blob.faces)
+    np.testing.assert_allclose(found[[a, b]], vertices[[b, b]], atol=1e-6)
+
+
 def test_unit_vectors() -> None:
     np.testing.assert_allclose(
         surface.unit(np.array([[3.0, 0, 4], [0, 0, 0], [0, -1e-100, 0]])), [[0.6, 0, 0.8], [0, 0, 0], [0, -1, 0]]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps.data.batch import Body
+from igps.geometry.extras import libigl
 from igps.geometry.geodesics import farthest_points
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.ordering import in_order_of_form
@@ -118,10 +119,7 @@ def local_diameters(
     Raises:
         ImportError: libigl is not installed.
     """
-    try:
-        import igl
-    except ImportError as error:
-        raise ImportError('local_diameters needs libigl: pip install "interior-gps[igl]".') from error
+    igl = libigl("local_diameters")
     centre, size = mesh.vertices.mean(axis=0), float(np.ptp(mesh.vertices, axis=0).max())
     vertices = np.asfortranarray((mesh.vertices - centre) / size)
     faces = np.asfortranarray(mesh.faces)

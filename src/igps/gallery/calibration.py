@@ -34,7 +34,7 @@ LEVELS = (0.0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, *(i / 10 for i in range(1,
 
 
 FINEST = 1e-5
-"""A smaller coarseness counts as this, of √area: flat faces lose nothing with half of their triangles."""
+"""A smaller coarseness counts as this, of √area: 2,000 samples may miss what little is not flat."""
 
 _DEPENDS_ON = ("algorithm_version", "resolution", "min_samples", "n_surface_samples")
 

@@ -2,12 +2,15 @@
 
 Two surfaces are laid onto each other, which tells the same shape from another pose and from a sibling. That is done for
 those alone whose samples lie at about the same distances from each other, or in an index, whose descriptions are near.
-They may be as far apart as their levels of detail explain: some times as far as the coarser of the two is from itself
-with half of its vertices. How many times is calibrated on generated bodies, see `Calibration`.
+They may be as far apart as their levels of detail explain: about as far as the coarser of the two is from itself with
+every vertex in the middle of its neighbours. What "about" means is calibrated on generated bodies, see `Calibration`.
+Bodies with different numbers of handles are not the same. What is the same somehow must then be the same as the finest
+file of its group.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -18,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import DisjointSet
 from torch import Tensor
 from tqdm import tqdm
 
@@ -26,21 +30,19 @@ from igps.data.sources import MeshFiles
 from igps.descriptors import descriptor as descriptor_of
 from igps.gallery.calibration import Calibration
 from igps.gallery.gallery import Gallery
-from igps.geometry.alignment import SurfaceSamples, distance_in_place, surface_distance
-from igps.geometry.attributes import AttributeName, surface_attributes
-from igps.geometry.disturbances import simplified
+from igps.geometry.alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
+from igps.geometry.attributes import AttributeName
+from igps.geometry.mending import Step, mended_by
 from igps.geometry.mesh import Mesh, MeshError
-from igps.geometry.sampling import surface_points
 from igps.geometry.signature import Signature
+from igps.geometry.surface import mean_of_neighbours
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor
 from igps.parallel import Failed, on_threads
 from igps.retrieval.distances import Distance, euclidean
 
-# Rows of distances, pairs whose surfaces are compared, samples of surfaces, and many samples, in memory at once.
-_ROWS, _PAIRS, _SURFACES, _DETAILED = 256, 256, 512, 64
-# Samples of a surface where two are near: neighbours are then four times as close as among those of a Signature.
-_N_DETAILED = 32_000
+# Rows of distances, pairs whose surfaces are compared, samples of surfaces, and surfaces, in memory at once.
+_ROWS, _PAIRS, _SURFACES, _TRIANGLES = 256, 256, 512, 64
 # Pairs as near as copies are asked for among so many of an index, then among ever more.
 _FIRST_TOP = 32
 _NORMALS: AttributeName = "surface_direction"
@@ -51,15 +53,21 @@ _MOST_STRETCHED = 0.15
 # A tenth of this is much between copies.
 _HOPELESS = 0.03
 
+# What is done to a mesh that leaves its handles as they are.
+_KEEP_HANDLES: set[Step] = {"welded", "smoothed", "subdivided"}
+
+_Pairs = dict[tuple[int, int], float]
+
 
 @dataclass(frozen=True)
 class Duplicates:
     """Groups of files that show the same body.
 
     Args:
-        groups: names of at least two files each, in order; each is the same as some other of its group.
+        groups: names of at least two files each, in order; each is the same as the finest of its group, or where poses
+            are asked for, as some other of it.
         paths: where the files of the groups are, by name.
-        pairs: the pairs that make the groups, and how far apart: their surfaces over √area, or their descriptions where
+        pairs: those that make the groups, and how far apart: their surfaces over √area, or their descriptions where
             poses are asked for.
         n_files: among how many they were looked for.
         failures: files that could not be compared.
@@ -79,7 +87,7 @@ class Comparison:
     Args:
         distance: by the descriptor.
         surfaces: of their surfaces laid onto each other, root mean square over √area.
-        limit: up to which `surfaces` is that of the same shape, at their levels of detail.
+        limit: up to which `surfaces` is that of the same shape, at their levels of detail; 0 if one has more handles.
         meaning: of the distance, in words.
         same: whether they are the same body in the same shape.
     """
@@ -133,31 +141,88 @@ def duplicates(
             near = _near(descriptions, chosen.distances, calibration.pose.distance, progress)
         else:
             near = _near(descriptions, _profile_distances, 2 * calibration.same.distance + _PROFILE_NOISE, progress)
-    limit = calibration.pose.distance if poses else calibration.same.distance
-    group = _Groups(len(dataset))
+    surfaces = None if poses else Surfaces(dataset)
+    joined = _joined(near, surfaces, calibration, n_workers, progress)
+    if surfaces is not None:
+        joined = _around_the_finest(joined, surfaces, calibration, n_workers, progress)
+        failures = [*failures, *surfaces.failures.values()]
     names = dataset.files.names
-    pairs: dict[tuple[str, str], float] = {}
-    surfaces = Surfaces(dataset)
-    while some := list(islice(near, _PAIRS)):
-        open_pairs = [(i, j, distance) for i, j, distance in some if group.of(i) != group.of(j)]
-        if poses:
-            found = iter([distance for _, _, distance in open_pairs])
-        else:
-            laid = on_threads(lambda one: surfaces.distance(one[0], one[1], calibration), open_pairs, n_workers)
-            found = iter(tqdm(laid, desc="laid onto each other", total=len(open_pairs), leave=False,
-                              disable=not progress))  # fmt: skip
-        for (i, j, _), distance in zip(open_pairs, found, strict=True):
-            if distance <= limit and group.of(i) != group.of(j):
-                group.join(i, j)
-                pairs[names[i], names[j]] = distance
-    members = [one for one in group.members() if len(one) > 1]
+    groups = _groups(joined)
     return Duplicates(
-        tuple(tuple(names[i] for i in one) for one in members),
-        {names[i]: dataset.files.paths[i] for one in members for i in one},
-        pairs,
+        tuple(tuple(names[i] for i in one) for one in groups),
+        {names[i]: dataset.files.paths[i] for one in groups for i in one},
+        {(names[i], names[j]): distance for (i, j), distance in joined.items()},
         len(dataset),
-        (*failures, *surfaces.failures.values()),
+        tuple(failures),
     )
+
+
+def _joined(
+    near: Iterator[tuple[int, int, float]],
+    surfaces: Surfaces | None,
+    calibration: Calibration,
+    n_workers: int | None,
+    progress: bool,
+) -> _Pairs:
+    """Those of near pairs that are the same, none of two that others have joined, by their surfaces if there are."""
+    group = DisjointSet()
+    joined: _Pairs = {}
+    while some := list(islice(near, _PAIRS)):
+        for i, j, _ in some:
+            group.add(i)
+            group.add(j)
+        open_pairs = [(i, j, distance) for i, j, distance in some if not group.connected(i, j)]
+        if surfaces is None:
+            distances = iter([distance for _, _, distance in open_pairs])
+        else:
+            laid = on_threads(partial(_laid, surfaces, calibration), open_pairs, n_workers)
+            distances = iter(tqdm(laid, desc="laid onto each other", total=len(open_pairs), leave=False,
+                                  disable=not progress))  # fmt: skip
+        for (i, j, _), distance in zip(open_pairs, distances, strict=True):
+            if distance < math.inf and group.merge(i, j):
+                joined[i, j] = distance
+    return joined
+
+
+def _laid(surfaces: Surfaces, calibration: Calibration, pair: tuple[int, int, float]) -> float:
+    return surfaces.distance(pair[0], pair[1], calibration)
+
+
+def _around_the_finest(
+    joined: _Pairs, surfaces: Surfaces, calibration: Calibration, n_workers: int | None, progress: bool
+) -> _Pairs:
+    """Pairs of the finest file of a group and another, and how far apart; groups may fall apart.
+
+    A file that is too coarse to tell joins bodies that differ in a detail. So the files of a group come again, the
+    finest first: each belongs to the nearest of those before it that lead a group, or leads one itself.
+    """
+
+    def pairs_of(members: list[int]) -> _Pairs:
+        leading: list[int] = []
+        found: _Pairs = {}
+        for i in sorted(members, key=lambda one: (surfaces.coarseness(one), one)):
+            apart = [surfaces.distance(one, i, calibration) for one in leading]
+            if min(apart, default=math.inf) < math.inf:
+                found[leading[int(np.argmin(apart))], i] = min(apart)
+            else:
+                leading.append(i)
+        return found
+
+    large = [members for members in _groups(joined) if len(members) > 2]
+    again = {i for members in large for i in members}
+    kept = {pair: distance for pair, distance in joined.items() if again.isdisjoint(pair)}
+    found = on_threads(pairs_of, large, n_workers)
+    for pairs in tqdm(found, desc="groups", total=len(large), disable=not progress):
+        kept |= pairs
+    return kept
+
+
+def _groups(joined: _Pairs) -> list[list[int]]:
+    """What pairs join, in order."""
+    group = DisjointSet({i for pair in joined for i in pair})
+    for i, j in joined:
+        group.merge(i, j)
+    return sorted(sorted(members) for members in group.subsets())
 
 
 def compared(
@@ -202,7 +267,7 @@ class Surfaces:
     """The samples of surfaces of a dataset, the last used of them in memory.
 
     Args:
-        dataset: of meshes, whose Signatures give few samples; many are drawn from the mesh where they are asked for.
+        dataset: of meshes, whose Signatures give the samples; a mesh itself is read where another is near.
 
     Attributes:
         failures: of meshes that could not be read, by index.
@@ -212,36 +277,32 @@ class Surfaces:
         self.failures: dict[int, Failure] = {}
         self._dataset = dataset
         self._last = lru_cache(_SURFACES)(self.samples)
-        self._detailed = lru_cache(_DETAILED)(self._detail)
-        self._coarseness = lru_cache(None)(self.coarseness)
+        self._last_triangles = lru_cache(_TRIANGLES)(self._triangles)
+        self._frame = lru_cache(None)(self._origin_and_area)
+        self._known = lru_cache(None)(self._coarseness_and_handles)
 
     def samples(self, i: int) -> SurfaceSamples:
         """Those of one.
 
         Raises:
-            MeshError: the mesh cannot be used; so does their `detail`.
+            MeshError: the mesh cannot be used; so does their `surface`.
             ValueError: the Signatures have no directions of the surface.
         """
         signature = self._signature(i)
         found = SurfaceSamples.of(signature.surface.points, signature.surface.attributes[_NORMALS], signature.area)
-        return replace(found, detail=partial(self._detailed, i))
+        return replace(found, surface=partial(self._last_triangles, i))
 
     def coarseness(self, i: int) -> float:
-        """How far one is from itself with half of the vertices, over √area: what its level of detail leaves open.
+        """How far one is from itself with each vertex in the middle of its neighbours, over √area.
 
-        Infinite where no half of it is a body.
+        That is what its level of detail leaves open: how far chords cut round parts off, and other triangles sharp
+        edges. On thin triangles, near neighbours count, see `mean_of_neighbours`.
 
         Raises:
             MeshError: the mesh cannot be used.
             ImportError: libigl is not installed.
         """
-        samples, mesh = self._last(i), self._mesh(i)
-        try:
-            half = simplified(mesh, 0.5)
-        except MeshError:
-            return math.inf
-        few, many = (self._drawn(i, half, n) for n in (len(samples.points), _N_DETAILED))
-        return distance_in_place(samples, replace(few, detail=lambda: many))
+        return self._known(i)[0]
 
     def distance(self, i: int, j: int, calibration: Calibration) -> float:
         """That of two, over √area; infinite where they are not the same, or one cannot be read."""
@@ -250,7 +311,8 @@ class Surfaces:
             apart = distance_if_alike(one, other, enough=calibration.same.distance)
             if apart > calibration.same.distance:
                 return math.inf
-            if apart > (limit := self.limit(i, j, calibration)):
+            limit = self.limit(i, j, calibration)
+            if apart > limit > 0:
                 # The search has ended at what was near enough: the nearest may be within the limit.
                 apart = distance_if_alike(one, other, enough=limit)
             return apart if apart <= limit else math.inf
@@ -258,8 +320,14 @@ class Surfaces:
             return math.inf
 
     def limit(self, i: int, j: int, calibration: Calibration) -> float:
-        """How far two may be apart and the same, see `Calibration.limit`; raises as `coarseness` does."""
-        return calibration.limit(max(self._coarseness(i), self._coarseness(j)))
+        """How far two may be apart and the same, see `Calibration.limit`; raises as `coarseness` does.
+
+        Not at all if one has more handles than the other.
+        """
+        (coarseness, handles), (of_other, handles_of_other) = self._known(i), self._known(j)
+        if None not in (handles, handles_of_other) and handles != handles_of_other:
+            return 0.0
+        return calibration.limit(max(coarseness, of_other))
 
     def profile(self, i: int) -> NDArray[np.float64] | None:
         """That of one; None where it cannot be read."""
@@ -268,18 +336,28 @@ class Surfaces:
         except MeshError:
             return None
 
-    def _detail(self, i: int) -> SurfaceSamples:
-        """Many samples of one, about the origin of the few."""
-        few, many = self._last(i), self._drawn(i, self._mesh(i), _N_DETAILED)
-        # With the few among them, so that a surface is no distance from itself.
-        return SurfaceSamples(np.concatenate([few.points, many.points]), np.concatenate([few.normals, many.normals]))
+    def _coarseness_and_handles(self, i: int) -> tuple[float, int | None]:
+        """Handles are None where the mesh is open, and where mending may have made some or closed holes."""
+        mesh = self._mesh(i)
+        blurred = TriangleSurface(mean_of_neighbours(self._placed(i, mesh), mesh.faces), mesh.faces)
+        handles = None
+        if not set(mended_by(mesh.notes)) - _KEEP_HANDLES:
+            with contextlib.suppress(MeshError):
+                handles = mesh.genus
+        return offset_in_place(self._last(i), blurred), handles
 
-    def _drawn(self, i: int, mesh: Mesh, n: int) -> SurfaceSamples:
-        """So many samples of a mesh, about the origin and in the unit of those of one."""
+    def _triangles(self, i: int) -> TriangleSurface:
+        mesh = self._mesh(i)
+        return TriangleSurface(self._placed(i, mesh), mesh.faces)
+
+    def _placed(self, i: int, mesh: Mesh) -> NDArray[np.float64]:
+        """The vertices of one about the origin and in the unit of its samples."""
+        origin, area = self._frame(i)
+        return (mesh.vertices - origin) / math.sqrt(area)
+
+    def _origin_and_area(self, i: int) -> tuple[NDArray[np.float64], float]:
         signature = self._signature(i)
-        drawn = surface_points(mesh, n, self._dataset.config.seed)
-        normals = surface_attributes(mesh, drawn.face, (_NORMALS,))[_NORMALS]
-        return SurfaceSamples.of(drawn.positions, normals, signature.area, signature.surface.points.mean(axis=0))
+        return signature.surface.points.mean(axis=0), signature.area
 
     def _mesh(self, i: int) -> Mesh:
         try:
@@ -303,29 +381,6 @@ class Surfaces:
 
     def _keep(self, i: int, error: MeshError) -> None:
         self.failures[i] = self._dataset.failure(i, Failed(str(error)))
-
-
-class _Groups:
-    """Numbers that are joined to groups (union by the smallest)."""
-
-    def __init__(self, n: int) -> None:
-        self._parent = list(range(n))
-
-    def of(self, i: int) -> int:
-        while self._parent[i] != i:
-            self._parent[i] = self._parent[self._parent[i]]
-            i = self._parent[i]
-        return i
-
-    def join(self, i: int, j: int) -> None:
-        first, second = sorted((self.of(i), self.of(j)))
-        self._parent[second] = first
-
-    def members(self) -> list[list[int]]:
-        found: dict[int, list[int]] = {}
-        for i in range(len(self._parent)):
-            found.setdefault(self.of(i), []).append(i)
-        return list(found.values())
 
 
 def _described(

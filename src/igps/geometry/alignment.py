@@ -13,6 +13,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
+from igps.geometry.extras import libigl
+from igps.geometry.surface import area_vectors, unit
+
 Array = NDArray[np.float64]
 
 # In units of √area. Of two points of a thin sheet, those whose normals agree are the near ones: a normal counts as so
@@ -42,13 +45,13 @@ class SurfaceSamples:
     Args:
         points: (P, 3) without unit.
         normals: (P, 3) outward, of length 1.
-        detail: gives many more samples of the surface, about the same origin and in the same unit, where they can be
-            had; it is asked for where surfaces are near.
+        surface: gives the surface itself, about the same origin and in the same unit, where it can be had; it is asked
+            for where surfaces are near.
     """
 
     points: Array
     normals: Array
-    detail: Callable[[], SurfaceSamples] | None = None
+    surface: Callable[[], TriangleSurface] | None = None
 
     @classmethod
     def of(
@@ -94,6 +97,36 @@ class SurfaceSamples:
         """How far apart neighbours are, about."""
         return 1 / math.sqrt(len(self.points))
 
+    def nearest(self, samples: SurfaceSamples) -> tuple[Array, Array]:
+        """(P, 3) and (P, 3) the nearest of them to each of other samples, whose normal agrees, and its normal."""
+        found = self.tree.query(_with_normals(samples))[1]
+        return self.points[found], self.normals[found]
+
+
+class TriangleSurface:
+    """A surface to find nearest points of.
+
+    Args:
+        vertices: (V, 3) without unit.
+        faces: (F, 3).
+
+    Raises:
+        ImportError: libigl is not installed.
+    """
+
+    gap = 0.0
+
+    def __init__(self, vertices: Array, faces: NDArray[np.int64]) -> None:
+        self._triangles = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
+        self._normals = unit(area_vectors(vertices, faces))
+        self._tree = libigl("alignment").AABB()
+        self._tree.init(*self._triangles)
+
+    def nearest(self, samples: SurfaceSamples) -> tuple[Array, Array]:
+        """(P, 3) and (P, 3) the nearest point of it to each of some samples, and the normal there."""
+        _, face, points = self._tree.squared_distance(*self._triangles, np.ascontiguousarray(samples.points))
+        return np.asarray(points), self._normals[np.asarray(face).ravel()]
+
 
 def surface_distance(
     one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, hopeless: float = math.inf
@@ -102,17 +135,17 @@ def surface_distance(
 
     One is moved, turned, perhaps mirrored, and scaled by up to a tenth (their areas are equal already), from many
     starts, by iterated closest points to tangent planes (Chen and Medioni 1992; Besl and McKay 1992). The offset of a
-    sample is that to the plane of the nearest sample of the other surface whose normal agrees, and beside it what it
-    lies off to the side of that sample, beyond the gaps between samples. Offsets are averaged over patches of ten
-    neighbours, a twentieth of √area across: relief that a coarser mesh has lost, and the roughness of triangles, go in
-    and out and cancel, where another shape or pose moves whole patches.
+    sample is that to the other surface; where that is not at hand, that to the plane of its nearest sample whose normal
+    agrees, and beside it what it lies off to the side of that sample, beyond the gaps between samples. Offsets are
+    averaged over patches of ten neighbours, a twentieth of √area across: relief that a coarser mesh has lost, and the
+    roughness of triangles, go in and out and cancel, where another shape or pose moves whole patches.
 
     Args:
         one, other: samples of the surfaces.
         enough: a distance that ends the search: a smaller one is not looked for.
         hopeless: a distance beyond which it matters no more how far apart they are: where few samples are farther
-            after many steps, no more are taken; nor all that there are, where more samples are farther than two thirds
-            of it.
+            after many steps, no more are taken; nor is the other surface itself asked for, where more samples are
+            farther than two thirds of it.
 
     Returns:
         Without unit; symmetric but for where the search ends.
@@ -137,37 +170,36 @@ def surface_distance(
     return best
 
 
-def distance_in_place(one: SurfaceSamples, other: SurfaceSamples) -> float:
-    """`surface_distance`, without unit, of two that lie on each other already, but for a small step."""
-    return _apart(one, other, _Placing(np.eye(3)))
+def offset_in_place(samples: SurfaceSamples, surface: TriangleSurface) -> float:
+    """Root mean square of the patches of samples, as in `surface_distance`, to a surface in its place."""
+    return math.sqrt(_mean_square(samples, surface))
 
 
 def _apart(one: SurfaceSamples, other: SurfaceSamples, placing: _Placing) -> float:
     """Root mean square of the patches of either, each laid onto all that is known of the other."""
     squares = []
     for samples, target, way in ((one, other, placing), (other, one, placing.inverse())):
-        finest = target if target.detail is None else target.detail()
+        finest = target if target.surface is None else target.surface()
         _, fitted = _fitted(samples, finest, way, _LAST_STEPS)
-        placed = fitted(samples)
-        neighbours = placed.tree.query(_with_normals(placed), k=min(_PATCH, len(placed.points)))[1]
-        means = _offsets(placed, finest)[neighbours].mean(axis=1)
         # In units of the mean of both, so that neither is favoured.
-        squares.append(np.einsum("ni,ni->n", means, means).mean() / fitted.scale)
+        squares.append(_mean_square(fitted(samples), finest) / fitted.scale)
     return math.sqrt(sum(squares) / 2)
 
 
-def _offsets(samples: SurfaceSamples, target: SurfaceSamples) -> Array:
+def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) -> float:
+    neighbours = samples.tree.query(_with_normals(samples), k=min(_PATCH, len(samples.points)))[1]
+    means = _offsets(samples, target)[neighbours].mean(axis=1)
+    return float(np.einsum("ni,ni->n", means, means).mean())
+
+
+def _offsets(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) -> Array:
     """(P, 3) from each sample to the surface of the target."""
-    found = _nearest(samples, target)
-    steps, normals = target.points[found] - samples.points, target.normals[found]
+    nearest, normals = target.nearest(samples)
+    steps = nearest - samples.points
     across = np.einsum("ni,ni->n", steps, normals)[:, None] * normals
     aside = steps - across
     length = np.linalg.norm(aside, axis=1, keepdims=True)
     return across + aside * np.maximum(1 - _GAP * target.gap / np.maximum(length, 1e-12), 0)
-
-
-def _nearest(samples: SurfaceSamples, target: SurfaceSamples) -> NDArray[np.intp]:
-    return np.asarray(target.tree.query(_with_normals(samples))[1])
 
 
 def _scores(samples: SurfaceSamples, target: SurfaceSamples, starts: Array) -> Array:
@@ -202,13 +234,14 @@ class _Placing:
         )
 
 
-def _fitted(samples: SurfaceSamples, target: SurfaceSamples, placing: _Placing, n_steps: int) -> tuple[float, _Placing]:
+def _fitted(
+    samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, placing: _Placing, n_steps: int
+) -> tuple[float, _Placing]:
     """Root mean square of the offsets, and the placing that the steps end at."""
     for _ in range(n_steps):
         placed = placing(samples)
-        found = _nearest(placed, target)
-        normals = target.normals[found]
-        across = np.einsum("ni,ni->n", target.points[found] - placed.points, normals)
+        nearest, normals = target.nearest(placed)
+        across = np.einsum("ni,ni->n", nearest - placed.points, normals)
         along = np.einsum("ni,ni->n", placed.points, normals)
         columns = np.column_stack([np.cross(placed.points, normals), normals, along])
         square = columns.T @ columns

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
+from igps.geometry.extras import libigl
 from igps.geometry.geodesics import edge_graph
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.simplification import simplify
@@ -76,10 +77,7 @@ def remesh(mesh: Mesh) -> Mesh:
         ImportError: libigl is not installed.
         MeshError: the old number of faces is out of reach.
     """
-    try:
-        import igl
-    except ImportError as error:
-        raise ImportError('remesh needs libigl: pip install "interior-gps[igl]".') from error
+    igl = libigl("remesh")
     vertices, faces = igl.upsample(np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces.astype(np.int32)))
     vertices, faces, *_ = igl.decimate(
         np.asfortranarray(vertices), np.asfortranarray(faces.astype(np.int32)), len(mesh.faces)

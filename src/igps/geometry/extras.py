@@ -5,8 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 
-def libigl() -> Any:
+def libigl(who: str = "watertight") -> Any:
     """The module igl.
+
+    Args:
+        who: needs it.
 
     Raises:
         ImportError: it is not installed; names the extra.
@@ -14,5 +17,5 @@ def libigl() -> Any:
     try:
         import igl
     except ImportError as error:
-        raise ImportError('watertight needs libigl: pip install "interior-gps[igl]".') from error
+        raise ImportError(f'{who} needs libigl: pip install "interior-gps[igl]".') from error
     return igl

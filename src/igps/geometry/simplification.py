@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from igps.geometry.extras import libigl
 from igps.geometry.mesh import Mesh, MeshError
 
 
@@ -24,10 +25,7 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     surplus = len(mesh.vertices) - max_vertices
     if surplus <= 0:
         return mesh
-    try:
-        import igl
-    except ImportError as error:
-        raise ImportError('simplify needs libigl: pip install "interior-gps[igl]".') from error
+    igl = libigl("simplify")
     # In unit scale, because quadrics are sums of squares. A collapse on a closed surface takes a vertex and two faces.
     centre, scale = mesh.vertices.mean(axis=0), float(np.ptp(mesh.vertices, axis=0).max())
     points = np.asfortranarray((mesh.vertices - centre) / scale)

@@ -32,6 +32,21 @@ def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> N
     return unit(np.column_stack([np.bincount(corners, vectors[:, i], len(vertices)) for i in range(3)]))
 
 
+def mean_of_neighbours(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(V, 3) length, the mean of each vertex's neighbours, each by the inverse square of its distance."""
+    ends = undirected_edges(faces, len(vertices))[0]
+    squares = np.square(vertices[ends[:, 0]] - vertices[ends[:, 1]]).sum(axis=1)
+    # Vertices in one place: nearer than any other, and no division by zero.
+    weights = 1 / np.maximum(squares, 1e-12 * squares.mean())
+    total = np.zeros(len(vertices))
+    sums = np.zeros_like(vertices)
+    for here, there in (ends.T, ends.T[::-1]):
+        total += np.bincount(here, weights, len(vertices))
+        for axis in range(3):
+            sums[:, axis] += np.bincount(here, weights * vertices[there, axis], len(vertices))
+    return sums / total[:, None]
+
+
 def unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 3) vectors of length 1 in the same directions; zero stays zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny)
