@@ -226,7 +226,9 @@ def fresh(tmp_path: Path) -> SignatureDataset:
         body = trimesh.creation.icosphere(subdivisions=2)
         body.vertices *= [1.0, 1.0 + 0.2 * i, 1.5]
         body.export(tmp_path / f"{i}.off")
-    return SignatureDataset(sorted(tmp_path.glob("*.off")), CONFIG, tmp_path / "cache")
+    dataset = SignatureDataset(sorted(tmp_path.glob("*.off")), CONFIG, tmp_path / "cache")
+    assert dataset.precompute(n_workers=1, progress=False) == []
+    return dataset
 
 
 def test_what_has_been_described_is_not_described_again(fresh: SignatureDataset) -> None:
@@ -245,8 +247,9 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDatase
     _, values = asked(fresh)
     assert asked(fresh, kept_as="other words")[0] == ["0", "1", "2"]
     assert asked(fresh, kept_as=None)[0] == ["0", "1", "2"]
-    more = SignatureDataset(paths, replace(CONFIG, n_eigenpairs=14), fresh.recipe.cache_dir)
-    assert asked(more)[0] == ["0", "1", "2"]
+    # Served by the same Signatures: another descriptor under the same words would get the histograms otherwise.
+    fewer = SignatureDataset(paths, replace(CONFIG, n_eigenpairs=11), fresh.recipe.cache_dir)
+    assert describe_usable(fewer, Area(), kept_as="one", n_workers=1)[0].shape == (3, 2)
     with_own = SignatureDataset(paths, CONFIG, fresh.recipe.cache_dir, point_functions={"height": lambda x: x[:, 2]})
     assert asked(with_own)[0] == asked(with_own)[0] == ["0", "1", "2"]
     body = trimesh.creation.icosphere(subdivisions=2)
@@ -256,6 +259,24 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDatase
     assert names == ["1"]
     assert torch.equal(other[[0, 2]], values[[0, 2]])
     assert not torch.equal(other[1], values[1])
+
+
+def test_a_file_that_changes_meanwhile_is_not_mistaken_for_what_it_was(fresh: SignatureDataset) -> None:
+    """Two files change places while they are described: neither description is kept as that of the other."""
+    first, second = fresh.files.paths[:2]
+    _, values = asked(fresh, kept_as=None)
+
+    class Meddling(Counting):
+        def describe(self, batch: SignatureBatch) -> Tensor:
+            if not self.asked:
+                other = first.with_suffix(".other")
+                first.rename(other)
+                second.rename(first)
+                other.rename(second)
+            return super().describe(batch)
+
+    describe_usable(fresh, Meddling(), kept_as="one", n_workers=1)
+    assert torch.equal(asked(fresh)[1], values[[1, 0, 2]])
 
 
 def test_damaged_descriptions_are_made_again(fresh: SignatureDataset, caplog: pytest.LogCaptureFixture) -> None:
@@ -275,7 +296,6 @@ def test_damaged_descriptions_are_made_again(fresh: SignatureDataset, caplog: py
 def test_where_descriptions_cannot_be_kept_they_are_made(
     fresh: SignatureDataset, caplog: pytest.LogCaptureFixture
 ) -> None:
-    fresh.recipe.cache_dir.mkdir()
     (fresh.recipe.cache_dir / "descriptions").write_text("in the way")
     for _ in range(2):
         assert asked(fresh)[0] == ["0", "1", "2"]

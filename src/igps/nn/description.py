@@ -96,7 +96,7 @@ def describe_usable(
         dataset: N meshes.
         descriptor: what describes them.
         kept_as: all that descriptions depend on beside Signatures, in words. What has been described under the same
-            words is read from the cache, all else kept there. None to describe all.
+            words is read from the cache, and all else kept there whose Signature is there before. None to describe all.
         n_workers: see `describe`.
         strict: raise at the first mesh that cannot be described.
         progress: show a bar.
@@ -139,19 +139,19 @@ class _Kept:
 
     def __init__(self, dataset: SignatureDataset, kept_as: str) -> None:
         self._dataset, self._kept_as = dataset, kept_as
+        self._served = dataset.cached_keys()
         self._cache = DescriptionCache(dataset.recipe.cache_dir)
         self._cache.remove_abandoned()
         self._is_writable = True
 
     def found(self) -> dict[int, NDArray[np.float32]]:
-        keys = enumerate(self._dataset.cached_keys())
-        values = {i: self._cache.get(self._key(served)) for i, served in keys if served is not None}
+        values = {i: self._cache.get(self._key(one)) for i, one in enumerate(self._served) if one is not None}
         return {i: one for i, one in values.items() if one is not None}
 
     def keep(self, i: int, values: NDArray[np.float32]) -> None:
-        # Asked again: describing it may have put its Signature there.
-        (served,) = self._dataset.subset([i]).cached_keys()
-        if served is None or not self._is_writable:
+        """Keep a description, if the file is the one that it was before it was described."""
+        served = self._served[i]
+        if served is None or not self._is_writable or self._dataset.subset([i]).cached_keys() != [served]:
             return
         try:
             self._cache.put(self._key(served), values)
