@@ -3,6 +3,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from torch import Tensor
 import jobs
 from igps.data.batch import Body, SignatureBatch
 from igps.data.dataset import SignatureDataset
+from igps.geometry.attributes import AttributeName
 from igps.geometry.mesh import MeshError
 from igps.geometry.signature import SignatureConfig
 from igps.nn.axes import InteriorDistance, Potential
@@ -248,8 +250,13 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDatase
     assert asked(fresh, kept_as="other words")[0] == ["0", "1", "2"]
     assert asked(fresh, kept_as=None)[0] == ["0", "1", "2"]
     # Served by the same Signatures: another descriptor under the same words would get the histograms otherwise.
-    fewer = SignatureDataset(paths, replace(CONFIG, n_eigenpairs=11), fresh.recipe.cache_dir)
-    assert describe_usable(fewer, Area(), kept_as="one", n_workers=1)[0].shape == (3, 2)
+    cache = fresh.recipe.cache_dir.with_name("other")
+    more = SignatureDataset(paths, replace(CONFIG, attributes=get_args(AttributeName)), cache)
+    more.precompute(n_workers=1, progress=False)
+    plain = SignatureDataset(paths, CONFIG, cache)
+    asked(more)
+    assert plain.cached_keys() == more.cached_keys()
+    assert describe_usable(plain, Area(), kept_as="one", n_workers=1)[0].shape == (3, 2)
     with_own = SignatureDataset(paths, CONFIG, fresh.recipe.cache_dir, point_functions={"height": lambda x: x[:, 2]})
     assert asked(with_own)[0] == asked(with_own)[0] == ["0", "1", "2"]
     body = trimesh.creation.icosphere(subdivisions=2)
