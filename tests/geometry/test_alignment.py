@@ -141,13 +141,13 @@ def test_in_place_nothing_is_moved() -> None:
     assert surface_distance(ball, beside) < 1e-4
 
 
-def test_what_lies_beside_a_surface_is_as_far_as_its_rim() -> None:
-    """Not in its plane alone: there are no gaps in a surface, as there are between samples."""
+def test_what_lies_beyond_an_edge_is_as_far_as_the_edge() -> None:
+    """Not as far as the plane of either side: there are no gaps in a surface, as there are between samples."""
     box = trimesh.creation.box((1.0, 1.0, 0.1))
     x = np.linspace(-0.4, 0.4, 30)
-    points = np.column_stack([x, np.full(30, 0.53), np.full(30, 0.05)])
-    beside = SurfaceSamples(points, np.tile([0.0, 0.0, 1.0], (30, 1)))
-    assert offset_in_place(beside, TriangleSurface(box.vertices, box.faces)) == pytest.approx(0.03)
+    points = np.column_stack([x, np.full(30, 0.53), np.full(30, 0.09)])
+    beyond = SurfaceSamples(points, np.tile([0.0, 0.6, 0.8], (30, 1)))
+    assert offset_in_place(beyond, TriangleSurface(box.vertices, box.faces)) == pytest.approx(0.05)
 
 
 def wheel(thinned: float, seed: int) -> SurfaceSamples:
