@@ -116,6 +116,7 @@ def calibrate(
     others = among(of_kind["poses"] | of_kind["bodies"])
     pairs = of_made(is_copy) + among(rigid_poses), others, of_made(~is_copy)
     of_same, of_others, of_longer = (_apart(some, n_workers) for some in pairs)
+    of_different = np.concatenate([of_others, of_longer])
 
     calibration = Calibration(
         "pretrained",
@@ -126,8 +127,8 @@ def calibrate(
         {kind: quantiles(by_kind[kind]) for kind in KINDS},
         {kind: len(by_kind[kind]) for kind in KINDS},
         near,
-        threshold_between(of_same[:, 0], of_others[:, 0], rate),
-        threshold_at(of_same[:, 1], np.concatenate([of_others[:, 1], of_longer[:, 1]]), rate),
+        threshold_between(of_same[:, 0], of_different[:, 0], rate),
+        threshold_at(of_same[:, 1], of_different[:, 1], rate),
         threshold_between(np.concatenate([by_kind["copies"], by_kind["poses"]]), by_kind["bodies"], pose_rate),
     )
     calibration.save(out)

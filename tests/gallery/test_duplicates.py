@@ -22,7 +22,7 @@ from igps.cli import COMMANDS, main
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
 from igps.gallery.calibration import Calibration, told_of
-from igps.gallery.duplicates import Surfaces, compared, duplicates
+from igps.gallery.duplicates import Surfaces, _around_the_finest, compared, duplicates
 from igps.gallery.gallery import Gallery, fingerprint
 from igps.geometry.signature import SignatureConfig
 from own_descriptors import Same
@@ -147,6 +147,26 @@ def test_a_coarse_copy_does_not_join_what_is_told_apart(tmp_path: Path) -> None:
     found = duplicates(dataset, n_workers=1)
     assert grouped(found.groups) == {frozenset({"one.off", "coarse.off"})}
     assert list(found.pairs) == [("one.off", "coarse.off")]
+
+
+def test_each_file_of_a_group_has_one_finer_file_beside_it() -> None:
+    """The nearest that leads a group, before any nearer one that does not; and none joins two groups."""
+    apart = {(0, 1): 0.1, (1, 2): 0.05, (0, 4): 0.2, (3, 4): 0.1, (1, 4): 0.01, (2, 3): 0.3}
+
+    class Table:
+        def coarseness(self, i: int) -> float:
+            return float(i != 3) * i
+
+        def distance(self, i: int, j: int, calibration: Calibration) -> float:
+            return apart.get((min(i, j), max(i, j)), math.inf)
+
+    calibration, joined = Calibration.load(), {(0, 1): 0.1, (1, 2): 0.05, (2, 3): 0.3, (3, 4): 0.1, (5, 6): 0.4}
+    found = _around_the_finest(joined, Table(), calibration, 1, progress=False)  # type: ignore[arg-type]
+    # 3 is as fine as 0 and leads; 2 is the same as 3, which leads, and as 1, which does not.
+    assert found == {(5, 6): 0.4, (0, 1): 0.1, (3, 2): 0.3, (3, 4): 0.1}
+    del apart[2, 3]
+    found = _around_the_finest(joined, Table(), calibration, 1, progress=False)  # type: ignore[arg-type]
+    assert found == {(5, 6): 0.4, (0, 1): 0.1, (1, 2): 0.05, (3, 4): 0.1}
 
 
 def test_handles_tell_bodies_apart_however_near_they_are(tmp_path: Path) -> None:

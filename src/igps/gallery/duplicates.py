@@ -4,8 +4,7 @@ Two surfaces are laid onto each other, which tells the same shape from another p
 those alone whose samples lie at about the same distances from each other, or in an index, whose descriptions are near.
 They may be as far apart as their levels of detail explain: about as far as the coarser of the two is from itself with
 every vertex in the middle of its neighbours. What "about" means is calibrated on generated bodies, see `Calibration`.
-Bodies with different numbers of handles are not the same. What is the same somehow must then be the same as the finest
-file of its group.
+Bodies with different numbers of handles are not the same. And no file joins two that are not the same as each other.
 """
 
 from __future__ import annotations
@@ -64,8 +63,8 @@ class Duplicates:
     """Groups of files that show the same body.
 
     Args:
-        groups: names of at least two files each, in order; each is the same as the finest of its group, or where poses
-            are asked for, as some other of it.
+        groups: names of at least two files each, in order; each is the same as some other of its group, by preference
+            the finest.
         paths: where the files of the groups are, by name.
         pairs: those that make the groups, and how far apart: their surfaces over √area, or their descriptions where
             poses are asked for.
@@ -191,19 +190,24 @@ def _laid(surfaces: Surfaces, calibration: Calibration, pair: tuple[int, int, fl
 def _around_the_finest(
     joined: _Pairs, surfaces: Surfaces, calibration: Calibration, n_workers: int | None, progress: bool
 ) -> _Pairs:
-    """Pairs of the finest file of a group and another, and how far apart; groups may fall apart.
+    """The pairs that make the groups, and how far apart; groups may fall apart.
 
     A file that is too coarse to tell joins bodies that differ in a detail. So the files of a group come again, the
-    finest first: each belongs to the nearest of those before it that lead a group, or leads one itself.
+    finest first: each belongs to the nearest of those that lead a group; or where it is the same as none of them, to
+    the nearest other file before it; or it leads a group itself. None joins two.
     """
 
     def pairs_of(members: list[int]) -> _Pairs:
         leading: list[int] = []
+        following: list[int] = []
         found: _Pairs = {}
         for i in sorted(members, key=lambda one: (surfaces.coarseness(one), one)):
-            apart = [surfaces.distance(one, i, calibration) for one in leading]
-            if min(apart, default=math.inf) < math.inf:
-                found[leading[int(np.argmin(apart))], i] = min(apart)
+            for finer in (leading, following):
+                apart = [surfaces.distance(one, i, calibration) for one in finer]
+                if min(apart, default=math.inf) < math.inf:
+                    found[finer[int(np.argmin(apart))], i] = min(apart)
+                    following.append(i)
+                    break
             else:
                 leading.append(i)
         return found
