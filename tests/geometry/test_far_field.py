@@ -20,7 +20,7 @@ from igps.geometry.coordinates import extend
 from igps.geometry.laplacian import laplacian
 from igps.linalg import eigenpairs
 
-pytestmark = pytest.mark.usefixtures("approximate_small_meshes")
+pytestmark = pytest.mark.usefixtures("approximate_small_meshes", "both_ways")
 
 
 @functools.cache

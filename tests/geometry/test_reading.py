@@ -10,7 +10,7 @@ import trimesh
 
 from conftest import FACES, TETRAHEDRON
 from igps.geometry.mesh import MeshError
-from igps.geometry.reading import MeshReading, load_mesh
+from igps.geometry.reading import MeshReading, load_mesh, read_surface
 
 
 def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
@@ -52,6 +52,60 @@ def test_quads_become_triangles(tmp_path: Path) -> None:
     assert mesh.faces.shape == (12, 3)
     assert mesh.volume == pytest.approx(1)
     assert mesh.area == pytest.approx(6)
+
+
+def test_off_files_are_read_as_trimesh_reads_them(tmp_path: Path) -> None:
+    """Plain ones are read without it; these are plain, or have faults and liberties of all kinds."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    plain = ball.export(file_type="off")
+    lines = plain.splitlines()
+    random = np.random.default_rng(0)
+    texts = [
+        plain,
+        plain.replace("\n", "\r\n"),
+        plain.replace("\n", " \n\t"),
+        plain.replace("\n", "\n\n"),
+        plain.replace("OFF\n", "OFF "),
+        "# a ball\n" + plain,
+        plain + "# a ball\n",
+        plain + "3 0 1 2\n",
+        "\n".join(lines[:-1]),
+        "\n".join([*lines[:5], *lines[6:]]),
+        "\n".join([lines[0], lines[1], *(line + " 0 0 1" for line in lines[2:44]), *lines[44:]]),
+        "\n".join([*lines[:44], *(line + " 255 0 0" for line in lines[44:])]),
+        "\n".join([*lines[:44], "4 0 1 2 3", *lines[45:]]),
+        "\n".join([*lines[:44], "3 0 1 2.5", *lines[45:]]),
+        "\n".join([*lines[:44], "3 0 1 42", *lines[45:]]),
+        "\n".join([*lines[:44], "3 0 1 -1", *lines[45:]]),
+        "\n".join(["OFF", "1 0 0", "0 0 0"]),
+        "OFF\n0 0 0\n",
+        "OFF\n5 3 0\n",
+        "OFF\n5 3 0\n\n\n\n\n\n3 0 1 2\n",
+    ]
+    alphabet = [*"0123456789.-+eEnaif #\n\t,x", "٣", "\x0c"]
+    for _ in range(1500):
+        text = list(plain)
+        for place in random.integers(0, len(text), random.integers(1, 4)):
+            text[place] = random.choice(["", random.choice(alphabet), text[place] + random.choice(alphabet)])
+        texts.append("".join(text))
+    outcomes = []
+    for text in texts:
+        path = tmp_path / "ball.off"
+        path.write_text(text)
+        try:
+            expected = trimesh.load(path, process=False, force="scene").to_mesh()
+        except Exception:  # of any kind
+            expected = None
+        try:
+            vertices, faces, _ = read_surface(path)
+        except MeshError:
+            vertices = faces = None
+        assert (faces is None) == (expected is None), text
+        if expected is not None:
+            np.testing.assert_array_equal(vertices, expected.vertices)
+            np.testing.assert_array_equal(faces, expected.faces)
+        outcomes.append(expected is not None)
+    assert 300 < sum(outcomes) < len(texts) - 300
 
 
 def test_texture_seams_do_not_split_vertices(tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ _SAMPLE_PARTNERS = 64  # points to which their distances are looked at
 _AXES_STEP = 32  # of the hats, by which the body's axes are told
 _SAMPLE_LINE = (0.11, 0.37, 1.0)  # in principal axes, the longest last; oblique, so that places differ
 _ATTEMPTS = 2  # approximations tried before the closed form
-_GROUP = 128  # points that see the same clusters
+_GROUP = 192  # points that see the same clusters
 _TREE_ERROR = 0.01  # of libigl's fast winding numbers; twice the largest found
 
 

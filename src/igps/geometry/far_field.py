@@ -11,7 +11,9 @@ from itertools import combinations, combinations_with_replacement, product
 
 import torch
 
+from igps.compiled import is_available
 from igps.geometry.closed_forms import Surface, Tile, spatial_order
+from igps.geometry.hat_loops import fill_hat_weights
 
 __all__ = ["Block", "ClusterMoments", "HatMoments", "HatTree", "in_leaves", "principal_axes"]
 
@@ -100,6 +102,9 @@ class HatMoments:
             centre = points.mean(0)
             coefficients = (coefficients @ _shift(centre)).to(dtype)
             monomials = _monomials(points - centre).to(dtype)
+        if points.device.type == "cpu" and is_available():
+            fill_hat_weights(coefficients.view(-1, 4, 10).numpy(), monomials.numpy(), weights.numpy())
+            return
         tile = Tile.of(points.device)
         size = tile.hats * max(1, tile.points // max(n_points, 1))  # few points leave room for more hats
         buffer = torch.empty(4 * size, n_points, dtype=dtype, device=points.device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -30,6 +31,8 @@ POINT_CLOUDS = frozenset({".xyz"})
 NEED_MODULES = frozenset({".3mf", ".3dxml", ".dae", ".zae", ".xaml", ".step", ".stp"})
 """Suffixes of files that trimesh reads by further modules. They are meshes where these are missing, too: a file that
 cannot be read is to be named, not passed over."""
+
+_WHOLE_NUMBERS = re.compile(r"\s*\d[\d\s]*", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -148,6 +151,8 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[n
         if rows.shape[1] not in (3, 6):
             raise ValueError(f"expected lines of 3 numbers, or of 6 with normals, got {rows.shape[1]}")
         return rows[:, :3], np.zeros((0, 3), dtype=np.int64), rows[:, 3:] if rows.shape[1] == 6 else None
+    if path.suffix.lower() == ".off" and (plain := _plain_off(path)) is not None:
+        return *plain, None
     scene: Any = trimesh.load(path, process=False, force="scene", **_loader_options(path))
     parts = list(scene.geometry.values())
     if parts and all(isinstance(part, trimesh.PointCloud) for part in parts):
@@ -155,6 +160,28 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[n
         return points, np.zeros((0, 3), dtype=np.int64), _normals(scene, len(points))
     mesh = scene.to_mesh()
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces), None
+
+
+def _plain_off(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
+    """What trimesh reads of an OFF file of coordinates and triangles alone, in a tenth of the time.
+
+    None where it holds anything else, or is broken.
+    """
+    try:
+        head, counts, *lines = path.read_text(encoding="utf-8").splitlines()
+        n_vertices, n_faces, _ = map(int, counts.split())
+        places, rows = lines[: max(n_vertices, 0)], lines[max(n_vertices, 0) :]
+        # Of no lines NumPy warns, and an older one makes whole numbers of broken ones
+        plain = head.strip() == "OFF" and "".join(places[:1]).strip() and _WHOLE_NUMBERS.fullmatch("\n".join(rows))
+        if not plain:
+            return None
+        vertices = np.loadtxt(places, np.float64, comments=None, ndmin=2)
+        faces = np.loadtxt(rows, np.int64, comments=None, ndmin=2)
+    except ValueError:  # comments, colours, polygons of several sizes, or no text
+        return None
+    if vertices.shape != (n_vertices, 3) or faces.shape != (n_faces, 4) or (faces[:, 0] != 3).any():
+        return None
+    return (vertices, np.ascontiguousarray(faces[:, 1:])) if faces[:, 1:].max() < n_vertices else None
 
 
 def _normals(cloud: Any, n_points: int) -> NDArray[np.float64] | None:

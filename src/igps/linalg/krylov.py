@@ -120,14 +120,14 @@ class Krylov:
         product = self._apply(self._basis[last])
         projection, lengths = self._sums(
             lambda piece: (
-                near[:, piece] @ product[:, piece].T.contiguous(),
+                product[:, piece] @ near[:, piece].T,
                 torch.linalg.norm(product[:, piece], dim=1) ** 2,
             )
         )
-        diagonal, scale = projection[self._current - self._previous :], math.sqrt(float(lengths.max()))
+        diagonal, scale = projection[:, self._current - self._previous :], math.sqrt(float(lengths.max()))
 
         def leave_new(piece: slice) -> tuple[torch.Tensor]:
-            new = product[:, piece].addmm_(projection.T, near[:, piece], alpha=-1)
+            new = product[:, piece].addmm_(projection, near[:, piece], alpha=-1)
             return (new @ new.T,)
 
         (remainder,) = self._sums(leave_new)
@@ -178,7 +178,7 @@ class Krylov:
         vectors = _empty(self._basis.shape[1], len(index)).numpy()
 
         def combine(piece: slice) -> None:
-            vectors[order[piece]] = (self._basis[1 : self._stop, piece].T @ coefficients).numpy()
+            vectors[order[piece]] = (coefficients.T @ self._basis[1 : self._stop, piece]).numpy().T
 
         self._team.each(combine, self._small_pieces())
         return ritz.eigenvalues[index].numpy(), vectors
@@ -257,16 +257,16 @@ class Krylov:
         old, new = self._basis[: self._swept], self._basis[self._swept : self._stop]
         if not len(new):
             return 0.0
-        (lost,) = self._sums(lambda piece: (old[:, piece] @ new[:, piece].T.contiguous(),))
+        (lost,) = self._sums(lambda piece: (new[:, piece] @ old[:, piece].T,))
         largest = float(lost.abs().max())
         single = self._single if largest <= SINGLE_LOSS else None
 
         def take_out(piece: slice) -> tuple[torch.Tensor]:
             here = new[:, piece]
             if single is None:
-                here.addmm_(lost.T, old[:, piece], alpha=-1)
+                here.addmm_(lost, old[:, piece], alpha=-1)
             else:
-                here.sub_(lost.T.float() @ single[: self._swept, piece])
+                here.sub_(lost.float() @ single[: self._swept, piece])
             return (here @ here.T,)
 
         (squares,) = self._sums(take_out)

@@ -25,11 +25,11 @@ SHIFT_RANK = 0.55
 SHIFT_BELOW = -1.0
 # Vectors in a block: few make a small basis, many make fast products. Up to so many pairs, few are better.
 # So they are where a basis takes gigabytes.
-SMALL_BLOCK, LARGE_BLOCK, FEW_EIGENPAIRS, LARGE_RESULT = 8, 16, 128, 2**27
+SMALL_BLOCK, LARGE_BLOCK, FEW_EIGENPAIRS, LARGE_RESULT = 8, 12, 128, 2**27
 # Basis size at which mostly all pairs have converged, as measured on bodies of 11,000 vertices: so many vectors a pair
 # and, besides, so many blocks, more for each factor of ten in the number of pairs and for each digit beyond seven
 BASIS_PER_EIGENPAIR, BASIS_PER_EIGENPAIR_BELOW = 1.35, 2.35
-BASIS_BLOCKS, BASIS_BLOCKS_PER_DECADE, BASIS_BLOCKS_PER_DIGIT = {SMALL_BLOCK: 3.4, LARGE_BLOCK: 1.4}, 4.8, 1.0
+BASIS_BLOCKS, BASIS_BLOCKS_PER_DECADE, BASIS_BLOCKS_PER_DIGIT = {SMALL_BLOCK: 3.4, LARGE_BLOCK: 2.4}, 4.8, 1.0
 # The basis gives up at this multiple of what the pairs need, and so many vectors more
 BASIS_LIMIT, BASIS_LIMIT_BESIDES = 3, 600
 # Numbers in the result from which a second thread pays
