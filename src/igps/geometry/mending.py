@@ -171,7 +171,7 @@ def _check_cloud(vertices: NDArray[np.float64], name: str) -> None:
 def _check_extent(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> None:
     if len(faces) == 1:
         raise MeshError(f"{name}: a single triangle is no body. Check that the export is complete.")
-    singular = np.linalg.svd(np.ptp(vertices[faces], axis=1).max(axis=0)[None], compute_uv=False)
-    if singular[0] == 0:
+    corners = vertices[faces]
+    if (corners == corners[:, :1]).all():
         raise MeshError(f"{name}: all faces are in one point; a surface was expected. Check the file.")
-    check_size(vertices[faces].reshape(-1, 3), name)  # before squares of its lengths overflow or vanish
+    check_size(corners.reshape(-1, 3), name)  # before squares of its lengths overflow or vanish
