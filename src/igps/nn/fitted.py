@@ -193,7 +193,8 @@ class KernelHead(SizedByData):
         kernel = self._kernel(self.anchors).double()
         kernel.diagonal().add_(self.ridge)
         targets = functional.one_hot(members, len(classes)).double()
-        self.coefficients = torch.linalg.solve(kernel, targets).to(self.anchors.dtype)
+        # As they lie in memory when loaded, so that products with them round alike
+        self.coefficients = torch.linalg.solve(kernel, targets).to(self.anchors.dtype).contiguous()
         return self
 
     def scores(self, descriptions: Tensor) -> Tensor:
