@@ -17,7 +17,7 @@ from igps.geometry import closed_forms, coordinates, far_field
 from igps.geometry.coordinates import extend, mean_value_coordinates, winding_number
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA"))]
-pytestmark = pytest.mark.usefixtures("approximate_small_meshes")
+pytestmark = pytest.mark.usefixtures("approximate_small_meshes", "both_ways")
 
 
 def published_loop(vertices: np.ndarray, faces: np.ndarray, point: np.ndarray) -> np.ndarray:

@@ -17,6 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from igps.compiled import is_available
+from igps.geometry.weight_loops import replace_weights
+
 __all__ = ["FaceBlock", "ListedRule", "Surface", "Tile", "has_area", "spatial_order", "squared_distances"]
 
 _ROOT_EPS = 2.0**-26  # flatter faces (height / length) are left out
@@ -122,6 +125,12 @@ class ListedRule:
         Rows (V,) says which row of the weights is a vertex's; all those without one share a row that is never near.
         Points on the surface get only their triangle's weights.
         """
+        if points.device.type == "cpu" and is_available():
+            replace_weights(
+                points.numpy(), near.numpy(), rows.numpy(), self.faces.numpy(), self.table.numpy(), self.first.numpy(),
+                self.around.numpy(), _ON_SURFACE, weights.numpy(),
+            )  # fmt: skip
+            return
         n_points, flat_weights = len(points), weights.view(-1)
         cells = rows[near[0]] * n_points + near[1]
         flat_weights.index_fill_(0, cells, 0)

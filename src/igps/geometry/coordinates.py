@@ -36,6 +36,7 @@ __all__ = ["Extension", "extend", "mean_value_coordinates", "winding_number"]
 
 _BLOCK_BYTES = 256 * 2**20  # of dense weights at a time
 _ROWS = 2**10  # of the functions that are copied at a time: with what is made of them they fit into a cache
+_REGISTER = 16  # numbers in single precision
 _TEAM_VERTICES = 2**14  # from which a second thread pays
 _EXACT_RATIO = 1.1  # opening ratio that keeps the dense exact rule away from points near an edge, where it cancels
 _HAT_ERROR = 3.5e-3  # of the hats' moments at opening ratio 1; it falls with the third power
@@ -151,12 +152,13 @@ class Extension:
                 f"divisors: expected one for each of {values.shape[1]} functions, got shape {np.shape(divisors)}"
             )
         self._surface, order = _renumbered(surface)
-        self._columns = torch.ones(
-            len(order), values.shape[1] + 1, dtype=dtype, device=device
-        )  # the last sums the weights
+        self._n_functions = values.shape[1]
+        # Those behind the functions sum the weights: one would do, but whole registers are multiplied faster.
+        n_columns = -(-(self._n_functions + 1) // _REGISTER) * _REGISTER
+        self._columns = torch.ones(len(order), n_columns, dtype=dtype, device=device)
         for part, rows in zip(self._columns.split(_ROWS), order.cpu().split(_ROWS), strict=True):
             taken = values[rows.numpy()]
-            part[:, :-1] = torch.as_tensor(taken if divisors is None else taken / divisors)
+            part[:, : self._n_functions] = torch.as_tensor(taken if divisors is None else taken / divisors)
         self._vertices, self._faces, self._accuracy = vertices, faces, accuracy
 
     @cached_property
@@ -173,11 +175,11 @@ class Extension:
         surface, columns, accuracy = self._surface, self._columns, self._accuracy
         hats, listed = self._rules
         x = torch.as_tensor(_scaled(self._vertices, self._faces, points)[2], device=columns.device)
-        out = np.empty((len(x), columns.shape[1] - 1))
+        out = np.empty((len(x), self._n_functions))
         setting = _approximation(hats, x, accuracy)
         for attempt in range(_ATTEMPTS + 1):
             for rows, sums in _weighted_sums(surface, hats, listed, columns, x, setting):
-                out[rows.cpu().numpy()] = _normalised(sums[:, :-1], sums[:, -1:]).cpu().numpy()
+                out[rows.cpu().numpy()] = _normalised(sums[:, : self._n_functions], sums[:, -1:]).cpu().numpy()
             if setting is None or accuracy is None:
                 break
             error = _sampled_error(hats, listed, columns, x, out, accuracy)
@@ -392,7 +394,7 @@ def _sampled_error(
     hats.fill_weights(x, rows, weights)
     listed.replace(x, hats.near(x, _hat_ratio(accuracy / _SAMPLE_GAIN)), rows, weights)
     exact = weights.to(columns.dtype).T @ columns
-    expected = (exact[:, :-1] / exact[:, -1:]).double()
+    expected = (exact[:, : values.shape[1]] / exact[:, -1:]).double()
     found, others = (torch.as_tensor(values[some.cpu().numpy()], device=x.device) for some in (chosen, partners))
     # To first order a distance d of found from others changes by error · (found − others) / d.
     errors = found - expected

@@ -13,7 +13,7 @@ import torch
 
 from igps.compiled import is_available
 from igps.geometry.closed_forms import Surface, Tile, spatial_order
-from igps.geometry.hat_loops import fill_hat_weights
+from igps.geometry.weight_loops import fill_hat_weights
 
 __all__ = ["Block", "ClusterMoments", "HatMoments", "HatTree", "in_leaves", "principal_axes"]
 

@@ -210,7 +210,11 @@ class Krylov:
 
     def _sums(self, parts: Callable[[slice], tuple[torch.Tensor, ...]]) -> tuple[torch.Tensor, ...]:
         """What each piece of the columns contributes, added in the order of the pieces."""
-        return tuple(torch.stack(part).sum(0) for part in zip(*self._team.each(parts, self._pieces), strict=True))
+        first, *others = self._team.each(parts, self._pieces)
+        for other in others:
+            for total, part in zip(first, other, strict=True):
+                total.add_(part)
+        return first
 
     def _room(self, n_rows: int) -> torch.Tensor:
         """The rows of the basis behind the last, which a block is written to before it is appended."""
