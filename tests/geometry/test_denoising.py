@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from igps.geometry import denoising
 from igps.geometry.denoising import denoised, is_noisy, noise_over_edge
 from igps.geometry.disturbances import noise
 from igps.geometry.mending import mend, mended_by
@@ -97,6 +98,48 @@ def test_turned_parts_of_thin_triangles_come_back(steps: int, sections: int) -> 
     # Steps between rims stay sharp: no corner has moved farther than the noise moved it.
     moved = np.linalg.norm(smooth.vertices - part.vertices, axis=1)
     assert np.quantile(moved, 0.95) < np.quantile(np.linalg.norm(rough.vertices - part.vertices, axis=1), 0.95)
+
+
+@pytest.mark.parametrize("amplitude", [0.002, 0.003])
+def test_edges_of_a_box_stay_sharp(amplitude: float) -> None:
+    """The normals of its sides are the oracle, also of the triangles along its edges; smoothing alone rounds those."""
+    box = trimesh.creation.box((1, 2, 3)).subdivide_to_size(0.1)
+    part = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
+    rough = noise(part, amplitude, seed=2)
+    assert is_noisy(rough.vertices, rough.faces)
+    smooth = Mesh(denoised(rough.vertices, rough.faces), part.faces)
+    expected, found = (_unit(area_vectors(mesh.vertices, part.faces)) for mesh in (part, smooth))
+    off = np.degrees(np.arccos(np.clip(np.einsum("ij,ij->i", expected, found), -1, 1)))
+    assert off.mean() < 2
+    beside = np.unique(box.face_adjacency[box.face_adjacency_angles > 1])
+    assert off[beside].mean() < 5
+    assert smooth.area == pytest.approx(part.area, rel=0.005)
+    assert smooth.volume == pytest.approx(part.volume, rel=0.002)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_plates_with_holes_keep_their_volume(seed: int) -> None:
+    """Every vertex lies on a rim, and all that is near it lies on that rim's one side."""
+    manifold3d = pytest.importorskip("manifold3d")
+    random = np.random.default_rng(seed)
+    plate = manifold3d.Manifold.cube((2, 1, 0.2), True)
+    for x in (-0.6, 0, 0.6):
+        hole = manifold3d.Manifold.cylinder(1, random.uniform(0.1, 0.25), -1, 256, True)
+        plate -= hole.translate((x, random.uniform(-0.2, 0.2), 0))
+    drawn = plate.to_mesh64()
+    part = Mesh(np.asarray(drawn.vert_properties)[:, :3].copy(), np.asarray(drawn.tri_verts).astype(np.int64))
+    rough = noise(part, 0.002, seed)
+    assert is_noisy(rough.vertices, rough.faces)
+    smooth = Mesh(denoised(rough.vertices, rough.faces), part.faces)
+    assert smooth.volume == pytest.approx(part.volume, rel=0.03)
+    assert abs(smooth.area - part.area) < 0.6 * (rough.area - part.area)
+
+
+def test_many_faces_are_filtered_as_few_are(sphere: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    rough = noise(sphere, 0.004, 2).vertices
+    expected = denoised(rough, sphere.faces)
+    monkeypatch.setattr(denoising, "_FACES_AT_ONCE", 100)
+    np.testing.assert_allclose(denoised(rough, sphere.faces), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e200])

@@ -5,12 +5,18 @@ neighbours when their mean height is taken off is small on a shape, and neighbou
 large, and neighbours have it in opposite directions more often than not. Only where both are so on most of the surface
 is anything changed.
 
+What is noisy is smoothed, and the normals of the smooth surface lead a filter of the noisy one's, by which it gets back
+its edges and its volume.
+
 On the long thin triangles of turned and drawn parts, whose rims are fine and whose ends are far from each other, a
 neighbour counts by the inverse square of its distance: what is looked at and smoothed there runs along the rims, where
-noise wrinkles the surface, and the steps from rim to rim stay sharp.
+noise wrinkles the surface, and the steps from rim to rim stay sharp. The normals of such triangles say little where
+noise is as wide as they are, so that smoothing is all.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +54,16 @@ _SHRINK, _GROW = 0.5, -0.53
 # 0.22 and 40 at 0.3. Fewer leave noise, more take thin limbs. Of the area that noise adds to parts of thin triangles,
 # 2 to 170 %, they leave about a tenth, and a fifth where it is larger than the triangles are narrow.
 _PASSES, _FEWEST_PASSES, _MOST_PASSES = 430, 3, 60
+# Where triangles are thin, no vertex goes farther than so many times the noise. On turned parts hardly one would; of
+# plates with holes, whose vertices have their near neighbours on one side, half the volume would go.
+_FARTHEST = 5
+# Width of the filter of normals, as their difference, how often it is run, and how often the vertices follow. On 15
+# generated bodies and 12 machine parts with noise of 0.1, 0.2 and 0.4 % of the diagonal, 3 runs at 0.35 leave normals
+# 2.9, 4.1 and 6.0 degrees off on the bodies (the smooth surface itself 3.8, 4.3 and 5.3) and 2.3, 4.4 and 8.8 on the
+# parts (6.6, 9.6 and 12.6). 0.3 keeps more noise, 0.4 rounds more edges; weights by distance made no difference.
+_WIDTH, _RUNS, _STEPS = 0.35, 3, 10
+# Faces whose neighbours are gathered at a time: at most some hundred megabytes.
+_FACES_AT_ONCE = 2**17
 # The lower quartile of the size of a normal deviate.
 _QUARTILE = 0.3186
 
@@ -62,23 +78,50 @@ def is_noisy(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
     if len(vertices) < _FEWEST:
         return False
     vertices = vertices / _unit_of_length(vertices)
-    edges, averaging, length = _neighbours(vertices, faces)
+    around = _Neighbours.of(vertices, faces)
     if (_faces_at_sides(faces, len(vertices)) == 2).mean() < _REGULAR:
         return False
     # Of the averaged surface: where noise is larger than the triangles, theirs say nothing.
-    normals = vertex_normals(averaging @ (averaging @ vertices), faces)
-    rough, in_common = _statistics(vertices, normals, edges, averaging, length)
+    normals = vertex_normals(around.averaging @ (around.averaging @ vertices), faces)
+    rough, in_common = _statistics(vertices, normals, around)
     return rough > _ROUGH and in_common < _IN_COMMON and _share_of_flat_edges(vertices, faces) < _FLAT
 
 
+@dataclass(frozen=True)
+class _Neighbours:
+    """Of each vertex; on thin triangles the near ones: by the inverse squares of their distances."""
+
+    edges: NDArray[np.int64]  # (E, 2)
+    averaging: sparse.csr_array  # (V, V): averages over the neighbours
+    length: NDArray[np.float64]  # (V,): of a vertex's edges
+    thin: bool
+
+    @staticmethod
+    def of(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> _Neighbours:
+        """Of vertices in units of `_unit_of_length`."""
+        n = len(vertices)
+        edges, _ = undirected_edges(faces, n)
+        rows, columns = edges.T.ravel(), edges[:, ::-1].T.ravel()
+        degree = np.maximum(np.bincount(rows, minlength=n), 1)
+        length = np.tile(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1), 2)
+        weights, of_vertex = np.ones(len(rows)), np.bincount(rows, weights=length, minlength=n) / degree
+        near = np.maximum(length, _SHORTEST) ** -2.0
+        nearness = np.bincount(rows, weights=near, minlength=n)
+        # Zero, as the mean is, of a vertex without neighbours.
+        of_near = np.sqrt(np.divide(degree, nearness, out=np.zeros(n), where=nearness > 0))
+        thin = bool(np.median(of_vertex - _THIN * of_near) > 0)
+        if thin:
+            weights, of_vertex = near, of_near
+        total = np.bincount(rows, weights=weights, minlength=n)
+        averaging = sparse.csr_array((weights / total[rows], (rows, columns)), shape=(n, n))
+        return _Neighbours(edges, averaging, of_vertex, thin)
+
+
 def _statistics(
-    vertices: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    edges: NDArray[np.int64],
-    averaging: sparse.csr_array,
-    length: NDArray[np.float64],
+    vertices: NDArray[np.float64], normals: NDArray[np.float64], around: _Neighbours
 ) -> tuple[float, float]:
     """The lower quartile of the remainder over the edges' lengths, and the share of neighbours that have its sign."""
+    edges, averaging, length = around.edges, around.averaging, around.length
     height = np.einsum("ij,ij->i", vertices - averaging @ vertices, normals)
     rest = (height - averaging @ height) / np.maximum(length, np.finfo(float).tiny)
     weights = averaging[edges[:, 0], edges[:, 1]] + averaging[edges[:, 1], edges[:, 0]]
@@ -87,22 +130,78 @@ def _statistics(
 
 
 def denoised(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(V, 3) vertices of a smoother surface of the same size, by Taubin's λ|μ passes (1995).
+    """(V, 3) vertices of a smoother surface of the same size; those on boundaries stay where they are.
 
-    As many passes as the noise asks for, see `noise_over_edge`. Vertices on boundaries stay where they are.
+    Taubin's λ|μ passes (1995), as many as the noise asks for, see `noise_over_edge`. Where triangles are thin, that is
+    all, and no vertex goes farther than noise may have moved it. Elsewhere the normals of the smooth surface lead a
+    bilateral filter of those of the noisy one (Zheng, Fu, Au and Tai 2011; with such a guide Zhang, Deng, Zhang,
+    Bouaziz and Liu 2015), and the noisy vertices follow (Sun, Rosin, Martin and Langbein 2007).
     """
     unit_length = _unit_of_length(vertices)
     vertices = vertices / unit_length
-    averaging = _neighbours(vertices, faces)[1]
+    around = _Neighbours.of(vertices, faces)
     free = np.ones((len(vertices), 1))
     alone = _faces_at_sides(faces, len(vertices)) == 1
     free[faces[alone]] = 0
     free[np.roll(faces, -1, axis=1)[alone]] = 0
-    n_passes = round(_PASSES * noise_over_edge(vertices, faces) ** 2)
-    for _ in range(min(max(n_passes, _FEWEST_PASSES), _MOST_PASSES)):
+    noise, edge = _noise_and_edge(vertices, faces, around)
+    smooth = vertices
+    for _ in range(min(max(round(_PASSES * (noise / edge) ** 2), _FEWEST_PASSES), _MOST_PASSES)):
         for step in (_SHRINK, _GROW):
-            vertices = vertices + step * free * (averaging @ vertices - vertices)
-    return unit_length * vertices
+            smooth = smooth + step * free * (around.averaging @ smooth - smooth)
+    if around.thin:
+        move = smooth - vertices
+        distance = np.linalg.norm(move, axis=1, keepdims=True)
+        smooth = vertices + move * np.minimum(1, _FARTHEST * noise / np.maximum(distance, np.finfo(float).tiny))
+    else:
+        smooth = _with_normals(vertices, faces, _filtered_normals(vertices, faces, smooth), free)
+    return unit_length * smooth
+
+
+def _filtered_normals(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], smooth: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(F, 3) unit normals: means over the faces that share a vertex, by area and by how alike a guide's normals are.
+
+    The guide is the smooth surface at first, then what came of the run before.
+    """
+    at_corners = _at_corners(faces, len(vertices))
+    areas = area_vectors(smooth, faces)
+    normals, guide = unit(area_vectors(vertices, faces)), unit(areas)
+    size = np.linalg.norm(areas, axis=1)
+    for _ in range(_RUNS):
+        means = np.empty_like(normals)
+        for start in range(0, len(faces), _FACES_AT_ONCE):
+            part = slice(start, start + _FACES_AT_ONCE)
+            shared = (at_corners[part] @ at_corners.T).tocsr()
+            here = np.repeat(guide[part], np.diff(shared.indptr), axis=0)
+            # Half the squared difference of unit vectors is one less their product.
+            unlike = 1 - np.einsum("ij,ij->i", here, guide[shared.indices])
+            shared.data = size[shared.indices] * np.exp(-unlike / _WIDTH**2)
+            means[part] = shared @ normals
+        normals = guide = unit(means)
+    return normals
+
+
+def _with_normals(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], normals: NDArray[np.float64], free: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(V, 3) vertices moved, as far as they are free (V, 1), until their faces have about these normals (F, 3)."""
+    to_vertices = _at_corners(faces, len(vertices)).T.tocsr()
+    projections = (to_vertices @ (normals[:, :, None] * normals[:, None]).reshape(-1, 9)).reshape(-1, 3, 3)
+    share = free / np.maximum(to_vertices.sum(axis=1), 1)[:, None]
+    for _ in range(_STEPS):
+        # Of each face around a vertex, its normal times how far along it the centroid lies.
+        heights = np.einsum("ij,ij->i", normals, vertices[faces].mean(axis=1))
+        move = to_vertices @ (heights[:, None] * normals) - np.einsum("vij,vj->vi", projections, vertices)
+        vertices = vertices + share * move
+    return vertices
+
+
+def _at_corners(faces: NDArray[np.int64], n_vertices: int) -> sparse.csr_array:
+    """(F, V) ones where a face has a vertex."""
+    begins = 3 * np.arange(len(faces) + 1)
+    return sparse.csr_array((np.ones(faces.size), faces.ravel(), begins), shape=(len(faces), n_vertices))
 
 
 def noise_over_edge(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
@@ -115,13 +214,19 @@ def noise_over_edge(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> 
     without noise passes for 0.01 to 0.04.
     """
     vertices = vertices / _unit_of_length(vertices)
-    _, averaging, length = _neighbours(vertices, faces)
-    normals = vertex_normals(averaging @ (averaging @ vertices), faces)
-    high_pass = (sparse.eye_array(len(vertices), format="csr") - averaging).tocsr()
+    noise, edge = _noise_and_edge(vertices, faces, _Neighbours.of(vertices, faces))
+    return noise / edge
+
+
+def _noise_and_edge(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], around: _Neighbours
+) -> tuple[float, float]:
+    normals = vertex_normals(around.averaging @ (around.averaging @ vertices), faces)
+    high_pass = (sparse.eye_array(len(vertices), format="csr") - around.averaging).tocsr()
     rest = high_pass @ np.einsum("ij,ij->i", high_pass @ vertices, normals)
     of_a_unit = np.sqrt(np.asarray((high_pass @ high_pass).power(2).sum(axis=1)))
     noise = np.quantile(np.abs(rest) / of_a_unit, 0.25) / _QUARTILE
-    return float(noise / max(np.sqrt(np.mean(length**2)), np.finfo(float).tiny))
+    return float(noise), float(max(np.sqrt(np.mean(around.length**2)), np.finfo(float).tiny))
 
 
 def _unit_of_length(vertices: NDArray[np.float64]) -> float:
@@ -144,26 +249,3 @@ def _faces_at_sides(faces: NDArray[np.int64], n_vertices: int) -> NDArray[np.int
     """(F, 3) how many faces share the side from each corner to the next."""
     _, edge_of = undirected_edges(faces, n_vertices)
     return np.asarray(np.bincount(edge_of)[edge_of].reshape(-1, 3))
-
-
-def _neighbours(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], sparse.csr_array, NDArray[np.float64]]:
-    """(E, 2) edges, the matrix that averages over neighbours, and the length of each vertex's edges.
-
-    On thin triangles both are of the near neighbours: by inverse squared lengths. In units of the longest side.
-    """
-    n = len(vertices)
-    edges, _ = undirected_edges(faces, n)
-    rows, columns = edges.T.ravel(), edges[:, ::-1].T.ravel()
-    degree = np.maximum(np.bincount(rows, minlength=n), 1)
-    length = np.tile(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1), 2)
-    weights, of_vertex = np.ones(len(rows)), np.bincount(rows, weights=length, minlength=n) / degree
-    near = np.maximum(length, _SHORTEST) ** -2.0
-    nearness = np.bincount(rows, weights=near, minlength=n)
-    # Zero, as the mean is, of a vertex without neighbours.
-    of_near = np.sqrt(np.divide(degree, nearness, out=np.zeros(n), where=nearness > 0))
-    if np.median(of_vertex - _THIN * of_near) > 0:
-        weights, of_vertex = near, of_near
-    total = np.bincount(rows, weights=weights, minlength=n)
-    return edges, sparse.csr_array((weights / total[rows], (rows, columns)), shape=(n, n)), of_vertex
