@@ -135,6 +135,20 @@ def test_plates_with_holes_keep_their_volume(seed: int) -> None:
     assert abs(smooth.area - part.area) < 0.6 * (rough.area - part.area)
 
 
+def test_a_fan_of_thousands_of_slivers_does_not_fold_up() -> None:
+    """Noise is wider than they are, and all meet in one vertex."""
+    manifold3d = pytest.importorskip("manifold3d")
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    whole = manifold3d.Manifold(manifold3d.Mesh64(np.array(ball.vertices), np.array(ball.faces, dtype=np.uint64)))
+    drawn = (whole + manifold3d.Manifold.cylinder(1.2, 0.3, 0, 3000).translate((0, 0, 0.9))).to_mesh64()
+    part = Mesh(np.asarray(drawn.vert_properties)[:, :3].copy(), np.asarray(drawn.tri_verts).astype(np.int64))
+    assert np.bincount(part.faces.ravel()).max() > 3000
+    rough = noise(part, 0.002, seed=0)
+    smooth = Mesh(denoised(rough.vertices, rough.faces), part.faces)
+    assert smooth.area < rough.area
+    assert smooth.volume == pytest.approx(part.volume, rel=0.005)
+
+
 def test_many_faces_are_filtered_as_few_are(sphere: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     rough = noise(sphere, 0.004, 2).vertices
     expected = denoised(rough, sphere.faces)

@@ -41,6 +41,8 @@ _FLAT, _FLAT_ANGLE = 0.1, np.radians(0.1)
 # By how much the mean length of a vertex's edges exceeds that by which the inverse squares are averaged, at the median
 # vertex: 1.02 to 1.11 on generated bodies, 4.2 to 300 on parts of thin triangles, the same with noise.
 _THIN = 2.0
+# The same at a single vertex of another body, as on the rim of a fan of thousands of faces.
+_VERY_THIN = 8.0
 # Of the longest side of the body: shorter edges count as that long, so that none is infinitely short.
 _SHORTEST = 1e-9
 # What is rough with fewer vertices was made so; and what hardly is a surface has no normals to speak of.
@@ -54,16 +56,17 @@ _SHRINK, _GROW = 0.5, -0.53
 # 0.22 and 40 at 0.3. Fewer leave noise, more take thin limbs. Of the area that noise adds to parts of thin triangles,
 # 2 to 170 %, they leave about a tenth, and a fifth where it is larger than the triangles are narrow.
 _PASSES, _FEWEST_PASSES, _MOST_PASSES = 430, 3, 60
-# Where triangles are thin, no vertex goes farther than so many times the noise. On turned parts hardly one would; of
-# plates with holes, whose vertices have their near neighbours on one side, half the volume would go.
+# No vertex goes farther than so many times the noise. On turned parts hardly one would; of plates with holes and thin
+# triangles, whose vertices have their near neighbours on one side, half the volume would go.
 _FARTHEST = 5
 # Width of the filter of normals, as their difference, how often it is run, and how often the vertices follow. On 15
 # generated bodies and 12 machine parts with noise of 0.1, 0.2 and 0.4 % of the diagonal, 3 runs at 0.35 leave normals
 # 2.9, 4.1 and 6.0 degrees off on the bodies (the smooth surface itself 3.8, 4.3 and 5.3) and 2.3, 4.4 and 8.8 on the
 # parts (6.6, 9.6 and 12.6). 0.3 keeps more noise, 0.4 rounds more edges; weights by distance made no difference.
 _WIDTH, _RUNS, _STEPS = 0.35, 3, 10
-# Faces whose neighbours are gathered at a time: at most some hundred megabytes.
-_FACES_AT_ONCE = 2**17
+# Faces whose neighbours are gathered at a time, and the most faces around a vertex that all count as neighbours of each
+# other: those around a hub of thousands would be millions of pairs.
+_FACES_AT_ONCE, _MOST_AROUND = 2**15, 64
 # The lower quartile of the size of a normal deviate.
 _QUARTILE = 0.3186
 
@@ -89,12 +92,12 @@ def is_noisy(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
 
 @dataclass(frozen=True)
 class _Neighbours:
-    """Of each vertex; on thin triangles the near ones: by the inverse squares of their distances."""
+    """Of each vertex; where most are among thin triangles, the near ones: by the inverse squares of their distances."""
 
     edges: NDArray[np.int64]  # (E, 2)
     averaging: sparse.csr_array  # (V, V): averages over the neighbours
     length: NDArray[np.float64]  # (V,): of a vertex's edges
-    thin: bool
+    stretch: NDArray[np.float64]  # (V,): mean length of a vertex's edges over that of the near ones
 
     @staticmethod
     def of(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> _Neighbours:
@@ -109,12 +112,12 @@ class _Neighbours:
         nearness = np.bincount(rows, weights=near, minlength=n)
         # Zero, as the mean is, of a vertex without neighbours.
         of_near = np.sqrt(np.divide(degree, nearness, out=np.zeros(n), where=nearness > 0))
-        thin = bool(np.median(of_vertex - _THIN * of_near) > 0)
-        if thin:
+        stretch = np.divide(of_vertex, of_near, out=np.zeros(n), where=of_near > 0)
+        if np.median(stretch) > _THIN:
             weights, of_vertex = near, of_near
         total = np.bincount(rows, weights=weights, minlength=n)
         averaging = sparse.csr_array((weights / total[rows], (rows, columns)), shape=(n, n))
-        return _Neighbours(edges, averaging, of_vertex, thin)
+        return _Neighbours(edges, averaging, of_vertex, stretch)
 
 
 def _statistics(
@@ -133,9 +136,9 @@ def denoised(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray
     """(V, 3) vertices of a smoother surface of the same size; those on boundaries stay where they are.
 
     Taubin's λ|μ passes (1995), as many as the noise asks for, see `noise_over_edge`. Where triangles are thin, that is
-    all, and no vertex goes farther than noise may have moved it. Elsewhere the normals of the smooth surface lead a
-    bilateral filter of those of the noisy one (Zheng, Fu, Au and Tai 2011; with such a guide Zhang, Deng, Zhang,
-    Bouaziz and Liu 2015), and the noisy vertices follow (Sun, Rosin, Martin and Langbein 2007).
+    all. Elsewhere the normals of the smooth surface lead a bilateral filter of those of the noisy one (Zheng, Fu, Au
+    and Tai 2011; with such a guide Zhang, Deng, Zhang, Bouaziz and Liu 2015), and the noisy vertices follow (Sun,
+    Rosin, Martin and Langbein 2007). No vertex goes farther than noise may have moved it.
     """
     unit_length = _unit_of_length(vertices)
     vertices = vertices / unit_length
@@ -149,13 +152,13 @@ def denoised(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray
     for _ in range(min(max(round(_PASSES * (noise / edge) ** 2), _FEWEST_PASSES), _MOST_PASSES)):
         for step in (_SHRINK, _GROW):
             smooth = smooth + step * free * (around.averaging @ smooth - smooth)
-    if around.thin:
-        move = smooth - vertices
-        distance = np.linalg.norm(move, axis=1, keepdims=True)
-        smooth = vertices + move * np.minimum(1, _FARTHEST * noise / np.maximum(distance, np.finfo(float).tiny))
-    else:
-        smooth = _with_normals(vertices, faces, _filtered_normals(vertices, faces, smooth), free)
-    return unit_length * smooth
+    if np.median(around.stretch) <= _THIN:
+        sharp = _with_normals(vertices, faces, _filtered_normals(vertices, faces, smooth), free)
+        smooth = np.where(around.stretch[:, None] > _VERY_THIN, smooth, sharp)
+    move = smooth - vertices
+    distance = np.linalg.norm(move, axis=1, keepdims=True)
+    move *= np.minimum(1, _FARTHEST * noise / np.maximum(distance, np.finfo(float).tiny))
+    return unit_length * (vertices + move)
 
 
 def _filtered_normals(
@@ -165,7 +168,8 @@ def _filtered_normals(
 
     The guide is the smooth surface at first, then what came of the run before.
     """
-    at_corners = _at_corners(faces, len(vertices))
+    n_around = np.bincount(faces.ravel(), minlength=len(vertices))
+    at_corners = _at_corners(faces, len(vertices))[:, n_around <= _MOST_AROUND]
     areas = area_vectors(smooth, faces)
     normals, guide = unit(area_vectors(vertices, faces)), unit(areas)
     size = np.linalg.norm(areas, axis=1)
@@ -221,6 +225,7 @@ def noise_over_edge(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> 
 def _noise_and_edge(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], around: _Neighbours
 ) -> tuple[float, float]:
+    """The two lengths of `noise_over_edge`, in the unit of the vertices."""
     normals = vertex_normals(around.averaging @ (around.averaging @ vertices), faces)
     high_pass = (sparse.eye_array(len(vertices), format="csr") - around.averaging).tocsr()
     rest = high_pass @ np.einsum("ij,ij->i", high_pass @ vertices, normals)
