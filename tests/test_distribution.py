@@ -74,3 +74,10 @@ def test_the_version_is_the_same_everywhere() -> None:
     newest = re.search(r"^## (.*)$", (PROJECT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
     assert newest is not None
     assert newest.group(1) == VERSION
+
+
+def test_the_citation_has_the_address_that_the_package_names() -> None:
+    urls = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]["urls"]
+    doi = re.search(r"^    doi: (.*)$", (PROJECT / "CITATION.cff").read_text(), flags=re.MULTILINE)
+    assert doi is not None
+    assert f"https://doi.org/{doi.group(1)}" in urls.values()
