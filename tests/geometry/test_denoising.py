@@ -117,22 +117,28 @@ def test_edges_of_a_box_stay_sharp(amplitude: float) -> None:
     assert smooth.volume == pytest.approx(part.volume, rel=0.002)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_plates_with_holes_keep_their_volume(seed: int) -> None:
-    """Every vertex lies on a rim, and all that is near it lies on that rim's one side."""
+def plate_with_holes(seed: int, longest_edge: float | None = None) -> Mesh:
+    """Long thin triangles between the rims; with shorter edges, slivers."""
     manifold3d = pytest.importorskip("manifold3d")
     random = np.random.default_rng(seed)
     plate = manifold3d.Manifold.cube((2, 1, 0.2), True)
     for x in (-0.6, 0, 0.6):
         hole = manifold3d.Manifold.cylinder(1, random.uniform(0.1, 0.25), -1, 256, True)
         plate -= hole.translate((x, random.uniform(-0.2, 0.2), 0))
-    drawn = plate.to_mesh64()
-    part = Mesh(np.asarray(drawn.vert_properties)[:, :3].copy(), np.asarray(drawn.tri_verts).astype(np.int64))
+    drawn = (plate if longest_edge is None else plate.refine_to_length(longest_edge)).to_mesh64()
+    return Mesh(np.asarray(drawn.vert_properties)[:, :3].copy(), np.asarray(drawn.tri_verts).astype(np.int64))
+
+
+@pytest.mark.parametrize("longest_edge", [None, 0.06])
+@pytest.mark.parametrize("seed", range(3))
+def test_plates_with_holes_keep_their_volume(seed: int, longest_edge: float | None) -> None:
+    """What is near a vertex lies on one side of it, along its rim; or noise is wider than slivers."""
+    part = plate_with_holes(seed, longest_edge)
     rough = noise(part, 0.002, seed)
     assert is_noisy(rough.vertices, rough.faces)
     smooth = Mesh(denoised(rough.vertices, rough.faces), part.faces)
     assert smooth.volume == pytest.approx(part.volume, rel=0.03)
-    assert abs(smooth.area - part.area) < 0.6 * (rough.area - part.area)
+    assert abs(smooth.area - part.area) < 0.5 * (rough.area - part.area)
 
 
 def test_a_fan_of_thousands_of_slivers_does_not_fold_up() -> None:
