@@ -17,11 +17,12 @@ from jsonargparse import auto_cli
 from torch import Tensor
 
 import igps
-from evaluate import histogram_descriptor
+from evaluate import histograms_and_prior
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, split_seen
 from igps.nn.description import describe
 from igps.nn.fitted import KernelHead
+from igps.nn.heads import Head
 from igps.nn.learner import RetrievalLearner
 
 
@@ -36,6 +37,8 @@ def classify(
 ) -> None:
     """Share of test shapes whose class is found by a `KernelHead`, mean ± standard deviation over splits.
 
+    Of a descriptor with a metric, such as `pretrained`, that is the head's prior.
+
     Args:
         root: labelled collection.
         descriptor: the features.
@@ -45,8 +48,9 @@ def classify(
         first_seed: see n_splits.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
     """
+    prior: Head | None = None
     if checkpoint is None:
-        module = histogram_descriptor(descriptor)
+        module, prior = histograms_and_prior(descriptor)
         dataset = igps.SignatureDataset(root, module.needs.completed(igps.SignatureConfig()), cache_dir)
         dataset.precompute(strict=True)
         histograms, part_cells = describe(dataset, module, progress=True), module.part_cells
@@ -61,14 +65,16 @@ def classify(
         part_cells = learner.part_cells
         # The validation part chose nothing here.
         found = [Split(data.split.train + data.split.validation, (), data.split.test)]
-    accuracy = [100 * _accuracy(histograms.flatten(1), labels, split, part_cells) for split in found]
+    accuracy = [100 * _accuracy(histograms.flatten(1), labels, split, part_cells, prior) for split in found]
     spread = stdev(accuracy) if len(accuracy) > 1 else 0.0
     print(f"accuracy {mean(accuracy):.1f} ± {spread:.1f} percent over {len(accuracy)} splits")
 
 
-def _accuracy(histograms: Tensor, labels: Tensor, split: Split, part_cells: Sequence[int] | None) -> float:
+def _accuracy(
+    histograms: Tensor, labels: Tensor, split: Split, part_cells: Sequence[int] | None, prior: Head | None
+) -> float:
     train, test = torch.tensor(split.train), torch.tensor(split.test)
-    predicted = KernelHead().fit(histograms[train], labels[train], part_cells).predict(histograms[test])
+    predicted = KernelHead(prior).fit(histograms[train], labels[train], part_cells).predict(histograms[test])
     return float((predicted == labels[test]).float().mean())
 
 

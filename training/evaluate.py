@@ -4,6 +4,7 @@
     python training/evaluate.py checkpoint build/training/lightning_logs/version_0/checkpoints/X.ckpt
 
 Nothing is chosen here: the heads are fitted to the training part with fixed parameters, the test part is scored once.
+Of a descriptor with a metric, such as `pretrained`, that is the heads' prior.
 """
 
 from __future__ import annotations
@@ -15,20 +16,20 @@ from typing import Literal
 
 import torch
 from jsonargparse import auto_cli
-from torch import Tensor, nn
+from torch import Tensor
 
 import igps
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, SplitProtocol, split_seen, split_unseen
 from igps.nn.description import describe
-from igps.nn.descriptor import HistogramDescriptor
+from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.fitted import KernelHead, WhitenedHead
+from igps.nn.heads import Head, distances_of
 from igps.nn.learner import RetrievalLearner
-from igps.nn.metric import CorrectedDistance
 from igps.report.learned import learned_layout
-from igps.retrieval import retrieval_scores
+from igps.retrieval import chi_square, retrieval_scores
 
-Head = Literal["none", "whitened", "kernel"]
+Fitted = Literal["none", "prior", "whitened", "kernel"]
 COLUMNS = {"ft": "FT", "nn": "NN", "dcg": "DCG", "st": "ST", "adr": "ADR", "map": "mAP"}
 
 
@@ -42,7 +43,7 @@ def splits(
     first_seed: int = 100,
     cache_dir: Path | None = None,
 ) -> None:
-    """Scores of the plain chi-square distance and of the fitted heads: mean ± standard deviation over splits.
+    """Scores of the plain chi-square distance and of the heads: mean ± standard deviation over splits.
 
     Args:
         root: labelled collection.
@@ -54,48 +55,60 @@ def splits(
         first_seed: see n_splits.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
     """
-    module = histogram_descriptor(descriptor)
+    module, prior = histograms_and_prior(descriptor)
     dataset = igps.SignatureDataset(root, module.needs.completed(igps.SignatureConfig()), cache_dir)
     dataset.precompute(strict=True)
     histograms, labels = describe(dataset, module, progress=True).flatten(1), dataset.labels
     print(f"{descriptor}, {protocol}, n_train={n_train}, {n_splits} splits from seed {first_seed}, percent")
     print(f"{'head':<10}" + "".join(f"{title:>14}" for title in COLUMNS.values()))
-    for head in ("none", "whitened", "kernel"):
+    for head in ("none", "prior", "whitened", "kernel"):
+        if head == "prior" and prior is None:
+            continue
         results = []
         for seed in range(first_seed, first_seed + n_splits):
             if protocol == "seen":
                 split = split_seen(labels, n_train, seed=seed)
             else:
                 split = split_unseen(labels, n_train, n_test=n_test, seed=seed)
-            results.append(score(histograms, labels, split, head, module.part_cells))
+            results.append(score(histograms, labels, split, head, module.part_cells, prior))
         values = [[100 * one[name] for one in results] for name in COLUMNS]
         print(f"{head:<10}" + "".join(f"{mean(v):>8.1f} ± {stdev(v) if n_splits > 1 else 0:>3.1f}" for v in values))
 
 
-def histogram_descriptor(name: str) -> HistogramDescriptor:
-    """The descriptor of a name, whose histograms heads are fitted to.
+def histograms_and_prior(name: str) -> tuple[HistogramDescriptor, Head | None]:
+    """The descriptor of a name, whose histograms heads are fitted to, and the metric that it has of them, if any.
 
     Raises:
         ValueError: it gives no histograms.
     """
     found = igps.descriptor(name)
+    if isinstance(found, EmbeddedDescriptor) and isinstance(found.descriptor, HistogramDescriptor):
+        return found.descriptor, found.head
     if not isinstance(found, HistogramDescriptor):
         raise ValueError(f"descriptor: expected one of histograms, such as interior or rich, got {name}.")
-    return found
+    return found, None
 
 
 def score(
-    histograms: Tensor, labels: Tensor, split: Split, head: Head, part_cells: Sequence[int] | None
+    histograms: Tensor,
+    labels: Tensor,
+    split: Split,
+    head: Fitted,
+    part_cells: Sequence[int] | None,
+    prior: Head | None = None,
 ) -> dict[str, float]:
     """Scores of the test part, each shape against the others."""
     train, test = torch.tensor(split.train), torch.tensor(split.test)
-    fitted: nn.Module | None = None
-    if head == "whitened":
-        fitted = WhitenedHead().fit(histograms[train], labels[train], part_cells)
-    elif head == "kernel":
-        fitted = KernelHead().fit(histograms[train], labels[train], part_cells)
-    distance = CorrectedDistance(fitted, share=1.0)
-    return retrieval_scores(distance(histograms[test], histograms[test]), labels[test]).mean()
+    if head == "none":
+        distances = chi_square(histograms[test], histograms[test])
+    else:
+        made = {"prior": prior, "whitened": WhitenedHead(prior=prior), "kernel": KernelHead(prior)}[head]
+        assert made is not None
+        if head != "prior":
+            made.fit(histograms[train], labels[train], part_cells)
+        vectors = made(histograms[test])
+        distances = distances_of(made)(vectors, vectors)
+    return retrieval_scores(distances, labels[test]).mean()
 
 
 def checkpoint(path: Path, out: Path = Path("build/evaluation")) -> None:

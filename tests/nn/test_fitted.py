@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy.special import softmax
 from sklearn.kernel_ridge import KernelRidge
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -190,21 +191,85 @@ def test_errors_name_the_argument(collection: tuple[Tensor, Tensor]) -> None:
         WhitenedHead(n_directions=0)
     with pytest.raises(ValueError, match="ridge"):
         KernelHead(ridge=0)
+    with pytest.raises(ValueError, match="temperature: expected a positive number, got 0"):
+        KernelHead(temperature=0)
+    for kind in (WhitenedHead, KernelHead):
+        for share in (0, 1):
+            with pytest.raises(ValueError, match=f"prior_share: expected a number between 0 and 1, got {share}"):
+                kind(prior_share=share)
     with pytest.raises(RuntimeError, match="expected to be fitted first"):
         KernelHead()(histograms)
 
 
-def test_kernel_head_leaves_a_given_whitening_as_it_is(collection: tuple[Tensor, Tensor]) -> None:
+@pytest.fixture
+def prior(collection: tuple[Tensor, Tensor]) -> WhitenedHead:
+    """Fitted to the last four classes, in two parts."""
     histograms, labels = collection
-    whitened = WhitenedHead().fit(histograms[labels >= 4], labels[labels >= 4], (20, 40))
-    before = {name: value.clone() for name, value in whitened.state_dict().items()}
-    few = labels < 4
-    head = KernelHead(whitened).fit(histograms[few], labels[few])
-    for name, value in whitened.state_dict().items():
+    return WhitenedHead().fit(histograms[labels >= 4], labels[labels >= 4], (20, 40))
+
+
+@pytest.mark.parametrize("kind", [WhitenedHead, KernelHead])
+def test_a_prior_stays_as_it_is(
+    collection: tuple[Tensor, Tensor], prior: WhitenedHead, kind: type[WhitenedHead | KernelHead]
+) -> None:
+    histograms, labels = collection
+    before = {name: value.clone() for name, value in prior.state_dict().items()}
+    head = kind(prior=prior).fit(histograms[labels < 4], labels[labels < 4], (30, 30))
+    for name, value in prior.state_dict().items():
         torch.testing.assert_close(value, before[name], rtol=0, atol=0)
-    assert head.whitened is whitened
-    assert len(head.medians) == 2
-    assert (head.predict(histograms[few]) == labels[few]).float().mean() > 0.9
+    torch.testing.assert_close(head(histograms).norm(dim=1), torch.ones(48))
+    copy = kind(prior=WhitenedHead())
+    copy.load_state_dict(head.state_dict())
+    torch.testing.assert_close(copy(histograms), head(histograms), rtol=0, atol=0)
+
+
+def test_whitened_distance_is_the_weighted_mean_with_the_priors(
+    collection: tuple[Tensor, Tensor], prior: WhitenedHead
+) -> None:
+    histograms, labels = collection
+    beside = WhitenedHead(prior=prior, prior_share=0.3).fit(histograms, labels)(histograms)
+    own, other = WhitenedHead().fit(histograms, labels)(histograms), prior(histograms)
+    expected = 0.7 * cosine(own, own) + 0.3 * cosine(other, other)
+    torch.testing.assert_close(cosine(beside, beside), expected, atol=1e-6, rtol=0)
+
+
+def test_the_priors_kernel_is_one_more(collection: tuple[Tensor, Tensor], prior: WhitenedHead) -> None:
+    histograms, labels = collection
+    train, test = slice(0, 48, 2), slice(1, 48, 2)
+    kernels = []
+    for metric in (WhitenedHead().fit(histograms[train], labels[train]), prior):
+        vectors = metric(histograms).double().numpy()
+        distances = 1 - vectors @ vectors[train].T
+        kernels.append(np.exp(-distances / np.median(distances[train][np.triu_indices(24, 1)])))
+    kernel = 0.75 * kernels[0] + 0.25 * kernels[1]
+    oracle = KernelRidge(alpha=0.03, kernel="precomputed").fit(kernel[train], np.eye(8)[labels[train]])
+    head = KernelHead(prior, prior_share=0.25).fit(histograms[train], labels[train])
+    np.testing.assert_allclose(head.scores(histograms[test]), oracle.predict(kernel[test]), atol=2e-3)
+
+
+def test_one_shape_of_each_class_leaves_the_prior_alone(collection: tuple[Tensor, Tensor], prior: WhitenedHead) -> None:
+    histograms, labels = collection
+    vectors = prior(histograms).double().numpy()
+    distances = 1 - vectors @ vectors[::6].T
+    few = distances[::6][np.triu_indices(8, 1)]
+    kernel = np.exp(-distances / np.sort(few)[(len(few) - 1) // 2])
+    oracle = KernelRidge(alpha=0.03, kernel="precomputed").fit(kernel[::6], np.eye(8))
+    head = KernelHead(prior).fit(histograms[::6], labels[::6])
+    np.testing.assert_allclose(head.scores(histograms), oracle.predict(kernel), atol=2e-3)
+
+
+def test_vectors_of_the_kernel_head_are_scores_and_what_is_likely(collection: tuple[Tensor, Tensor]) -> None:
+    histograms, labels = collection
+    head = KernelHead(temperature=0.1).fit(histograms[::2], labels[::2])
+    scores = head.scores(histograms).double().numpy()
+    about = scores - 1 / 8
+    about /= np.linalg.norm(about, axis=1, keepdims=True)
+    likely = np.sqrt(softmax(scores / 0.2, axis=1))  # three shapes of each class: twice as warm as with six
+    expected = 1 - (about @ about.T + likely @ likely.T) / 2
+    vectors = head(histograms)
+    np.testing.assert_allclose(cosine(vectors, vectors), expected, atol=1e-5)
+    hard = KernelHead(temperature=1e-6).fit(histograms[::2], labels[::2])
+    assert torch.isfinite(hard(histograms)).all()  # as no exponential overflows
 
 
 def test_one_shape_of_each_class_is_centred_alone(collection: tuple[Tensor, Tensor]) -> None:

@@ -19,6 +19,7 @@ from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, split_seen, split_unseen
 from igps.descriptors.pretrained import pretrained
 from igps.nn.axes import InteriorDistance, Potential
+from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.fitted import KernelHead, WhitenedHead
 from igps.nn.learner import RetrievalLearner
 from igps.retrieval import chi_square, retrieval_scores
@@ -96,6 +97,30 @@ def test_splits_are_scored_as_by_the_librarys_parts(root: Path, name: str, proto
     # A shuffled labelling would not do: a third of 8 shapes, or of 11, are of the query's class.
     assert printed["none"][0] > 55
     assert any(one["none"]["ft"] != one["whitened"]["ft"] for one in found)
+
+
+def test_a_metric_is_the_prior_of_the_heads(root: Path) -> None:
+    table = run(
+        "evaluate.py", "splits", root / "meshes", "--descriptor", "pretrained", "--protocol", "unseen", "--n_train", 2,
+        "--n_splits", 1, "--cache_dir", root / "cache",
+    )  # fmt: skip
+    module = igps.descriptor("pretrained")
+    assert isinstance(module, EmbeddedDescriptor)
+    config = module.needs.completed(igps.SignatureConfig())
+    dataset = igps.SignatureDataset(root / "meshes", config, root / "cache")
+    vectors, histograms = igps.describe(dataset, module), igps.describe(dataset, module.descriptor).flatten(1)
+    split = split_unseen(dataset.labels, 2, seed=100)
+    train, test = torch.tensor(split.train), torch.tensor(split.test)
+    cells = module.descriptor.part_cells
+    whitened = WhitenedHead().fit(histograms[train], dataset.labels[train], cells)(histograms[test])
+    own, prior = 1 - whitened @ whitened.T, 1 - vectors[test] @ vectors[test].T
+    by_row = {"prior": module.distances(vectors[test], vectors[test]), "whitened": (own + prior) / 2}
+    printed = rows(table)
+    assert list(printed) == ["none", "prior", "whitened", "kernel"]
+    for name, distances in by_row.items():
+        wanted = retrieval_scores(distances.clamp_min(0), dataset.labels[test]).mean()
+        expected = [x for key in ("ft", "nn", "dcg", "st", "adr", "map") for x in (100 * wanted[key], 0)]
+        assert printed[name] == pytest.approx(expected, abs=0.06), name
 
 
 def test_classification_counts_what_the_kernel_head_finds(root: Path) -> None:

@@ -9,7 +9,19 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from igps.nn.heads import Head, SizedByData, check_cells, checked_cells, checked_labels, means_of, square_roots
+from igps.nn.heads import (
+    Head,
+    SizedByData,
+    check_cells,
+    check_share,
+    checked_cells,
+    checked_labels,
+    means_of,
+    square_roots,
+)
+
+# So many shapes of a class tell as well as more how far scores can be trusted
+_MANY = 6
 
 
 class WhitenedHead(SizedByData):
@@ -24,6 +36,9 @@ class WhitenedHead(SizedByData):
     The parts of a `HistogramDescriptor` may be treated one by one: each is whitened and brought to one length, so that
     the cosine distance is the mean of those of the parts.
 
+    Beside a prior, a metric of the same descriptions that was fitted elsewhere, such as that of `pretrained`, the
+    cosine distance is the weighted mean of its own and the prior's.
+
     Example:
         >>> import torch
         >>> histograms = torch.tensor([[0.9, 0.1, 0.0], [0.7, 0.3, 0.0], [0.1, 0.0, 0.9], [0.3, 0.0, 0.7]])
@@ -35,6 +50,8 @@ class WhitenedHead(SizedByData):
     Args:
         n_directions: eigenvectors of W that are kept of each part, the largest.
         shrinkage: s; a large one leaves only the centring.
+        prior: a fitted head, which stays as it is; None for no other.
+        prior_share: its weight, between 0 and 1.
     """
 
     mean: Tensor
@@ -42,14 +59,23 @@ class WhitenedHead(SizedByData):
     gains: Tensor
     part_cells: Tensor
 
-    def __init__(self, n_directions: int = 64, shrinkage: float = 0.3) -> None:
+    def __init__(
+        self,
+        n_directions: int = 64,
+        shrinkage: float = 0.3,
+        prior: Head | None = None,
+        prior_share: float = 1 / 2,
+    ) -> None:
         super().__init__()
         if n_directions < 1:
             raise ValueError(f"n_directions: expected at least 1, got {n_directions}.")
         if shrinkage <= 0:
             raise ValueError(f"shrinkage: expected a positive number, got {shrinkage}.")
+        check_share(prior_share)
         self.n_directions = n_directions
         self.shrinkage = shrinkage
+        self.prior = prior
+        self.prior_share = prior_share
         self.register_buffer("mean", torch.zeros(0))
         self.register_buffer("directions", torch.zeros(n_directions, 0))
         self.register_buffer("gains", torch.ones(0, n_directions))
@@ -103,7 +129,13 @@ class WhitenedHead(SizedByData):
 
     def forward(self, descriptions: Tensor) -> Tensor:
         """(N, ...) histograms to (N, D) of length 1."""
-        roots = square_roots(descriptions)
+        own = self._whitened(square_roots(descriptions))
+        if self.prior is None:
+            return own
+        share = self.prior_share
+        return torch.cat([(1 - share) ** 0.5 * own, share**0.5 * self.prior(descriptions)], dim=1)
+
+    def _whitened(self, roots: Tensor) -> Tensor:
         if not len(self.mean):
             return functional.normalize(roots, dim=1)
         check_cells(roots, len(self.mean))
@@ -124,44 +156,58 @@ class KernelHead(SizedByData):
     """Descriptions to what they have of each training class, by kernel ridge regression on a `WhitenedHead`.
 
     The kernel is exp(−d/m), d the cosine distance of the whitened histograms, m its median between training shapes, and
-    the mean of such kernels if there are several parts. It is regressed onto the indicators of the classes. The best
-    there is here for classes that were trained on; for other classes use the `WhitenedHead`.
+    the mean of such kernels if there are several parts. It is regressed onto the indicators of the classes. Beside a
+    prior, a metric of the same descriptions that was fitted elsewhere, such as that of `pretrained`, the prior's kernel
+    is one more, with a weight of its own. The best there is here for classes that were trained on; for other classes
+    use the `WhitenedHead`.
+
+    A vector is half the scores about their mean, which say how much of each class a shape has, and half the roots of a
+    softmax of them, which say which class it is of: by the latter alone, shapes of one class would lie in one place.
 
     Example:
         >>> import torch
         >>> histograms = torch.tensor([[0.9, 0.1, 0.0], [0.7, 0.3, 0.0], [0.1, 0.0, 0.9], [0.3, 0.0, 0.7]])
         >>> classes = torch.tensor([0, 0, 1, 1])
         >>> head = KernelHead().fit(histograms, classes)
-        >>> head.classes[head(torch.tensor([[0.8, 0.1, 0.1]])).argmax(dim=1)].tolist()
+        >>> head.predict(torch.tensor([[0.8, 0.1, 0.1]])).tolist()
         [0]
 
     Args:
-        whitened: the head below: one that is fitted already, such as that of `pretrained`, stays as it is, which serves
-            better where labels are few; a new one, fitted to the same shapes, if None.
-        n_directions, shrinkage: of a new one.
+        prior: a fitted head, which stays as it is; None for no other. With one shape of each class, which tells nothing
+            of how the shapes of a class vary, its kernel is the only one.
+        n_directions, shrinkage: of the `WhitenedHead`.
         ridge: added to the kernel's diagonal, which is 1.
+        prior_share: weight of the prior's kernel, between 0 and 1.
+        temperature: of the softmax, with six training shapes of a class or more; with n on average, 6 / n of it.
     """
 
     anchors: Tensor
     medians: Tensor
+    shares: Tensor
     coefficients: Tensor
     classes: Tensor
 
     def __init__(
         self,
-        whitened: Head | None = None,
+        prior: Head | None = None,
         n_directions: int = 64,
         shrinkage: float = 0.3,
         ridge: float = 0.03,
+        prior_share: float = 1 / 3,
+        temperature: float = 0.05,
     ) -> None:
         super().__init__()
         if ridge <= 0:
             raise ValueError(f"ridge: expected a positive number, got {ridge}.")
-        self.whitened: Head = WhitenedHead(n_directions, shrinkage) if whitened is None else whitened
-        self._whiten = whitened is None
-        self.ridge = ridge
+        if temperature <= 0:
+            raise ValueError(f"temperature: expected a positive number, got {temperature}.")
+        check_share(prior_share)
+        self.whitened = WhitenedHead(n_directions, shrinkage)
+        self.prior = prior
+        self.ridge, self.prior_share, self.temperature = ridge, prior_share, temperature
         self.register_buffer("anchors", torch.zeros(0, 0))
         self.register_buffer("medians", torch.ones(0))
+        self.register_buffer("shares", torch.ones(0))
         self.register_buffer("coefficients", torch.zeros(0, 0))
         self.register_buffer("classes", torch.zeros(0, dtype=torch.long))
 
@@ -179,15 +225,14 @@ class KernelHead(SizedByData):
         classes, members = labels.unique(return_inverse=True)
         if len(classes) < 2:
             raise ValueError(f"labels: expected at least two classes, got {len(classes)}.")
-        if self._whiten and len(classes) < len(labels):
+        if len(classes) < len(labels):
             self.whitened.fit(descriptions, labels, part_cells)
-        elif isinstance(self.whitened, WhitenedHead) and self._whiten:
-            # A single shape of a class tells nothing of the variation within it; what is left is to centre.
+        else:
             self.whitened.centre(descriptions, part_cells)
         self.classes = classes
-        self.anchors = self.whitened(descriptions)
+        self.anchors = self._vectors(descriptions)
+        self.shares = self._shares(learned=len(classes) < len(labels)).to(self.anchors)
         i, j = torch.triu_indices(len(self.anchors), len(self.anchors), 1, device=self.anchors.device)
-        self.medians = self.medians.new_ones(len(self._parts(self.anchors)))
         distances = self._distances(self.anchors)[:, i, j]
         self.medians = distances.median(dim=1).values.clamp_min(torch.finfo(distances.dtype).tiny)
         kernel = self._kernel(self.anchors).double()
@@ -205,24 +250,42 @@ class KernelHead(SizedByData):
         """
         if not len(self.anchors):
             raise RuntimeError("KernelHead: expected to be fitted first. Call fit(descriptions, labels).")
-        return self._kernel(self.whitened(descriptions)) @ self.coefficients
+        return self._kernel(self._vectors(descriptions)) @ self.coefficients
 
     def predict(self, descriptions: Tensor) -> Tensor:
         """(N, ...) histograms to (N,) classes, as they were named in `fit`."""
         return self.classes[self.scores(descriptions).argmax(dim=1)]
 
     def forward(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, D) of length 1."""
-        return functional.normalize(self.scores(descriptions) - 1 / len(self.classes), dim=1)
+        """(N, ...) histograms to (N, 2 n_classes) of length 1."""
+        scores = self.scores(descriptions)
+        of_each = functional.normalize(scores - 1 / len(self.classes), dim=1)
+        # Few shapes of a class leave scores of other classes that are nearly as large
+        n_of_each = len(self.anchors) / len(self.classes)
+        likely = (scores / (self.temperature * max(1, _MANY / n_of_each))).softmax(dim=1).sqrt()
+        return torch.cat([of_each, likely], dim=1) / 2**0.5
 
-    def _kernel(self, whitened: Tensor) -> Tensor:
-        return (-self._distances(whitened) / self.medians[:, None, None]).exp().mean(dim=0)
+    def _shares(self, *, learned: bool) -> Tensor:
+        """Weights of the kernels, of the parts and of the prior, that sum to 1."""
+        n_parts = len(self.whitened.part_cells)
+        if self.prior is None:
+            return torch.full((n_parts,), 1 / n_parts)
+        share = self.prior_share if learned else 1.0
+        return torch.tensor([(1 - share) / n_parts] * n_parts + [share])
 
-    def _distances(self, whitened: Tensor) -> Tensor:
-        """(parts, N, n_shapes) cosine distances to the training shapes."""
-        parts = zip(self._parts(whitened), self._parts(self.anchors), strict=True)
-        # The parts of a vector of length 1 have that length together.
-        return torch.stack([1 - len(self.medians) * part @ anchors.T for part, anchors in parts])
+    def _kernel(self, vectors: Tensor) -> Tensor:
+        kernels = (-self._distances(vectors) / self.medians[:, None, None]).exp()
+        return torch.einsum("k,kij->ij", self.shares, kernels)
 
-    def _parts(self, whitened: Tensor) -> tuple[Tensor, ...]:
-        return self.whitened.parts(whitened) if isinstance(self.whitened, WhitenedHead) else (whitened,)
+    def _vectors(self, descriptions: Tensor) -> Tensor:
+        """Unit vectors of the parts and of the prior, side by side."""
+        own = self.whitened(descriptions) * len(self.whitened.part_cells) ** 0.5
+        return own if self.prior is None else torch.cat([own, self.prior(descriptions)], dim=1)
+
+    def _distances(self, vectors: Tensor) -> Tensor:
+        """(kernels, N, n_shapes) cosine distances to the training shapes."""
+        sizes = self.whitened.part_cells.tolist()
+        if self.prior is not None:
+            sizes.append(vectors.shape[1] - sum(sizes))
+        pairs = zip(vectors.split(sizes, dim=1), self.anchors.split(sizes, dim=1), strict=True)
+        return torch.stack([1 - one @ other.T for one, other in pairs])

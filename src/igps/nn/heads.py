@@ -62,6 +62,12 @@ def check_cells(cells: Tensor, n_expected: int) -> None:
         raise ValueError(f"descriptions: expected {n_expected} cells as in training, got {cells.shape[1]}.")
 
 
+def check_share(prior_share: float) -> None:
+    """Raise a ValueError unless it is between 0 and 1."""
+    if not 0 < prior_share < 1:
+        raise ValueError(f"prior_share: expected a number between 0 and 1, got {prior_share}.")
+
+
 def checked_cells(cells: Tensor, part_cells: Sequence[int] | None) -> list[int]:
     """How many of (N, cells) values each part has, all one part if None; a ValueError where they do not add up."""
     found = list(part_cells or (cells.shape[1],))
