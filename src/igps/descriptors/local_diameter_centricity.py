@@ -13,7 +13,7 @@ from igps.geometry.geodesics import farthest_points
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.ordering import in_order_of_form
 from igps.geometry.sampling import surface_points
-from igps.geometry.surface import area_vectors, unit, vertex_areas
+from igps.geometry.surface import area_vectors, longest_side, unit, vertex_areas
 from igps.nn.descriptor import BodyDescriptor
 from igps.nn.needs import Needs
 
@@ -120,7 +120,7 @@ def local_diameters(
         ImportError: libigl is not installed.
     """
     igl = libigl("local_diameters")
-    centre, size = mesh.vertices.mean(axis=0), float(np.ptp(mesh.vertices, axis=0).max())
+    centre, size = mesh.vertices.mean(axis=0), longest_side(mesh.vertices)
     vertices = np.asfortranarray((mesh.vertices - centre) / size)
     faces = np.asfortranarray(mesh.faces)
     normals = unit(area_vectors(vertices, mesh.faces))

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from igps.data.batch import Body
 from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.surface import longest_side
 from igps.geometry.voxels import grid_axes, inside_grid
 from igps.nn.descriptor import BodyDescriptor
 from igps.nn.needs import Needs
@@ -121,7 +122,7 @@ def _sampled_cells(mesh: Mesh, n_voxels: int) -> tuple[NDArray[np.bool_], float]
 
     The second result is the side of a cell, length.
     """
-    longest = float(np.ptp(mesh.vertices, axis=0).max())
+    longest = longest_side(mesh.vertices)
     resolution = int(np.clip(np.ceil(longest * (n_voxels / abs(mesh.volume)) ** (1 / 3)), 1, _MAX_RESOLUTION))
     cell = longest / resolution
     axes = []

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from igps.geometry.surface import area_vectors, undirected_edges, unit, vertex_normals
+from igps.geometry.surface import area_vectors, longest_side, undirected_edges, unit, vertex_normals
 
 # The lower quartile of that remainder over the mean length of a vertex's edges: up to 0.014 on generated shapes of more
 # than 2,000 vertices and up to 0.028 on those of 1,000 to 2,000, 0.034 to 0.092 with noise of 0.2 % of the diagonal,
@@ -82,12 +82,12 @@ def is_noisy(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
         return False
     vertices = vertices / _unit_of_length(vertices)
     around = _Neighbours.of(vertices, faces)
-    if (_faces_at_sides(faces, len(vertices)) == 2).mean() < _REGULAR:
+    if (around.faces_at_sides == 2).mean() < _REGULAR:
         return False
     # Of the averaged surface: where noise is larger than the triangles, theirs say nothing.
     normals = vertex_normals(around.averaging @ (around.averaging @ vertices), faces)
     rough, in_common = _statistics(vertices, normals, around)
-    return rough > _ROUGH and in_common < _IN_COMMON and _share_of_flat_edges(vertices, faces) < _FLAT
+    return rough > _ROUGH and in_common < _IN_COMMON and _share_of_flat_edges(vertices, faces, around.edge_of) < _FLAT
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,7 @@ class _Neighbours:
     """Of each vertex; where most are among thin triangles, the near ones: by the inverse squares of their distances."""
 
     edges: NDArray[np.int64]  # (E, 2)
+    edge_of: NDArray[np.int64]  # (3F,): of every side of every face
     averaging: sparse.csr_array  # (V, V): averages over the neighbours
     length: NDArray[np.float64]  # (V,): of a vertex's edges
     stretch: NDArray[np.float64]  # (V,): mean length of a vertex's edges over that of the near ones
@@ -103,7 +104,7 @@ class _Neighbours:
     def of(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> _Neighbours:
         """Of vertices in units of `_unit_of_length`."""
         n = len(vertices)
-        edges, _ = undirected_edges(faces, n)
+        edges, edge_of = undirected_edges(faces, n)
         rows, columns = edges.T.ravel(), edges[:, ::-1].T.ravel()
         degree = np.maximum(np.bincount(rows, minlength=n), 1)
         length = np.tile(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1), 2)
@@ -117,7 +118,12 @@ class _Neighbours:
             weights, of_vertex = near, of_near
         total = np.bincount(rows, weights=weights, minlength=n)
         averaging = sparse.csr_array((weights / total[rows], (rows, columns)), shape=(n, n))
-        return _Neighbours(edges, averaging, of_vertex, stretch)
+        return _Neighbours(edges, edge_of, averaging, of_vertex, stretch)
+
+    @property
+    def faces_at_sides(self) -> NDArray[np.int64]:
+        """(F, 3) how many faces share the side from each corner to the next."""
+        return np.asarray(np.bincount(self.edge_of)[self.edge_of].reshape(-1, 3))
 
 
 def _statistics(
@@ -144,7 +150,7 @@ def denoised(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray
     vertices = vertices / unit_length
     around = _Neighbours.of(vertices, faces)
     free = np.ones((len(vertices), 1))
-    alone = _faces_at_sides(faces, len(vertices)) == 1
+    alone = around.faces_at_sides == 1
     free[faces[alone]] = 0
     free[np.roll(faces, -1, axis=1)[alone]] = 0
     noise, edge = _noise_and_edge(vertices, faces, around)
@@ -236,21 +242,14 @@ def _noise_and_edge(
 
 def _unit_of_length(vertices: NDArray[np.float64]) -> float:
     """The longest side, up to a power of two: squares of lengths are numbers in it, and to divide by it is exact."""
-    _, exponent = np.frexp(max(np.ptp(vertices, axis=0).max(), np.finfo(float).tiny))
+    _, exponent = np.frexp(max(longest_side(vertices), np.finfo(float).tiny))
     return float(np.ldexp(1.0, int(exponent) - 1))
 
 
-def _share_of_flat_edges(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
-    """The share of edges whose two triangles lie in one plane."""
+def _share_of_flat_edges(vertices: NDArray[np.float64], faces: NDArray[np.int64], edge_of: NDArray[np.int64]) -> float:
+    """The share of edges whose two triangles lie in one plane, of faces whose sides (3F,) are these edges."""
     normals = unit(area_vectors(vertices, faces))
-    _, edge_of = undirected_edges(faces, len(vertices))
     order = np.argsort(edge_of, kind="stable")
     pairs = np.flatnonzero(edge_of[order[1:]] == edge_of[order[:-1]])
     apart = np.linalg.norm(normals[order[pairs] // 3] - normals[order[pairs + 1] // 3], axis=1)
     return float((apart < _FLAT_ANGLE).mean())
-
-
-def _faces_at_sides(faces: NDArray[np.int64], n_vertices: int) -> NDArray[np.int64]:
-    """(F, 3) how many faces share the side from each corner to the next."""
-    _, edge_of = undirected_edges(faces, n_vertices)
-    return np.asarray(np.bincount(edge_of)[edge_of].reshape(-1, 3))

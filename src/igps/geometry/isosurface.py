@@ -14,6 +14,7 @@ from igps.geometry.surface import (
     components,
     directed_edges,
     face_areas,
+    longest_side,
     signed_volume,
     vertex_normals,
 )
@@ -58,7 +59,7 @@ def simplified(
     if surplus <= 0:
         return vertices, faces
     igl = libigl()
-    scale = float(np.ptp(vertices, axis=0).max())
+    scale = longest_side(vertices)
     points, triangles = vertices / scale, faces
     # The shortest edges first, which marching cubes leave in plenty and which need no quadrics: that is much faster.
     for collapse, n_vertices in ((igl.decimate, 3 * max_vertices), (igl.qslim, max_vertices)):

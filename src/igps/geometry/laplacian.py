@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from igps.geometry.mesh import Mesh
+from igps.geometry.surface import longest_side
 
 Backend = Literal["cotangent", "robust"]
 
@@ -42,7 +43,7 @@ def laplacian(mesh: Mesh, backend: Backend = "cotangent") -> tuple[sparse.csr_ma
         except ImportError as error:
             raise ImportError('backend="robust" needs robust-laplacian: pip install "interior-gps[robust]".') from error
         # In unit scale, because the library's mollification is an absolute length.
-        scale = float(np.ptp(mesh.vertices, axis=0).max())
+        scale = longest_side(mesh.vertices)
         centred = (mesh.vertices - mesh.vertices.mean(axis=0)) / scale
         stiffness, mass = robust_laplacian.mesh_laplacian(centred, np.asarray(mesh.faces))
         return stiffness.tocsr(), mass.diagonal() * scale**2

@@ -8,6 +8,7 @@ import numpy as np
 
 from igps.geometry.extras import libigl
 from igps.geometry.mesh import Mesh, MeshError
+from igps.geometry.surface import longest_side
 
 
 def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
@@ -27,7 +28,7 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
         return mesh
     igl = libigl("simplify")
     # In unit scale, because quadrics are sums of squares. A collapse on a closed surface takes a vertex and two faces.
-    centre, scale = mesh.vertices.mean(axis=0), float(np.ptp(mesh.vertices, axis=0).max())
+    centre, scale = mesh.vertices.mean(axis=0), longest_side(mesh.vertices)
     points = np.asfortranarray((mesh.vertices - centre) / scale)
     points, faces, *_ = igl.qslim(points, np.asfortranarray(mesh.faces), max(len(mesh.faces) - 2 * surplus, 4))
     if len(points) > max_vertices:

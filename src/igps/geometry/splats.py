@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from igps.geometry.mesh import MeshError
+from igps.geometry.surface import longest_side
 
 # Points beyond which they are thinned out first.
 _MANY_POINTS = 200_000
@@ -23,7 +24,7 @@ def splats(
             f"{name}: a cloud of {len(points)} points; at least 10 are needed for a surface. Check that the file holds "
             "faces, or scan more points."
         )
-    side = float(np.ptp(points, axis=0).max())
+    side = longest_side(points)
     if side == 0:
         raise MeshError(f"{name}: all points are in one place; a surface was expected. Check the file.")
     from_middle = points - points.mean(axis=0)

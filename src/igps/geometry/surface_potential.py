@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from igps.compiled import is_available
 from igps.geometry.closed_forms import spatial_order, squared_distances
 from igps.geometry.potential_loops import fill_potentials
+from igps.geometry.surface import longest_side
 
 __all__ = ["surface_potential"]
 
@@ -48,7 +49,7 @@ def surface_potential(
         (P,) length.
     """
     corners = torch.from_numpy(vertices[faces])  # a copy
-    centre, scale = corners.mean((0, 1)), float(np.ptp(vertices, axis=0).max())
+    centre, scale = corners.mean((0, 1)), longest_side(vertices)
     corners = (corners - centre) / scale
     sides = corners.roll(-2, dims=1) - corners.roll(-1, dims=1)
     heights = torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1) / sides.square().sum(2).amax(1)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from igps.geometry.coordinates import winding_number
 from igps.geometry.limits import check_grid
 from igps.geometry.mesh import Mesh, MeshError
-from igps.geometry.surface import directed_edges
+from igps.geometry.surface import box_sides, directed_edges, longest_side
 
 # A cell centre closer to the surface than this share of a cell lies on it, and does not count as inside. It is far
 # above rounding, so that a moved or turned mesh keeps its samples.
@@ -66,7 +66,7 @@ def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> 
 
 def _finest_resolution(mesh: Mesh) -> int:
     """The largest resolution whose grid is within the limits."""
-    sides = np.ptp(mesh.vertices, axis=0) / np.ptp(mesh.vertices, axis=0).max()
+    sides = box_sides(mesh.vertices) / longest_side(mesh.vertices)
     resolution = _MAX_RESOLUTION
     while np.prod(np.ceil(sides * resolution).clip(1)) > _MAX_CELLS:
         resolution -= 1
@@ -171,7 +171,7 @@ def _scan(
 def _cell(axes: tuple[NDArray[np.float64], ...], vertices: NDArray[np.float64]) -> float:
     """The grid's cell: the first axis tells it, or where that has one point, as across a flat body, the next does."""
     steps = (float(axis[1] - axis[0]) for axis in axes if len(axis) > 1)
-    return next(steps, float(np.ptp(vertices, axis=0).max()))
+    return next(steps, longest_side(vertices))
 
 
 def _ranges(first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

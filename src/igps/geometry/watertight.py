@@ -28,7 +28,7 @@ from igps.geometry.level_set import joined, level_set
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.outside import OrientedSurface, outside_of
 from igps.geometry.splats import splats
-from igps.geometry.surface import diagonal, face_areas
+from igps.geometry.surface import diagonal, face_areas, longest_side
 
 # Groups of triangles of less than this share of the area are specks, if they are apart in a grid of so many cells.
 _SPECK_AREA, _SPECK_CELLS = 2e-3, 64
@@ -127,7 +127,7 @@ def _without_specks(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """The faces without groups that lie apart from everything else and have next to no area."""
     corners = vertices[faces]
-    low, side = corners.min(axis=(0, 1)), float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+    low, side = corners.min(axis=(0, 1)), longest_side(corners.reshape(-1, 3))
     cell = side / _SPECK_CELLS
     points, face = _spread(corners, cell)
     index = np.floor((points - low) / cell).astype(np.int64) + 1

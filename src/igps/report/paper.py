@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps.geometry.mesh import Mesh
+from igps.geometry.surface import longest_side
 from igps.geometry.weld import TUBE_FACES
 from igps.report.drawing import GREY, PALETTE, new_figure, paint
 
@@ -91,7 +92,7 @@ def draw_weld_change(mesh: Mesh, welded: Mesh, change: NDArray[np.floating], out
 
     _zoom(right, welded, tube)
     first, last = (welded.vertices[tube[1::2, i]] for i in (0, 2))  # the ends of the three edges along the tube
-    length = float(np.linalg.norm(first - last, axis=1).mean() / np.ptp(welded.vertices, axis=0).max())
+    length = float(np.linalg.norm(first - last, axis=1).mean() / longest_side(welded.vertices))
     right.set_title(f"the tube (orange, {TUBE_FACES} triangles),\n{length:.1%} of the body's extent", fontsize=9)
     _save(figure, out)
 

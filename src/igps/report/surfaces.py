@@ -18,7 +18,7 @@ from igps.data.recipe import Recipe
 from igps.geometry.mesh import Mesh, MeshError
 from igps.geometry.signature import Signature
 from igps.geometry.simplification import simplify
-from igps.geometry.surface import compact
+from igps.geometry.surface import compact, longest_side
 from igps.parallel import Failed, run
 
 logger = logging.getLogger(__name__)
@@ -223,7 +223,7 @@ def clustered(
 
     Handles and gaps may close, so that the result is good to look at and for nothing else.
     """
-    low, extent = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
+    low, extent = vertices.min(axis=0), longest_side(vertices)
     resolution = max(2, int(np.sqrt(n_vertices)))
     while True:
         cells = np.minimum((vertices - low) * (resolution / extent), resolution - 1).astype(np.int64)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from igps.geometry.surface import longest_side
 from igps.shapes.crossing import crossing_faces
 from igps.shapes.kinds import BodyClass, Motion
 from igps.shapes.meshing import Faces, defect, mesh, roughen
@@ -184,7 +185,7 @@ def _drawn(body_class: BodyClass, kin: np.random.Generator, rng: np.random.Gener
     rig = _rig(bones, motion, np.array([1.0, 0.0, 0.0]))
     corners = np.concatenate([np.stack(bone.placed.bounds()) for bone in bones])
     # A sheet stays nearly flat, or it could not be rolled without stretching it.
-    warp = Warp.draw(rng, float(np.ptp(corners, axis=0).max()), 0.05 if motion == "sheet" else 0.14 * spread)
+    warp = Warp.draw(rng, longest_side(corners), 0.05 if motion == "sheet" else 0.14 * spread)
     thinnest = min(float(rod.radii.min()) for rod in rig.rods)
     relief = (0.14 * spread * thinnest * rng.uniform(), rng.uniform(0.25, 0.6), int(rng.integers(2**31)))
     return Body(bones, rig, skeleton.genus, motion, warp, relief)

@@ -16,6 +16,7 @@ from igps.data.dataset import SignatureDataset
 from igps.geometry.coordinates import Extension
 from igps.geometry.laplacian import laplacian
 from igps.geometry.mesh import Mesh
+from igps.geometry.surface import longest_side
 from igps.geometry.voxels import grid_axes, inside_grid, interior_samples
 from igps.geometry.weld import facing_vertices, weld
 from igps.linalg import Spectrum, eigenpairs
@@ -172,7 +173,7 @@ def potential_slice(
         of_samples = np.linalg.norm(embedding(samples), axis=1)
         bar.update()
         coarse = samples[int(np.argmin(of_samples))]
-        around = _around(body, coarse, np.ptp(body.vertices, axis=0).max() / resolution)
+        around = _around(body, coarse, longest_side(body.vertices) / resolution)
         of_around = np.linalg.norm(embedding(around), axis=1)
         bar.update()
         centre = around[int(np.argmin(of_around))]
