@@ -202,6 +202,13 @@ def test_coarse_bodies_are_told_apart_from_noisy_ones(index: int) -> None:
     assert is_noisy(noise(mesh, 0.18 * edge / mesh.diagonal, 0).vertices, mesh.faces)
 
 
+@pytest.mark.parametrize(("share", "expected"), [(0.005, True), (0.05, False)])
+def test_what_is_full_of_holes_is_no_surface_to_look_over(sphere: Mesh, share: float, expected: bool) -> None:
+    rough = noise(sphere, 0.004, 0)
+    faces = rough.faces[np.random.default_rng(0).random(len(rough.faces)) >= share]
+    assert is_noisy(rough.vertices, faces) is expected
+
+
 def test_boundaries_stay(sphere: Mesh) -> None:
     faces = sphere.faces[sphere.vertices[sphere.faces].mean(axis=1)[:, 2] < 0.5]
     noisy = noise(sphere, 0.004, 1).vertices

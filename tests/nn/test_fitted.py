@@ -237,13 +237,13 @@ def test_the_priors_kernel_is_one_more(collection: tuple[Tensor, Tensor], prior:
     histograms, labels = collection
     train, test = slice(0, 48, 2), slice(1, 48, 2)
     kernels = []
-    for metric in (WhitenedHead().fit(histograms[train], labels[train]), prior):
-        vectors = metric(histograms).double().numpy()
-        distances = 1 - vectors @ vectors[train].T
+    parts = histograms.split([20, 40], dim=1)
+    for vectors in (*(WhitenedHead().fit(part[train], labels[train])(part) for part in parts), prior(histograms)):
+        distances = 1 - (vectors @ vectors[train].T).double().numpy()
         kernels.append(np.exp(-distances / np.median(distances[train][np.triu_indices(24, 1)])))
-    kernel = 0.75 * kernels[0] + 0.25 * kernels[1]
+    kernel = 0.375 * (kernels[0] + kernels[1]) + 0.25 * kernels[2]
     oracle = KernelRidge(alpha=0.03, kernel="precomputed").fit(kernel[train], np.eye(8)[labels[train]])
-    head = KernelHead(prior, prior_share=0.25).fit(histograms[train], labels[train])
+    head = KernelHead(prior, prior_share=0.25).fit(histograms[train], labels[train], (20, 40))
     np.testing.assert_allclose(head.scores(histograms[test]), oracle.predict(kernel[test]), atol=2e-3)
 
 
@@ -258,13 +258,19 @@ def test_one_shape_of_each_class_leaves_the_prior_alone(collection: tuple[Tensor
     np.testing.assert_allclose(head.scores(histograms), oracle.predict(kernel), atol=2e-3)
 
 
-def test_vectors_of_the_kernel_head_are_scores_and_what_is_likely(collection: tuple[Tensor, Tensor]) -> None:
+@pytest.mark.parametrize(("n_of_each", "temperature"), [(3, 0.2), (6, 0.1), (24, 0.1)])
+def test_vectors_of_the_kernel_head_are_scores_and_what_is_likely(
+    collection: tuple[Tensor, Tensor], n_of_each: int, temperature: float
+) -> None:
+    """With three shapes of each class twice as warm as with six or more."""
     histograms, labels = collection
-    head = KernelHead(temperature=0.1).fit(histograms[::2], labels[::2])
+    used = slice(None, None, 2 if n_of_each == 3 else 1)
+    labels = labels % 2 if n_of_each == 24 else labels
+    head = KernelHead(temperature=0.1).fit(histograms[used], labels[used])
     scores = head.scores(histograms).double().numpy()
-    about = scores - 1 / 8
+    about = scores - 1 / len(labels.unique())
     about /= np.linalg.norm(about, axis=1, keepdims=True)
-    likely = np.sqrt(softmax(scores / 0.2, axis=1))  # three shapes of each class: twice as warm as with six
+    likely = np.sqrt(softmax(scores / temperature, axis=1))
     expected = 1 - (about @ about.T + likely @ likely.T) / 2
     vectors = head(histograms)
     np.testing.assert_allclose(cosine(vectors, vectors), expected, atol=1e-5)
