@@ -29,7 +29,8 @@ from igps.nn.learner import RetrievalLearner
 from igps.report.learned import learned_layout
 from igps.retrieval import chi_square, retrieval_scores
 
-Fitted = Literal["none", "prior", "whitened", "kernel"]
+Row = Literal["none", "prior", "whitened", "kernel"]
+FITTED: dict[str, type[WhitenedHead | KernelHead]] = {"whitened": WhitenedHead, "kernel": KernelHead}
 COLUMNS = {"ft": "FT", "nn": "NN", "dcg": "DCG", "st": "ST", "adr": "ADR", "map": "mAP"}
 
 
@@ -93,22 +94,18 @@ def score(
     histograms: Tensor,
     labels: Tensor,
     split: Split,
-    head: Fitted,
+    head: Row,
     part_cells: Sequence[int] | None,
     prior: Head | None = None,
 ) -> dict[str, float]:
     """Scores of the test part, each shape against the others."""
     train, test = torch.tensor(split.train), torch.tensor(split.test)
-    if head == "none":
-        distances = chi_square(histograms[test], histograms[test])
-    else:
-        made = {"prior": prior, "whitened": WhitenedHead(prior=prior), "kernel": KernelHead(prior)}[head]
-        assert made is not None
-        if head != "prior":
-            made.fit(histograms[train], labels[train], part_cells)
-        vectors = made(histograms[test])
-        distances = distances_of(made)(vectors, vectors)
-    return retrieval_scores(distances, labels[test]).mean()
+    metric = prior if head == "prior" else None
+    if head in FITTED:
+        metric = FITTED[head](prior=prior).fit(histograms[train], labels[train], part_cells)
+    distance = chi_square if metric is None else distances_of(metric)
+    vectors = histograms[test] if metric is None else metric(histograms[test])
+    return retrieval_scores(distance(vectors, vectors), labels[test]).mean()
 
 
 def checkpoint(path: Path, out: Path = Path("build/evaluation")) -> None:

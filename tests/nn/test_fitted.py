@@ -223,6 +223,17 @@ def test_a_prior_stays_as_it_is(
     torch.testing.assert_close(copy(histograms), head(histograms), rtol=0, atol=0)
 
 
+def test_weights_and_temperature_are_loaded(collection: tuple[Tensor, Tensor], prior: WhitenedHead) -> None:
+    """Into heads that were made with others."""
+    pairs = (
+        (WhitenedHead(prior=prior, prior_share=0.2), WhitenedHead(prior=WhitenedHead())),
+        (KernelHead(prior, prior_share=0.2, temperature=0.3), KernelHead(WhitenedHead())),
+    )
+    for head, other in pairs:
+        other.load_state_dict(head.fit(*collection).state_dict())
+        torch.testing.assert_close(other(collection[0]), head(collection[0]), rtol=0, atol=0)
+
+
 def test_whitened_distance_is_the_weighted_mean_with_the_priors(
     collection: tuple[Tensor, Tensor], prior: WhitenedHead
 ) -> None:

@@ -58,6 +58,7 @@ class WhitenedHead(SizedByData):
     directions: Tensor
     gains: Tensor
     part_cells: Tensor
+    prior_share: Tensor
 
     def __init__(
         self,
@@ -75,7 +76,7 @@ class WhitenedHead(SizedByData):
         self.n_directions = n_directions
         self.shrinkage = shrinkage
         self.prior = prior
-        self.prior_share = prior_share
+        self.register_buffer("prior_share", torch.tensor(prior_share))
         self.register_buffer("mean", torch.zeros(0))
         self.register_buffer("directions", torch.zeros(n_directions, 0))
         self.register_buffer("gains", torch.ones(0, n_directions))
@@ -133,7 +134,7 @@ class WhitenedHead(SizedByData):
         if self.prior is None:
             return own
         share = self.prior_share
-        return torch.cat([(1 - share) ** 0.5 * own, share**0.5 * self.prior(descriptions)], dim=1)
+        return torch.cat([(1 - share).sqrt() * own, share.sqrt() * self.prior(descriptions)], dim=1)
 
     def _whitened(self, roots: Tensor) -> Tensor:
         if not len(self.mean):
@@ -186,6 +187,7 @@ class KernelHead(SizedByData):
     shares: Tensor
     coefficients: Tensor
     classes: Tensor
+    temperature: Tensor
 
     def __init__(
         self,
@@ -204,7 +206,8 @@ class KernelHead(SizedByData):
         check_share(prior_share)
         self.whitened = WhitenedHead(n_directions, shrinkage)
         self.prior = prior
-        self.ridge, self.prior_share, self.temperature = ridge, prior_share, temperature
+        self.ridge, self.prior_share = ridge, prior_share
+        self.register_buffer("temperature", torch.tensor(temperature))
         self.register_buffer("anchors", torch.zeros(0, 0))
         self.register_buffer("medians", torch.ones(0))
         self.register_buffer("shares", torch.ones(0))
