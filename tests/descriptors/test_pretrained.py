@@ -96,12 +96,12 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
         return normalize(joined @ of_level["joined"].T)
 
     classes, bodies = level("of_classes", CLASS_PARTS), level("of_bodies", BODY_PARTS)
-    share, weight, reach = (stored[f"head.{name}"] for name in ("share", "weight", "reach"))
+    share, reach = (stored[f"head.{name}"] for name in ("share", "reach"))
     expected = torch.cat([(1 - share).sqrt() * classes, share.sqrt() * bodies], dim=1)
     found = describe(part, module)
     torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=0)
     kernel = torch.exp(-torch.cdist(bodies, bodies, compute_mode="donot_use_mm_for_euclid_dist").square() / reach**2)
-    distances = (1 - classes @ classes.T + weight * (1 - kernel)) / (1 + weight)
+    distances = (1 - classes @ classes.T) * (1 - kernel)
     torch.testing.assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)
 
 

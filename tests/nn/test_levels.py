@@ -73,18 +73,18 @@ def test_parts_have_equal_shares_and_others_do_not_count(collection: tuple[Tenso
     torch.testing.assert_close(head(changed), found, atol=1e-6, rtol=0)
 
 
-def test_the_distance_is_the_cosine_of_the_classes_and_a_kernel_of_the_bodies(
+def test_the_distance_is_that_of_the_classes_less_what_a_kernel_of_the_bodies_takes_away(
     collection: tuple[Tensor, Tensor, Tensor],
 ) -> None:
     histograms, classes, bodies = collection
     of_classes, of_bodies = LevelHead(width=20), LevelHead(width=6)
-    head = TwoLevelHead(of_classes, of_bodies, reach=0.4, weight=0.7, share=0.3)
+    head = TwoLevelHead(of_classes, of_bodies, reach=0.4, share=0.3)
     vectors = head.fit(histograms, classes, bodies=bodies)(histograms)
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
     x, y = of_classes(histograms).double(), of_bodies(histograms).double()
     torch.testing.assert_close((vectors @ vectors.T).double(), 0.7 * x @ x.T + 0.3 * y @ y.T, atol=1e-5, rtol=0)
     kernel = torch.exp(-torch.cdist(y, y, compute_mode="donot_use_mm_for_euclid_dist").square() / 0.4**2)
-    expected = (1 - x @ x.T + 0.7 * (1 - kernel)) / 1.7
+    expected = (1 - x @ x.T) * (1 - kernel)
     torch.testing.assert_close(head.distances(vectors, vectors).double(), expected, atol=2e-3, rtol=0)
     assert kernel.min() < 0.1  # nor is it 1 throughout
     assert ((kernel > 0.2) & (kernel < 0.9)).any()
@@ -108,7 +108,7 @@ def test_both_levels_are_ordered(collection: tuple[Tensor, Tensor, Tensor]) -> N
 
 def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> None:
     histograms, classes, bodies = collection
-    fitted = TwoLevelHead(LevelHead((0,), 5, 7), LevelHead((1,), 6, 8), reach=0.3, weight=0.4, share=0.5)
+    fitted = TwoLevelHead(LevelHead((0,), 5, 7), LevelHead((1,), 6, 8), reach=0.3, share=0.5)
     fitted.fit(histograms, classes, (15, 25), bodies=bodies)
     other = TwoLevelHead(LevelHead((0,)), LevelHead((1,)))
     other.load_state_dict(fitted.state_dict())
@@ -143,9 +143,9 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
         LevelHead().fit(histograms, torch.arange(len(histograms)))
     with pytest.raises(RuntimeError, match="expected to be fitted first"):
         LevelHead()(histograms)
-    with pytest.raises(ValueError, match=r"reach, weight, share: .* got 0.0, 1.0 and 0.1"):
+    with pytest.raises(ValueError, match=r"reach, share: .* got 0.0 and 0.1"):
         TwoLevelHead(reach=0.0)
-    with pytest.raises(ValueError, match=r"one between 0 and 1, got 0.15, 1.0 and 1"):
+    with pytest.raises(ValueError, match=r"one between 0 and 1, got 0.2 and 1"):
         TwoLevelHead(share=1)
     fitted = LevelHead().fit(histograms, classes)
     with pytest.raises(ValueError, match="expected 40 cells as in training, got 39"):

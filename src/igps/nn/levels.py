@@ -121,22 +121,20 @@ class TwoLevelHead(nn.Module):
     """Descriptions to unit vectors, and a distance of them by which a body's other poses come first, then its class.
 
     A vector is that of a `LevelHead` fitted to the labels of classes beside that of one fitted to the labels of bodies.
-    The cosine of the former orders the whole collection. The latter adds the kernel exp(−‖x − y‖² / reach²), which
-    counts only between shapes that are nearly the same body: beyond its reach, where how different two bodies are says
-    nothing of their classes, it is silent, and well within it, where poses lie, it is flat. The cosine distance of the
-    whole vector is nearly that of the classes, and serves engines that know no other to find what is ranked by the
-    distance then.
+    The distance is the cosine distance of the former, times 1 − exp(−‖x − y‖² / reach²) of the latter: what makes two
+    shapes of one class the poses of one body takes away the distance that is left between them. Beyond the reach, where
+    how different two bodies are says nothing of their classes, that factor is 1. The cosine distance of the whole
+    vector is nearly that of the classes, and serves engines that know no other to find what is ranked by the distance
+    then.
 
     Args:
         of_classes: head of the level of classes.
         of_bodies: head of the level of bodies.
-        reach: of the kernel, between unit vectors.
-        weight: of the kernel, the cosine of the classes having 1.
+        reach: between unit vectors of the bodies; well within it lie the poses of one.
         share: of the squared length of a vector that belongs to the bodies.
     """
 
     reach: Tensor
-    weight: Tensor
     share: Tensor
 
     def __init__(
@@ -144,19 +142,17 @@ class TwoLevelHead(nn.Module):
         of_classes: LevelHead | None = None,
         of_bodies: LevelHead | None = None,
         *,
-        reach: float = 0.15,
-        weight: float = 1.0,
+        reach: float = 0.2,
         share: float = 0.1,
     ) -> None:
         super().__init__()
-        if reach <= 0 or weight < 0 or not 0 < share < 1:
+        if reach <= 0 or not 0 < share < 1:
             raise ValueError(
-                f"reach, weight, share: expected a positive number, one of at least 0, and one between 0 and 1, got "
-                f"{reach}, {weight} and {share}."
+                f"reach, share: expected a positive number, and one between 0 and 1, got {reach} and {share}."
             )
         self.of_classes = of_classes or LevelHead(width=192)
         self.of_bodies = of_bodies or LevelHead(width=64, shrinkage=0.3)
-        for name, value in (("reach", reach), ("weight", weight), ("share", share)):
+        for name, value in (("reach", reach), ("share", share)):
             self.register_buffer(name, torch.tensor(value))
 
     @property
@@ -200,8 +196,7 @@ class TwoLevelHead(nn.Module):
         n = len(self.of_classes.joined)
         classes = cosine(queries[:, :n], gallery[:, :n])
         squares = 2 * cosine(queries[:, n:], gallery[:, n:])  # of unit vectors
-        kernel = torch.exp(-squares / self.reach.square())
-        return (classes + self.weight * (1 - kernel)) / (1 + self.weight)
+        return classes * -torch.expm1(-squares / self.reach.square())
 
 
 def _principal(rows: Tensor, n: int) -> Tensor:
