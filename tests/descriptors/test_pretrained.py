@@ -101,7 +101,7 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
     found = describe(part, module)
     torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=0)
     kernel = torch.exp(-torch.cdist(bodies, bodies, compute_mode="donot_use_mm_for_euclid_dist").square() / reach**2)
-    distances = (1 - classes @ classes.T) * (1 - kernel)
+    distances = (1 - classes @ classes.T) * (1 - kernel) ** 2
     torch.testing.assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)
 
 

@@ -84,7 +84,7 @@ def test_the_distance_is_that_of_the_classes_less_what_a_kernel_of_the_bodies_ta
     x, y = of_classes(histograms).double(), of_bodies(histograms).double()
     torch.testing.assert_close((vectors @ vectors.T).double(), 0.7 * x @ x.T + 0.3 * y @ y.T, atol=1e-5, rtol=0)
     kernel = torch.exp(-torch.cdist(y, y, compute_mode="donot_use_mm_for_euclid_dist").square() / 0.4**2)
-    expected = (1 - x @ x.T) * (1 - kernel)
+    expected = (1 - x @ x.T) * (1 - kernel) ** 2
     torch.testing.assert_close(head.distances(vectors, vectors).double(), expected, atol=2e-3, rtol=0)
     assert kernel.min() < 0.1  # nor is it 1 throughout
     assert ((kernel > 0.2) & (kernel < 0.9)).any()

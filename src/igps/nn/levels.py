@@ -121,11 +121,10 @@ class TwoLevelHead(nn.Module):
     """Descriptions to unit vectors, and a distance of them by which a body's other poses come first, then its class.
 
     A vector is that of a `LevelHead` fitted to the labels of classes beside that of one fitted to the labels of bodies.
-    The distance is the cosine distance of the former, times 1 − exp(−‖x − y‖² / reach²) of the latter: what makes two
-    shapes of one class the poses of one body takes away the distance that is left between them. Beyond the reach, where
-    how different two bodies are says nothing of their classes, that factor is 1. The cosine distance of the whole
-    vector is nearly that of the classes, and serves engines that know no other to find what is ranked by the distance
-    then.
+    The distance is the cosine distance of the former, times (1 − exp(−‖x − y‖² / reach²))² of the latter. Well within
+    the reach, where the poses of a body lie, nothing of the distance is left; beyond it, where how different two bodies
+    are says nothing of their classes, all of it. The cosine distance of the whole vector is nearly that of the classes,
+    and serves engines that know no other to find what is ranked by the distance then.
 
     Args:
         of_classes: head of the level of classes.
@@ -196,7 +195,7 @@ class TwoLevelHead(nn.Module):
         n = len(self.of_classes.joined)
         classes = cosine(queries[:, :n], gallery[:, :n])
         squares = 2 * cosine(queries[:, n:], gallery[:, n:])  # of unit vectors
-        return classes * -torch.expm1(-squares / self.reach.square())
+        return classes * torch.expm1(-squares / self.reach.square()).square()
 
 
 def _principal(rows: Tensor, n: int) -> Tensor:
