@@ -250,13 +250,13 @@ def test_query_lists_the_nearest(
     header, *lines = capsys.readouterr().out.splitlines()
     assert header.split() == ["rank", "distance", "mesh", "class"]
     assert len(lines) == 4
-    assert lines[0].split() == ["1", "0.0000", "egg/1.off", "egg"]
+    assert lines[0].split() == ["1", "0", "egg/1.off", "egg"]
     histograms = describe(SignatureDataset(root, CONFIG, tmp_path / "cache"), small_interior())
     distances = chi_square(histograms[4:5], histograms)[0]
     names = [f"{label}/{i}.off" for label in ("ball", "egg") for i in range(3)]
     nearest = torch.argsort(distances, stable=True)[:4].tolist()
     assert [line.split()[2] for line in lines] == [names[i] for i in nearest]
-    assert [float(line.split()[1]) for line in lines] == pytest.approx(distances[nearest].tolist(), abs=1e-4)
+    assert [float(line.split()[1]) for line in lines] == pytest.approx(distances[nearest].tolist(), rel=5e-3)
 
 
 @pytest.mark.parametrize(

@@ -166,9 +166,9 @@ def query(
 
 def _print_found(rows: Sequence[tuple[str, str | None, float]]) -> None:
     width = max(len(name) for name, _, _ in rows)
-    print(f"{'rank':>4}  {'distance':>8}  {'mesh':<{width}}  class")
+    print(f"{'rank':>4}  {'distance':>9}  {'mesh':<{width}}  class")
     for place, (name, label, distance) in enumerate(rows, 1):
-        print(f"{place:>4}  {distance:>8.4f}  {name:<{width}}  {'-' if label is None else label}")
+        print(f"{place:>4}  {distance:>9.3g}  {name:<{width}}  {'-' if label is None else label}")
 
 
 def _as_rows(rows: Sequence[tuple[str, str | None, float]]) -> list[dict[str, Any]]:

@@ -74,7 +74,11 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
         ValueError: it holds other parameters.
     """
     module = EmbeddedDescriptor(
-        seven_parts(), two_levels(), name="pretrained", source="seven histograms, fitted to generated shapes"
+        seven_parts(),
+        two_levels(),
+        name="pretrained",
+        source="seven histograms, fitted to generated shapes",
+        invariant_to=("motion", "scale", "pose"),
     )
     try:
         module.load_state_dict({name: tensor.float() for name, tensor in load_file(path).items()})

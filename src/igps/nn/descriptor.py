@@ -187,16 +187,26 @@ class EmbeddedDescriptor(Descriptor):
         descriptor: `SignatureBatch` to descriptions.
         head: descriptions to (N, D) of length 1.
         name, source: see `Descriptor`.
+        invariant_to: see `Descriptor`; that of `descriptor` if None, though a head may have learned more.
     """
 
     comparison = "cosine"
 
-    def __init__(self, descriptor: Descriptor, head: nn.Module, *, name: str = "embedded", source: str = "") -> None:
+    def __init__(
+        self,
+        descriptor: Descriptor,
+        head: nn.Module,
+        *,
+        name: str = "embedded",
+        source: str = "",
+        invariant_to: Sequence[str] | None = None,
+    ) -> None:
         super().__init__()
         self.descriptor = descriptor
         self.head = head
         self.name, self.source = name, source
-        self.invariant_to, self.needs = descriptor.invariant_to, descriptor.needs
+        self.invariant_to = descriptor.invariant_to if invariant_to is None else tuple(invariant_to)
+        self.needs = descriptor.needs
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, D) embeddings of length 1."""
