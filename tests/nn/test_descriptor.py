@@ -281,3 +281,4 @@ def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch: SignatureBat
     roots = below(batch).sqrt() - below(batch).sqrt().mean(dim=0)
     torch.testing.assert_close(embedding, roots / roots.norm(dim=1, keepdim=True), atol=1e-5, rtol=0)
     torch.testing.assert_close(descriptor.distances(embedding, embedding), cosine(embedding, embedding))
+    assert EmbeddedDescriptor(below, descriptor.head, invariant_to=["pose"]).invariant_to == ("pose",)
