@@ -23,8 +23,9 @@ from scipy.spatial.transform import Rotation
 from igps import Mesh, Signature, SignatureConfig, collate, compute_signature, descriptor
 from igps.descriptors import NAMES
 from igps.geometry.signature import Samples
-from igps.nn.descriptor import Descriptor
+from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.nn.needs import Needs
+from igps.retrieval import Distance, cosine
 
 SEED = 13
 
@@ -112,6 +113,11 @@ def _cut(number: int, times: int) -> Mesh:
     return mesh
 
 
+def _distance(one: Descriptor) -> Distance:
+    """That of the descriptor; of vectors the cosine, as the distance of a head may be blind to small movements."""
+    return cosine if isinstance(one, EmbeddedDescriptor) else one.distances
+
+
 class Describer:
     """Descriptions by every descriptor, and the scale of their distances."""
 
@@ -126,7 +132,7 @@ class Describer:
         self.median = {}
         for name, one in self.descriptors.items():
             together = torch.cat([description[name] for description in self.whole])
-            distances = one.distances(together, together)
+            distances = _distance(one)(together, together)
             self.median[name] = float(distances[~torch.eye(len(together), dtype=torch.bool)].median())
 
     def describe(self, signature: Signature, mesh: Mesh, among: Sequence[str] | None = None) -> dict[str, torch.Tensor]:
@@ -149,7 +155,7 @@ class Describer:
     def movements(self, before: dict[str, torch.Tensor], after: dict[str, torch.Tensor]) -> dict[str, float]:
         """Percent of the median distance, by each descriptor."""
         return {
-            name: 100 * float(self.descriptors[name].distances(before[name], value)) / self.median[name]
+            name: 100 * float(_distance(self.descriptors[name])(before[name], value)) / self.median[name]
             for name, value in after.items()
         }
 
