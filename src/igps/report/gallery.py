@@ -57,7 +57,7 @@ def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progre
         _frame(row_axes[0], f"query {query}", _QUERY)
         for axis, (model, distance, relevant) in zip(row_axes[1:], results[query], strict=False):
             draw_mesh(axis, root / model)
-            _frame(axis, f"{model}\n{distance:.3g}", _RELEVANT if relevant else _IRRELEVANT)
+            _frame(axis, f"{model}\n{distance:#.3g}", _RELEVANT if relevant else _IRRELEVANT)
     figure.suptitle(
         "Query (left) and its nearest meshes with their chi-square distance; "
         "blue: same class, orange and dashed: another",
