@@ -12,6 +12,7 @@ from problems import cotangent_problem, torus
 from scipy import sparse
 
 from conftest import with_slivers
+from igps.linalg import multifrontal
 from igps.linalg.direct import Factors, analyse
 from igps.linalg.factorization import Factorization, SingularMatrixError
 from igps.linalg.multifrontal import Factors as CompiledFactors
@@ -150,6 +151,32 @@ def test_subtrees_solved_side_by_side() -> None:
     with Team(3) as team:
         for _ in range(3):
             assert torch.equal(factors.solve(right, team), solution)
+
+
+@pytest.mark.parametrize("at_once", [50, 256])
+def test_subtrees_eliminated_side_by_side(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The five-point Laplacian of as large a grid, its inertia from its eigenvalues: a team changes no bit."""
+    monkeypatch.setattr(multifrontal, "AT_ONCE", at_once)
+    line = sparse.diags_array([[-1.0] * 142, [2.0] * 143, [-1.0] * 142], offsets=[-1, 0, 1])
+    one = sparse.eye_array(143)
+    matrix = sparse.csr_array(sparse.kron(line, one) + sparse.kron(one, line))
+    places = np.stack(np.meshgrid(range(143), range(143)), axis=-1).reshape(-1, 2)
+    of_line = 2 - 2 * np.cos(np.arange(1, 144) * np.pi / 144)
+    eigenvalues = np.sort((of_line[:, None] + of_line).ravel())
+    behind = 500 + int(np.diff(eigenvalues[500:600]).argmax())
+    shift = float(eigenvalues[behind : behind + 2].mean())
+    structure = analyse(matrix, places)
+    factors = structure.factorize(matrix, shift)
+    assert factors.n_negative == structure.inertia(matrix, shift) == behind + 1
+    right = torch.from_numpy(np.random.default_rng(1).normal(size=(143**2, 2)))
+    solution = factors.solve(right)
+    residual = matrix @ solution.numpy() - shift * solution.numpy() - right.numpy()
+    assert np.abs(residual).max() < 1e4 * EPSILON * 8 * float(solution.abs().max())
+    with Team(3) as team:
+        for _ in range(3):
+            again = structure.factorize(matrix, shift, team)
+            assert torch.equal(again.solve(right), solution)
+            assert again.n_negative == structure.inertia(matrix, shift, team) == behind + 1
 
 
 def test_coinciding_places_are_allowed() -> None:

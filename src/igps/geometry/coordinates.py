@@ -19,7 +19,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -415,9 +415,8 @@ def _approximate_sums(
     """`_weighted_sums`; hats and clusters within so many radii of a point count as near. The clusters' ratio is not the
     smaller one, so that hats near a point are never hidden in a cluster."""
     tree = HatTree.of(hats)
-    clusters = ClusterMoments.of(tree, hats, columns)
 
-    def of_block(block: Block) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    def of_block(clusters: ClusterMoments, block: Block) -> list[tuple[torch.Tensor, torch.Tensor]]:
         terms = clusters.rows(block.clusters)
         n_terms, n_rows = len(terms), len(terms) + len(block.hats)
         values = columns.new_empty(n_rows, columns.shape[1])
@@ -438,7 +437,8 @@ def _approximate_sums(
 
     pays = points.device.type == "cpu" and len(columns) >= _TEAM_VERTICES
     with Team(None if pays else 1) as team:
-        for sums in team.each(of_block, list(tree.blocks(points, _GROUP, cluster_ratio))):
+        clusters = ClusterMoments.of(tree, hats, columns, team)
+        for sums in team.each(partial(of_block, clusters), list(tree.blocks(points, _GROUP, cluster_ratio))):
             yield from sums
 
 

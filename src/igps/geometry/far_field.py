@@ -14,6 +14,7 @@ import torch
 from igps.compiled import is_available
 from igps.geometry.closed_forms import Surface, Tile, spatial_order
 from igps.geometry.weight_loops import fill_hat_weights
+from igps.threads import ALONE, Team
 
 __all__ = ["Block", "ClusterMoments", "HatMoments", "HatTree", "in_leaves", "principal_axes"]
 
@@ -229,12 +230,13 @@ class ClusterMoments:
     sums: torch.Tensor  # (19 C, K)
 
     @staticmethod
-    def of(tree: HatTree, hats: HatMoments, functions: torch.Tensor) -> ClusterMoments:
+    def of(tree: HatTree, hats: HatMoments, functions: torch.Tensor, team: Team = ALONE) -> ClusterMoments:
         """Of functions (V, K), given at the hats."""
         n_clusters = [len(each) for each in tree.radii]
         sums = functions.new_empty(sum(n_clusters), _N_TERMS, functions.shape[1])
-        levels = zip(tree.sizes, tree.centres, tree.radii, sums.split(n_clusters), strict=True)
-        for size, centres, radii, out in levels:
+
+        def fill_level(level: tuple[int, torch.Tensor, torch.Tensor, torch.Tensor]) -> None:
+            size, centres, radii, out = level
             cluster = torch.arange(tree.n_hats, device=functions.device) // size
             terms = hats.taylor_terms(centres[cluster], radii[cluster], functions.dtype)
             n_full = tree.n_hats // size
@@ -242,6 +244,8 @@ class ClusterMoments:
             torch.bmm(left.mT, right, out=out[:n_full])
             if n_full < len(out):
                 torch.mm(terms[n_full * size :].T, functions[n_full * size :], out=out[-1])
+
+        team.each(fill_level, list(zip(tree.sizes, tree.centres, tree.radii, sums.split(n_clusters), strict=True)))
         return ClusterMoments(torch.cat(tree.centres), torch.cat(tree.radii), sums.flatten(0, 1))
 
     def fill_terms(self, points: torch.Tensor, clusters: torch.Tensor, out: torch.Tensor) -> None:

@@ -77,12 +77,12 @@ def _heron(lengths: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _stiffness(faces: NDArray[np.int64], cotangents: NDArray[np.float64], n_vertices: int) -> sparse.csr_matrix:
-    start, end = np.roll(faces, -1, axis=1).ravel(), np.roll(faces, -2, axis=1).ravel()
-    weight = cotangents.ravel() / 2
-    row = np.concatenate([start, end, start, end])
-    column = np.concatenate([end, start, start, end])
-    value = np.concatenate([-weight, -weight, weight, weight])
-    return sparse.csr_matrix((value, (row, column)), shape=(n_vertices, n_vertices))
+    # Half of the cotangent of each corner, at one of the two entries of the edge opposite it.
+    shape = n_vertices, n_vertices
+    ends = faces[:, [1, 2, 0]].ravel(), faces[:, [2, 0, 1]].ravel()
+    halves = sparse.csr_matrix((cotangents.ravel() / 2, ends), shape=shape)
+    weights = halves + halves.T
+    return sparse.diags(np.asarray(weights.sum(axis=1)).ravel(), format="csr") - weights
 
 
 def _mixed_voronoi_mass(

@@ -30,10 +30,10 @@ class Factors(Protocol):
 class Structure(Protocol):
     """Elimination order and block structure for one sparsity pattern; serves any number of values and shifts."""
 
-    def factorize(self, matrix: sparse.csr_array, shift: float = 0.0) -> Factors:
-        """The factors of ``matrix − shift · I``."""
+    def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> Factors:
+        """The factors of ``matrix − shift · I``; their bits do not depend on the team."""
 
-    def inertia(self, matrix: sparse.csr_array, shift: float = 0.0) -> int:
+    def inertia(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> int:
         """The number of negative eigenvalues of ``matrix − shift · I``."""
 
     def arranged(self, matrix: sparse.csr_array) -> tuple[Structure, sparse.csr_array, np.ndarray]:
@@ -46,10 +46,10 @@ class Batched:
 
     dissection: Dissection
 
-    def factorize(self, matrix: sparse.csr_array, shift: float = 0.0) -> Factors:
+    def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> Factors:
         return factorize(self.dissection, matrix, shift)
 
-    def inertia(self, matrix: sparse.csr_array, shift: float = 0.0) -> int:
+    def inertia(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> int:
         return factorize(self.dissection, matrix, shift).n_negative
 
     def arranged(self, matrix: sparse.csr_array) -> tuple[Structure, sparse.csr_array, np.ndarray]:

@@ -60,10 +60,6 @@ def lanczos(
     # a solve reads and writes long vectors in the order of elimination: so they had better lie
     structure, matrix, order = analyse(matrix, positions).arranged(matrix)
     zero_mode = zero_mode[order]
-    if inside:
-        shift, factors = _factorize_inside(structure, matrix, zero_mode, n_eigenpairs, tolerance)
-    else:
-        shift, factors = SHIFT_BELOW, structure.factorize(matrix, SHIFT_BELOW)
     few = n_eigenpairs <= FEW_EIGENPAIRS or n_eigenpairs * len(zero_mode) > LARGE_RESULT
     block_size = SMALL_BLOCK if few else LARGE_BLOCK
     per_eigenpair = BASIS_PER_EIGENPAIR if inside else BASIS_PER_EIGENPAIR_BELOW
@@ -73,9 +69,13 @@ def lanczos(
     first_look = math.ceil(per_eigenpair * n_eigenpairs + n_blocks * block_size)
     limit = math.ceil(BASIS_LIMIT * per_eigenpair * n_eigenpairs) + BASIS_LIMIT_BESIDES
     limit = min(limit, len(zero_mode) - 2 * block_size)
-    n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
     generator = np.random.default_rng(seed)
     with Team(None if n_eigenpairs * len(zero_mode) >= TEAM_RESULT else 1) as team:
+        if inside:
+            shift, factors = _factorize_inside(structure, matrix, zero_mode, n_eigenpairs, tolerance, team)
+        else:
+            shift, factors = SHIFT_BELOW, structure.factorize(matrix, SHIFT_BELOW, team)
+        n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
         krylov = Krylov(factors, zero_mode, block_size, first_look + 3 * block_size, generator, team)
         while krylov.size < first_look:
             krylov.expand()
@@ -88,7 +88,7 @@ def lanczos(
                 n_found, bound = gap
                 # side by side, unless the basis must be kept in case that some are missing
                 vectors = partial(krylov.eigenvectors, ritz, found[:n_eigenpairs], order)
-                jobs: list[Callable[[], Any]] = [partial(structure.inertia, matrix, bound)]
+                jobs: list[Callable[[], Any]] = [partial(structure.inertia, matrix, bound, team)]
                 jobs += [] if krylov.loses_basis else [vectors]
                 n_negative, *pairs = team.each(_call, jobs)
                 n_present = n_negative - 1
@@ -109,7 +109,12 @@ def lanczos(
 
 
 def _factorize_inside(
-    structure: Structure, matrix: sparse.csr_array, zero_mode: np.ndarray, n_eigenpairs: int, tolerance: float
+    structure: Structure,
+    matrix: sparse.csr_array,
+    zero_mode: np.ndarray,
+    n_eigenpairs: int,
+    tolerance: float,
+    team: Team,
 ) -> tuple[float, Factors]:
     """A shift with about SHIFT_RANK of the wanted eigenvalues below it, at which the factorization is accurate.
 
@@ -120,10 +125,10 @@ def _factorize_inside(
     mode = torch.from_numpy(zero_mode)[:, None]
     best: tuple[float, float, float, Factors] | None = None
     for _ in range(6):
-        factors = structure.factorize(matrix, shift)
+        factors = structure.factorize(matrix, shift, team)
         rank = factors.n_negative
         off_target = max(0.0, abs(rank - target) - 0.2 * target - 1)
-        defect = float(torch.linalg.norm(shift * factors.solve(mode) + mode))
+        defect = float(torch.linalg.norm(shift * factors.solve(mode, team) + mode))
         logger.debug("shift %.6g: %d eigenvalues below, defect %.1e", shift, rank, defect)
         if best is None or (off_target, defect) < best[:2]:
             best = off_target, defect, shift, factors

@@ -22,6 +22,8 @@ from igps.threads import ALONE, Team
 SUBTREE, MOST_SUBTREES = 2**13, 3
 # Own unknowns of a node above which its dense algebra is PyTorch's. OpenBLAS starts threads for LAPACK from 64 on.
 LARGE = 63
+# Rows or columns of one product of such a node
+AT_ONCE = 256
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Tree:
         block_start: (N + 1,) where each node's block [D E] starts among all blocks.
         update_start: (N,) where its complement starts among those that wait to be added.
         n_updates: entries of all complements that wait at the same time, at most.
-        subtrees: ranges of nodes that may be solved side by side.
+        subtrees: ranges of nodes that may be eliminated, and solved, side by side.
         above: the other nodes, as ranges, each behind its children.
         carried_start: (N,) where the rows that a node adds to its boundary start among those that wait to be added.
         n_carried: rows that wait at the same time, at most.
@@ -61,15 +63,14 @@ class Tree:
     carried_start: np.ndarray
     n_carried: int
 
-    def factorize(self, matrix: sparse.csr_array, shift: float = 0.0) -> Factors:
+    def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> Factors:
         """Factorize ``matrix − shift · I``; arguments and errors are those of `factorization.factorize`."""
         blocks = np.empty(self.block_start[-1])
-        return Factors(self, blocks, self._eliminate(matrix, shift, blocks, self.block_start))
+        return Factors(self, blocks, self._eliminate(matrix, shift, team, blocks))
 
-    def inertia(self, matrix: sparse.csr_array, shift: float = 0.0) -> int:
+    def inertia(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> int:
         """The number of negative eigenvalues of ``matrix − shift · I``."""
-        one_block = np.empty(int(np.diff(self.block_start).max()))
-        return self._eliminate(matrix, shift, one_block, np.zeros_like(self.block_start))
+        return self._eliminate(matrix, shift, team, None)
 
     def arranged(self, matrix: sparse.csr_array) -> tuple[Tree, sparse.csr_array, np.ndarray]:
         """The structure for unknowns in the order of elimination, such a matrix, and which each was before (V,)."""
@@ -82,34 +83,56 @@ class Tree:
         structure = replace(self, indptr=indptr, indices=indices, order=same, number=same)
         return structure, sparse.csr_array((data, indices, indptr), shape=matrix.shape), self.order
 
-    def _eliminate(self, matrix: sparse.csr_array, shift: float, blocks: np.ndarray, block_start: np.ndarray) -> int:
-        """Write the blocks; the number of negative eigenvalues."""
-        from igps.linalg import loops
-
+    def _eliminate(self, matrix: sparse.csr_array, shift: float, team: Team, blocks: np.ndarray | None) -> int:
+        """Write the blocks, if they are to be kept; the number of negative eigenvalues."""
         matrix = canonical(matrix)
         check_entries(matrix, self.indptr, self.indices)
-        n_own, n_boundary = np.diff(self.first), np.diff(self.start)
-        updates, front = np.empty(self.n_updates), np.empty(int((n_own + n_boundary).max()) ** 2)
+        values, updates = matrix.data.astype(np.float64, copy=False), np.empty(self.n_updates)
+
+        def eliminate(nodes: tuple[int, int]) -> int:
+            return self._eliminate_range(nodes, values, float(shift), updates, blocks, team)
+
+        return sum(team.each(eliminate, self.subtrees)) + sum(map(eliminate, self.above))
+
+    def _eliminate_range(
+        self,
+        nodes: tuple[int, int],
+        values: np.ndarray,
+        shift: float,
+        updates: np.ndarray,
+        blocks: np.ndarray | None,
+        team: Team,
+    ) -> int:
+        """Write the blocks of a range of nodes, and what they leave to nodes behind it; their negative pivots."""
+        from igps.linalg import loops
+
+        begin, end = nodes
+        n_own, n_boundary = np.diff(self.first[begin : end + 1]), np.diff(self.start[begin : end + 1])
+        front = np.empty(int((n_own + n_boundary).max()) ** 2)
+        block_start = self.block_start
+        if blocks is None:
+            blocks, block_start = np.empty(int((n_own * (n_own + n_boundary)).max())), np.zeros_like(block_start)
+        place = np.empty(len(self.order), dtype=np.int64)
         problem = (
-            matrix.data.astype(np.float64, copy=False), float(shift), self.indptr, self.indices, self.order,
-            self.number, self.first, self.children, self.start, self.boundary, self.parent_row, updates,
-            self.update_start, np.empty(len(self.order), dtype=np.int64), front,
+            values, shift, self.indptr, self.indices, self.order, self.number, self.first, self.children, self.start,
+            self.boundary, self.parent_row, updates, self.update_start, place, front,
         )  # fmt: skip
         workspace = np.empty(LARGE**2), np.empty(LARGE**2), np.empty(LARGE, dtype=np.int32), _blas_and_lapack()
-        n_negative = begin = 0
-        for node in [*np.flatnonzero(n_own > LARGE).tolist(), len(n_own)]:
-            n_negative_small = loops.eliminate((begin, node), *problem, blocks, block_start, *workspace)
+        n_negative, next_node = 0, begin
+        for node in [*(begin + np.flatnonzero(n_own > LARGE)).tolist(), end]:
+            n_negative_small = loops.eliminate((next_node, node), *problem, blocks, block_start, *workspace)
             if n_negative_small < 0:
                 raise SingularMatrixError(SINGULAR)
             n_negative += n_negative_small
-            begin = node + 1
-            if node < len(n_own):
+            next_node = node + 1
+            if node < end:
                 loops.assemble(node, *problem)
-                size, n_bound = int(n_own[node]), int(n_boundary[node])
+                size, n_bound = int(n_own[node - begin]), int(n_boundary[node - begin])
                 n_negative += _eliminate_large(
                     torch.from_numpy(front[: (size + n_bound) ** 2].reshape(size + n_bound, size + n_bound)),
                     torch.from_numpy(blocks[block_start[node] :][: size * (size + n_bound)].reshape(size, -1)),
                     torch.from_numpy(updates[self.update_start[node] :][: n_bound**2].reshape(n_bound, n_bound)),
+                    team,
                 )
         return n_negative
 
@@ -171,7 +194,7 @@ def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, 
     subtrees = _subtrees(n_levels, len(order))
     inside = {node for begin, end in subtrees for node in range(begin, end)}
     above = [(node, node + 1) for node in range(len(n_own)) if node not in inside]
-    update_start, n_updates = _stacks(children, n_boundary**2, [(0, len(n_own))])
+    update_start, n_updates = _stacks(children, n_boundary**2, [*subtrees, *above])
     carried_start, n_carried = _stacks(children, n_boundary, [*subtrees, *above])
     return Tree(
         indptr=indptr,
@@ -223,14 +246,26 @@ def _stacks(children: np.ndarray, sizes: np.ndarray, ranges: list[tuple[int, int
     return place, end
 
 
-def _eliminate_large(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor) -> int:
-    """Write D, E and the complement of a front, of which the upper triangle is known; its negative pivots."""
-    n_own = len(block)
+def _eliminate_large(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor, team: Team) -> int:
+    """Write D, E and the upper triangle of the complement of a front, of which that triangle is known; its negative
+    pivots.
+    """
+    n_own, n_bound = len(block), len(update)
     pivot, coupling = front[:n_own, :n_own].triu(), front[:n_own, n_own:]
     inverse, n_negative = invert((pivot + pivot.triu(1).T)[None])
     block[:, :n_own] = inverse[0]
-    block[:, n_own:] = -(inverse[0] @ coupling)
-    torch.addmm(front[n_own:, n_own:], coupling.T, block[:, n_own:], out=update)
+    elimination, below = block[:, n_own:], front[n_own:, n_own:]
+    pieces = [slice(begin, begin + AT_ONCE) for begin in range(0, n_bound, AT_ONCE)]
+
+    def eliminate(piece: slice) -> None:
+        elimination[:, piece] = -(inverse[0] @ coupling[:, piece])
+
+    def complement(piece: slice) -> None:
+        behind = slice(piece.start, None)
+        torch.addmm(below[piece, behind], coupling[:, piece].T, elimination[:, behind], out=update[piece, behind])
+
+    team.each(eliminate, pieces)
+    team.each(complement, pieces)
     return n_negative
 
 
