@@ -22,7 +22,7 @@ from igps.threads import ALONE, Team
 SUBTREE, MOST_SUBTREES = 2**13, 3
 # Own unknowns of a node above which its dense algebra is PyTorch's. OpenBLAS starts threads for LAPACK from 64 on.
 LARGE = 63
-# Rows or columns of one product of such a node
+# Rows or columns of such a node that are multiplied at once
 AT_ONCE = 256
 
 
@@ -247,9 +247,7 @@ def _stacks(children: np.ndarray, sizes: np.ndarray, ranges: list[tuple[int, int
 
 
 def _eliminate_large(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor, team: Team) -> int:
-    """Write D, E and the upper triangle of the complement of a front, of which that triangle is known; its negative
-    pivots.
-    """
+    """Write D, E and the complement of a front; of both only the upper triangle counts. Its negative pivots."""
     n_own, n_bound = len(block), len(update)
     pivot, coupling = front[:n_own, :n_own].triu(), front[:n_own, n_own:]
     inverse, n_negative = invert((pivot + pivot.triu(1).T)[None])
