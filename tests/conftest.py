@@ -14,7 +14,7 @@ from igps.compiled import is_available
 from igps.geometry import closed_forms, coordinates, far_field, surface_potential
 from igps.geometry.mesh import Mesh
 from igps.geometry.reading import load_mesh
-from igps.linalg import direct, eigensolver, ordering
+from igps.linalg import direct, eigensolver, krylov, ordering
 from igps.nn import counted_pairs
 
 # The meshes are small: on two threads they are hardly faster, and many times slower where another process takes a core.
@@ -31,7 +31,16 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 def both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The test runs with loops compiled, where they can be, and without."""
     if request.param == "plain":
-        for module in (direct, eigensolver, ordering, counted_pairs, surface_potential, far_field, closed_forms):
+        for module in (
+            direct,
+            eigensolver,
+            krylov,
+            ordering,
+            counted_pairs,
+            surface_potential,
+            far_field,
+            closed_forms,
+        ):
             monkeypatch.setattr(module, "is_available", lambda: False)
     elif not is_available():
         pytest.skip("needs numba, the extra [fast]")

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from scipy.linalg import qr
 
+from igps.compiled import is_available
 from igps.linalg.checks import ROUNDING
 from igps.linalg.direct import Factors
 from igps.threads import ALONE, Team
@@ -120,15 +121,15 @@ class Krylov:
         product = self._apply(self._basis[last])
         projection, lengths = self._sums(
             lambda piece: (
-                product[:, piece] @ near[:, piece].T,
+                _overlaps(product, near, piece),
                 torch.linalg.norm(product[:, piece], dim=1) ** 2,
             )
         )
         diagonal, scale = projection[:, self._current - self._previous :], math.sqrt(float(lengths.max()))
 
         def leave_new(piece: slice) -> tuple[torch.Tensor]:
-            new = product[:, piece].addmm_(projection, near[:, piece], alpha=-1)
-            return (new @ new.T,)
+            product[:, piece].addmm_(projection, near[:, piece], alpha=-1)
+            return (_overlaps(product, product, piece),)
 
         (remainder,) = self._sums(leave_new)
         quick = self._factor_quickly(product, remainder, scale)
@@ -261,17 +262,16 @@ class Krylov:
         old, new = self._basis[: self._swept], self._basis[self._swept : self._stop]
         if not len(new):
             return 0.0
-        (lost,) = self._sums(lambda piece: (new[:, piece] @ old[:, piece].T,))
+        (lost,) = self._sums(lambda piece: (_overlaps(new, old, piece),))
         largest = float(lost.abs().max())
         single = self._single if largest <= SINGLE_LOSS else None
 
         def take_out(piece: slice) -> tuple[torch.Tensor]:
-            here = new[:, piece]
             if single is None:
-                here.addmm_(lost, old[:, piece], alpha=-1)
+                new[:, piece].addmm_(lost, old[:, piece], alpha=-1)
             else:
-                here.sub_(lost.float() @ single[: self._swept, piece])
-            return (here @ here.T,)
+                _subtract(new, lost.float(), single[: self._swept], piece)
+            return (_overlaps(new, new, piece),)
 
         (squares,) = self._sums(take_out)
         self._multiply(_inverse(torch.linalg.cholesky(squares)), new, new)
@@ -336,10 +336,29 @@ class Krylov:
         self._multiply(_inverse(first), block, rows)
         if smallest > ROUND_PIVOT * largest:
             return rows, first.T
-        (squares,) = self._sums(lambda piece: (rows[:, piece] @ rows[:, piece].T,))
+        (squares,) = self._sums(lambda piece: (_overlaps(rows, rows, piece),))
         second = torch.linalg.cholesky(squares)
         self._multiply(_inverse(second), rows, rows)
         return rows, second.T @ first.T
+
+
+def _overlaps(rows: torch.Tensor, others: torch.Tensor, piece: slice) -> torch.Tensor:
+    """The products (n, m) of rows with others, over a piece of the columns."""
+    if is_available():
+        from igps.linalg import row_loops
+
+        return torch.from_numpy(row_loops.overlaps(rows.numpy(), others.numpy(), piece.start, piece.stop))
+    return rows[:, piece] @ others[:, piece].T
+
+
+def _subtract(rows: torch.Tensor, factors: torch.Tensor, others: torch.Tensor, piece: slice) -> None:
+    """Take factors (n, m) times others from rows, in a piece of the columns; in the precision of the others."""
+    if is_available():
+        from igps.linalg import row_loops
+
+        row_loops.subtract(rows.numpy(), factors.numpy(), others.numpy(), piece.start, piece.stop)
+    else:
+        rows[:, piece].sub_(factors @ others[:, piece])
 
 
 def _pieces(size: int, number: int) -> list[slice]:
