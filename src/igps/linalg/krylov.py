@@ -24,7 +24,7 @@ QUICK_PIVOT = 1e-4
 ROUND_PIVOT = 0.1
 # So many blocks go by between two sweeps, or one where a sweep has found a larger loss of orthogonality; a smaller one
 # may be taken out in single precision
-SWEEP_EVERY, SWEEP_LOSS, SINGLE_LOSS = 2, 1e-7, 1e-8
+SWEEP_EVERY, SWEEP_LOSS, SINGLE_LOSS = 2, 1e-7, 3e-8
 # Of a larger basis there is no copy in single precision, to save memory: 1 GiB
 MOST_SINGLE_ENTRIES = 2**28
 # Columns of the basis that are turned into eigenvectors at once
