@@ -40,6 +40,15 @@ def allocate(n_bytes: int) -> int:
     return len(bytearray(n_bytes))
 
 
+def pages_cleared(n_bytes: int) -> int:
+    """How many pages the system hands out for so many bytes."""
+    import resource
+
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    bytearray(b"x") * n_bytes
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
 def fail_with(number: int) -> int:
     """Raise the system's error of a number; a MemoryError for 0."""
     if number == 0:

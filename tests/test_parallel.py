@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import errno
+import mmap
 import multiprocessing
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -63,6 +65,14 @@ def test_workers_have_one_thread_and_the_environment_stays(monkeypatch: pytest.M
     assert {threads for _, threads in results.values()} == {"1"}
     assert os.environ["OMP_NUM_THREADS"] == "3"
     assert "MKL_NUM_THREADS" not in os.environ
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left as they are")
+def test_a_worker_keeps_the_memory_of_one_body_for_the_next() -> None:
+    size = 40 * 2**20
+    first, second, third = all_of(jobs.pages_cleared, [size] * 3, n_workers=1, limits=Limits(seconds=100)).values()
+    assert first > 0.9 * size / mmap.PAGESIZE
+    assert max(second, third) < first / 10
 
 
 def test_a_job_that_kills_its_process_is_named_and_costs_no_other_its_result() -> None:

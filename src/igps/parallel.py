@@ -49,7 +49,13 @@ __all__ = [
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# A worker has one thread for linear algebra, or n workers on n cores run n² threads. And glibc's allocator keeps what
+# is freed for the next body: pages that are given back come again one by one, each cleared by the system.
+_WORKERS_ENVIRONMENT = {
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+    "MALLOC_MMAP_THRESHOLD_": str(2**26),
+    "MALLOC_TRIM_THRESHOLD_": str(2**28),
+}
 # A job whose process died is tried once more: an administrator or another program may have been the cause.
 _MOST_DEATHS = 2
 _KILLED = (
@@ -257,7 +263,7 @@ class _Worker(Generic[Job, Result]):
         starts = 0
         while self._pool is None:
             starts += 1
-            with _one_thread_each():
+            with _workers_environment():
                 pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(self._limits.memory,))
                 try:
                     self._pid = pool.submit(os.getpid).result()
@@ -292,7 +298,7 @@ def _by_workers(
     finished = False
     try:
         # All at once: a process takes seconds to import what it needs.
-        with _one_thread_each(), ThreadPoolExecutor(n_workers) as starters:
+        with _workers_environment(), ThreadPoolExecutor(n_workers) as starters:
             list(starters.map(lambda worker: worker.started(), workers))
         while True:
             for worker in workers:
@@ -328,13 +334,13 @@ def _by_workers(
 
 
 @contextlib.contextmanager
-def _one_thread_each() -> Generator[None, None, None]:
-    """The environment of a process with one thread for linear algebra, or n workers on n cores run n² threads.
+def _workers_environment() -> Generator[None, None, None]:
+    """The environment of the processes that are started meanwhile.
 
-    The libraries read it when they are first imported, which in a spawned process is before any initialiser runs.
+    The libraries read it when they are loaded, which in a spawned process is before any initialiser runs.
     """
-    before: dict[str, Any] = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    before: dict[str, Any] = {name: os.environ.get(name) for name in _WORKERS_ENVIRONMENT}
+    os.environ.update(_WORKERS_ENVIRONMENT)
     try:
         yield
     finally:
