@@ -41,7 +41,7 @@ def checked_mass(mass: np.ndarray | sparse.sparray | sparse.spmatrix) -> np.ndar
 def checked_stiffness(
     stiffness: sparse.sparray | sparse.spmatrix, mass: np.ndarray, n_eigenpairs: int
 ) -> sparse.csr_array:
-    """The stiffness as an exactly symmetric csr array, after all checks on the arguments."""
+    """The stiffness as an exactly symmetric csr array, which may be the argument, after all checks on the arguments."""
     if not sparse.issparse(stiffness):
         raise ValueError(f"stiffness must be a scipy sparse matrix, got {type(stiffness).__name__}")
     n_vertices = len(mass)
@@ -54,7 +54,7 @@ def checked_stiffness(
             f"n_eigenpairs={n_eigenpairs} needs matrices of more than {n_eigenpairs + 1} rows, these have "
             f"{n_vertices}: ask for fewer eigenpairs, or subdivide the surface"
         )
-    stiffness = sparse.csr_array(stiffness, dtype=np.float64)
+    stiffness = canonical(sparse.csr_array(stiffness, dtype=np.float64))
     if not np.isfinite(stiffness.data).all():
         raise ValueError(
             "stiffness has entries that are not finite: of a surface, repair the degenerate triangles first"
@@ -78,7 +78,9 @@ def checked_stiffness(
         raise ValueError(
             "the rows of stiffness must sum to zero, as on a closed surface the constant is an eigenfunction"
         )
-    symmetric = sparse.csr_array((stiffness + transpose) / 2)
+    parts = [(stiffness.indptr, transpose.indptr), (stiffness.indices, transpose.indices)]
+    exact = all(np.array_equal(*both) for both in [*parts, (stiffness.data, transpose.data)])
+    symmetric = stiffness if exact else sparse.csr_array((stiffness + transpose) / 2)
     n_components = connected_components(_significant(symmetric), directed=False, return_labels=False)
     if n_components > 1:
         raise ValueError(
@@ -90,7 +92,8 @@ def checked_stiffness(
 
 def _significant(stiffness: sparse.csr_array) -> sparse.csr_array:
     """The matrix without entries that are zero but for rounding: these would tie components together in vain."""
-    entries = stiffness.tocoo()
-    diagonal = stiffness.diagonal()
+    entries, diagonal = stiffness.tocoo(), stiffness.diagonal()
     kept = np.abs(entries.data) > ROUNDING * np.minimum(diagonal[entries.row], diagonal[entries.col])
+    if kept.all():
+        return stiffness
     return sparse.csr_array((entries.data[kept], (entries.row[kept], entries.col[kept])), shape=stiffness.shape)

@@ -56,7 +56,7 @@ class Batched:
         return self, matrix, np.arange(matrix.shape[0])
 
 
-def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = 32) -> Structure:
+def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = 48) -> Structure:
     """The structure for all matrices with one symmetric pattern; arguments and errors are those of `dissect`."""
     if is_available():
         return multifrontal.analyse(matrix, coordinates, leaf_size=leaf_size)

@@ -123,9 +123,9 @@ def eigenpairs(
         raise ValueError(f"method must be 'lanczos' or 'eigsh', got {method!r}")
 
     area = mass.sum()
-    scale = sparse.diags_array(np.sqrt(area / mass))
-    matrix = sparse.csr_array(scale @ stiffness @ scale)
-    matrix.sort_indices()
+    scale = np.sqrt(area / mass)
+    matrix = stiffness.copy()
+    matrix.data *= scale.repeat(np.diff(matrix.indptr)) * scale[matrix.indices]
     if method == "eigsh":
         eigenvalues, eigenfunctions = _arpack(stiffness, mass, n_eigenpairs, seed)
         residual, _ = _residual(matrix, eigenvalues * area, eigenfunctions * np.sqrt(mass)[:, None], math.inf)

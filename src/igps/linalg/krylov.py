@@ -119,19 +119,16 @@ class Krylov:
         last = slice(self._current, self._stop)
         near = self._basis[self._previous : self._stop]
         product = self._apply(self._basis[last])
-        projection, lengths = self._sums(
-            lambda piece: (
-                _overlaps(product, near, piece),
-                torch.linalg.norm(product[:, piece], dim=1) ** 2,
-            )
-        )
-        diagonal, scale = projection[:, self._current - self._previous :], math.sqrt(float(lengths.max()))
+        (projection,) = self._sums(lambda piece: (_overlaps(product, near, piece),))
+        diagonal = projection[:, self._current - self._previous :]
 
         def leave_new(piece: slice) -> tuple[torch.Tensor]:
             product[:, piece].addmm_(projection, near[:, piece], alpha=-1)
             return (_overlaps(product, product, piece),)
 
         (remainder,) = self._sums(leave_new)
+        # of the product, which is what the recurrence takes from it and what is left
+        scale = math.sqrt(float((remainder.diagonal() + projection.square().sum(1)).max()))
         quick = self._factor_quickly(product, remainder, scale)
         if quick is None:
             self._sweep()

@@ -29,7 +29,7 @@ SMALL_BLOCK, LARGE_BLOCK, FEW_EIGENPAIRS, LARGE_RESULT = 8, 12, 128, 2**27
 # Basis size at which mostly all pairs have converged, as measured on bodies of 11,000 vertices: so many vectors a pair
 # and, besides, so many blocks, more for each factor of ten in the number of pairs and for each digit beyond seven
 BASIS_PER_EIGENPAIR, BASIS_PER_EIGENPAIR_BELOW = 1.35, 2.35
-BASIS_BLOCKS, BASIS_BLOCKS_PER_DECADE, BASIS_BLOCKS_PER_DIGIT = {SMALL_BLOCK: 3.4, LARGE_BLOCK: 2.4}, 4.8, 1.0
+BASIS_BLOCKS, BASIS_BLOCKS_PER_DECADE, BASIS_BLOCKS_PER_DIGIT = 2.4, 4.8, 1.0
 # The basis gives up at this multiple of what the pairs need, and so many vectors more
 BASIS_LIMIT, BASIS_LIMIT_BESIDES = 3, 600
 # Numbers in the result from which a second thread pays
@@ -64,7 +64,7 @@ def lanczos(
     block_size = SMALL_BLOCK if few else LARGE_BLOCK
     per_eigenpair = BASIS_PER_EIGENPAIR if inside else BASIS_PER_EIGENPAIR_BELOW
     digits = -math.log10(max(tolerance, ROUNDING)) - 7
-    n_blocks = BASIS_BLOCKS[block_size] + BASIS_BLOCKS_PER_DECADE * math.log10(n_eigenpairs)
+    n_blocks = BASIS_BLOCKS + BASIS_BLOCKS_PER_DECADE * math.log10(n_eigenpairs)
     n_blocks = max(1, n_blocks + BASIS_BLOCKS_PER_DIGIT * digits)
     first_look = math.ceil(per_eigenpair * n_eigenpairs + n_blocks * block_size)
     limit = math.ceil(BASIS_LIMIT * per_eigenpair * n_eigenpairs) + BASIS_LIMIT_BESIDES

@@ -182,7 +182,7 @@ class Factors:
         return solution.T
 
 
-def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = 32) -> Tree:
+def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = 48) -> Tree:
     """Elimination order and fronts; arguments and errors are those of `symbolic.dissect`."""
     from igps.linalg import loops
 

@@ -130,7 +130,7 @@ def dissect(
     matrix: sparse.csr_array,
     coordinates: np.ndarray | None = None,
     *,
-    leaf_size: int = 32,
+    leaf_size: int = 48,
     device: torch.device | str = "cpu",
 ) -> Dissection:
     """Elimination order and block structure for all matrices with one symmetric sparsity pattern.
