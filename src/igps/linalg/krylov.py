@@ -254,7 +254,7 @@ class Krylov:
         to the spread of the others: with each block some hundred times as much. Two blocks go by before it is swept
         out, in both at once, as products of the basis with twice as many columns take less than twice the time. The
         projection is then wrong by the square of what was lost (Simon 1984), which is below rounding. Single precision
-        takes out exactly enough of what is that small.
+        takes out exactly enough of what is that small; then the rows are mostly still orthonormal.
         """
         old, new = self._basis[: self._swept], self._basis[self._swept : self._stop]
         if not len(new):
@@ -271,7 +271,8 @@ class Krylov:
             return (_overlaps(new, new, piece),)
 
         (squares,) = self._sums(take_out)
-        self._multiply(_inverse(torch.linalg.cholesky(squares)), new, new)
+        if float((squares - torch.eye(len(new))).abs().max()) > ROUNDING:
+            self._multiply(_inverse(torch.linalg.cholesky(squares)), new, new)
         self._mark_swept()
         return largest
 
