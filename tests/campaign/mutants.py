@@ -113,7 +113,11 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         # Below zero there is only rounding.
         (
             "src/igps/retrieval/reranking.py",
-            "mixed = (1 - share) * jaccard.clamp_min( -1) + share * own / mean.clamp_min(torch.finfo(own.dtype).tiny)",
+            "apart = (1 - length[:, None] * alike * length).clamp_min( -1)",
+        ),
+        (
+            "src/igps/retrieval/reranking.py",
+            "return _mixed((jaccard + jaccard.T).clamp_min( -1) / 2, own, share)",
         ),
     }
 )

@@ -51,7 +51,7 @@ def retrieve(
             failures.csv if a mesh could not be used.
         report: make a page of the results in that folder, report.html, see `igps report`
         rerank: score the distances that the whole collection has set right by its neighbourhoods, too, in a table of
-            their own (k-reciprocal re-ranking, without labels); distances.npz has them as "reranked".
+            their own (diffusion and k-reciprocal re-ranking, without labels); distances.npz has them as "reranked".
         n_workers: processes that compute; all cores if not given.
         strict: stop at the first mesh that cannot be used instead of skipping it
     """
@@ -130,8 +130,8 @@ def query(
         top: how many to list.
         descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own; if not given, that of the
             index, or pretrained.
-        rerank: put the nearest 200 in order by what neighbours they have in common (k-reciprocal re-ranking, without
-            labels); the distances listed are those of this order, without unit.
+        rerank: put the nearest 200 in order by what neighbours they have in common (diffusion and k-reciprocal
+            re-ranking, without labels); the distances listed are those of this order, without unit.
     """
     if top < 1:
         raise ValueError(f"top: expected at least 1, got {top}.")

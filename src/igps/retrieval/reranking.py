@@ -20,26 +20,35 @@ def rerank(
     n_neighbours: int = 20,
     n_expanded: int = 6,
     share: float = 0.3,
+    diffusion: float = 0.95,
     *,
     keep_nearest: bool = True,
     progress: bool = False,
 ) -> Tensor:
-    """k-reciprocal re-ranking: shapes are close whose neighbours are the same (Zhong, Zheng, Cao and Li 2017).
+    """Diffusion, then k-reciprocal re-ranking: shapes are close that lead to one another, and whose neighbours do.
 
-    The neighbourhood of a shape are those among its k nearest that have it among theirs, joined by the neighbourhoods,
-    of k/2, of its members where two thirds of those are in it already. Its members weigh exp(−d), d in units of the
-    mean distance to the k nearest; the weights are averaged over the nearest shapes, and the Jaccard distance of two
-    such neighbourhoods is mixed with the distance itself. The whole collection decides: a shape less, and the others
-    rank differently. What neighbours have in common tells which class a shape is of, less which body of it; so the
-    nearest of each stays its nearest.
+    *Diffusion* (Zhou, Weston, Gretton, Bousquet and Schölkopf 2004): shapes are tied to their k/2 nearest, by weights
+    exp(−d² / σσ′), σ the mean distance to these (Zelnik-Manor and Perona 2004). With S = D^−½ W D^−½, two shapes are as
+    alike as all walks between them tell, (I − diffusion · S)⁻¹ with ones on the diagonal.
+
+    *k-reciprocal neighbours* (Zhong, Zheng, Cao and Li 2017), by the distances that diffusion gave: the neighbourhood
+    of a shape are those among its k nearest that have it among theirs, joined by the neighbourhoods, of k/2, of its
+    members where two thirds of those are in it already. Its members weigh exp(−d), d in units of the mean distance to
+    the k nearest; the weights are averaged over the nearest shapes, and two such neighbourhoods have their Jaccard
+    distance.
+
+    What each step gives is mixed with the distance that it was given. The whole collection decides: a shape less, and
+    the others rank differently. What neighbours have in common tells which class a shape is of, less which body of it;
+    so the nearest of each stays its nearest.
 
     Args:
         distances: (N, N) of a collection to itself, symmetric, ≥ 0.
         n_neighbours: k, at most N − 1.
         n_expanded: nearest shapes, itself among them, that the weights are averaged over.
-        share: of the distance itself, in units of its mean, in the sum.
-        keep_nearest: pairs of which one is the other's nearest come before all others, in their own order; the paper
-            leaves them where they fall.
+        share: of the distance that a step was given, in units of its mean, in the sum.
+        diffusion: how slowly walks fade, from 0 to less than 1; with 0 there is no such step.
+        keep_nearest: pairs of which one is the other's nearest come before all others, in their own order, after each
+            step; the papers leave them where they fall.
         progress: show a bar.
 
     Returns:
@@ -57,34 +66,23 @@ def rerank(
             f"n_neighbours, n_expanded, share: expected at least 1, at least 1, and 0 to 1, got {n_neighbours}, "
             f"{n_expanded} and {share}."
         )
+    if not 0 <= diffusion < 1:
+        raise ValueError(f"diffusion: expected 0 to less than 1, got {diffusion}.")
     n = len(distances)
     k = min(n_neighbours, n - 1)
     if k < 1:
         return torch.zeros_like(distances)
-    own = distances.double().clone()
-    own.fill_diagonal_(-1)  # a shape is its own nearest, also where another is at distance 0
-    order = own.argsort(dim=1, stable=True)
-    own.fill_diagonal_(0)
-    members = _reciprocal(order, k)
-    half = _reciprocal(order, max(1, round(k / 2)))
-    inside = half.double() @ members.double().T  # of the neighbourhood of j, how many belong to that of i: [j, i]
-    joins = (2 / 3 * half.sum(dim=1) <= inside.T) & members
-    members = members | ((joins.double() @ half.double()) > 0)
-
-    near = own.gather(1, order[:, 1 : k + 1]).mean(dim=1, keepdim=True).clamp_min(torch.finfo(own.dtype).tiny)
-    weights = members * torch.exp(-own / near)
-    weights /= weights.sum(dim=1, keepdim=True)
-    weights = weights[order[:, : min(n_expanded, n)]].mean(dim=1)
-    rows = tqdm(weights, desc="re-ranked", disable=not progress)
-    smaller = torch.stack([torch.minimum(row, weights).sum(dim=1) for row in rows])
-    jaccard = 1 - smaller / (2 - smaller)
-    jaccard = (jaccard + jaccard.T) / 2
-    mean = own.sum() / (n * (n - 1))
-    mixed = (1 - share) * jaccard.clamp_min(0) + share * own / mean.clamp_min(torch.finfo(own.dtype).tiny)
-    mixed.fill_diagonal_(0)
+    own = distances.double().clone().fill_diagonal_(0)
+    nearest = _order(own)[:, 1]
+    found = own
+    if diffusion:
+        found = _diffused(own, max(1, round(k / 2)), share, diffusion)
+        if keep_nearest:
+            _bring_forward(found, own, nearest)
+    found = _by_neighbourhoods(found, k, n_expanded, share, progress)
     if keep_nearest:
-        _bring_forward(mixed, own, order[:, 1])
-    return mixed.to(distances.dtype)
+        _bring_forward(found, own, nearest)
+    return found.to(distances.dtype)
 
 
 def rerank_found(
@@ -113,13 +111,65 @@ def rerank_found(
     return SearchResult(*(torch.stack(each) for each in zip(*results, strict=True)))
 
 
+def _diffused(own: Tensor, k: int, share: float, fading: float) -> Tensor:
+    """(N, N) distances by all walks between shapes, mixed with their own; each is tied to its k nearest."""
+    near = _order(own)[:, 1 : k + 1]
+    scale = own.gather(1, near).mean(dim=1)
+    tied = torch.zeros(own.shape, dtype=torch.bool, device=own.device).scatter_(1, near, True)
+    weights = torch.exp(-own.square() / _above_zero(scale[:, None] * scale)) * (tied | tied.T)
+    degree = _above_zero(weights.sum(dim=1)).rsqrt()
+    walks = torch.eye(len(own), dtype=own.dtype, device=own.device) - fading * degree[:, None] * weights * degree
+    alike = torch.cholesky_inverse(torch.linalg.cholesky(walks))
+    length = alike.diagonal().rsqrt()
+    apart = (1 - length[:, None] * alike * length).clamp_min(0)
+    return _mixed((apart + apart.T) / (2 * _above_zero(_mean(apart))), own, share)
+
+
+def _by_neighbourhoods(own: Tensor, k: int, n_expanded: int, share: float, progress: bool) -> Tensor:
+    """(N, N) distances by k-reciprocal neighbourhoods, mixed with their own."""
+    order = _order(own)
+    members = _reciprocal(order, k)
+    half = _reciprocal(order, max(1, round(k / 2)))
+    inside = half.double() @ members.double().T  # of the neighbourhood of j, how many belong to that of i: [j, i]
+    joins = (2 / 3 * half.sum(dim=1) <= inside.T) & members
+    members = members | ((joins.double() @ half.double()) > 0)
+
+    near = _above_zero(own.gather(1, order[:, 1 : k + 1]).mean(dim=1, keepdim=True))
+    weights = members * torch.exp(-own / near)
+    weights /= weights.sum(dim=1, keepdim=True)
+    weights = weights[order[:, :n_expanded]].mean(dim=1)
+    rows = tqdm(weights, desc="re-ranked", disable=not progress)
+    smaller = torch.stack([torch.minimum(row, weights).sum(dim=1) for row in rows])
+    jaccard = 1 - smaller / (2 - smaller)
+    return _mixed((jaccard + jaccard.T).clamp_min(0) / 2, own, share)
+
+
+def _mixed(found: Tensor, own: Tensor, share: float) -> Tensor:
+    return ((1 - share) * found + share * own / _above_zero(_mean(own))).fill_diagonal_(0)
+
+
+def _mean(distances: Tensor) -> Tensor:
+    """Of a collection's distances to itself, () without those of shapes to themselves."""
+    n = len(distances)
+    return distances.sum() / (n * (n - 1))
+
+
+def _above_zero(values: Tensor) -> Tensor:
+    return values.clamp_min(torch.finfo(values.dtype).tiny)
+
+
+def _order(distances: Tensor) -> Tensor:
+    """(N, N) the shapes as each ranks them, itself first, also where another is at distance 0."""
+    return distances.clone().fill_diagonal_(-1).argsort(dim=1, stable=True)
+
+
 def _bring_forward(mixed: Tensor, own: Tensor, nearest: Tensor) -> None:
     """Make each shape's nearest by its own distances, (N,), its nearest by the mixed ones, in place."""
     pairs = torch.zeros(mixed.shape, dtype=torch.bool, device=mixed.device).scatter_(1, nearest[:, None], True)
     pairs = pairs | pairs.T
     others = mixed[~pairs & (mixed > 0)]
     least = others.min() if len(others) else mixed.new_ones(())
-    largest = own[pairs].max().clamp_min(torch.finfo(own.dtype).tiny)
+    largest = _above_zero(own[pairs].max())
     # half of the least, so that single precision leaves no tie
     mixed[pairs] = 0.5 * least * own[pairs] / largest
 
