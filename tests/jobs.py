@@ -49,6 +49,12 @@ def pages_cleared(n_bytes: int) -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 
+def huge_pages() -> str:
+    """When the system hands out huge pages, as Linux says it."""
+    setting = Path("/sys/kernel/mm/transparent_hugepage/enabled")
+    return setting.read_text() if setting.exists() else ""
+
+
 def fail_with(number: int) -> int:
     """Raise the system's error of a number; a MemoryError for 0."""
     if number == 0:

@@ -68,6 +68,7 @@ def test_workers_have_one_thread_and_the_environment_stays(monkeypatch: pytest.M
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left as they are")
+@pytest.mark.skipif("[always]" in jobs.huge_pages(), reason="the system hands out huge pages, of which there are few")
 def test_a_worker_keeps_the_memory_of_one_body_for_the_next() -> None:
     size = 40 * 2**20
     first, second, third = all_of(jobs.pages_cleared, [size] * 3, n_workers=1, limits=Limits(seconds=100)).values()

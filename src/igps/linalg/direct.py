@@ -12,6 +12,7 @@ from scipy import sparse
 from igps.compiled import is_available
 from igps.linalg import multifrontal
 from igps.linalg.factorization import factorize
+from igps.linalg.ordering import LEAF_SIZE
 from igps.linalg.symbolic import Dissection, dissect
 from igps.threads import ALONE, Team
 
@@ -56,7 +57,9 @@ class Batched:
         return self, matrix, np.arange(matrix.shape[0])
 
 
-def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = 48) -> Structure:
+def analyse(
+    matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = LEAF_SIZE
+) -> Structure:
     """The structure for all matrices with one symmetric pattern; arguments and errors are those of `dissect`."""
     if is_available():
         return multifrontal.analyse(matrix, coordinates, leaf_size=leaf_size)

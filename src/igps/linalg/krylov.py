@@ -127,7 +127,7 @@ class Krylov:
             return (_overlaps(product, product, piece),)
 
         (remainder,) = self._sums(leave_new)
-        # of the product, which is what the recurrence takes from it and what is left
+        # the longest row of the product, by Pythagoras: what the recurrence took from it, and what is left
         scale = math.sqrt(float((remainder.diagonal() + projection.square().sum(1)).max()))
         quick = self._factor_quickly(product, remainder, scale)
         if quick is None:

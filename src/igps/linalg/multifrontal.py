@@ -15,7 +15,7 @@ from scipy import sparse
 
 from igps.linalg.checks import canonical, check_entries
 from igps.linalg.factorization import SINGULAR, SingularMatrixError, invert
-from igps.linalg.ordering import checked_graph, nested_dissection
+from igps.linalg.ordering import LEAF_SIZE, checked_graph, nested_dissection
 from igps.threads import ALONE, Team
 
 # Unknowns from which a subtree is worth a thread of its own, and the most subtrees, as a power of two
@@ -182,7 +182,7 @@ class Factors:
         return solution.T
 
 
-def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = 48) -> Tree:
+def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = LEAF_SIZE) -> Tree:
     """Elimination order and fronts; arguments and errors are those of `symbolic.dissect`."""
     from igps.linalg import loops
 

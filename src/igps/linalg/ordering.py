@@ -12,6 +12,8 @@ from scipy.sparse.csgraph import dijkstra
 from igps.compiled import is_available
 from igps.linalg.checks import canonical
 
+# A part of about so many vertices is not split any more: fewer make more and smaller products, more make fuller fronts
+LEAF_SIZE = 48
 # Of the part's vertices, how far from the middle a cut may lie. Wider windows find smaller separators, but the lopsided
 # trees that follow cost more than they save.
 CUT_WINDOW = 0.05

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy import sparse
 
-from igps.linalg.ordering import checked_graph, nested_dissection
+from igps.linalg.ordering import LEAF_SIZE, checked_graph, nested_dissection
 
 # Largest ratio of front sizes within a batch: many small batches lose time between them, few large ones in padding.
 BATCH_SPREAD = 1.2
@@ -130,7 +130,7 @@ def dissect(
     matrix: sparse.csr_array,
     coordinates: np.ndarray | None = None,
     *,
-    leaf_size: int = 48,
+    leaf_size: int = LEAF_SIZE,
     device: torch.device | str = "cpu",
 ) -> Dissection:
     """Elimination order and block structure for all matrices with one symmetric sparsity pattern.
