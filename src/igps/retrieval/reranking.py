@@ -130,16 +130,19 @@ def _by_neighbourhoods(own: Tensor, k: int, n_expanded: int, share: float, progr
     order = _order(own)
     members = _reciprocal(order, k)
     half = _reciprocal(order, max(1, round(k / 2)))
-    inside = half.double() @ members.double().T  # of the neighbourhood of j, how many belong to that of i: [j, i]
+    inside = half.float() @ members.float().T  # of the neighbourhood of j, how many belong to that of i: [j, i]
     joins = (2 / 3 * half.sum(dim=1) <= inside.T) & members
-    members = members | ((joins.double() @ half.double()) > 0)
+    members = members | ((joins.float() @ half.float()) > 0)
 
     near = _above_zero(own.gather(1, order[:, 1 : k + 1]).mean(dim=1, keepdim=True))
     weights = members * torch.exp(-own / near)
     weights /= weights.sum(dim=1, keepdim=True)
     weights = weights[order[:, :n_expanded]].mean(dim=1)
-    rows = tqdm(weights, desc="re-ranked", disable=not progress)
-    smaller = torch.stack([torch.minimum(row, weights).sum(dim=1) for row in rows])
+    columns = weights.T.contiguous()
+    smaller = torch.empty_like(weights)
+    for i, row in enumerate(tqdm(weights, desc="re-ranked", disable=not progress)):
+        among = row.nonzero().flatten()  # few: of the others the smaller weight is 0
+        smaller[i] = torch.minimum(row[among, None], columns[among]).sum(dim=0)
     jaccard = 1 - smaller / (2 - smaller)
     return _mixed((jaccard + jaccard.T).clamp_min(0) / 2, own, share)
 
