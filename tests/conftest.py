@@ -16,6 +16,7 @@ from igps.geometry.mesh import Mesh
 from igps.geometry.reading import load_mesh
 from igps.linalg import direct, eigensolver, krylov, ordering
 from igps.nn import counted_pairs
+from igps.retrieval import distances
 
 # The meshes are small: on two threads they are hardly faster, and many times slower where another process takes a core.
 torch.set_num_threads(1)
@@ -40,6 +41,7 @@ def both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
             surface_potential,
             far_field,
             closed_forms,
+            distances,
         ):
             monkeypatch.setattr(module, "is_available", lambda: False)
     elif not is_available():

@@ -41,6 +41,7 @@ from igps.nn.centres import middles
 from igps.nn.hard_pairs import pair_histogram
 from igps.nn.histogram import joint_histogram
 from igps.nn.pair_axes import Distances, OrientedPoints
+from igps.retrieval import chi_square
 from igps.threads import n_cores
 
 K = 250
@@ -291,6 +292,20 @@ def histogram_backward(data: Path | None) -> Figure:
     reference = 1024 * 1023 / 2e6 / reference
     note = "forward and backward to all centres, soft classes; baseline: one class, 1,024 points"
     return Figure(rate, "M pairs/s", reference, "dense autograd", rate / reference, note)
+
+
+def chi_square_distances(data: Path | None) -> Figure:
+    from sklearn.metrics.pairwise import additive_chi2_kernel
+
+    histograms = torch.rand(2000, 512, generator=torch.Generator().manual_seed(0))
+    histograms /= histograms.sum(dim=1, keepdim=True)
+    chi_square(histograms[:2], histograms[:2])  # compiled at the first call
+    return against(
+        "scikit-learn additive_chi2_kernel",
+        lambda: chi_square(histograms, histograms),
+        lambda: additive_chi2_kernel(histograms.numpy(), histograms.numpy()),
+        note="2,000 histograms of 512 cells with one another",
+    )
 
 
 def oriented_pairs(data: Path | None) -> Figure:
@@ -550,6 +565,7 @@ FIGURES: dict[str, Callable[[Path | None], Figure | dict[str, Figure]]] = {
     "voxels_128": voxels_128,
     "histogram_pairs": histogram_pairs,
     "histogram_backward": histogram_backward,
+    "chi_square": chi_square_distances,
     "oriented_pairs": oriented_pairs,
     "describe_rich": describe_before,
     "descriptor_15k": descriptor_15k,

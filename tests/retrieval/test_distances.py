@@ -13,7 +13,8 @@ from sklearn.metrics.pairwise import additive_chi2_kernel
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from igps.retrieval import Distance, chi_square, cosine, euclidean, hellinger
+from igps import threads
+from igps.retrieval import Distance, chi_square, cosine, distances, euclidean, hellinger
 
 ALL = [chi_square, hellinger, euclidean, cosine]
 ORACLES: dict[Distance, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
@@ -32,6 +33,7 @@ def histograms(n: int, cells: tuple[int, ...], *, seed: int, filled: float = 0.6
     return values / values.flatten(1).sum(1).view(n, *[1] * len(cells))
 
 
+@pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize("distance", ALL)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 4e-6)])
 @pytest.mark.parametrize(("n_queries", "n_gallery", "cells"), [(7, 5, (3, 8)), (1, 90, (10, 64)), (3, 2, (9000,))])
@@ -46,6 +48,7 @@ def test_agrees_with_another_library(
     np.testing.assert_allclose(result.double().numpy(), expected, rtol=0, atol=tolerance)
 
 
+@pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize("distance", ALL)
 def test_a_set_with_itself_has_a_zero_diagonal_and_is_symmetric(distance: Distance) -> None:
     shapes = histograms(60, (10, 64), seed=3).float()
@@ -55,6 +58,7 @@ def test_a_set_with_itself_has_a_zero_diagonal_and_is_symmetric(distance: Distan
     assert (distances >= 0).all()
 
 
+@pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize(
     ("distance", "farthest"), [(chi_square, 1.0), (hellinger, 1.0), (euclidean, 2**0.5), (cosine, 1)]
 )
@@ -76,6 +80,26 @@ def test_cosine_ignores_length_even_at_the_ends_of_the_dtype(scale: float) -> No
     assert cosine(scale * a, scale * b).item() == pytest.approx(1 - 0.5**0.5, rel=1e-6)
 
 
+@pytest.mark.parametrize(("n_queries", "n_gallery"), [(70, 9), (9, 70), (1, 1)])
+def test_threads_change_no_bit_of_chi_square(n_queries: int, n_gallery: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "n_cores", lambda: 8)
+    monkeypatch.setattr(distances, "_TRIPLES_PER_THREAD", 0)
+    queries, gallery = histograms(n_queries, (40,), seed=21), histograms(n_gallery, (40,), seed=22)
+    before = torch.get_num_threads()
+    found = []
+    try:
+        for n_threads in (1, 2, 3):
+            torch.set_num_threads(n_threads)
+            found.append(chi_square(queries, gallery))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(found[1], found[0])
+    assert torch.equal(found[2], found[0])
+    expected = ORACLES[chi_square](queries.numpy(), gallery.numpy())
+    np.testing.assert_allclose(found[0].numpy(), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.usefixtures("both_ways")
 def test_chi_square_of_tiny_entries_does_not_underflow() -> None:
     assert chi_square(torch.tensor([[1e-30]]), torch.tensor([[0.0]])).item() == pytest.approx(5e-31, rel=1e-6, abs=0)
 
@@ -86,6 +110,7 @@ def test_half_precision_is_computed_in_float32() -> None:
         torch.testing.assert_close(distance(queries, queries[:2]), distance(queries.float(), queries[:2].float()))
 
 
+@pytest.mark.usefixtures("both_ways")
 def test_chi_square_weights_each_cell() -> None:
     queries, gallery = histograms(4, (3, 8), seed=5), histograms(6, (3, 8), seed=6)
     for shape in [(3, 8), (3, 1), (8,), ()]:
@@ -98,6 +123,7 @@ def test_chi_square_weights_each_cell() -> None:
         np.testing.assert_allclose(chi_square(queries, gallery, weights).numpy(), expected, atol=1e-14)
 
 
+@pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize("distance", ALL)
 def test_gradients_agree_with_finite_differences(distance: Distance) -> None:
     queries, gallery = histograms(3, (2, 5), seed=8, filled=2), histograms(4, (2, 5), seed=9, filled=2)
@@ -151,6 +177,7 @@ def test_chi_square_never_holds_all_triples_of_query_gallery_and_cell() -> None:
         assert 0 < largest.n_bytes <= 2**20
 
 
+@pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize("distance", ALL)
 def test_an_empty_set_of_queries_gives_an_empty_matrix(distance: Distance) -> None:
     assert distance(torch.empty(0, 4), torch.ones(3, 4)).shape == (0, 3)

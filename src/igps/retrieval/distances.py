@@ -15,6 +15,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from igps.compiled import is_available
+from igps.threads import Team
+
 Distance = Callable[[Tensor, Tensor], Tensor]
 """A distance function: queries (Q, ...) and gallery (G, ...) to distances (Q, G) ≥ 0, smaller is closer."""
 
@@ -23,6 +26,8 @@ Distance = Callable[[Tensor, Tensor], Tensor]
 _CPU_TILE_BYTES = 2**20
 _DEVICE_TILE_BYTES = 48 * 2**20
 _CELLS_PER_TILE = 4096
+# Triples that a thread of the compiled loops computes at least: some milliseconds
+_TRIPLES_PER_THREAD = 2**24
 
 
 def chi_square(queries: Tensor, gallery: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -115,6 +120,8 @@ class _ChiSquare(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor, w: Tensor | None) -> Tensor:
         ctx.save_for_backward(a, b, w)
+        if a.device.type == "cpu" and is_available():
+            return _compiled_chi_square(a, b, w)
         distances = a.new_zeros(len(a), len(b))
         for q, g, c in _tiles(a, b):
             ratio, difference = _ratio(a[q, c], b[g, c])
@@ -143,6 +150,29 @@ class _ChiSquare(torch.autograd.Function):
         if w is not None:
             grad_a, grad_b = grad_a * w, grad_b * w
         return grad_a, grad_b, None if grad_w is None else grad_w / 2
+
+
+def _compiled_chi_square(a: Tensor, b: Tensor, w: Tensor | None) -> Tensor:
+    """As the tiles, some ten times as fast; threads share the longer of both sides."""
+    from igps.retrieval import distance_loops
+
+    distances = a.new_empty(len(a), len(b))
+    weights = a.new_ones(a.shape[1]) if w is None else w
+    queries, gallery, cells = (tensor.detach().contiguous().numpy() for tensor in (a, b, weights))
+    found, length = distances.numpy(), max(len(a), len(b))
+
+    def write(begin: int) -> None:
+        part = slice(begin, begin + step)
+        if len(a) >= len(b):
+            distance_loops.chi_squares(queries[part], gallery, cells, found[part])
+        else:
+            distance_loops.chi_squares(queries, gallery[part], cells, found[:, part])
+
+    large = distances.numel() * a.shape[1] > 2 * _TRIPLES_PER_THREAD
+    with Team(None if large else 1) as team:
+        step = max(1, -(-length // (1 if team.n_threads == 1 else 4 * team.n_threads)))
+        team.each(write, range(0, length, step))
+    return distances.mul_(0.5)
 
 
 def _ratio(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,45 @@
+"""Loops that Numba compiles for `distances`: no temporary as large as queries times gallery times cells."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.compiled import compiled
+
+Real = TypeVar("Real", np.float32, np.float64)
+
+# Rows of the gallery that the processor's second cache keeps while the queries go by, if they have some hundred cells
+TILE = 64
+# Sums may be taken in any order: of several cells at once
+SUMS = {"contract", "reassoc", "nsz"}
+
+
+@compiled()
+def chi_squares(
+    queries: NDArray[Real], gallery: NDArray[Real], weights: NDArray[Real], distances: NDArray[Real]
+) -> None:
+    """Write the sums of w (a−b)² / (a+b) over the cells, of rows (Q, cells) with rows (G, cells), to (Q, G)."""
+    for begin in range(0, len(gallery), TILE):
+        for q in range(len(queries)):
+            for g in range(begin, min(begin + TILE, len(gallery))):
+                distances[q, g] = chi_square(queries[q], gallery[g], weights)
+
+
+@compiled(fastmath=SUMS)
+def chi_square(a: NDArray[Real], b: NDArray[Real], weights: NDArray[Real]) -> Real:
+    """The sum of w (a−b)² / (a+b) over the cells."""
+    total, one = a.dtype.type(0), a.dtype.type(1)
+    for cell in range(np.uint64(len(a))):
+        total += weights[cell] * term(a[cell], b[cell], one)
+    return total
+
+
+# Said in so many words, as Numba else takes what the caller has: the square of a small number may be 0.
+@compiled(fastmath=False)
+def term(a: Real, b: Real, one: Real) -> Real:
+    """(a−b)² / (a+b), divided before it is multiplied; 0 where both are 0."""
+    apart, both = a - b, a + b
+    return apart / (both if both > 0 else one) * apart
