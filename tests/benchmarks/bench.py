@@ -41,7 +41,7 @@ from igps.nn.centres import middles
 from igps.nn.hard_pairs import pair_histogram
 from igps.nn.histogram import joint_histogram
 from igps.nn.pair_axes import Distances, OrientedPoints
-from igps.retrieval import chi_square
+from igps.retrieval import chi_square, euclidean
 from igps.threads import n_cores
 
 K = 250
@@ -308,6 +308,17 @@ def chi_square_distances(data: Path | None) -> Figure:
     )
 
 
+def euclidean_distances(data: Path | None) -> Figure:
+    vectors = torch.randn(4000, 252, generator=torch.Generator().manual_seed(0))
+    euclidean(vectors[:2], vectors[:2])  # compiled at the first call
+    return against(
+        "torch cdist",
+        lambda: euclidean(vectors, vectors),
+        lambda: torch.cdist(vectors, vectors, compute_mode="donot_use_mm_for_euclid_dist"),
+        note="4,000 vectors of 252 numbers with one another; baseline: as exact, without products of matrices",
+    )
+
+
 def oriented_pairs(data: Path | None) -> Figure:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(1000, 3, generator=generator)
@@ -566,6 +577,7 @@ FIGURES: dict[str, Callable[[Path | None], Figure | dict[str, Figure]]] = {
     "histogram_pairs": histogram_pairs,
     "histogram_backward": histogram_backward,
     "chi_square": chi_square_distances,
+    "euclidean": euclidean_distances,
     "oriented_pairs": oriented_pairs,
     "describe_rich": describe_before,
     "descriptor_15k": descriptor_15k,

@@ -80,8 +80,11 @@ def test_cosine_ignores_length_even_at_the_ends_of_the_dtype(scale: float) -> No
     assert cosine(scale * a, scale * b).item() == pytest.approx(1 - 0.5**0.5, rel=1e-6)
 
 
+@pytest.mark.parametrize("distance", ALL)
 @pytest.mark.parametrize(("n_queries", "n_gallery"), [(70, 9), (9, 70), (1, 1)])
-def test_threads_change_no_bit_of_chi_square(n_queries: int, n_gallery: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_change_no_bit(
+    distance: Distance, n_queries: int, n_gallery: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(threads, "n_cores", lambda: 8)
     monkeypatch.setattr(distances, "_TRIPLES_PER_THREAD", 0)
     queries, gallery = histograms(n_queries, (40,), seed=21), histograms(n_gallery, (40,), seed=22)
@@ -90,12 +93,12 @@ def test_threads_change_no_bit_of_chi_square(n_queries: int, n_gallery: int, mon
     try:
         for n_threads in (1, 2, 3):
             torch.set_num_threads(n_threads)
-            found.append(chi_square(queries, gallery))
+            found.append(distance(queries, gallery))
     finally:
         torch.set_num_threads(before)
     assert torch.equal(found[1], found[0])
     assert torch.equal(found[2], found[0])
-    expected = ORACLES[chi_square](queries.numpy(), gallery.numpy())
+    expected = ORACLES[distance](queries.numpy(), gallery.numpy())
     np.testing.assert_allclose(found[0].numpy(), expected, rtol=0, atol=1e-12)
 
 

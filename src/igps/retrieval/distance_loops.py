@@ -1,4 +1,4 @@
-"""Loops that Numba compiles for `distances`: no temporary as large as queries times gallery times cells."""
+"""Loops that Numba compiles for `distances`: sums over the cells, and no temporary of all pairs and cells."""
 
 from __future__ import annotations
 
@@ -19,13 +19,22 @@ SUMS = {"contract", "reassoc", "nsz"}
 
 @compiled()
 def chi_squares(
-    queries: NDArray[Real], gallery: NDArray[Real], weights: NDArray[Real], distances: NDArray[Real]
+    weights: NDArray[Real], queries: NDArray[Real], gallery: NDArray[Real], distances: NDArray[Real]
 ) -> None:
     """Write the sums of w (a−b)² / (a+b) over the cells, of rows (Q, cells) with rows (G, cells), to (Q, G)."""
     for begin in range(0, len(gallery), TILE):
         for q in range(len(queries)):
             for g in range(begin, min(begin + TILE, len(gallery))):
                 distances[q, g] = chi_square(queries[q], gallery[g], weights)
+
+
+@compiled()
+def squares(queries: NDArray[Real], gallery: NDArray[Real], distances: NDArray[Real]) -> None:
+    """Write the sums of (a−b)² over the cells, of rows (Q, cells) with rows (G, cells), to (Q, G)."""
+    for begin in range(0, len(gallery), TILE):
+        for q in range(len(queries)):
+            for g in range(begin, min(begin + TILE, len(gallery))):
+                distances[q, g] = square(queries[q], gallery[g])
 
 
 @compiled(fastmath=SUMS)
@@ -43,3 +52,13 @@ def term(a: Real, b: Real, one: Real) -> Real:
     """(a−b)² / (a+b), divided before it is multiplied; 0 where both are 0."""
     apart, both = a - b, a + b
     return apart / (both if both > 0 else one) * apart
+
+
+@compiled(fastmath=SUMS)
+def square(a: NDArray[Real], b: NDArray[Real]) -> Real:
+    """The sum of (a−b)² over the cells."""
+    total = a.dtype.type(0)
+    for cell in range(np.uint64(len(a))):
+        apart = a[cell] - b[cell]
+        total += apart * apart
+    return total

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -121,7 +123,10 @@ class _ChiSquare(torch.autograd.Function):
     def forward(ctx: Any, a: Tensor, b: Tensor, w: Tensor | None) -> Tensor:
         ctx.save_for_backward(a, b, w)
         if a.device.type == "cpu" and is_available():
-            return _compiled_chi_square(a, b, w)
+            from igps.retrieval import distance_loops
+
+            weights = (a.new_ones(a.shape[1]) if w is None else w.detach()).contiguous().numpy()
+            return _by_loops(partial(distance_loops.chi_squares, weights), a, b).mul_(0.5)
         distances = a.new_zeros(len(a), len(b))
         for q, g, c in _tiles(a, b):
             ratio, difference = _ratio(a[q, c], b[g, c])
@@ -152,27 +157,23 @@ class _ChiSquare(torch.autograd.Function):
         return grad_a, grad_b, None if grad_w is None else grad_w / 2
 
 
-def _compiled_chi_square(a: Tensor, b: Tensor, w: Tensor | None) -> Tensor:
-    """As the tiles, some ten times as fast; threads share the longer of both sides."""
-    from igps.retrieval import distance_loops
-
-    distances = a.new_empty(len(a), len(b))
-    weights = a.new_ones(a.shape[1]) if w is None else w
-    queries, gallery, cells = (tensor.detach().contiguous().numpy() for tensor in (a, b, weights))
-    found, length = distances.numpy(), max(len(a), len(b))
+def _by_loops(loop: Callable[[np.ndarray, np.ndarray, np.ndarray], None], a: Tensor, b: Tensor) -> Tensor:
+    """What a compiled loop writes, given queries and gallery: (Q, G). Threads share the longer of both sides."""
+    found, length = a.new_empty(len(a), len(b)), max(len(a), len(b))
+    queries, gallery, result = (tensor.detach().contiguous().numpy() for tensor in (a, b, found))
 
     def write(begin: int) -> None:
         part = slice(begin, begin + step)
         if len(a) >= len(b):
-            distance_loops.chi_squares(queries[part], gallery, cells, found[part])
+            loop(queries[part], gallery, result[part])
         else:
-            distance_loops.chi_squares(queries, gallery[part], cells, found[:, part])
+            loop(queries, gallery[part], result[:, part])
 
-    large = distances.numel() * a.shape[1] > 2 * _TRIPLES_PER_THREAD
+    large = found.numel() * a.shape[1] > 2 * _TRIPLES_PER_THREAD
     with Team(None if large else 1) as team:
         step = max(1, -(-length // (1 if team.n_threads == 1 else 4 * team.n_threads)))
         team.each(write, range(0, length, step))
-    return distances.mul_(0.5)
+    return found
 
 
 def _ratio(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
@@ -197,6 +198,11 @@ def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
 
 
 def _row_distance(a: Tensor, b: Tensor) -> Tensor:
+    derived = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
+    if a.device.type == "cpu" and not derived and is_available():
+        from igps.retrieval import distance_loops
+
+        return _by_loops(distance_loops.squares, a, b).sqrt_()
     # The faster form by a matrix product cancels: it leaves a diagonal that is not zero.
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
