@@ -17,6 +17,9 @@ from typing import Any, Generic, ParamSpec, TypeVar
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
+# For `fastmath`: sums may be taken in any order, so of several terms at once
+SUMS = {"contract", "reassoc", "nsz"}
+
 _compiling = threading.RLock()  # one that compiles what it calls
 
 

@@ -11,6 +11,7 @@ import torch
 from scipy.spatial.distance import cdist
 from sklearn.metrics.pairwise import additive_chi2_kernel
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from igps import threads
@@ -132,6 +133,29 @@ def test_gradients_agree_with_finite_differences(distance: Distance) -> None:
     queries, gallery = histograms(3, (2, 5), seed=8, filled=2), histograms(4, (2, 5), seed=9, filled=2)
     queries, gallery = (10 * queries + 0.1).requires_grad_(), (10 * gallery + 0.1).requires_grad_()
     assert torch.autograd.gradcheck(distance, (queries, gallery))
+
+
+@pytest.mark.usefixtures("both_ways")
+@pytest.mark.parametrize("distance", ALL)
+def test_gradients_of_one_side_are_those_of_both(distance: Distance) -> None:
+    both = [histograms(3, (4,), seed=23, filled=2).requires_grad_(), histograms(2, (4,), seed=24, filled=2)]
+    both[1].requires_grad_()
+    expected = torch.autograd.grad(distance(*both).sum(), both)
+    for side in (0, 1):
+        one = [tensor.detach().requires_grad_(i == side) for i, tensor in enumerate(both)]
+        (found,) = torch.autograd.grad(distance(*one).sum(), [one[side]])
+        torch.testing.assert_close(found, expected[side])
+
+
+@pytest.mark.usefixtures("both_ways")
+@pytest.mark.parametrize("distance", ALL)
+@pytest.mark.parametrize("side", [0, 1])
+def test_forward_derivatives_are_refused_and_not_lost(distance: Distance, side: int) -> None:
+    both = [histograms(3, (4,), seed=25, filled=2), histograms(2, (4,), seed=26, filled=2)]
+    with forward_ad.dual_level():
+        both[side] = forward_ad.make_dual(both[side], torch.ones_like(both[side]))
+        with pytest.raises(NotImplementedError):
+            distance(*both)
 
 
 def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_formula() -> None:

@@ -11,15 +11,13 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.compiled import compiled
+from igps.compiled import SUMS, compiled
 
 Real = TypeVar("Real", np.float32, np.float64)
 Four = tuple[float, float, float, float]
 
 # Columns of a few rows that the processor's second cache holds, and sums of as many rows that the first one holds
 CHUNK, STRIP = 4096, 512
-# Sums may be taken in any order: of several columns at once
-SUMS = {"contract", "reassoc", "nsz"}
 
 
 @compiled()

@@ -7,14 +7,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.compiled import compiled
+from igps.compiled import SUMS, compiled
 
 Real = TypeVar("Real", np.float32, np.float64)
 
 # Rows of the gallery that the processor's second cache keeps while the queries go by, if they have some hundred cells
 TILE = 64
-# Sums may be taken in any order: of several cells at once
-SUMS = {"contract", "reassoc", "nsz"}
 
 
 @compiled()

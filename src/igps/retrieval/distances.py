@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 from torch.autograd.function import once_differentiable
 
 from igps.compiled import is_available
@@ -159,11 +160,10 @@ class _ChiSquare(torch.autograd.Function):
 
 def _by_loops(loop: Callable[[np.ndarray, np.ndarray, np.ndarray], None], a: Tensor, b: Tensor) -> Tensor:
     """What a compiled loop writes, given queries and gallery: (Q, G). Threads share the longer of both sides."""
-    found, length = a.new_empty(len(a), len(b)), max(len(a), len(b))
+    found = a.new_empty(len(a), len(b))
     queries, gallery, result = (tensor.detach().contiguous().numpy() for tensor in (a, b, found))
 
-    def write(begin: int) -> None:
-        part = slice(begin, begin + step)
+    def write(part: slice) -> None:
         if len(a) >= len(b):
             loop(queries[part], gallery, result[part])
         else:
@@ -171,8 +171,9 @@ def _by_loops(loop: Callable[[np.ndarray, np.ndarray, np.ndarray], None], a: Ten
 
     large = found.numel() * a.shape[1] > 2 * _TRIPLES_PER_THREAD
     with Team(None if large else 1) as team:
-        step = max(1, -(-length // (1 if team.n_threads == 1 else 4 * team.n_threads)))
-        team.each(write, range(0, length, step))
+        length = max(len(a), len(b))
+        step = max(1, math.ceil(length / (4 * team.n_threads))) if large else length
+        team.each(write, [slice(begin, begin + step) for begin in range(0, length, step)])
     return found
 
 
@@ -198,13 +199,17 @@ def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
 
 
 def _row_distance(a: Tensor, b: Tensor) -> Tensor:
-    derived = torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)
-    if a.device.type == "cpu" and not derived and is_available():
+    if a.device.type == "cpu" and is_available() and not (_is_derived(a) or _is_derived(b)):
         from igps.retrieval import distance_loops
 
         return _by_loops(distance_loops.squares, a, b).sqrt_()
     # The faster form by a matrix product cancels: it leaves a diagonal that is not zero.
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _is_derived(tensor: Tensor) -> bool:
+    """Whether a derivative by it is asked for, in reverse or forward: NumPy's arrays know neither."""
+    return (torch.is_grad_enabled() and tensor.requires_grad) or unpack_dual(tensor).tangent is not None
 
 
 def square_root(values: Tensor) -> Tensor:
