@@ -93,6 +93,23 @@ def test_walks_come_before_the_sets(k: int, share: float, fading: float, points:
     torch.testing.assert_close(found, expected, atol=1e-10, rtol=0)
 
 
+def test_the_nearest_come_forward_between_the_steps_too(points: Tensor) -> None:
+    """Else the second step would see neighbourhoods that diffusion has torn apart."""
+    k, share, fading, n = 6, 0.3, 0.8, 12
+    distances = euclidean(points[:n], points[:n]).tolist()
+    nearest = [min((j for j in range(n) if j != i), key=lambda j, i=i: distances[i][j]) for i in range(n)]
+    pairs = {pair for i, j in enumerate(nearest) for pair in ((i, j), (j, i))}
+    diffused = diffused_by_hand(distances, k // 2, share, fading)
+    least = min(diffused[i][j] for i in range(n) for j in range(n) if i != j and (i, j) not in pairs)
+    largest = max(distances[i][j] for i, j in pairs)
+    for i, j in pairs:
+        diffused[i][j] = least / 2 * distances[i][j] / largest
+    expected = torch.tensor(by_hand(diffused, k, 2, share), dtype=torch.float64)
+    rest = torch.tensor([[(i, j) not in pairs for j in range(n)] for i in range(n)])
+    found = rerank(torch.tensor(distances, dtype=torch.float64), k, 2, share, fading)
+    torch.testing.assert_close(found[rest], expected[rest], atol=1e-10, rtol=0)
+
+
 def test_a_shape_is_its_own_nearest_among_equals(points: Tensor) -> None:
     """Three copies of each of four, and one of the others; the nearest of a copy is itself, then the next copies."""
     repeated = torch.cat([points[:8], points[:4], points[:4]])
