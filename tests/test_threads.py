@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader
 
 import igps
 import igps.threads as threads_module
+from conftest import torch_threads
 from igps.cli import main
 from igps.data.batch import LabelledSignature
 from igps.geometry.mesh import Mesh
@@ -49,10 +50,8 @@ def settings() -> tuple[int, int, list[int]]:
 @pytest.fixture(autouse=True)
 def three_threads() -> Iterator[None]:
     """An unusual number, so that what restores another is seen."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    yield
-    torch.set_num_threads(before)
+    with torch_threads(3):
+        yield
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from problems import Problem, cotangent_problem, torus
 from scipy import sparse
 from scipy.linalg import eigh
 
+from conftest import torch_threads
 from igps import threads
 from igps.geometry.laplacian import laplacian
 from igps.geometry.mesh import Mesh
@@ -125,14 +126,10 @@ def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
             return super().__enter__()
 
     monkeypatch.setattr(lanczos, "Team", Watched)
-    before = torch.get_num_threads()
     spectra = []
-    try:
-        for n_threads in (1, 2, 5):
-            torch.set_num_threads(n_threads)
+    for n_threads in (1, 2, 5):
+        with torch_threads(n_threads):
             spectra.append(eigenpairs(stiffness, mass, 20, positions=positions))
-    finally:
-        torch.set_num_threads(before)
     assert teams == [1, 2, 5]
     assert_pairs(spectra[0], (stiffness, mass, positions))
     for other in spectra[1:]:

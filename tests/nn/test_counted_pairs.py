@@ -9,6 +9,7 @@ from loops import Axis, cosines, distances, pair_histogram_by_loops
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from conftest import torch_threads
 from igps import threads
 from igps.compiled import is_available
 from igps.nn import counted_pairs
@@ -133,16 +134,12 @@ def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "n_cores", lambda: 8)
     coordinates, points, directions, memberships = points_and_more(700)
     centres, angles = torch.tensor(MANY).double(), torch.tensor(COSINES).double()
-    before = torch.get_num_threads()
     histograms = []
-    try:
-        for n_threads in (1, 2, 5):
-            torch.set_num_threads(n_threads)
+    for n_threads in (1, 2, 5):
+        with torch_threads(n_threads):
             histograms.append(
                 count_pairs(memberships, [(coordinates, centres)], [(points, directions, angles, angles)])
             )
-    finally:
-        torch.set_num_threads(before)
     torch.testing.assert_close(histograms[0].sum(), torch.ones((), dtype=torch.float64))
     assert torch.equal(histograms[0], histograms[1])
     assert torch.equal(histograms[0], histograms[2])

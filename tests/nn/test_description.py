@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import jobs
+from conftest import torch_threads
 from igps.data.batch import Body, SignatureBatch
 from igps.data.dataset import SignatureDataset
 from igps.geometry.attributes import AttributeName
@@ -127,14 +128,10 @@ def test_training_subsets_are_for_training_alone(dataset: SignatureDataset) -> N
 
 
 def test_one_thread_is_put_back() -> None:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
+    with torch_threads(2):
         with one_thread():
             assert torch.get_num_threads() == 1
         assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("function", [describe, describe_usable])

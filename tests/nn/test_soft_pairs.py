@@ -10,6 +10,7 @@ import torch
 from loops import distances, pair_histogram_by_loops
 from torch import Tensor
 
+from conftest import torch_threads
 from igps.nn.hard_pairs import class_pairs
 from igps.nn.soft_pairs import soft_pair_histogram
 
@@ -115,18 +116,14 @@ def test_blocks_and_threads_do_not_show(n_axes: int, monkeypatch: pytest.MonkeyP
     whole = soft(*leaves)
     upstream = torch.randn(whole.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     expected = [whole.detach(), *torch.autograd.grad(whole, leaves, upstream)]
-    threads = torch.get_num_threads()
     monkeypatch.setattr("igps.nn.soft_pairs._BLOCK", 7)
     monkeypatch.setattr("igps.nn.soft_pairs._MOST_KEPT", 0)
     for n_threads in (1, 3):
-        torch.set_num_threads(n_threads)
-        try:
+        with torch_threads(n_threads):
             result = soft(*leaves)
             gradients = torch.autograd.grad(result, leaves, upstream)
             with ThreadPoolExecutor(1) as pool:  # a new thread inherits what the workers must not have changed
                 assert pool.submit(torch.get_num_threads).result() == torch.get_num_threads() == n_threads
-        finally:
-            torch.set_num_threads(threads)
         for value, other in zip([result.detach(), *gradients], expected, strict=True):
             np.testing.assert_allclose(value, other, atol=1e-13)
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from conftest import torch_threads
 from igps import threads
 from igps.retrieval import Distance, chi_square, cosine, distances, euclidean, hellinger
 
@@ -89,14 +90,10 @@ def test_threads_change_no_bit(
     monkeypatch.setattr(threads, "n_cores", lambda: 8)
     monkeypatch.setattr(distances, "_TRIPLES_PER_THREAD", 0)
     queries, gallery = histograms(n_queries, (40,), seed=21), histograms(n_gallery, (40,), seed=22)
-    before = torch.get_num_threads()
     found = []
-    try:
-        for n_threads in (1, 2, 3):
-            torch.set_num_threads(n_threads)
+    for n_threads in (1, 2, 3):
+        with torch_threads(n_threads):
             found.append(distance(queries, gallery))
-    finally:
-        torch.set_num_threads(before)
     assert torch.equal(found[1], found[0])
     assert torch.equal(found[2], found[0])
     expected = ORACLES[distance](queries.numpy(), gallery.numpy())
