@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -111,7 +112,7 @@ class Krylov:
 
     @property
     def loses_basis(self) -> bool:
-        """Whether the basis makes place for the eigenvectors."""
+        """Whether the basis must make place for the eigenvectors."""
         return self._large
 
     def expand(self) -> None:
@@ -164,25 +165,24 @@ class Krylov:
             below_shift=(theta < 0)[order],
         )
 
-    def eigenvectors(self, ritz: RitzPairs, index: torch.Tensor, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Eigenvalues (K,) and eigenvectors (V, K) of the Ritz pairs with these indices; see `loses_basis`.
+    def eigenvectors(
+        self, ritz: RitzPairs, index: torch.Tensor, order: np.ndarray
+    ) -> tuple[np.ndarray, list[Callable[[], None]]]:
+        """(V, K) for the eigenvectors of the Ritz pairs with these indices, and the steps that fill it, in any order.
 
         Entry i of a vector becomes row ``order[i]``.
         """
-        coefficients = ritz.coefficients[:, index]
-        coefficients /= torch.linalg.norm(coefficients, dim=0)
-        if self.loses_basis:
-            return ritz.eigenvalues[index].numpy(), self._combine_in_place(coefficients, order)
+        coefficients = _coefficients(ritz, index)
         vectors = _empty(self._basis.shape[1], len(index)).numpy()
 
         def combine(piece: slice) -> None:
             vectors[order[piece]] = (coefficients.T @ self._basis[1 : self._stop, piece]).numpy().T
 
-        self._team.each(combine, self._small_pieces())
-        return ritz.eigenvalues[index].numpy(), vectors
+        return vectors, [partial(combine, piece) for piece in self._small_pieces()]
 
-    def _combine_in_place(self, coefficients: torch.Tensor, order: np.ndarray) -> np.ndarray:
-        """The basis times coefficients (m + b, K), as (V, K): never in memory beside the basis."""
+    def eigenvectors_in_place(self, ritz: RitzPairs, index: torch.Tensor, order: np.ndarray) -> np.ndarray:
+        """The same eigenvectors (V, K), never in memory beside the basis, which is lost; see `loses_basis`."""
+        coefficients = _coefficients(ritz, index)
         n_vertices, n_vectors = self._basis.shape[1], coefficients.shape[1]
         for piece in self._small_pieces():
             self._basis[:n_vectors, piece] = coefficients.T @ self._basis[1 : self._stop, piece]
@@ -338,6 +338,12 @@ class Krylov:
         second = torch.linalg.cholesky(squares)
         self._multiply(_inverse(second), rows, rows)
         return rows, second.T @ first.T
+
+
+def _coefficients(ritz: RitzPairs, index: torch.Tensor) -> torch.Tensor:
+    """(m + b, K) of the Ritz pairs with these indices, of length 1."""
+    coefficients = ritz.coefficients[:, index]
+    return coefficients / torch.linalg.norm(coefficients, dim=0)
 
 
 def _overlaps(rows: torch.Tensor, others: torch.Tensor, piece: slice) -> torch.Tensor:

@@ -86,14 +86,19 @@ def lanczos(
             missing = False
             if gap is not None:
                 n_found, bound = gap
-                # side by side, unless the basis must be kept in case that some are missing
-                vectors = partial(krylov.eigenvectors, ritz, found[:n_eigenpairs], order)
-                jobs: list[Callable[[], Any]] = [partial(structure.inertia, matrix, bound, team)]
-                jobs += [] if krylov.loses_basis else [vectors]
-                n_negative, *pairs = team.each(_call, jobs)
+                wanted = found[:n_eigenpairs]
+                count: Callable[[], int] = partial(structure.inertia, matrix, bound, team)
+                if krylov.loses_basis:  # which must be kept in case that some are missing
+                    vectors, n_negative = None, count()
+                else:  # side by side
+                    vectors, filling = krylov.eigenvectors(ritz, wanted, order)
+                    steps: list[Callable[[], Any]] = [count, *filling]
+                    n_negative = team.each(_call, steps)[0]
                 n_present = n_negative - 1
                 if n_present == n_found:
-                    return pairs[0] if pairs else vectors()
+                    if vectors is None:
+                        vectors = krylov.eigenvectors_in_place(ritz, wanted, order)
+                    return ritz.eigenvalues[wanted].numpy(), vectors
                 if n_present < n_found:
                     raise ConvergenceError(
                         f"{n_found} eigenvalues found below {bound:.6g} / area, where there are {n_present}"
@@ -142,8 +147,8 @@ def _factorize_inside(
     return best[2:]
 
 
-def _call(job: Callable[[], Any]) -> Any:
-    return job()
+def _call(step: Callable[[], Any]) -> Any:
+    return step()
 
 
 def gap_behind(eigenvalues: torch.Tensor, n_eigenpairs: int) -> tuple[int, float] | None:
