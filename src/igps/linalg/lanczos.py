@@ -87,7 +87,7 @@ def lanczos(
             if gap is not None:
                 n_found, bound = gap
                 wanted = found[:n_eigenpairs]
-                count: Callable[[], int] = partial(structure.inertia, matrix, bound, team)
+                count = partial(structure.inertia, matrix, bound, team)
                 if krylov.loses_basis:  # which must be kept in case that some are missing
                     vectors, n_negative = None, count()
                 else:  # side by side
