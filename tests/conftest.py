@@ -36,7 +36,6 @@ def both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
         for module in (
             direct,
             eigensolver,
-            krylov,
             ordering,
             counted_pairs,
             surface_potential,
@@ -47,6 +46,8 @@ def both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
             monkeypatch.setattr(module, "is_available", lambda: False)
     elif not is_available():
         pytest.skip("needs numba, the extra [fast]")
+    # On either kind of processor
+    monkeypatch.setattr(krylov, "beats_blas", lambda: request.param == "compiled")
 
 
 @contextlib.contextmanager

@@ -3,8 +3,9 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
-from igps.compiled import compiled, is_available
+from igps.compiled import beats_blas, compiled, is_available
 
 
 @compiled()
@@ -51,3 +52,21 @@ def test_numbas_own_switch_turns_it_off(value, expected, monkeypatch):
         assert is_available() is (pytest.importorskip("numba") is not None if expected is None else expected)
     finally:
         is_available.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("processor", "has_avx512", "has_mkl", "expected"),
+    [
+        ("emeraldrapids", True, True, False),
+        ("emeraldrapids", True, False, True),
+        ("haswell", False, True, True),
+        ("znver4", True, True, True),
+        ("neoverse-n1", False, False, True),
+    ],
+)
+def test_only_where_mkl_is_at_home_it_goes_before_compiled_loops(processor, has_avx512, has_mkl, expected, monkeypatch):
+    binding = pytest.importorskip("llvmlite.binding")
+    monkeypatch.setattr(binding, "get_host_cpu_name", lambda: processor)
+    monkeypatch.setattr(binding, "get_host_cpu_features", lambda: {"avx512f": has_avx512})
+    monkeypatch.setattr(torch.backends.mkl, "is_available", lambda: has_mkl)
+    assert beats_blas.__wrapped__() is expected

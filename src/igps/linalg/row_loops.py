@@ -1,7 +1,8 @@
 """Loops that Numba compiles for `krylov`: products of a few long rows with many.
 
-A BLAS is made for matrices that are large both ways: with so few rows it needs up to twice the time of these loops,
-which keep the sums of a few rows with a few others in registers while the columns go by.
+A BLAS is made for matrices that are large both ways: with so few rows most need up to twice the time of these loops,
+which keep the sums of a few rows with a few others in registers while the columns go by. `igps.compiled.beats_blas`
+says where not.
 """
 
 from __future__ import annotations
