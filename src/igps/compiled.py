@@ -34,7 +34,7 @@ def is_available() -> bool:
 def beats_blas() -> bool:
     """Whether compiled loops are faster than PyTorch's BLAS at products of a few long rows with many.
 
-    They take half of its time on AMD's processors, but twice as much on Intel's with AVX-512, for which MKL is made.
+    On AMD's processors they take down to half of its time, on Intel's with AVX-512, for which MKL is made, up to twice.
     """
     if not is_available():
         return False
