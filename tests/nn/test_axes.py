@@ -10,6 +10,7 @@ from torch import nn
 from igps.nn.axes import (
     AXES,
     Attribute,
+    BallRadius,
     EmbeddedPairCosines,
     EuclideanDistance,
     InteriorDistance,
@@ -105,6 +106,8 @@ def test_needs() -> None:
     assert EuclideanDistance().needs(fine) == Needs()
     assert PairCosines().needs(fine) == Needs(attributes=("surface_direction",))
     assert EmbeddedPairCosines().needs(fine) == Needs(n_eigenpairs=9)
+    assert BallRadius().needs(fine) == Needs(attributes=("surface_direction",))
+    assert Potential(embedding=coarse).needs(fine) == Needs(n_eigenpairs=2)
     assert Attribute("depth", [0.1]).needs(fine) == Needs(attributes=("depth",))
     assert Attribute("one of my own", [0.1]).needs(fine) == Needs()
 

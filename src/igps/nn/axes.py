@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from igps.nn.pair_axes import EmbeddedPairCosines, EuclideanDistance, InteriorDistance, PairAxis, PairCosines
-from igps.nn.point_axes import Attribute, PointAxis, Potential
+from igps.nn.point_axes import Attribute, BallRadius, PointAxis, Potential
 
 __all__ = [
     "AXES",
     "Attribute",
+    "BallRadius",
     "EmbeddedPairCosines",
     "EuclideanDistance",
     "InteriorDistance",
@@ -24,6 +25,7 @@ AXES: dict[str, type[PointAxis | PairAxis]] = {
     "euclidean_distance": EuclideanDistance,
     "pair_cosines": PairCosines,
     "embedded_pair_cosines": EmbeddedPairCosines,
+    "ball_radius": BallRadius,
 }
 """The axes that have a layout of their own, by name."""
 

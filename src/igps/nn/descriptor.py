@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from igps.data.batch import Body, SignatureBatch
 from igps.nn.heads import distances_of
-from igps.nn.histogram import PairHistogram
 from igps.nn.needs import Needs
+from igps.nn.sample_histogram import SampleHistogram
 from igps.nn.view import Views
 from igps.retrieval import chi_square
 from igps.retrieval.vectors import Comparison
@@ -118,19 +118,20 @@ class BodyDescriptor(Descriptor):
 
 
 class HistogramDescriptor(Descriptor):
-    """Pair histograms, one or several side by side, compared by χ².
+    """Histograms of samples or of their pairs, one or several side by side, compared by χ².
 
     Several are flattened and joined into one histogram of sum 1, in which each part has the same share, and in a part
     each of its histograms. The χ² distance is then the mean of those of the parts. Embeddings that are the same module,
     and samples that are the same subset, are computed once for all.
 
     Example:
+        >>> from igps.nn.histogram import PairHistogram
         >>> two = HistogramDescriptor([PairHistogram(), PairHistogram(["interior_distance"])], name="two")
         >>> two.part_cells, two.distances(torch.eye(3)[:1], torch.eye(3)).tolist()
         ((640, 64), [[0.0, 1.0, 1.0]])
 
     Args:
-        histograms: one `PairHistogram`; or the parts, each one or several of them.
+        histograms: one `SampleHistogram`, such as a `PairHistogram`; or the parts, each one or several of them.
         name, source, invariant_to: see `Descriptor`.
 
     Raises:
@@ -141,26 +142,26 @@ class HistogramDescriptor(Descriptor):
 
     def __init__(
         self,
-        histograms: PairHistogram | Sequence[PairHistogram | Sequence[PairHistogram]],
+        histograms: SampleHistogram | Sequence[SampleHistogram | Sequence[SampleHistogram]],
         *,
         name: str = "histogram",
         source: str = "",
         invariant_to: Sequence[str] = (),
     ) -> None:
         super().__init__()
-        parts = [histograms] if isinstance(histograms, PairHistogram) else list(histograms)
-        groups = [[part] if isinstance(part, PairHistogram) else list(part) for part in parts]
+        parts = [histograms] if isinstance(histograms, SampleHistogram) else list(histograms)
+        groups = [[part] if isinstance(part, SampleHistogram) else list(part) for part in parts]
         if not groups or not all(groups):
             raise ValueError("histograms: expected at least one in each part, got none.")
         self.histograms = nn.ModuleList(histogram for group in groups for histogram in group)
-        self._sizes = None if isinstance(histograms, PairHistogram) else tuple(len(group) for group in groups)
+        self._sizes = None if isinstance(histograms, SampleHistogram) else tuple(len(group) for group in groups)
         self.name, self.source, self.invariant_to = name, source, tuple(invariant_to)
         self.needs = reduce(or_, (histogram.needs for group in groups for histogram in group))
 
     @property
-    def parts(self) -> tuple[tuple[PairHistogram, ...], ...]:
+    def parts(self) -> tuple[tuple[SampleHistogram, ...], ...]:
         """The histograms of each part."""
-        histograms = iter([one for one in self.histograms if isinstance(one, PairHistogram)])
+        histograms = iter([one for one in self.histograms if isinstance(one, SampleHistogram)])
         return tuple(tuple(islice(histograms, size)) for size in self._sizes or (1,))
 
     @property

@@ -10,18 +10,18 @@ from operator import or_
 import torch
 from torch import Tensor, nn
 
-from igps.data.batch import SignatureBatch
 from igps.nn.axes import PairAxis, PointAxis, axis_of
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.hard_pairs import class_pairs, hard_pair_histogram
 from igps.nn.needs import Needs
 from igps.nn.oriented_pairs import oriented_pair_histogram
 from igps.nn.pair_axes import DistanceAxis, Distances, OrientedPoints
+from igps.nn.sample_histogram import SampleHistogram, joint, present
 from igps.nn.soft_pairs import soft_pair_histogram
-from igps.nn.view import SampleKind, Views, check_kind
+from igps.nn.view import SampleKind, View
 
 
-class PairHistogram(nn.Module):
+class PairHistogram(SampleHistogram):
     """The joint histogram of all pairs of samples of each body, along some axes.
 
     Axes of points sort the samples into classes: their combinations are C classes, and the histogram has a row for
@@ -44,10 +44,7 @@ class PairHistogram(nn.Module):
             along the first axis of points changes slowest.
         embedding: eigenfunctions (N, P, K), eigenvalues (N, K) and areas (N,) to coordinates (N, P, D), for the axes
             that have none of their own; the commute time if None.
-        samples: "interior" or "surface".
-        n_samples: of a body with more samples, a subset of so many that is always the same; None uses all.
-        n_training_samples: in training mode, a random subset of so many, another one each time: it is faster, and a
-            head cannot learn the samples by heart. None uses the same as in evaluation.
+        samples, n_samples, n_training_samples: see `SampleHistogram`.
 
     Raises:
         ValueError: an unknown axis or kind of samples, no axis of pairs, or too few samples to form a pair.
@@ -62,11 +59,7 @@ class PairHistogram(nn.Module):
         n_samples: int | None = None,
         n_training_samples: int | None = None,
     ) -> None:
-        super().__init__()
-        check_kind(samples)
-        for name, value in (("n_samples", n_samples), ("n_training_samples", n_training_samples)):
-            if value is not None and value < 2:
-                raise ValueError(f"{name}: expected None or at least 2, to form a pair, got {value}.")
+        super().__init__(samples, n_samples, n_training_samples)
         given = [axis_of(one) if isinstance(one, str) else one for one in axes]
         if unknown := [one for one in given if not isinstance(one, PointAxis | PairAxis)]:
             raise ValueError(f"axes: expected axes of points or of pairs, got {type(unknown[0]).__name__}.")
@@ -74,9 +67,6 @@ class PairHistogram(nn.Module):
         if not self.pair_axes:
             raise ValueError("axes: expected at least one of pairs, such as 'interior_distance', got none.")
         self.embedding: nn.Module = embedding or SpectralEmbedding()
-        self.samples: SampleKind = samples
-        self.n_samples = n_samples
-        self.n_training_samples = n_training_samples
 
     @property
     def point_axes(self) -> list[PointAxis]:
@@ -96,44 +86,26 @@ class PairHistogram(nn.Module):
         return (len(class_pairs(math.prod(one.n_classes for one in self.point_axes))), *bins)
 
     @property
-    def n_cells(self) -> int:
-        """Cells of a body's histogram."""
-        return math.prod(self.shape)
-
-    @property
     def needs(self) -> Needs:
         """What all axes together need of a body."""
         axes: list[PointAxis | PairAxis] = [*self.point_axes, *self.pair_axes]
         return reduce(or_, (axis.needs(self.embedding) for axis in axes))
 
-    def forward(self, batch: SignatureBatch) -> Tensor:
-        """(N, C(C+1)/2, B, ...) histograms, each body's of sum 1.
-
-        Raises:
-            ValueError: a body without two samples, attributes that are missing, or values that are not finite.
-        """
-        return self.of_views(Views(batch, self.training))
-
-    def of_views(self, views: Views) -> Tensor:
-        """`forward` of a batch whose views are shared with other histograms."""
-        view = views.of(self.samples, self.n_samples, self.n_training_samples)
+    def of_view(self, view: View) -> Tensor:
+        """(N, C(C+1)/2, B, ...) histograms of the samples in a view."""
         values = [one.values(view, self.embedding) for one in self.point_axes]
         pairs = [one.pairs(view, self.embedding) for one in self.pair_axes]
-        # Where nothing is padding, nothing need be copied.
-        present = [slice(None) if bool(real.all()) else real for real in view.samples.mask]
         return torch.stack(
             [
                 self._of_shape([value[i, real] for value in values], [one.of_shape(i, real) for one in pairs])
-                for i, real in enumerate(present)
+                for i, real in enumerate(present(view))
             ]
         )
 
     def _of_shape(self, values: list[Tensor], pairs: list[Distances | OrientedPoints]) -> Tensor:
-        memberships = torch.ones(len(pairs[0].points), 1, device=pairs[0].points.device)
-        for one, value in zip(self.point_axes, values, strict=True):
-            classes = one.memberships(value)
-            memberships = (memberships[:, :, None] * classes[:, None, :]).flatten(1)
-        return joint_histogram(memberships, pairs)
+        everything = torch.ones(len(pairs[0].points), 1, device=pairs[0].points.device)
+        classes = [one.memberships(value) for one, value in zip(self.point_axes, values, strict=True)]
+        return joint_histogram(joint([everything, *classes]), pairs)
 
 
 # Its loops over data gain nothing by torch.compile, which is to leave it alone. This mark says so as

@@ -1,10 +1,11 @@
-"""Axes of points: the classes that the samples of a body are sorted into, by their potential or by any attribute."""
+"""Axes of points: classes of the samples of a body, by their potential, the balls that touch them, or an attribute."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -62,19 +63,75 @@ class Potential(PointAxis):
     Args:
         n_classes: C equal intervals of [0, `reach`], with their centres in the middle.
         reach: end of the last interval; what lies beyond counts in the last class.
+        embedding: other than the histogram's: for a second scale.
         soft, learnable: see `PointAxis`.
     """
 
-    def __init__(self, n_classes: int = 4, reach: float = 1.5, *, soft: bool = False, learnable: bool = False) -> None:
+    def __init__(
+        self,
+        n_classes: int = 4,
+        reach: float = 1.5,
+        *,
+        embedding: nn.Module | None = None,
+        soft: bool = False,
+        learnable: bool = False,
+    ) -> None:
         super().__init__(middles(n_classes, reach, "classes"), soft, learnable)
+        self.embedding = embedding
 
     def needs(self, embedding: nn.Module) -> Needs:
-        """Those of the embedding."""
-        return needs_of_embedding(embedding)
+        """Those of the embedding, its own or the histogram's."""
+        return needs_of_embedding(self.embedding or embedding)
 
     def values(self, view: View, embedding: nn.Module) -> Tensor:
         """(N, P) potential."""
-        return barycentroid_potential(view.embedded(embedding))
+        return barycentroid_potential(view.embedded(self.embedding or embedding))
+
+
+class BallRadius(PointAxis):
+    """Classes of the radius of the largest ball that touches the surface at a sample, from inside or from outside.
+
+    From inside it is half the local thickness, from outside it tells how narrow the hollow is in which a sample lies.
+    Both are pose-invariant but near joints, and tell a plate from a rod and a block, and a bowl from a dome. See
+    `ball_radii`. Surface samples alone have such balls.
+
+    Args:
+        side: "inside" or "outside".
+        smallest, largest: centres of the first and last class, over √area; the others lie between them in a geometric
+            progression, along which points are in linear proportion in two classes.
+        n_classes: C.
+    """
+
+    def __init__(
+        self, side: Literal["inside", "outside"] = "inside", smallest: float = 0.012, largest: float = 0.25,
+        n_classes: int = 4,
+    ) -> None:  # fmt: skip
+        if side not in ("inside", "outside"):
+            raise ValueError(f"side: expected 'inside' or 'outside', got {side!r}.")
+        if not 0 < smallest < largest < math.inf or n_classes < 2:
+            raise ValueError(
+                f"smallest, largest, n_classes: expected 0 < smallest < largest, and at least two classes, got "
+                f"{smallest}, {largest} and {n_classes}."
+            )
+        super().__init__(torch.linspace(math.log(smallest), math.log(largest), n_classes), soft=True, learnable=False)
+        self.side = side
+
+    def needs(self, embedding: nn.Module) -> Needs:
+        """The directions."""
+        return Needs(attributes=("surface_direction",))
+
+    def values(self, view: View, embedding: nn.Module) -> Tensor:
+        """(N, P) logarithms of the radii over √area.
+
+        Raises:
+            ValueError: interior samples.
+        """
+        if view.kind != "surface":
+            raise ValueError("samples: expected surface samples, which balls touch, got interior ones.")
+        return view.ball_radii()[..., ("inside", "outside").index(self.side)].log()
+
+    def extra_repr(self) -> str:
+        return repr(self.side)
 
 
 class Attribute(PointAxis):

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from igps.data.batch import SampleBatch, SignatureBatch
+from igps.nn.balls import ball_radii
 from igps.nn.precision import full_precision
 
 SampleKind = Literal["interior", "surface"]
@@ -36,6 +37,7 @@ class View:
         self.kind = kind
         self.samples = samples
         self._embedded: dict[nn.Module, Tensor] = {}
+        self._ball_radii: Tensor | None = None
 
     def embedded(self, embedding: nn.Module) -> Tensor:
         """(N, P, D) embedding of the samples."""
@@ -61,6 +63,19 @@ class View:
                 "to SignatureDataset(point_functions=...)."
             )
         return self.samples.attributes[name]
+
+    def ball_radii(self) -> Tensor:
+        """(N, P, 2) `ball_radii` of surface samples, over √area; 1 where padded.
+
+        Raises:
+            ValueError: they have no directions.
+        """
+        if self._ball_radii is None:
+            points, directions = self.positions(), self.attribute("surface_direction")
+            self._ball_radii = torch.ones_like(points[..., :2])
+            for i, real in enumerate(self.samples.mask):
+                self._ball_radii[i, real] = ball_radii(points[i, real], directions[i, real])
+        return self._ball_radii
 
     def embedded_directions(self, embedding: nn.Module) -> Tensor:
         """(N, P, D) unit vectors from interior samples to the surface in the embedding, or out of it on the surface."""

@@ -19,13 +19,13 @@ def learned_layout(descriptor: HistogramDescriptor, path: str | Path) -> None:
     """Save a picture of the bin and class centres and of the spectral filter g(λ·area), learned and as they started.
 
     Args:
-        descriptor: its histograms are drawn one a row.
+        descriptor: its histograms of pairs are drawn one a row; others learn nothing.
         path: of the picture, such as layout.png.
 
     Raises:
         ImportError: matplotlib is not installed.
     """
-    histograms = [histogram for part in descriptor.parts for histogram in part]
+    histograms = [one for part in descriptor.parts for one in part if isinstance(one, PairHistogram)]
     rows = [(histogram.embedding, _centres(histogram)) for histogram in histograms]
     n_columns = 1 + max(len(centres) for _, centres in rows)
     figure = new_figure(4 * n_columns, 3.2 * len(rows))
