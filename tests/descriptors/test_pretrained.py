@@ -26,12 +26,12 @@ from igps.geometry.signature import SignatureConfig
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.retrieval import chi_square, retrieval_scores
-from igps.shapes import ArticulatedShapes
+from igps.shapes import ArticulatedShapes, GradedShapes
 
 # Of `rich`: six histograms in its first part, two oriented ones.
 CELLS = (25920, 750, 750)
 # Of `seven_parts`
-SEVEN_CELLS = (1280, 576, 750, 750, 750, 750, 1000)
+SEVEN_CELLS = (640, 750, 750, 750, 1000, 1920, 576)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_a_class_is_closer_to_itself(dataset: SignatureDataset, histograms: torc
 
 
 def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> None:
-    """Written down from the stored numbers: roots, directions and lengths part by part, waves."""
+    """Written down from the stored numbers: roots, directions and lengths part by part, the pole of the bodies."""
     part = dataset.subset(range(4))
     module = pretrained()
     roots = describe(part, module.descriptor).double().sqrt()
@@ -92,16 +92,24 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
         assert of_level["part_cells"].long().tolist() == list(SEVEN_CELLS)
         centred = (roots - of_level["mean"]).split(SEVEN_CELLS, dim=1)
         directions = of_level["directions"].split(SEVEN_CELLS, dim=1)
-        joined = torch.cat([normalize(centred[i] @ directions[i].T) for i in parts], dim=1)
-        return normalize(joined @ of_level["joined"].T)
+        projected = [centred[i] @ directions[i].T for i in parts]
+        if of_level["lengths"]:
+            vectors = torch.cat(projected, dim=1) @ of_level["joined"].T
+            return torch.cat([vectors, (1 - vectors.square().sum(dim=1, keepdim=True)).sqrt()], dim=1)
+        return normalize(torch.cat([normalize(one) for one in projected], dim=1) @ of_level["joined"].T)
 
-    classes, bodies = level("of_classes", CLASS_PARTS), level("of_bodies", BODY_PARTS)
-    share, reach = (stored[f"head.{name}"] for name in ("share", "reach"))
-    expected = torch.cat([(1 - share).sqrt() * classes, share.sqrt() * bodies], dim=1)
+    classes = level("of_classes", CLASS_PARTS)
+    first, second = (level(f"of_bodies.{k}", (part,)) for k, part in enumerate(BODY_PARTS))
+    share, reaches = (stored[f"head.{name}"] for name in ("share", "reaches"))
+    root = (share / 2).sqrt()
     found = describe(part, module)
-    torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=0)
-    kernel = torch.exp(-torch.cdist(bodies, bodies, compute_mode="donot_use_mm_for_euclid_dist").square() / reach**2)
-    distances = (1 - classes @ classes.T) * (1 - kernel) ** 2
+    torch.testing.assert_close(
+        found.double(), torch.cat([(1 - share).sqrt() * classes, root * first, root * second], dim=1), atol=1e-4, rtol=0
+    )
+    apart = torch.zeros(4, 4, dtype=torch.float64)
+    for one, reach in zip((first, second), reaches, strict=True):
+        apart += (torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist") / reach) ** 6
+    distances = (1 - classes @ classes.T) * (1 - torch.exp(-apart))
     torch.testing.assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)
 
 
@@ -111,18 +119,25 @@ def test_pretrained_gives_short_unit_vectors(dataset: SignatureDataset) -> None:
     torch.testing.assert_close(found.norm(dim=1), torch.ones(3), atol=1e-5, rtol=0)
 
 
-def test_pretrained_gains_on_shapes_it_has_not_seen(dataset: SignatureDataset, histograms: Tensor) -> None:
-    """Over the plain distance of `rich`, and over that of its own histograms."""
-    module = pretrained()
+def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
+    """Over the plain distance of `rich`, and over that of its own histograms: on classes that are hard to tell apart.
+
+    Of another seed than those that it was fitted to, and without the twelve templates, which all descriptors tell.
+    """
+    GradedShapes(12, 4, 1, seed=3, look_alikes=False).write(tmp_path, n_workers=None)
+    module, plain = pretrained(), rich()
+    config = (module.needs | plain.needs).completed(SignatureConfig(n_eigenpairs=64))
+    dataset = SignatureDataset(tmp_path, config, tmp_path / "cache")
+    assert not dataset.precompute()
 
     def first_tier(distances: Tensor) -> float:
         return retrieval_scores(distances, dataset.labels).mean()["ft"]
 
-    own = describe(dataset, module.descriptor)
+    own, others = describe(dataset, module.descriptor), describe(dataset, plain)
     embedded = module.head(own)
     learned = first_tier(module.distances(embedded, embedded))
-    assert learned > first_tier(chi_square(histograms, histograms)) + 0.02
-    assert learned > first_tier(chi_square(own, own)) + 0.02
+    assert learned > first_tier(chi_square(others, others)) + 0.1
+    assert learned > first_tier(chi_square(own, own)) + 0.1
 
 
 def test_a_metric_of_ones_own_is_stored_and_loaded(dataset: SignatureDataset, tmp_path: Path) -> None:

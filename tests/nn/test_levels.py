@@ -73,21 +73,56 @@ def test_parts_have_equal_shares_and_others_do_not_count(collection: tuple[Tenso
     torch.testing.assert_close(head(changed), found, atol=1e-6, rtol=0)
 
 
-def test_the_distance_is_that_of_the_classes_less_what_a_kernel_of_the_bodies_takes_away(
+def test_with_lengths_distances_are_those_of_mahalanobis(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    """Written down with SciPy's matrix functions, up to one factor; and a number that makes the length 1."""
+    histograms, _, bodies = collection
+    roots = histograms.double().sqrt().numpy()
+    members = bodies.numpy()
+    means = np.stack([roots[members == b].mean(axis=0) for b in range(members.max() + 1)])
+    residuals = roots - means[members]
+    within = residuals.T @ residuals
+    relative = within * min(len(roots) - len(means), N_CELLS) / within.trace()
+    whitening = np.real(sqrtm(0.2 * np.linalg.inv(0.2 * np.eye(N_CELLS) + relative)))
+    _, _, axes = np.linalg.svd((means - roots.mean(axis=0)) @ whitening, full_matrices=False)
+    expected = torch.from_numpy(roots @ whitening @ axes[:10].T)
+    head = LevelHead(width=10, n_directions=10, shrinkage=0.2, lengths=True).fit(histograms.double(), bodies)
+    found = head(histograms.double())
+    assert found.shape == (len(histograms), 11)
+    torch.testing.assert_close(found.norm(dim=1), torch.ones(len(found), dtype=torch.float64))
+    own, theirs = torch.pdist(found[:, :10]), torch.pdist(expected)
+    torch.testing.assert_close(own / own.median(), theirs / theirs.median(), atol=1e-6, rtol=1e-6)
+    assert float(own.median()) == pytest.approx(0.5, rel=1e-6)
+
+
+def test_what_is_far_beyond_all_training_shapes_is_a_unit_vector_too(
     collection: tuple[Tensor, Tensor, Tensor],
 ) -> None:
+    histograms, _, bodies = collection
+    head = LevelHead(width=10, lengths=True).fit(histograms, bodies)
+    alone = torch.zeros(N_CELLS, N_CELLS).fill_diagonal_(1.0)  # all in one cell, where training shapes have all 40
+    torch.testing.assert_close(head(alone).norm(dim=1), torch.ones(N_CELLS), atol=1e-5, rtol=0)
+
+
+def test_the_distance_is_that_of_the_classes_where_any_witness_tells_two_bodies_apart(
+    collection: tuple[Tensor, Tensor, Tensor],
+) -> None:
+    """Written down from the vectors of the heads, of which the last number, with lengths, is no part of a distance."""
     histograms, classes, bodies = collection
-    of_classes, of_bodies = LevelHead(width=20), LevelHead(width=6)
-    head = TwoLevelHead(of_classes, of_bodies, reach=0.4, share=0.3)
-    vectors = head.fit(histograms, classes, bodies=bodies)(histograms)
+    of_classes = LevelHead(width=20)
+    witnesses = LevelHead((0,), width=6), LevelHead((1,), width=5, n_directions=5, lengths=True)
+    head = TwoLevelHead(of_classes, witnesses, reaches=(0.7, 0.3), share=0.3)
+    vectors = head.fit(histograms, classes, (15, 25), bodies=bodies)(histograms)
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
-    x, y = of_classes(histograms).double(), of_bodies(histograms).double()
-    torch.testing.assert_close((vectors @ vectors.T).double(), 0.7 * x @ x.T + 0.3 * y @ y.T, atol=1e-5, rtol=0)
-    kernel = torch.exp(-torch.cdist(y, y, compute_mode="donot_use_mm_for_euclid_dist").square() / 0.4**2)
-    expected = (1 - x @ x.T) * (1 - kernel) ** 2
-    torch.testing.assert_close(head.distances(vectors, vectors).double(), expected, atol=2e-3, rtol=0)
-    assert kernel.min() < 0.1  # nor is it 1 throughout
-    assert ((kernel > 0.2) & (kernel < 0.9)).any()
+    x, y, z = (one(histograms).double() for one in (of_classes, *witnesses))
+    products = 0.7 * x @ x.T + 0.15 * y @ y.T + 0.15 * z @ z.T
+    torch.testing.assert_close((vectors @ vectors.T).double(), products, atol=1e-5, rtol=0)
+    first, second = (torch.cdist(one, one, compute_mode="donot_use_mm_for_euclid_dist") for one in (y, z[:, :-1]))
+    same = torch.exp(-((first / 0.7) ** 6) - (second / 0.3) ** 6)
+    found = head.distances(vectors, vectors).double()
+    torch.testing.assert_close(found, (1 - x @ x.T) * (1 - same), atol=1e-4, rtol=0)
+    assert same.min() < 0.1  # nor is it 1 throughout
+    assert ((same > 0.2) & (same < 0.9)).any()
+    assert ((first < 0.5) & (second > 0.4) & (same < 0.1)).any()  # by the second witness alone
 
 
 def test_both_levels_are_ordered(collection: tuple[Tensor, Tensor, Tensor]) -> None:
@@ -103,18 +138,18 @@ def test_both_levels_are_ordered(collection: tuple[Tensor, Tensor, Tensor]) -> N
         level: retrieval_scores(distances, labels).mean()["ft"] for level, labels in (("b", of_body), ("c", of_class))
     }
     assert found["b"] > ft(head.of_classes(rest), of_body) + 0.05
-    assert found["c"] > ft(head.of_bodies(rest), of_class) + 0.05
+    assert found["c"] > ft(head.witnesses[0](rest), of_class) + 0.05
 
 
 def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> None:
     histograms, classes, bodies = collection
-    fitted = TwoLevelHead(LevelHead((0,), 5, 7), LevelHead((1,), 6, 8), reach=0.3, share=0.5)
+    fitted = TwoLevelHead(LevelHead((0,), 5, 7), [LevelHead((1,), 6, 8, lengths=True)], reaches=[0.3], share=0.3)
     fitted.fit(histograms, classes, (15, 25), bodies=bodies)
-    other = TwoLevelHead(LevelHead((0,)), LevelHead((1,)))
+    other = TwoLevelHead(LevelHead((0,)), [LevelHead((1,))])  # whether lengths count is stored too
     other.load_state_dict(fitted.state_dict())
     torch.testing.assert_close(other(histograms), fitted(histograms))
     vectors = other(histograms)
-    assert vectors.shape == (len(histograms), 5 + 6)
+    assert vectors.shape == (len(histograms), 5 + 6 + 1)
     torch.testing.assert_close(other.distances(vectors, vectors), fitted.distances(vectors, vectors))
 
 
@@ -143,9 +178,11 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
         LevelHead().fit(histograms, torch.arange(len(histograms)))
     with pytest.raises(RuntimeError, match="expected to be fitted first"):
         LevelHead()(histograms)
-    with pytest.raises(ValueError, match=r"reach, share: .* got 0.0 and 0.1"):
-        TwoLevelHead(reach=0.0)
-    with pytest.raises(ValueError, match=r"one between 0 and 1, got 0.2 and 1"):
+    with pytest.raises(ValueError, match=r"reaches, share: .* got \(0.0,\) and 0.5"):
+        TwoLevelHead(reaches=[0.0])
+    with pytest.raises(ValueError, match=r"a positive number for each of 1 heads of bodies, .* got \(0.1, 0.2\)"):
+        TwoLevelHead(reaches=[0.1, 0.2])
+    with pytest.raises(ValueError, match=r"one between 0 and 1, got \(0.1,\) and 1"):
         TwoLevelHead(share=1)
     fitted = LevelHead().fit(histograms, classes)
     with pytest.raises(ValueError, match="expected 40 cells as in training, got 39"):

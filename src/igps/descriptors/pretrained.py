@@ -6,58 +6,61 @@ from pathlib import Path
 
 from safetensors.torch import load_file, save_file
 
-from igps.descriptors.multiscale import N_ORIENTED_SAMPLES, N_SAMPLES
-from igps.nn.axes import EmbeddedPairCosines, EuclideanDistance, InteriorDistance, PairAxis, PairCosines, Potential
+from igps.descriptors.multiscale import N_ORIENTED_SAMPLES
+from igps.nn.axes import BallRadius, EmbeddedPairCosines, EuclideanDistance, InteriorDistance, PairCosines, Potential
+from igps.nn.axial_histogram import AxialHistogram
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histogram import PairHistogram
 from igps.nn.levels import LevelHead, TwoLevelHead
-from igps.nn.view import SampleKind
+from igps.nn.point_histogram import PointHistogram
 
 PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
 """The parameters of `pretrained`, written by training/pretrain.py."""
 
-# Of `seven_parts`: what bending leaves alone tells bodies, how points lie to each other tells classes
-BODY_PARTS, CLASS_PARTS = (0,), (1, 2, 3, 4, 5, 6)
+# Of `seven_parts`: what bending leaves alone tells bodies, how points lie to each other and to the axes tells classes
+BODY_PARTS, CLASS_PARTS = (0, 6), (1, 2, 3, 4, 5, 6)
+# Of the bodies: the median distance of training shapes is 0.5
+_REACHES = (0.1, 0.2)
 
 
 def seven_parts() -> HistogramDescriptor:
     """What `pretrained` sees of a body, of at most 64 eigenpairs.
 
-    By interior distances alone: those of surface samples on two scales; those of interior samples on two scales
-    jointly; how interior samples lie to the surface in the embedding of 16 eigenpairs, and surface samples to each
-    other in that of 8. With directions in space: how interior samples lie to the surface by interior distance, surface
-    samples by Euclidean distance, and surface samples by the distance of the embedding.
+    By interior distances alone: those of surface samples; how interior samples lie to the surface in the embedding of
+    16 eigenpairs, and surface samples to each other in that of 8. With directions in space: how surface samples lie to
+    each other by Euclidean distance, and by that of the embedding; and how they lie to the body's principal axes. And
+    of surface samples the balls that touch them from both sides, by the potentials of 4 and 16 eigenpairs.
     """
     embeddings = {n: SpectralEmbedding(n_eigenpairs=n) for n in (64, 50, 16, 8, 4)}
-
-    def histogram(
-        n_eigenpairs: int, *axes: Potential | PairAxis, n: int | None = N_SAMPLES, samples: SampleKind = "interior"
-    ) -> PairHistogram:
-        return PairHistogram(axes, embeddings[n_eigenpairs], samples, n_samples=n)
-
     n = N_ORIENTED_SAMPLES
-    on_surface = [histogram(k, Potential(4), InteriorDistance(64), n=None, samples="surface") for k in (64, 16)]
+    # 2,000 samples lie 0.022 apart: what is thinner than that is thin
+    balls = [BallRadius("inside", 0.022, 0.25), BallRadius("outside", 0.03, 1.5)]
+    potentials = [Potential(6, 0.9, embedding=embeddings[4], soft=True), Potential(6, 0.96, soft=True)]
     return HistogramDescriptor(
         [
-            on_surface,
-            histogram(50, InteriorDistance(24, 3.0), InteriorDistance(24, 2.5, embedding=embeddings[4])),
-            histogram(16, InteriorDistance(6, 3.0), EmbeddedPairCosines(5), n=n),
-            histogram(8, InteriorDistance(6, 3.0), EmbeddedPairCosines(5), n=n, samples="surface"),
-            histogram(50, InteriorDistance(6, 3.0), PairCosines(5), n=n),
-            histogram(50, EuclideanDistance(6, 1.0), PairCosines(5), n=n, samples="surface"),
-            histogram(50, InteriorDistance(8, 3.0), PairCosines(5), n=n, samples="surface"),
+            PairHistogram([Potential(4), InteriorDistance(64)], embeddings[64], "surface"),
+            PairHistogram([InteriorDistance(6, 3.0), EmbeddedPairCosines(5)], embeddings[16], n_samples=n),
+            PairHistogram([InteriorDistance(6, 3.0), EmbeddedPairCosines(5)], embeddings[8], "surface", n_samples=n),
+            PairHistogram([EuclideanDistance(6, 1.0), PairCosines(5)], embeddings[50], "surface", n_samples=n),
+            PairHistogram([InteriorDistance(8, 3.0), PairCosines(5)], embeddings[50], "surface", n_samples=n),
+            AxialHistogram(embeddings[16]),
+            PointHistogram([*balls, *potentials], embeddings[16]),
         ],
         name="seven_parts",
-        source="Rustamov 2007 and 2010; Wahl, Hillenbrand and Hirzinger 2003",
+        source="Rustamov 2007 and 2010; Wahl, Hillenbrand and Hirzinger 2003; Ma, Bae and Choi 2012",
         invariant_to=("motion", "scale"),
     )
 
 
 def two_levels() -> TwoLevelHead:
     """The head of `pretrained`, not fitted."""
-    of_classes = LevelHead(CLASS_PARTS, width=192)
-    return TwoLevelHead(of_classes, LevelHead(BODY_PARTS, width=64, shrinkage=0.3))
+    surface, balls = BODY_PARTS
+    of_bodies = [
+        LevelHead([surface], 90, n_directions=90, shrinkage=0.3, lengths=True),
+        LevelHead([balls], 20, n_directions=20, shrinkage=0.1, lengths=True),
+    ]
+    return TwoLevelHead(LevelHead(CLASS_PARTS, width=144), of_bodies, reaches=_REACHES)
 
 
 def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:

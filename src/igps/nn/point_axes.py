@@ -103,7 +103,7 @@ class BallRadius(PointAxis):
     """
 
     def __init__(
-        self, side: Literal["inside", "outside"] = "inside", smallest: float = 0.012, largest: float = 0.25,
+        self, side: Literal["inside", "outside"] = "inside", smallest: float = 0.022, largest: float = 0.25,
         n_classes: int = 4,
     ) -> None:  # fmt: skip
         if side not in ("inside", "outside"):
