@@ -100,3 +100,10 @@ def test_three_samples_are_enough_and_two_are_not(ball_radii: Radii) -> None:
 def test_points_that_coincide_touch_no_ball(ball_radii: Radii) -> None:
     points = torch.zeros(5, 3)
     assert (ball_radii(points, torch.tensor([0.0, 0.0, 1.0]).expand(5, 3)) == 10).all()
+
+
+def test_what_is_not_finite_is_refused(ball_radii: Radii) -> None:
+    points = torch.eye(3)
+    points[1, 1] = torch.nan
+    with pytest.raises(ValueError, match="expected finite points and directions, got NaN or infinity"):
+        ball_radii(points, torch.eye(3))

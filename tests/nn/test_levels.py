@@ -36,11 +36,8 @@ def ft(vectors: Tensor, labels: Tensor) -> float:
     return retrieval_scores(cosine(vectors, vectors), labels).mean()["ft"]
 
 
-def test_a_level_is_the_projection_of_the_whitened_roots_on_their_means(
-    collection: tuple[Tensor, Tensor, Tensor],
-) -> None:
-    """Written down with SciPy's matrix functions; the signs and the basis of the vectors are free, cosines are not."""
-    histograms, _, bodies = collection
+def projected(histograms: Tensor, bodies: Tensor, shrinkage: float) -> np.ndarray:
+    """(N, 10) centred roots, whitened within bodies, along the directions in which the means vary most."""
     roots = histograms.double().sqrt().numpy()
     members = bodies.numpy()
     means = np.stack([roots[members == b].mean(axis=0) for b in range(members.max() + 1)])
@@ -48,14 +45,21 @@ def test_a_level_is_the_projection_of_the_whitened_roots_on_their_means(
     within = residuals.T @ residuals
     rank = min(len(roots) - len(means), N_CELLS)
     relative = within * rank / within.trace()
-    shrinkage = 0.2
     whitening = np.real(sqrtm(shrinkage * np.linalg.inv(shrinkage * np.eye(N_CELLS) + relative)))
     centred = roots - roots.mean(axis=0)
     # of 40 cells the roots span all: nothing but the mean is taken off
     _, _, axes = np.linalg.svd((means - roots.mean(axis=0)) @ whitening, full_matrices=False)
-    expected = centred @ whitening @ axes[:10].T
+    return centred @ whitening @ axes[:10].T
+
+
+def test_a_level_is_the_projection_of_the_whitened_roots_on_their_means(
+    collection: tuple[Tensor, Tensor, Tensor],
+) -> None:
+    """Written down with SciPy's matrix functions; the signs and the basis of the vectors are free, cosines are not."""
+    histograms, _, bodies = collection
+    expected = projected(histograms, bodies, 0.2)
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    head = LevelHead(width=10, n_directions=10, shrinkage=shrinkage).fit(histograms.double(), bodies)
+    head = LevelHead(width=10, n_directions=10, shrinkage=0.2).fit(histograms.double(), bodies)
     found = head(histograms.double()).numpy()
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-6)
 
@@ -76,15 +80,7 @@ def test_parts_have_equal_shares_and_others_do_not_count(collection: tuple[Tenso
 def test_with_lengths_distances_are_those_of_mahalanobis(collection: tuple[Tensor, Tensor, Tensor]) -> None:
     """Written down with SciPy's matrix functions, up to one factor; and a number that makes the length 1."""
     histograms, _, bodies = collection
-    roots = histograms.double().sqrt().numpy()
-    members = bodies.numpy()
-    means = np.stack([roots[members == b].mean(axis=0) for b in range(members.max() + 1)])
-    residuals = roots - means[members]
-    within = residuals.T @ residuals
-    relative = within * min(len(roots) - len(means), N_CELLS) / within.trace()
-    whitening = np.real(sqrtm(0.2 * np.linalg.inv(0.2 * np.eye(N_CELLS) + relative)))
-    _, _, axes = np.linalg.svd((means - roots.mean(axis=0)) @ whitening, full_matrices=False)
-    expected = torch.from_numpy(roots @ whitening @ axes[:10].T)
+    expected = torch.from_numpy(projected(histograms, bodies, 0.2))
     head = LevelHead(width=10, n_directions=10, shrinkage=0.2, lengths=True).fit(histograms.double(), bodies)
     found = head(histograms.double())
     assert found.shape == (len(histograms), 11)

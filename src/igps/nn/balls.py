@@ -34,10 +34,12 @@ def ball_radii(points: Tensor, directions: Tensor) -> Tensor:
         (P, 2) radii inside and outside, from 0.001 to 10; the latter where no sample is on that side.
 
     Raises:
-        ValueError: fewer than three points.
+        ValueError: fewer than three points, or values that are not finite.
     """
     if len(points) < _RANK:
         raise ValueError(f"samples: expected at least {_RANK} of each body, which tell its balls, got {len(points)}.")
+    if not (torch.isfinite(points).all() and torch.isfinite(directions).all()):
+        raise ValueError("samples: expected finite points and directions, got NaN or infinity.")
     if can_count(points, directions):
         bent = np.zeros((len(points), 2), dtype=_array(points).dtype)
         bends(_array(points), _array(directions.to(points.dtype)), _TANGENTIAL, bent)
