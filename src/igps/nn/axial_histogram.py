@@ -37,6 +37,11 @@ class AxialHistogram(SampleHistogram):
         n_bins: along the axis, beside it, and of the cosines of the direction with the axis and with the line from it.
     """
 
+    along: Tensor
+    beside: Tensor
+    cosine: Tensor
+    outward: Tensor
+
     def __init__(
         self,
         embedding: nn.Module | None = None,
@@ -56,11 +61,6 @@ class AxialHistogram(SampleHistogram):
         self.register_buffer("beside", torch.linspace(0, _REACH, beside))
         self.register_buffer("cosine", torch.linspace(-1, 1, cosine))
         self.register_buffer("outward", torch.linspace(-1, 1, outward))
-
-    along: Tensor
-    beside: Tensor
-    cosine: Tensor
-    outward: Tensor
 
     @property
     def shape(self) -> tuple[int, ...]:

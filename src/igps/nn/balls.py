@@ -41,8 +41,9 @@ def ball_radii(points: Tensor, directions: Tensor) -> Tensor:
     if not (torch.isfinite(points).all() and torch.isfinite(directions).all()):
         raise ValueError("samples: expected finite points and directions, got NaN or infinity.")
     if can_count(points, directions):
-        bent = np.zeros((len(points), 2), dtype=_array(points).dtype)
-        bends(_array(points), _array(directions.to(points.dtype)), _TANGENTIAL, bent)
+        places = _array(points)
+        bent = np.zeros((len(points), 2), dtype=places.dtype)
+        bends(places, _array(directions.to(points.dtype)), _TANGENTIAL, bent)
         return (1 / torch.from_numpy(bent)).clamp(_SMALLEST, _LARGEST)
     with full_precision():
         squares = torch.cdist(points, points, compute_mode="use_mm_for_euclid_dist").square().fill_diagonal_(torch.inf)
