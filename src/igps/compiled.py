@@ -63,6 +63,11 @@ class Compiled(Generic[Arguments, Result]):
         return self.dispatcher(*args, **kwargs)
 
     @property
+    def plain(self) -> Callable[Arguments, Result]:
+        """The function as it is written, which runs anywhere, slowly."""
+        return self._function
+
+    @property
     def dispatcher(self) -> Callable[..., Any]:
         """What Numba makes of the function, and of those that it calls.
 

@@ -72,6 +72,18 @@ def test_directions_in_the_embedding_lead_outwards_whatever_the_padding(kind: st
         torch.testing.assert_close(unpadded[0], directions[i, :n])
 
 
+def test_neighbours_in_the_embedding_are_found_once_whatever_the_padding() -> None:
+    batch, embedding = two_bodies(), SpectralEmbedding(n_eigenpairs=4)
+    view = View(batch, "surface", batch.surface)
+    found = view.neighbours(embedding)
+    assert view.neighbours(embedding) is found
+    for i, n in enumerate(N_POINTS):
+        points = embedded(batch, i, "surface", 4)
+        apart = (points[:, None] - points).norm(dim=2).fill_diagonal_(torch.inf)
+        assert found[i].shape == (n, 16)
+        assert torch.equal(found[i], apart.argsort(dim=1)[:, :16])
+
+
 def test_subsets() -> None:
     batch = two_bodies()
     assert Views(batch, training=False).of("interior", None, 5).samples is batch.interior

@@ -33,7 +33,7 @@ class SampleHistogram(nn.Module, ABC):
         check_kind(samples)
         for name, value in (("n_samples", n_samples), ("n_training_samples", n_training_samples)):
             if value is not None and value < 2:
-                raise ValueError(f"{name}: expected None or at least 2, to form a pair, got {value}.")
+                raise ValueError(f"{name}: expected None or at least 2, got {value}.")
         self.samples: SampleKind = samples
         self.n_samples = n_samples
         self.n_training_samples = n_training_samples

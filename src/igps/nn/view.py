@@ -10,6 +10,8 @@ from torch.nn import functional
 
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.nn.balls import ball_radii
+from igps.nn.embedding import barycentroid_potential
+from igps.nn.merge_tree import nearest
 from igps.nn.precision import full_precision
 
 SampleKind = Literal["interior", "surface"]
@@ -38,6 +40,7 @@ class View:
         self.samples = samples
         self._embedded: dict[nn.Module, Tensor] = {}
         self._ball_radii: Tensor | None = None
+        self._neighbours: dict[nn.Module, list[Tensor]] = {}
 
     def embedded(self, embedding: nn.Module) -> Tensor:
         """(N, P, D) embedding of the samples."""
@@ -76,6 +79,18 @@ class View:
             for i, real in enumerate(self.samples.mask):
                 self._ball_radii[i, real] = ball_radii(points[i, real], directions[i, real])
         return self._ball_radii
+
+    def log_potential(self, embedding: nn.Module) -> Tensor:
+        """(N, P) logarithms of the barycentroid potential."""
+        potential = barycentroid_potential(self.embedded(embedding))
+        return potential.clamp_min(torch.finfo(potential.dtype).tiny).log()
+
+    def neighbours(self, embedding: nn.Module) -> list[Tensor]:
+        """Of each shape, (P, k) the other samples that are nearest to each in the embedding, padding left out."""
+        if embedding not in self._neighbours:
+            coordinates = self.embedded(embedding)
+            self._neighbours[embedding] = [nearest(coordinates[i, real]) for i, real in enumerate(self.samples.mask)]
+        return self._neighbours[embedding]
 
     def embedded_directions(self, embedding: nn.Module) -> Tensor:
         """(N, P, D) unit vectors from interior samples to the surface in the embedding, or out of it on the surface."""
