@@ -1,4 +1,4 @@
-"""`rich` is its parts side by side; `pretrained` is the shipped metric on top of its seven parts."""
+"""`rich` is its parts side by side; `pretrained` is the shipped metric on top of its eight parts."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from igps.descriptors.pretrained import (
     BODY_PARTS,
     CLASS_PARTS,
     PRETRAINED,
+    eight_parts,
     pretrained,
     save_pretrained,
-    seven_parts,
     two_levels,
 )
 from igps.descriptors.rich import rich
@@ -30,8 +30,8 @@ from igps.shapes import ArticulatedShapes, GradedShapes
 
 # Of `rich`: six histograms in its first part, two oriented ones.
 CELLS = (25920, 750, 750)
-# Of `seven_parts`
-SEVEN_CELLS = (640, 750, 750, 750, 1000, 1920, 576)
+# Of `eight_parts`
+EIGHT_CELLS = (640, 750, 750, 1000, 1920, 576, 16, 180)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataset:
     """Shapes of a seed that the pretrained metric was not fitted to."""
     root = tmp_path_factory.mktemp("shapes")
     ArticulatedShapes(n_classes=24, n_per_class=3, seed=7, n_vertices=1500).write(root)
-    needs = rich().needs | seven_parts().needs
+    needs = rich().needs | eight_parts().needs
     config = needs.completed(SignatureConfig(n_eigenpairs=64, n_surface_samples=1000))
     return SignatureDataset(root, config, root / "cache")
 
@@ -89,9 +89,9 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
 
     def level(name: str, parts: tuple[int, ...]) -> Tensor:
         of_level = {key.rsplit(".", 1)[1]: tensor for key, tensor in stored.items() if f".{name}." in key}
-        assert of_level["part_cells"].long().tolist() == list(SEVEN_CELLS)
-        centred = (roots - of_level["mean"]).split(SEVEN_CELLS, dim=1)
-        directions = of_level["directions"].split(SEVEN_CELLS, dim=1)
+        assert of_level["part_cells"].long().tolist() == list(EIGHT_CELLS)
+        centred = (roots - of_level["mean"]).split(EIGHT_CELLS, dim=1)
+        directions = of_level["directions"].split(EIGHT_CELLS, dim=1)
         projected = [centred[i] @ directions[i].T for i in parts]
         if of_level["lengths"]:
             vectors = torch.cat(projected, dim=1) @ of_level["joined"].T
@@ -142,7 +142,7 @@ def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
 
 def test_a_metric_of_ones_own_is_stored_and_loaded(dataset: SignatureDataset, tmp_path: Path) -> None:
     dataset = dataset.subset(range(20))
-    descriptor = seven_parts().eval()
+    descriptor = eight_parts().eval()
     described = describe(dataset, descriptor)
     head = two_levels().fit(described, dataset.labels, descriptor.part_cells)
     save_pretrained(EmbeddedDescriptor(descriptor, head), tmp_path / "metric.safetensors")

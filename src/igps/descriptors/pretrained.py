@@ -9,30 +9,33 @@ from safetensors.torch import load_file, save_file
 from igps.descriptors.multiscale import N_ORIENTED_SAMPLES
 from igps.nn.axes import BallRadius, EmbeddedPairCosines, EuclideanDistance, InteriorDistance, PairCosines, Potential
 from igps.nn.axial_histogram import AxialHistogram
+from igps.nn.branch_histogram import BranchHistogram
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histogram import PairHistogram
 from igps.nn.levels import LevelHead, TwoLevelHead
+from igps.nn.piece_histogram import PieceHistogram
 from igps.nn.point_histogram import PointHistogram
 
 PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
 """The parameters of `pretrained`, written by training/pretrain.py."""
 
-# Of `seven_parts`: what bending leaves alone tells bodies, how points lie to each other and to the axes tells classes
-BODY_PARTS, CLASS_PARTS = (0, 6), (1, 2, 3, 4, 5, 6)
+# Of `eight_parts`: what bending leaves alone tells bodies, all others tell classes
+BODY_PARTS, CLASS_PARTS = (0, 5), (1, 2, 3, 4, 5, 6, 7)
 # Of the bodies: the median distance of training shapes is 0.5
-_REACHES = (0.1, 0.2)
+_REACHES = (0.12, 0.25)
 
 
-def seven_parts() -> HistogramDescriptor:
+def eight_parts() -> HistogramDescriptor:
     """What `pretrained` sees of a body, of at most 64 eigenpairs.
 
-    By interior distances alone: those of surface samples; how interior samples lie to the surface in the embedding of
-    16 eigenpairs, and surface samples to each other in that of 8. With directions in space: how surface samples lie to
-    each other by Euclidean distance, and by that of the embedding; and how they lie to the body's principal axes. And
-    of surface samples the balls that touch them from both sides, by the potentials of 4 and 16 eigenpairs.
+    By interior distances alone: those of surface samples, and how interior samples lie to the surface in the embedding
+    of 16 eigenpairs. With directions in space: how surface samples lie to each other by Euclidean distance, and by that
+    of the embedding; and how they lie to the body's principal axes. Of surface samples the balls that touch them from
+    both sides, by the potentials of 4 and 16 eigenpairs. And by the latter, the body's limbs: how far each reaches, and
+    how large and how long the pieces are that remain of the body without its middle.
     """
-    embeddings = {n: SpectralEmbedding(n_eigenpairs=n) for n in (64, 50, 16, 8, 4)}
+    embeddings = {n: SpectralEmbedding(n_eigenpairs=n) for n in (64, 50, 16, 4)}
     n = N_ORIENTED_SAMPLES
     # 2,000 samples lie 0.022 apart: what is thinner than that is thin
     balls = [BallRadius("inside", 0.022, 0.25), BallRadius("outside", 0.03, 1.5)]
@@ -41,14 +44,15 @@ def seven_parts() -> HistogramDescriptor:
         [
             PairHistogram([Potential(4), InteriorDistance(64)], embeddings[64], "surface"),
             PairHistogram([InteriorDistance(6, 3.0), EmbeddedPairCosines(5)], embeddings[16], n_samples=n),
-            PairHistogram([InteriorDistance(6, 3.0), EmbeddedPairCosines(5)], embeddings[8], "surface", n_samples=n),
             PairHistogram([EuclideanDistance(6, 1.0), PairCosines(5)], embeddings[50], "surface", n_samples=n),
             PairHistogram([InteriorDistance(8, 3.0), PairCosines(5)], embeddings[50], "surface", n_samples=n),
             AxialHistogram(embeddings[16]),
             PointHistogram([*balls, *potentials], embeddings[16]),
+            BranchHistogram(embeddings[16], n_samples=n),
+            PieceHistogram(embedding=embeddings[16], n_samples=n),
         ],
-        name="seven_parts",
-        source="Rustamov 2007 and 2010; Wahl, Hillenbrand and Hirzinger 2003; Ma, Bae and Choi 2012",
+        name="eight_parts",
+        source="Rustamov 2007 and 2010; Wahl, Hillenbrand and Hirzinger 2003; Ma, Bae, Choi 2012; Skraba et al. 2010",
         invariant_to=("motion", "scale"),
     )
 
@@ -58,13 +62,13 @@ def two_levels() -> TwoLevelHead:
     surface, balls = BODY_PARTS
     of_bodies = [
         LevelHead([surface], 90, n_directions=90, shrinkage=0.3, lengths=True),
-        LevelHead([balls], 20, n_directions=20, shrinkage=0.1, lengths=True),
+        LevelHead([balls], 20, n_directions=20, shrinkage=0.3, lengths=True),
     ]
     return TwoLevelHead(LevelHead(CLASS_PARTS, width=144), of_bodies, reaches=_REACHES)
 
 
 def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
-    """Unit vectors of 256 numbers, in evaluation mode: `seven_parts` under a head that was fitted to generated shapes.
+    """Unit vectors of 256 numbers, in evaluation mode: `eight_parts` under a head that was fitted to generated shapes.
 
     It needs no label of the shapes that it compares: by the head's distance, other poses of a body come first, then
     other bodies of its class. The model card is in the documentation.
@@ -77,10 +81,10 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
         ValueError: it holds other parameters.
     """
     module = EmbeddedDescriptor(
-        seven_parts(),
+        eight_parts(),
         two_levels(),
         name="pretrained",
-        source="seven histograms, fitted to generated shapes",
+        source="eight histograms, fitted to generated shapes",
         invariant_to=("motion", "scale", "pose"),
     )
     try:
@@ -91,7 +95,7 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
 
 
 def save_pretrained(module: EmbeddedDescriptor, path: str | Path) -> None:
-    """Write a fitted `seven_parts` under `two_levels` to a safetensors file, the head in half precision."""
+    """Write a fitted `eight_parts` under `two_levels` to a safetensors file, the head in half precision."""
     state = {
         name: (tensor.half() if name.startswith("head.") and tensor.is_floating_point() else tensor).contiguous()
         for name, tensor in module.state_dict().items()

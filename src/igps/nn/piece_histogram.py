@@ -14,9 +14,9 @@ from igps.nn.point_axes import soft_memberships
 from igps.nn.sample_histogram import SampleHistogram, present
 from igps.nn.view import SampleKind, View
 
-# Shares of the samples, from 1 in 64 on
+# Centres are logarithms to base 2. Of sizes, from one sample in 64 on
 _SMALLEST, _LARGEST = -6.0, -0.5
-# A square plate has length √(12/12) = 1 over the root of its area, on both sides: 2; from half of that to a thin rod
+# Of lengths: a ball lies at −0.8, a rod that is a hundred times as long as it is thick at 2.5
 _ROUNDEST, _LONGEST = -1.0, 2.5
 # Of fewer samples the length says nothing
 _FEWEST = 4
