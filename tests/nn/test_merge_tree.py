@@ -87,6 +87,9 @@ def test_the_lower_of_two_peaks_ends_where_they_meet(merge_tree: Build) -> None:
 def test_of_equal_peaks_the_first_lives_on(merge_tree: Build) -> None:
     tree = merge_tree(*on_a_path([2.0, 1.0, 2.0, 0.0]))
     assert sorted(zip(tree.peaks.tolist(), tree.saddles.tolist(), strict=True)) == [(0, 3), (2, 1)]
+    many = merge_tree(*on_a_path([2.0, 1.0] * 200 + [0.0]))
+    assert sorted(many.peaks.tolist()) == list(range(0, 400, 2))
+    assert (0, 400) in zip(many.peaks.tolist(), many.saddles.tolist(), strict=True)
 
 
 def test_what_is_apart_ends_at_the_bottom(merge_tree: Build) -> None:
