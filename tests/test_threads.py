@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -231,6 +232,46 @@ def test_threads_that_overlap_leave_each_other_as_they_were() -> None:
         worker.join()
     assert sorted(found) == [(4, 1, 4), (5, 1, 5), (6, 1, 6), (7, 1, 7)]
     assert (torch.get_num_threads(), blas()) == (before[0], before[2])
+
+
+def test_who_leaves_last_lifts_the_limit_that_another_set() -> None:
+    """Also where the other lives on, to which threadpoolctl would leave it."""
+    before = settings()
+    entered, left = threading.Event(), threading.Event()
+
+    def other() -> None:
+        with one_thread():
+            entered.set()
+            assert left.wait(60)
+            assert set(blas()) == {1}
+
+    worker = threading.Thread(target=other)
+    with one_thread():
+        worker.start()
+        assert entered.wait(60)
+    left.set()
+    worker.join()
+    assert settings() == before
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_process_has_threads_of_its_own_to_ask() -> None:
+    """Those that were started ahead stay behind in its parent."""
+    with one_thread():
+        pass
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+
+    def child() -> None:
+        with one_thread():
+            inside = torch.get_num_threads()
+        sender.send((inside, torch.get_num_threads()))
+
+    process = multiprocessing.get_context("fork").Process(target=child)
+    process.start()
+    assert receiver.poll(60)
+    assert receiver.recv() == (1, 3)
+    process.join(60)
+    assert process.exitcode == 0
 
 
 def test_a_thread_that_starts_inside_gets_what_it_would_have_got() -> None:

@@ -15,15 +15,18 @@ import os
 import re
 import sys
 import threading
+from _thread import start_new_thread
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
+import threadpoolctl
 import torch
-from threadpoolctl import ThreadpoolController
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -185,31 +188,71 @@ def _set_torch_threads(n: int) -> None:
     """
     if _get_torch_threads() == n:
         return
-    with _torch_threads:
-        of_new_threads = _in_new_thread(torch.get_num_threads)
+    with _torch_threads, _new_threads.one() as ask:
+        of_new_threads = ask(torch.get_num_threads)
         torch.set_num_threads(n)
-        _in_new_thread(lambda: torch.set_num_threads(of_new_threads))
+        ask(lambda: torch.set_num_threads(of_new_threads))
 
 
-def _in_new_thread(function: Callable[[], Result]) -> Result:
-    results: list[Result] = []
-    thread = threading.Thread(target=lambda: results.append(function()))
-    thread.start()
-    thread.join()
-    return results[0]
+class _NewThreads:
+    """Threads that have not computed yet, started ahead of their use.
+
+    Beside busy processes a thread takes milliseconds until it runs for the first time, but hardly any time to wake.
+    """
+
+    _AHEAD = 2  # as many as `one_thread` takes
+
+    def __init__(self) -> None:
+        self._asleep: deque[tuple[_Questions, _Answers]] = deque()
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=self._asleep.clear)  # of the threads, only the one that forks lives on
+
+    @contextlib.contextmanager
+    def one(self) -> Iterator[Callable[[Callable[[], Any]], Any]]:
+        """Calls functions of the caller in one new thread, and gives their results."""
+        try:
+            questions, answers = self._asleep.popleft()
+        except IndexError:
+            questions, answers = self._started()
+
+        def ask(function: Callable[[], Any]) -> Any:
+            questions.put(function)
+            return answers.get()
+
+        try:
+            yield ask
+        finally:
+            questions.put(None)
+            while len(self._asleep) < self._AHEAD:
+                self._asleep.append(self._started())
+
+    @staticmethod
+    def _started() -> tuple[_Questions, _Answers]:
+        questions, answers = _Questions(), _Answers()
+
+        def work() -> None:
+            while (function := questions.get()) is not None:
+                answers.put(function())
+
+        start_new_thread(work, ())  # `Thread.start` would wait until it runs
+        return questions, answers
+
+
+_Questions = SimpleQueue[Callable[[], Any] | None]
+_Answers = SimpleQueue[Any]
+_new_threads = _NewThreads()
 
 
 @lru_cache(maxsize=1)
-def _libraries(n_modules: int) -> ThreadpoolController:
+def _libraries(n_modules: int) -> threadpoolctl.ThreadpoolController:
     """Those that are loaded; to look for them takes as long as a small product, and only an import brings others."""
-    return ThreadpoolController()
+    return threadpoolctl.ThreadpoolController()
 
 
 class _Blas:
     """The threads of NumPy's and SciPy's products: a setting of the process, so that those who need it are counted.
 
-    Of the threads that are alive threadpoolctl lets only the one lift a limit that set it; so both are done by threads
-    that end at once.
+    As long as a thread is alive that has set a limit, threadpoolctl lets no other lift it; so who has set one lets go.
     """
 
     def __init__(self) -> None:
@@ -221,8 +264,9 @@ class _Blas:
     def on_one_thread(self) -> Iterator[None]:
         with self._lock:
             if self._users == 0:
-                limits = _in_new_thread(lambda: _libraries(len(sys.modules)).limit(limits=1, user_api="blas"))
+                limits = _libraries(len(sys.modules)).limit(limits=1, user_api="blas")
                 self._restore = limits.restore_original_limits
+                _let_go()
             self._users += 1
         try:
             yield
@@ -230,7 +274,15 @@ class _Blas:
             with self._lock:
                 self._users -= 1
                 if self._users == 0 and self._restore is not None:
-                    _in_new_thread(self._restore)
+                    self._restore()
+                    _let_go()
+
+
+def _let_go() -> None:
+    """Threadpoolctl before 3.8 lets every thread set and lift limits, and has nothing to let go of."""
+    clear = getattr(getattr(threadpoolctl, "OpenBLASController", None), "clear_controlling_thread", None)
+    if clear is not None:
+        clear()
 
 
 _blas_on_one_thread = _Blas().on_one_thread

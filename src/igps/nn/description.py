@@ -214,8 +214,8 @@ def evaluation_mode(module: nn.Module) -> Iterator[None]:
 
 def _describe_one(job: tuple[Descriptor, SignatureDataset]) -> Description:
     descriptor, dataset = job
-    batch = dataset.batch([0])
     with one_thread(), torch.inference_mode():
+        batch = dataset.batch([0])
         start = time.process_time()
         if descriptor.needs.mesh:
             batch = dataset.batch([0], meshes=True)
