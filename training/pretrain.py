@@ -20,7 +20,7 @@ from jsonargparse import auto_cli
 from torch import Tensor
 
 import igps
-from igps.descriptors.pretrained import PRETRAINED, eight_parts, save_pretrained, two_levels
+from igps.descriptors.pretrained import PRETRAINED, pretrained_parts, save_pretrained, two_levels
 from igps.geometry.reading import MeshReading
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
@@ -68,7 +68,7 @@ def pretrain(
         shapes.write(root, progress=True, n_workers=n_workers)
     except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
         print(error)
-    descriptor = eight_parts().eval()
+    descriptor = pretrained_parts().eval()
     generated = _usable(root, descriptor, cache_dir, n_workers)
     histograms, labels = describe(generated, descriptor, progress=True, n_workers=n_workers), generated.labels
     bodies = _numbers([body_of(name) for name in generated.files.names])

@@ -1,4 +1,4 @@
-"""`rich` is its parts side by side; `pretrained` is the shipped metric on top of its eight parts."""
+"""`rich` is its parts side by side; `pretrained` is the shipped metric on top of its own parts."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from igps.descriptors.pretrained import (
     BODY_PARTS,
     CLASS_PARTS,
     PRETRAINED,
-    eight_parts,
     pretrained,
+    pretrained_parts,
     save_pretrained,
     two_levels,
 )
@@ -25,13 +25,14 @@ from igps.descriptors.rich import rich
 from igps.geometry.signature import SignatureConfig
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
-from igps.retrieval import chi_square, retrieval_scores
+from igps.nn.levels import TwoLevelHead
+from igps.retrieval import chi_square, cosine, retrieval_scores
 from igps.shapes import ArticulatedShapes, GradedShapes
 
 # Of `rich`: six histograms in its first part, two oriented ones.
 CELLS = (25920, 750, 750)
-# Of `eight_parts`
-EIGHT_CELLS = (640, 750, 750, 1000, 1920, 576, 16, 180)
+# Of `pretrained_parts`
+PART_CELLS = (640, 750, 750, 1000, 1920, 576, 16, 180, 63)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataset:
     """Shapes of a seed that the pretrained metric was not fitted to."""
     root = tmp_path_factory.mktemp("shapes")
     ArticulatedShapes(n_classes=24, n_per_class=3, seed=7, n_vertices=1500).write(root)
-    needs = rich().needs | eight_parts().needs
+    needs = rich().needs | pretrained_parts().needs
     config = needs.completed(SignatureConfig(n_eigenpairs=64, n_surface_samples=1000))
     return SignatureDataset(root, config, root / "cache")
 
@@ -89,34 +90,48 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
 
     def level(name: str, parts: tuple[int, ...]) -> Tensor:
         of_level = {key.rsplit(".", 1)[1]: tensor for key, tensor in stored.items() if f".{name}." in key}
-        assert of_level["part_cells"].long().tolist() == list(EIGHT_CELLS)
-        centred = (roots - of_level["mean"]).split(EIGHT_CELLS, dim=1)
-        directions = of_level["directions"].split(EIGHT_CELLS, dim=1)
-        projected = [centred[i] @ directions[i].T for i in parts]
+        assert of_level["part_cells"].long().tolist() == list(PART_CELLS)
+        sizes = [PART_CELLS[i] for i in parts]
+        seen = torch.cat([roots.split(PART_CELLS, dim=1)[i] for i in parts], dim=1)
+        projected = [
+            part @ directions[: part.shape[1]].T
+            for part, directions in zip(
+                (seen - of_level["mean"]).split(sizes, dim=1), of_level["directions"].split(sizes, dim=1), strict=True
+            )
+        ]
         if of_level["lengths"]:
-            vectors = torch.cat(projected, dim=1) @ of_level["joined"].T
+            (vectors,) = projected
             return torch.cat([vectors, (1 - vectors.square().sum(dim=1, keepdim=True)).sqrt()], dim=1)
-        return normalize(torch.cat([normalize(one) for one in projected], dim=1) @ of_level["joined"].T)
+        return normalize(torch.cat([normalize(one) for one in projected], dim=1))
 
     classes = level("of_classes", CLASS_PARTS)
-    first, second = (level(f"of_bodies.{k}", (part,)) for k, part in enumerate(BODY_PARTS))
+    bodies = [level(f"of_bodies.{k}", (part,)) for k, part in enumerate(BODY_PARTS)]
     share, reaches = (stored[f"head.{name}"] for name in ("share", "reaches"))
-    root = (share / 2).sqrt()
+    root = (share / len(bodies)).sqrt()
     found = describe(part, module)
-    torch.testing.assert_close(
-        found.double(), torch.cat([(1 - share).sqrt() * classes, root * first, root * second], dim=1), atol=1e-4, rtol=0
-    )
+    expected = torch.cat([(1 - share).sqrt() * classes, *(root * one for one in bodies)], dim=1)
+    torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=0)
+    compared = [one[:, :-1] for one in bodies]
+    from_mean = torch.stack([one.square().sum(dim=1) for one in compared]).mean(dim=0).sqrt()
+    shorter = (torch.outer(from_mean, from_mean).sqrt() / (0.5 / 2**0.5)).sqrt()
     apart = torch.zeros(4, 4, dtype=torch.float64)
-    for one, reach in zip((first, second), reaches, strict=True):
-        apart += (torch.cdist(one[:, :-1], one[:, :-1], compute_mode="donot_use_mm_for_euclid_dist") / reach) ** 6
+    for one, reach in zip(compared, reaches, strict=True):
+        apart += (torch.cdist(one, one, compute_mode="donot_use_mm_for_euclid_dist") * shorter / reach) ** 10
     distances = (1 - classes @ classes.T) * (1 - torch.exp(-apart))
     torch.testing.assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)
 
 
-def test_pretrained_gives_short_unit_vectors(dataset: SignatureDataset) -> None:
-    found = describe(dataset.subset(range(3)), pretrained())
-    assert found.shape[1] <= 256
-    torch.testing.assert_close(found.norm(dim=1), torch.ones(3), atol=1e-5, rtol=0)
+def test_pretrained_gives_unit_vectors_and_short_ones(dataset: SignatureDataset) -> None:
+    """The short ones, by their cosine, lose little of what the whole ones find by theirs."""
+    module = pretrained()
+    found = describe(dataset, module)
+    assert isinstance(module.head, TwoLevelHead)
+    short = module.head.short(found)
+    assert short.shape == (len(dataset), 256)
+    for vectors in (found, short):
+        torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(dataset)), atol=1e-5, rtol=0)
+    whole, of_short = (retrieval_scores(cosine(one, one), dataset.labels).mean()["ft"] for one in (found, short))
+    assert of_short > whole - 0.02
 
 
 def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
@@ -142,7 +157,7 @@ def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
 
 def test_a_metric_of_ones_own_is_stored_and_loaded(dataset: SignatureDataset, tmp_path: Path) -> None:
     dataset = dataset.subset(range(20))
-    descriptor = eight_parts().eval()
+    descriptor = pretrained_parts().eval()
     described = describe(dataset, descriptor)
     head = two_levels().fit(described, dataset.labels, descriptor.part_cells)
     save_pretrained(EmbeddedDescriptor(descriptor, head), tmp_path / "metric.safetensors")

@@ -59,7 +59,7 @@ def test_a_level_is_the_projection_of_the_whitened_roots_on_their_means(
     histograms, _, bodies = collection
     expected = projected(histograms, bodies, 0.2)
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    head = LevelHead(width=10, n_directions=10, shrinkage=0.2).fit(histograms.double(), bodies)
+    head = LevelHead(n_directions=10, shrinkage=0.2).fit(histograms.double(), bodies)
     found = head(histograms.double()).numpy()
     np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-6)
 
@@ -67,10 +67,11 @@ def test_a_level_is_the_projection_of_the_whitened_roots_on_their_means(
 def test_parts_have_equal_shares_and_others_do_not_count(collection: tuple[Tensor, Tensor, Tensor]) -> None:
     histograms, classes, _ = collection
     cells = (12, 18, 10)
-    alone = [LevelHead(width=60).fit(part, classes)(part) for part in histograms.split(cells, dim=1)]
-    head = LevelHead((0, 2), width=200).fit(histograms, classes, cells)
+    alone = [LevelHead().fit(part, classes)(part) for part in histograms.split(cells, dim=1)]
+    head = LevelHead((0, 2)).fit(histograms, classes, cells)
     expected = (cosine(alone[0], alone[0]) + cosine(alone[2], alone[2])) / 2
     found = head(histograms)
+    assert found.shape == (len(histograms), 12 + 10)  # as many numbers as cells, where directions would be more
     torch.testing.assert_close(cosine(found, found), expected, atol=2e-4, rtol=0)
     changed = histograms.clone()
     changed[:, 12:30] = torch.rand(len(changed), 18, generator=torch.Generator().manual_seed(1))
@@ -81,7 +82,7 @@ def test_with_lengths_distances_are_those_of_mahalanobis(collection: tuple[Tenso
     """Written down with SciPy's matrix functions, up to one factor; and a number that makes the length 1."""
     histograms, _, bodies = collection
     expected = torch.from_numpy(projected(histograms, bodies, 0.2))
-    head = LevelHead(width=10, n_directions=10, shrinkage=0.2, lengths=True).fit(histograms.double(), bodies)
+    head = LevelHead(n_directions=10, shrinkage=0.2, lengths=True).fit(histograms.double(), bodies)
     found = head(histograms.double())
     assert found.shape == (len(histograms), 11)
     torch.testing.assert_close(found.norm(dim=1), torch.ones(len(found), dtype=torch.float64))
@@ -94,7 +95,7 @@ def test_what_is_far_beyond_all_training_shapes_is_a_unit_vector_too(
     collection: tuple[Tensor, Tensor, Tensor],
 ) -> None:
     histograms, _, bodies = collection
-    head = LevelHead(width=10, lengths=True).fit(histograms, bodies)
+    head = LevelHead(n_directions=10, lengths=True).fit(histograms, bodies)
     alone = torch.zeros(N_CELLS, N_CELLS).fill_diagonal_(1.0)  # all in one cell, where training shapes have all 40
     torch.testing.assert_close(head(alone).norm(dim=1), torch.ones(N_CELLS), atol=1e-5, rtol=0)
 
@@ -104,21 +105,45 @@ def test_the_distance_is_that_of_the_classes_where_any_witness_tells_two_bodies_
 ) -> None:
     """Written down from the vectors of the heads, of which the last number, with lengths, is no part of a distance."""
     histograms, classes, bodies = collection
-    of_classes = LevelHead(width=20)
-    witnesses = LevelHead((0,), width=6), LevelHead((1,), width=5, n_directions=5, lengths=True)
+    of_classes = LevelHead(n_directions=20)
+    witnesses = LevelHead((0,), n_directions=6, lengths=True), LevelHead((1,), n_directions=5, lengths=True)
     head = TwoLevelHead(of_classes, witnesses, reaches=(0.7, 0.3), share=0.3)
     vectors = head.fit(histograms, classes, (15, 25), bodies=bodies)(histograms)
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
     x, y, z = (one(histograms).double() for one in (of_classes, *witnesses))
     products = 0.7 * x @ x.T + 0.15 * y @ y.T + 0.15 * z @ z.T
     torch.testing.assert_close((vectors @ vectors.T).double(), products, atol=1e-5, rtol=0)
-    first, second = (torch.cdist(one, one, compute_mode="donot_use_mm_for_euclid_dist") for one in (y, z[:, :-1]))
-    same = torch.exp(-((first / 0.7) ** 6) - (second / 0.3) ** 6)
+    y, z = y[:, :-1], z[:, :-1]
+    first, second = (torch.cdist(one, one, compute_mode="donot_use_mm_for_euclid_dist") for one in (y, z))
+    usual, from_mean = 0.5 / 2**0.5, ((y.norm(dim=1) ** 2 + z.norm(dim=1) ** 2) / 2).sqrt()
+    shorter = (torch.outer(from_mean, from_mean).sqrt() / usual).sqrt()
+    same = torch.exp(-((first * shorter / 0.7) ** 10) - (second * shorter / 0.3) ** 10)
     found = head.distances(vectors, vectors).double()
     torch.testing.assert_close(found, (1 - x @ x.T) * (1 - same), atol=1e-4, rtol=0)
+    torch.testing.assert_close(head.distances(vectors[:7], vectors[3:]).double(), found[:7, 3:], atol=1e-5, rtol=0)
     assert same.min() < 0.1  # nor is it 1 throughout
     assert ((same > 0.2) & (same < 0.9)).any()
     assert ((first < 0.5) & (second > 0.4) & (same < 0.1)).any()  # by the second witness alone
+    assert ((shorter < 0.95) | (shorter > 1.05)).double().mean() > 0.5
+
+
+def test_short_vectors_are_the_best_of_so_many_numbers(
+    collection: tuple[Tensor, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of NumPy's singular value decomposition; and where there is room for all, cosines stay what they are."""
+    histograms, classes, bodies = collection
+    head = TwoLevelHead().fit(histograms, classes, bodies=bodies)
+    vectors = head(histograms)
+    short = head.short(vectors)
+    assert short.shape[1] <= vectors.shape[1] <= 256
+    torch.testing.assert_close(cosine(short, short), cosine(vectors, vectors), atol=1e-5, rtol=0)
+    monkeypatch.setattr("igps.nn.levels.MOST_NUMBERS", 7)
+    found = head.fit(histograms, classes, bodies=bodies).short(vectors)
+    assert found.shape == (len(vectors), 7)
+    _, _, axes = np.linalg.svd(vectors.double().numpy(), full_matrices=False)
+    expected = vectors.double().numpy() @ axes[:7].T
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-4)
 
 
 def test_both_levels_are_ordered(collection: tuple[Tensor, Tensor, Tensor]) -> None:
@@ -139,21 +164,25 @@ def test_both_levels_are_ordered(collection: tuple[Tensor, Tensor, Tensor]) -> N
 
 def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> None:
     histograms, classes, bodies = collection
-    fitted = TwoLevelHead(LevelHead((0,), 5, 7), [LevelHead((1,), 6, 8, lengths=True)], reaches=[0.3], share=0.3)
+    fitted = TwoLevelHead(LevelHead((0,), 5), [LevelHead((1,), 6, lengths=True)], reaches=[0.3], share=0.3)
     fitted.fit(histograms, classes, (15, 25), bodies=bodies)
-    other = TwoLevelHead(LevelHead((0,)), [LevelHead((1,))])  # whether lengths count is stored too
+    other = TwoLevelHead(LevelHead((0,)), [LevelHead((1,), lengths=True)])
     other.load_state_dict(fitted.state_dict())
     torch.testing.assert_close(other(histograms), fitted(histograms))
     vectors = other(histograms)
     assert vectors.shape == (len(histograms), 5 + 6 + 1)
     torch.testing.assert_close(other.distances(vectors, vectors), fitted.distances(vectors, vectors))
+    torch.testing.assert_close(other.short(vectors), fitted.short(vectors))
+    level = LevelHead((1,))  # whether lengths count is stored too
+    level.load_state_dict(fitted.witnesses[0].state_dict())
+    torch.testing.assert_close(level(histograms), fitted.witnesses[0](histograms))
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"parts": (0, 2)}, r"parts: expected some of 0 to 1"),
-        ({"width": 0}, "at least 1"),
+        ({"n_directions": 0}, "n_directions: expected at least 1, got 0"),
         ({"shrinkage": 0.0}, "shrinkage: expected a positive number"),
     ],
 )
@@ -180,6 +209,12 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
         TwoLevelHead(reaches=[0.1, 0.2])
     with pytest.raises(ValueError, match=r"one between 0 and 1, got \(0.1,\) and 1"):
         TwoLevelHead(share=1)
-    fitted = LevelHead().fit(histograms, classes)
+    with pytest.raises(ValueError, match="of_bodies: expected heads with lengths"):
+        TwoLevelHead(of_bodies=[LevelHead()])
+    with pytest.raises(RuntimeError, match="TwoLevelHead: expected to be fitted first"):
+        TwoLevelHead().short(histograms)
+    fitted = TwoLevelHead().fit(histograms, classes)
     with pytest.raises(ValueError, match="expected 40 cells as in training, got 39"):
         fitted(histograms[:, :39])
+    with pytest.raises(ValueError, match=r"vectors: expected \d+ numbers each, got 40"):
+        fitted.short(histograms)

@@ -16,24 +16,25 @@ from igps.nn.histogram import PairHistogram
 from igps.nn.levels import LevelHead, TwoLevelHead
 from igps.nn.piece_histogram import PieceHistogram
 from igps.nn.point_histogram import PointHistogram
+from igps.nn.spectrum_histogram import SpectrumHistogram
 
 PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
 """The parameters of `pretrained`, written by training/pretrain.py."""
 
-# Of `eight_parts`: what bending leaves alone tells bodies, all others tell classes
-BODY_PARTS, CLASS_PARTS = (0, 5), (1, 2, 3, 4, 5, 6, 7)
+# Of `pretrained_parts`: what bending leaves alone tells bodies, all others tell classes
+BODY_PARTS, CLASS_PARTS = (0, 5, 8), (1, 2, 3, 4, 5, 6, 7)
 # Of the bodies: the median distance of training shapes is 0.5
-_REACHES = (0.12, 0.25)
+_REACHES = (0.125, 0.21, 0.125)
 
 
-def eight_parts() -> HistogramDescriptor:
+def pretrained_parts() -> HistogramDescriptor:
     """What `pretrained` sees of a body, of at most 64 eigenpairs.
 
     By interior distances alone: those of surface samples, and how interior samples lie to the surface in the embedding
     of 16 eigenpairs. With directions in space: how surface samples lie to each other by Euclidean distance, and by that
     of the embedding; and how they lie to the body's principal axes. Of surface samples the balls that touch them from
-    both sides, by the potentials of 4 and 16 eigenpairs. And by the latter, the body's limbs: how far each reaches, and
-    how large and how long the pieces are that remain of the body without its middle.
+    both sides, by the potentials of 4 and 16 eigenpairs. By the latter, the body's limbs: how far each reaches, and how
+    large and how long the pieces are that remain of the body without its middle. And the eigenvalues alone.
     """
     embeddings = {n: SpectralEmbedding(n_eigenpairs=n) for n in (64, 50, 16, 4)}
     n = N_ORIENTED_SAMPLES
@@ -50,28 +51,32 @@ def eight_parts() -> HistogramDescriptor:
             PointHistogram([*balls, *potentials], embeddings[16]),
             BranchHistogram(embeddings[16], n_samples=n),
             PieceHistogram(embedding=embeddings[16], n_samples=n),
+            SpectrumHistogram(64),
         ],
-        name="eight_parts",
-        source="Rustamov 2007 and 2010; Wahl, Hillenbrand and Hirzinger 2003; Ma, Bae, Choi 2012; Skraba et al. 2010",
+        name="pretrained_parts",
+        source="Rustamov 2007 and 2010; Wahl, Hillenbrand and Hirzinger 2003; Reuter, Wolter and Peinecke 2006; Ma, "
+        "Bae, Choi 2012; Skraba et al. 2010",
         invariant_to=("motion", "scale"),
     )
 
 
 def two_levels() -> TwoLevelHead:
     """The head of `pretrained`, not fitted."""
-    surface, balls = BODY_PARTS
+    surface, balls, spectrum = BODY_PARTS
     of_bodies = [
-        LevelHead([surface], 90, n_directions=90, shrinkage=0.3, lengths=True),
-        LevelHead([balls], 20, n_directions=20, shrinkage=0.3, lengths=True),
+        LevelHead([surface], n_directions=90, shrinkage=0.3, lengths=True),
+        LevelHead([balls], n_directions=20, shrinkage=0.3, lengths=True),
+        LevelHead([spectrum], n_directions=60, shrinkage=1.0, lengths=True),
     ]
-    return TwoLevelHead(LevelHead(CLASS_PARTS, width=144), of_bodies, reaches=_REACHES)
+    return TwoLevelHead(LevelHead(CLASS_PARTS, n_directions=150, shrinkage=0.1), of_bodies, reaches=_REACHES)
 
 
 def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
-    """Unit vectors of 256 numbers, in evaluation mode: `eight_parts` under a head that was fitted to generated shapes.
+    """Unit vectors, in evaluation mode: `pretrained_parts` under a head that was fitted to generated shapes.
 
     It needs no label of the shapes that it compares: by the head's distance, other poses of a body come first, then
-    other bodies of its class. The model card is in the documentation.
+    other bodies of its class. The head's `short` makes vectors of 256 numbers of its 1,089. The model card is in the
+    documentation.
 
     Args:
         path: of the parameters, as `save_pretrained` wrote them; those that the package ships by default.
@@ -81,10 +86,10 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
         ValueError: it holds other parameters.
     """
     module = EmbeddedDescriptor(
-        eight_parts(),
+        pretrained_parts(),
         two_levels(),
         name="pretrained",
-        source="eight histograms, fitted to generated shapes",
+        source="nine histograms, fitted to generated shapes",
         invariant_to=("motion", "scale", "pose"),
     )
     try:
@@ -95,7 +100,7 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
 
 
 def save_pretrained(module: EmbeddedDescriptor, path: str | Path) -> None:
-    """Write a fitted `eight_parts` under `two_levels` to a safetensors file, the head in half precision."""
+    """Write a fitted `pretrained_parts` under `two_levels` to a safetensors file, the head in half precision."""
     state = {
         name: (tensor.half() if name.startswith("head.") and tensor.is_floating_point() else tensor).contiguous()
         for name, tensor in module.state_dict().items()
