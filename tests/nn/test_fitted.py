@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 from igps.nn.fitted import KernelHead, WhitenedHead
 from igps.nn.heads import Head
 from igps.retrieval import cosine, retrieval_scores
+from igps.retrieval.distances import Distance
 
 N_CELLS = 60
 
@@ -208,6 +209,22 @@ def prior(collection: tuple[Tensor, Tensor]) -> WhitenedHead:
     return WhitenedHead().fit(histograms[labels >= 4], labels[labels >= 4], (20, 40))
 
 
+class SquaredPrior(WhitenedHead):
+    """A metric with a distance of its own."""
+
+    @property
+    def distances(self) -> Distance:
+        return lambda queries, gallery: cosine(queries, gallery) ** 2
+
+
+@pytest.fixture
+def squared(prior: WhitenedHead) -> SquaredPrior:
+    """The prior with that distance."""
+    found = SquaredPrior()
+    found.load_state_dict(prior.state_dict())
+    return found
+
+
 @pytest.mark.parametrize("kind", [WhitenedHead, KernelHead])
 def test_a_prior_stays_as_it_is(
     collection: tuple[Tensor, Tensor], prior: WhitenedHead, kind: type[WhitenedHead | KernelHead]
@@ -235,26 +252,39 @@ def test_weights_and_temperature_are_loaded(collection: tuple[Tensor, Tensor], p
 
 
 def test_whitened_distance_is_the_weighted_mean_with_the_priors(
-    collection: tuple[Tensor, Tensor], prior: WhitenedHead
+    collection: tuple[Tensor, Tensor], prior: WhitenedHead, squared: SquaredPrior
 ) -> None:
+    """With the prior's own distance, where it has one; the cosine distance of the vectors is that with its cosines."""
     histograms, labels = collection
-    beside = WhitenedHead(prior=prior, prior_share=0.3).fit(histograms, labels)(histograms)
     own, other = WhitenedHead().fit(histograms, labels)(histograms), prior(histograms)
-    expected = 0.7 * cosine(own, own) + 0.3 * cosine(other, other)
-    torch.testing.assert_close(cosine(beside, beside), expected, atol=1e-6, rtol=0)
+    for given, of_prior in ((prior, cosine(other, other)), (squared, cosine(other, other) ** 2)):
+        head = WhitenedHead(prior=given, prior_share=0.3).fit(histograms, labels)
+        beside = head(histograms)
+        found = head.distances(beside, beside[:9])
+        torch.testing.assert_close(found, (0.7 * cosine(own, own) + 0.3 * of_prior)[:, :9], atol=1e-6, rtol=0)
+        whole = 0.7 * cosine(own, own) + 0.3 * cosine(other, other)
+        torch.testing.assert_close(cosine(beside, beside), whole, atol=1e-6, rtol=0)
+    with pytest.raises(RuntimeError, match="WhitenedHead: expected to be fitted first"):
+        WhitenedHead(prior=prior).distances(beside, beside)
 
 
-def test_the_priors_kernel_is_one_more(collection: tuple[Tensor, Tensor], prior: WhitenedHead) -> None:
+@pytest.mark.parametrize("power", [1, 2])
+def test_the_priors_kernel_is_one_more(
+    collection: tuple[Tensor, Tensor], prior: WhitenedHead, squared: SquaredPrior, power: int
+) -> None:
+    """By the prior's own distance, where it has one."""
     histograms, labels = collection
     train, test = slice(0, 48, 2), slice(1, 48, 2)
     kernels = []
     parts = histograms.split([20, 40], dim=1)
-    for vectors in (*(WhitenedHead().fit(part[train], labels[train])(part) for part in parts), prior(histograms)):
-        distances = 1 - (vectors @ vectors[train].T).double().numpy()
+    heads = [WhitenedHead().fit(part[train], labels[train])(part) for part in parts]
+    for vectors, exponent in (*((one, 1) for one in heads), (prior(histograms), power)):
+        distances = (1 - (vectors @ vectors[train].T).double().numpy()) ** exponent
         kernels.append(np.exp(-distances / np.median(distances[train][np.triu_indices(24, 1)])))
     kernel = 0.375 * (kernels[0] + kernels[1]) + 0.25 * kernels[2]
     oracle = KernelRidge(alpha=0.03, kernel="precomputed").fit(kernel[train], np.eye(8)[labels[train]])
-    head = KernelHead(prior, prior_share=0.25).fit(histograms[train], labels[train], (20, 40))
+    given = prior if power == 1 else squared
+    head = KernelHead(given, prior_share=0.25).fit(histograms[train], labels[train], (20, 40))
     np.testing.assert_allclose(head.scores(histograms[test]), oracle.predict(kernel[test]), atol=2e-3)
 
 

@@ -16,9 +16,11 @@ from igps.nn.heads import (
     check_share,
     checked_cells,
     checked_labels,
+    distances_of,
     means_of,
     square_roots,
 )
+from igps.retrieval.distances import Distance, cosine
 
 # So many shapes of a class tell as well as more how far scores can be trusted
 _MANY = 6
@@ -37,7 +39,7 @@ class WhitenedHead(SizedByData):
     the cosine distance is the mean of those of the parts.
 
     Beside a prior, a metric of the same descriptions that was fitted elsewhere, such as that of `pretrained`, the
-    cosine distance is the weighted mean of its own and the prior's.
+    distance is the weighted mean of its own and the prior's.
 
     Example:
         >>> import torch
@@ -136,6 +138,19 @@ class WhitenedHead(SizedByData):
         share = self.prior_share
         return torch.cat([(1 - share).sqrt() * own, share.sqrt() * self.prior(descriptions)], dim=1)
 
+    @property
+    def distances(self) -> Distance:
+        """From (Q, D) and (G, D) vectors to (Q, G) distances: the cosine's, or beside a prior a mean with its own."""
+        return cosine if self.prior is None else self._beside_prior
+
+    def _beside_prior(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        if not len(self.mean):
+            raise RuntimeError("WhitenedHead: expected to be fitted first. Call fit(descriptions, labels).")
+        own, priors = zip(*(one.tensor_split([len(self.mean)], dim=1) for one in (queries, gallery)), strict=True)
+        root = self.prior_share.sqrt()
+        of_prior = distances_of(self.prior)(*(one / root for one in priors))
+        return (1 - self.prior_share) * cosine(*own) + self.prior_share * of_prior
+
     def _whitened(self, roots: Tensor) -> Tensor:
         if not len(self.mean):
             return functional.normalize(roots, dim=1)
@@ -158,9 +173,9 @@ class KernelHead(SizedByData):
 
     The kernel is exp(−d/m), d the cosine distance of the whitened histograms, m its median between training shapes, and
     the mean of such kernels if there are several parts. It is regressed onto the indicators of the classes. Beside a
-    prior, a metric of the same descriptions that was fitted elsewhere, such as that of `pretrained`, the prior's kernel
-    is one more, with a weight of its own. The best there is here for classes that were trained on; for other classes
-    use the `WhitenedHead`.
+    prior, a metric of the same descriptions that was fitted elsewhere, such as that of `pretrained`, the kernel of the
+    prior's own distance is one more, with a weight of its own. The best there is here for classes that were trained on;
+    for other classes use the `WhitenedHead`.
 
     A vector is half the scores about their mean, which say how much of each class a shape has, and half the roots of a
     softmax of them, which say which class it is of: by the latter alone, shapes of one class would lie in one place.
@@ -286,9 +301,10 @@ class KernelHead(SizedByData):
         return own if self.prior is None else torch.cat([own, self.prior(descriptions)], dim=1)
 
     def _distances(self, vectors: Tensor) -> Tensor:
-        """(kernels, N, n_shapes) cosine distances to the training shapes."""
+        """(kernels, N, n_shapes) distances to the training shapes: cosine's of the parts, and the prior's own."""
         sizes = self.whitened.part_cells.tolist()
+        split = [one.split([*sizes, one.shape[1] - sum(sizes)], dim=1) for one in (vectors, self.anchors)]
+        found = [1 - one @ other.T for one, other in list(zip(*split, strict=True))[: len(sizes)]]
         if self.prior is not None:
-            sizes.append(vectors.shape[1] - sum(sizes))
-        pairs = zip(vectors.split(sizes, dim=1), self.anchors.split(sizes, dim=1), strict=True)
-        return torch.stack([1 - one @ other.T for one, other in pairs])
+            found.append(distances_of(self.prior)(split[0][-1], split[1][-1]))
+        return torch.stack(found)
