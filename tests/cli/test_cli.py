@@ -23,6 +23,7 @@ from igps.descriptors import NAMES, descriptor
 from igps.descriptors.d2 import D2
 from igps.geometry.signature import SignatureConfig
 from igps.nn.description import describe
+from igps.nn.descriptor import EmbeddedDescriptor
 from igps.retrieval import chi_square, rerank, retrieval_scores
 from own_descriptors import SMALL, small_interior
 
@@ -226,6 +227,26 @@ def test_extract_files_and_folder(root: Path, tmp_path: Path, monkeypatch: pytes
         np.testing.assert_allclose(two["features"].sum(axis=(1, 2)), 1, atol=1e-5)
         assert everything["labels"].tolist() == ["ball"] * 3 + ["egg"] * 3
         np.testing.assert_allclose(two["features"], everything["features"][[4, 0]], atol=1e-7)
+
+
+def test_extract_short_vectors(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of `pretrained`, of which a database takes no more than 256 numbers; a histogram has none."""
+    common = ["extract", root / "egg", "--cache_dir", tmp_path / "cache", "--n_workers", "1"]
+    igps(monkeypatch, *common, "--out", tmp_path / "long.npz")
+    igps(monkeypatch, *common, "--short", "--out", tmp_path / "short.npz")
+    with np.load(tmp_path / "long.npz") as long, np.load(tmp_path / "short.npz") as short:
+        assert long["features"].shape[1] > 256 >= short["features"].shape[1]
+        np.testing.assert_allclose(np.linalg.norm(short["features"], axis=1), 1, atol=1e-5)
+        module = descriptor("pretrained")
+        assert isinstance(module, EmbeddedDescriptor)
+        expected = module.short(torch.from_numpy(long["features"])).numpy()
+        np.testing.assert_allclose(short["features"], expected, atol=1e-6)
+    with pytest.raises(SystemExit, match="1"):
+        igps(monkeypatch, *common, "--short", "--descriptor", INTERIOR, "--out", tmp_path / "none.npz")
+    assert "short: expected a descriptor of vectors, such as pretrained" in capsys.readouterr().err
+    assert not (tmp_path / "none.npz").exists()
 
 
 def test_query_lists_the_nearest(

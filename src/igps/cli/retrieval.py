@@ -21,7 +21,7 @@ from igps.data.sources import MeshFiles, find_meshes, labelled_meshes
 from igps.descriptors import descriptor as descriptor_of
 from igps.gallery.gallery import Gallery, kept_as
 from igps.nn.description import describe_usable
-from igps.nn.descriptor import Descriptor
+from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.report.sources import write_sources
 from igps.report.tables import scores_table
 from igps.retrieval import N_RERANKED, RetrievalScores, rank, rerank_found, retrieval_scores, search
@@ -83,9 +83,10 @@ def extract(
     meshes: list[Path],
     out: Path,
     descriptor: str = "pretrained",
+    short: bool = False,
     **reading: Any,
 ) -> None:
-    """Write the descriptions of meshes to a file, for use in any classifier.
+    """Write the descriptions of meshes to a file, for use in any classifier or vector database.
 
     The file is a NumPy archive: `features` (N, ...) as the descriptor gives them, `names` (N,), and `labels` (N,) where
     the meshes come from a folder with classes.
@@ -95,10 +96,16 @@ def extract(
         out: the archive, a file ending in .npz; what was done to meshes that were mended is written beside it, in a
             file of the same name ending in .notes.csv.
         descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
+        short: write unit vectors of at most 256 numbers in place of longer ones, for engines that compare by the cosine
+            (pretrained).
     """
     source = meshes[0] if len(meshes) == 1 else meshes
+    chosen = descriptor_of(descriptor)
+    if short and not isinstance(chosen, EmbeddedDescriptor):
+        raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}.")
     dataset, descriptions, failures = _described(source, descriptor, **reading)
-    features = descriptions.numpy()
+    shortened = chosen.short(descriptions) if short and isinstance(chosen, EmbeddedDescriptor) else descriptions
+    features = shortened.numpy()
     arrays: dict[str, Any] = {"features": features, "names": np.array(dataset.files.names)}
     if dataset.files.labels is not None:
         arrays["labels"] = np.array(dataset.files.labels)

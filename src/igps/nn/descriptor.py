@@ -15,11 +15,12 @@ from torch import Tensor, nn
 
 from igps.data.batch import Body, SignatureBatch
 from igps.nn.heads import distances_of
+from igps.nn.levels import TwoLevelHead
 from igps.nn.needs import Needs
 from igps.nn.sample_histogram import SampleHistogram
 from igps.nn.view import Views
 from igps.retrieval import chi_square
-from igps.retrieval.vectors import Comparison
+from igps.retrieval.vectors import MOST_NUMBERS, Comparison
 from igps.threads import one_thread
 
 
@@ -216,3 +217,18 @@ class EmbeddedDescriptor(Descriptor):
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G) distances of the head's own, such as a `TwoLevelHead` has, or cosine distances."""
         return distances_of(self.head)(queries, gallery)
+
+    def short(self, embeddings: Tensor) -> Tensor:
+        """(N, D) embeddings to (N, ≤ 256) of length 1, for engines that take no more and compare by the cosine.
+
+        Raises:
+            ValueError: they have more numbers, and the head has no shorter ones.
+        """
+        if embeddings.shape[1] <= MOST_NUMBERS:
+            return embeddings
+        if not isinstance(self.head, TwoLevelHead):
+            raise ValueError(
+                f"short: expected a TwoLevelHead, as that of pretrained, got {type(self.head).__name__} and vectors of "
+                f"{embeddings.shape[1]} numbers."
+            )
+        return self.head.short(embeddings)
