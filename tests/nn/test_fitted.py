@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from igps.nn.fitted import KernelHead, WhitenedHead
 from igps.nn.heads import Head
 from igps.retrieval import cosine, retrieval_scores
-from igps.retrieval.distances import Distance
+from igps.retrieval.distances import Distance, euclidean
 
 N_CELLS = 60
 
@@ -210,11 +210,11 @@ def prior(collection: tuple[Tensor, Tensor]) -> WhitenedHead:
 
 
 class SquaredPrior(WhitenedHead):
-    """A metric with a distance of its own."""
+    """A metric with a distance of its own: of unit vectors the square of the cosine's, of others not."""
 
     @property
     def distances(self) -> Distance:
-        return lambda queries, gallery: cosine(queries, gallery) ** 2
+        return lambda queries, gallery: euclidean(queries, gallery) ** 4 / 4
 
 
 @pytest.fixture
