@@ -366,3 +366,28 @@ def test_a_kill_leaves_the_last_good_state(tmp_path: Path) -> None:
     left = {path.name.partition("-")[0] for path in folder.iterdir()}
     assert left == {"manifest.json", "lock", "part"}
     assert len(list(folder.iterdir())) == 3
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs a system that tells the memory of files")
+def test_what_was_read_of_a_part_can_be_given_back(tmp_path: Path) -> None:
+    """Otherwise an index of a million would fill the memory of who builds it with its files."""
+
+    def of_files() -> float:
+        (found,) = re.findall(r"RssFile:\s+(\d+) kB", Path("/proc/self/status").read_text())
+        return int(found) / 1024
+
+    generator = np.random.default_rng(0)
+    for n_cells, kept in ((500, 4), (1500, 2)):  # the longer in half precision
+        writer = index_part.PartWriter(tmp_path / str(n_cells), n_cells)
+        values = generator.standard_normal((10_000, n_cells)).astype(np.float32)
+        writer.append(values, [Entry(str(i), str(i)) for i in range(len(values))])
+        writer.finish()
+        part = index_part.Part(tmp_path / str(n_cells), len(values), n_cells)
+        before, size = of_files(), values.size * kept / 2**20
+        found = np.concatenate([part.descriptions(rows) for rows in part.chunks()])
+        read = of_files()
+        part.forget()
+        assert read > before + 0.8 * size
+        assert of_files() < read - 0.8 * size
+        np.testing.assert_allclose(found, values, rtol=1e-3, atol=1e-3)
+        np.testing.assert_array_equal(part.descriptions(np.arange(7)), found[:7])

@@ -431,6 +431,7 @@ def _map_for(
     for part in parts:
         here = part.left(np.arange(len(part)))
         rows.append(part.descriptions(np.sort(generator.choice(here, int(np.ceil(share * len(here))), False))))
+        part.forget()
     sample = np.concatenate(rows)
     return VectorMap.fit(sample, comparison), len(sample)
 
@@ -459,6 +460,7 @@ def _written(path: Path, group: Sequence[Part], vector_map: VectorMap | None, pr
             for rows in part.chunks():
                 left = part.left(rows)
                 writer.append(part.descriptions(left), part.entries(left))
+                part.forget()
         writer.finish()
         n = writer.n
     if vector_map is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import sqlite3
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -109,6 +110,7 @@ def add_vectors(part: Part, vector_map: VectorMap, seed: int = 0, *, progress: b
         ):
             for rows in part.chunks():
                 file.write(vector_map(part.descriptions(rows)).astype("<f4").data)
+                part.forget()
                 bar.update(len(rows))
     n_numbers = len(vector_map.components) if vector_map.components is not None else part.n_cells
     if len(part) > _MOST_FLAT:
@@ -126,6 +128,7 @@ def _write_clusters(folder: Path, vectors: NDArray[np.float32], seed: int, progr
         for i in range(0, len(vectors), 16 * _ROWS_AT_ONCE):
             rows = vectors[i : i + 16 * _ROWS_AT_ONCE]
             index.add(_widened(rows, index.d))
+            _forget(vectors)
             bar.update(len(rows))
     index.nprobe = _PROBED
     faiss.write_index(index, str(folder / _NEAREST))
@@ -186,6 +189,10 @@ class Part:
         if self._scales is not None:
             rows *= self._scales[positions, None]
         return rows
+
+    def forget(self) -> None:
+        """Give back the memory of the descriptions that were read, which a pass over all of them fills."""
+        _forget(self._rows)
 
     def entries(self, positions: Sequence[int] | NDArray[np.int64]) -> list[Entry]:
         """What is known of the positions, in their order."""
@@ -281,4 +288,15 @@ def _mapped(path: Path, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
         raise ValueError(f"{path} is too short for {shape[0]} entries")
     if not shape[0]:
         return np.zeros(shape, dtype)
-    return np.asarray(np.memmap(path, dtype, "r", shape=shape))
+    with path.open("rb") as file:
+        memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    return np.frombuffer(memory, dtype, int(np.prod(shape))).reshape(shape)
+
+
+def _forget(mapped: NDArray[Any]) -> None:
+    """Drop the pages of a mapped file, which count as memory of the process; they are read again where asked for."""
+    memory: Any = mapped
+    while isinstance(memory, np.ndarray | memoryview):
+        memory = memory.base if isinstance(memory, np.ndarray) else memory.obj
+    if isinstance(memory, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        memory.madvise(mmap.MADV_DONTNEED)
