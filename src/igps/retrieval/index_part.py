@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -185,10 +186,11 @@ class Part:
 
     def descriptions(self, positions: NDArray[np.int64]) -> NDArray[np.float32]:
         """(N, cells) of the positions (N,)."""
-        rows = self._rows[positions].astype(np.float32, copy=False)
-        if self._scales is not None:
-            rows *= self._scales[positions, None]
-        return rows
+        rows = np.take(self._rows, positions, axis=0)
+        if self._scales is None:
+            return rows
+        # NumPy widens half precision one number at a time
+        return torch.from_numpy(rows).float().mul_(torch.from_numpy(self._scales[positions, None])).numpy()
 
     def forget(self) -> None:
         """Give back the memory of the descriptions that were read, which a pass over all of them fills."""
