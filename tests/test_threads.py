@@ -254,6 +254,24 @@ def test_who_leaves_last_lifts_the_limit_that_another_set() -> None:
     assert settings() == before
 
 
+def test_no_thread_is_needed_beside_those_that_are_asleep(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the system gives no more, as in a container with a limit."""
+    with one_thread():
+        pass
+    before, refused = settings(), []
+
+    def refuse(*_: object) -> None:
+        refused.append(1)
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threads_module, "start_new_thread", refuse)
+    with one_thread():
+        inside = torch.get_num_threads()
+    assert inside == 1
+    assert refused
+    assert settings() == before
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_forked_process_has_threads_of_its_own_to_ask() -> None:
     """Those that were started ahead stay behind in its parent."""

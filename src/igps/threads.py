@@ -194,6 +194,10 @@ def _set_torch_threads(n: int) -> None:
         ask(lambda: torch.set_num_threads(of_new_threads))
 
 
+_Questions = SimpleQueue[Callable[[], Any] | None]
+_Answers = SimpleQueue[Any]
+
+
 class _NewThreads:
     """Threads that have not computed yet, started ahead of their use.
 
@@ -223,8 +227,9 @@ class _NewThreads:
             yield ask
         finally:
             questions.put(None)
-            while len(self._asleep) < self._AHEAD:
-                self._asleep.append(self._started())
+            with contextlib.suppress(RuntimeError):  # where the system gives no more, one is started when it is needed
+                while len(self._asleep) < self._AHEAD:
+                    self._asleep.append(self._started())
 
     @staticmethod
     def _started() -> tuple[_Questions, _Answers]:
@@ -238,8 +243,6 @@ class _NewThreads:
         return questions, answers
 
 
-_Questions = SimpleQueue[Callable[[], Any] | None]
-_Answers = SimpleQueue[Any]
 _new_threads = _NewThreads()
 
 

@@ -100,12 +100,11 @@ def extract(
             (pretrained).
     """
     source = meshes[0] if len(meshes) == 1 else meshes
-    chosen = descriptor_of(descriptor)
-    if short and not isinstance(chosen, EmbeddedDescriptor):
+    shortening = descriptor_of(descriptor) if short else None
+    if shortening is not None and not isinstance(shortening, EmbeddedDescriptor):
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}.")
     dataset, descriptions, failures = _described(source, descriptor, **reading)
-    shortened = chosen.short(descriptions) if short and isinstance(chosen, EmbeddedDescriptor) else descriptions
-    features = shortened.numpy()
+    features = (descriptions if shortening is None else shortening.short(descriptions)).numpy()
     arrays: dict[str, Any] = {"features": features, "names": np.array(dataset.files.names)}
     if dataset.files.labels is not None:
         arrays["labels"] = np.array(dataset.files.labels)

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from igps.data.batch import Body, SignatureBatch
 from igps.nn.heads import distances_of
-from igps.nn.levels import TwoLevelHead
 from igps.nn.needs import Needs
 from igps.nn.sample_histogram import SampleHistogram
 from igps.nn.view import Views
@@ -226,9 +225,11 @@ class EmbeddedDescriptor(Descriptor):
         """
         if embeddings.shape[1] <= MOST_NUMBERS:
             return embeddings
-        if not isinstance(self.head, TwoLevelHead):
+        own = getattr(self.head, "short", None)
+        if own is None:
             raise ValueError(
-                f"short: expected a TwoLevelHead, as that of pretrained, got {type(self.head).__name__} and vectors of "
-                f"{embeddings.shape[1]} numbers."
+                f"short: expected a head that shortens its vectors, as the TwoLevelHead of pretrained does, got "
+                f"{type(self.head).__name__} and vectors of {embeddings.shape[1]} numbers."
             )
-        return self.head.short(embeddings)
+        shortened: Tensor = own(embeddings)
+        return shortened

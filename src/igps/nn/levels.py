@@ -19,6 +19,7 @@ _PRINCIPAL = 500
 # Where lengths count: the median distance of training shapes, so that all find room in a sphere of radius 1; and how
 # many of the shapes tell it
 _MEDIAN, _TELLING = 0.5, 1000
+# Their usual distance from the mean: of so many directions most two are nearly at right angles
 _USUAL_LENGTH = _MEDIAN / math.sqrt(2)
 # The factor between nothing and all of a distance turns from one to the other as steeply
 _STEEPNESS = 10
@@ -37,8 +38,8 @@ class LevelHead(SizedByData):
 
     Args:
         parts: which parts of a description it looks at; all if None.
-        n_directions: of each part, at most as many as it has cells; so many numbers the vectors have, and one more with
-            `lengths`.
+        n_directions: of each part, at most as many as it has cells; so many numbers of each part the vectors have, and
+            one more in all with `lengths`.
         shrinkage: added to the covariance within labels, in units of its mean eigenvalue.
         lengths: whether lengths count beside directions.
     """
