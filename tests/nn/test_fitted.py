@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import combinations
+from statistics import fmean, pvariance
+
 import numpy as np
 import pytest
 import torch
@@ -266,6 +270,64 @@ def test_whitened_distance_is_the_weighted_mean_with_the_priors(
         torch.testing.assert_close(cosine(beside, beside), whole, atol=1e-6, rtol=0)
     with pytest.raises(RuntimeError, match="WhitenedHead: expected to be fitted first"):
         WhitenedHead(prior=prior).distances(beside, beside)
+
+
+def test_beside_a_prior_parts_count_by_fishers_discriminant(
+    collection: tuple[Tensor, Tensor], squared: SquaredPrior
+) -> None:
+    """Of classes that were fitted to; the last part tells shapes of one class apart, but not the classes."""
+    histograms, labels = collection
+    backwards = histograms.roll(1, dims=0).view(8, 6, N_CELLS).transpose(0, 1).reshape(48, N_CELLS)
+    descriptions, cells = torch.cat([histograms, backwards], dim=1), (5, 55, 60)
+    train = torch.arange(48)[labels < 5]
+    apart = [
+        1 - vectors @ vectors.T
+        for part in descriptions.split(cells, dim=1)
+        for vectors in [WhitenedHead().fit(part[train], labels[train])(part).double().numpy()]
+    ]
+    pairs = list(combinations(train.tolist(), 2))
+    shares = []
+    for distances in apart:
+        near = [distances[i, j] for i, j in pairs if labels[i] == labels[j]]
+        far = [distances[i, j] for i, j in pairs if labels[i] != labels[j]]
+        shares.append(max(0, fmean(far) - fmean(near)) / (pvariance(near) + pvariance(far)))
+    assert shares[1] > 2 * shares[0] > 0
+    assert shares[2] == 0
+    own = np.average(apart, axis=0, weights=shares)
+    head = WhitenedHead(prior=Stretched(squared, N_CELLS), prior_share=0.3)
+    vectors = head.fit(descriptions[train], labels[train], cells)(descriptions)
+    expected = 0.7 * own + 0.3 * squared.distances(squared(histograms), squared(histograms)).numpy()
+    np.testing.assert_allclose(head.distances(vectors, vectors), expected, atol=1e-5)
+    torch.testing.assert_close(vectors.norm(dim=1), torch.ones(48))
+
+
+class Stretched(torch.nn.Module):
+    """A prior that looks at the first cells alone."""
+
+    def __init__(self, head: WhitenedHead, n_cells: int) -> None:
+        super().__init__()
+        self.head, self.n_cells = head, n_cells
+        self.distances = head.distances
+
+    def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Stretched:
+        raise AssertionError("a prior stays as it is")
+
+    def forward(self, descriptions: Tensor) -> Tensor:
+        vectors: Tensor = self.head(descriptions[:, : self.n_cells])
+        return vectors
+
+
+def test_where_no_pair_tells_anything_all_parts_count_alike(
+    collection: tuple[Tensor, Tensor], prior: WhitenedHead
+) -> None:
+    """One class alone, or classes that are the same shapes again."""
+    histograms, _ = collection
+    again = torch.cat([histograms[:6], histograms[:6]])
+    for shapes, labels in ((histograms[:6], torch.zeros(6)), (again, torch.arange(2).repeat_interleave(6))):
+        beside = WhitenedHead(prior=prior).fit(shapes, labels, (20, 40))
+        assert beside.part_shares.tolist() == [0.5, 0.5]
+        alone = WhitenedHead().fit(shapes, labels, (20, 40))(histograms)
+        torch.testing.assert_close(beside(histograms)[:, :N_CELLS], (2 / 3) ** 0.5 * alone)
 
 
 @pytest.mark.parametrize("power", [1, 2])

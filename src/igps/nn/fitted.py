@@ -24,6 +24,8 @@ from igps.retrieval.distances import Distance, cosine
 
 # So many shapes of a class tell as well as more how far scores can be trusted
 _MANY = 6
+# Variances of distances below this are rounding
+_SMALLEST_VARIANCE = 1e-8
 
 
 class WhitenedHead(SizedByData):
@@ -39,7 +41,10 @@ class WhitenedHead(SizedByData):
     the cosine distance is the mean of those of the parts.
 
     Beside a prior, a metric of the same descriptions that was fitted elsewhere, such as that of `pretrained`, the
-    distance is the weighted mean of its own and the prior's.
+    distance is the weighted mean of its own and the prior's. Such a metric has histograms for many kinds of shapes, of
+    which not all serve the classes at hand. So the parts then count by Fisher's discriminant (1936) of pairs: each
+    distance times (m − m′) / (v + v′), m and v its mean and variance between shapes of two training classes, m′ and v′
+    between those of one.
 
     Example:
         >>> import torch
@@ -60,6 +65,7 @@ class WhitenedHead(SizedByData):
     directions: Tensor
     gains: Tensor
     part_cells: Tensor
+    part_shares: Tensor
     prior_share: Tensor
 
     def __init__(
@@ -67,7 +73,7 @@ class WhitenedHead(SizedByData):
         n_directions: int = 64,
         shrinkage: float = 0.3,
         prior: Head | None = None,
-        prior_share: float = 1 / 2,
+        prior_share: float = 1 / 3,
     ) -> None:
         super().__init__()
         if n_directions < 1:
@@ -83,6 +89,7 @@ class WhitenedHead(SizedByData):
         self.register_buffer("directions", torch.zeros(n_directions, 0))
         self.register_buffer("gains", torch.ones(0, n_directions))
         self.register_buffer("part_cells", torch.zeros(0, dtype=torch.long))
+        self.register_buffer("part_shares", torch.ones(0))
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
@@ -106,6 +113,10 @@ class WhitenedHead(SizedByData):
         residuals = self.parts((roots - means[members]).double())
         for part, directions, gains in zip(residuals, self.parts(self.directions), self.gains, strict=True):
             self._fit_part(part, len(roots) - len(means), directions, gains)
+        if self.prior is not None and len(means) > 1:
+            discriminants = torch.stack([_discriminant(part, members) for part in self.whitened_parts(roots)])
+            if discriminants.sum() > 0:
+                self.part_shares = discriminants / discriminants.sum()
         return self
 
     @torch.no_grad()
@@ -117,6 +128,7 @@ class WhitenedHead(SizedByData):
         self.mean = roots.mean(dim=0)
         self.directions = roots.new_zeros(self.n_directions, roots.shape[1])
         self.gains = roots.new_ones(len(cells), self.n_directions)
+        self.part_shares = roots.new_full((len(cells),), 1 / len(cells))
         return self
 
     def _fit_part(self, residuals: Tensor, rank: int, directions: Tensor, gains: Tensor) -> None:
@@ -154,6 +166,11 @@ class WhitenedHead(SizedByData):
     def _whitened(self, roots: Tensor) -> Tensor:
         if not len(self.mean):
             return functional.normalize(roots, dim=1)
+        lengths = self.part_shares.sqrt()
+        return torch.cat([n * part for n, part in zip(lengths, self.whitened_parts(roots), strict=True)], dim=1)
+
+    def whitened_parts(self, roots: Tensor) -> list[Tensor]:
+        """Unit vectors (N, cells) of each part, of the square roots (N, D) of histograms."""
         check_cells(roots, len(self.mean))
         whitened = [
             part - ((part @ directions.T) * (1 - gains)) @ directions
@@ -161,7 +178,7 @@ class WhitenedHead(SizedByData):
                 self.parts(roots - self.mean), self.parts(self.directions), self.gains, strict=True
             )
         ]
-        return torch.cat([functional.normalize(part, dim=1) for part in whitened], dim=1) / len(whitened) ** 0.5
+        return [functional.normalize(part, dim=1) for part in whitened]
 
     def parts(self, cells: Tensor) -> tuple[Tensor, ...]:
         """Views of (N, D) values, one of each part."""
@@ -297,8 +314,8 @@ class KernelHead(SizedByData):
 
     def _vectors(self, descriptions: Tensor) -> Tensor:
         """Unit vectors of the parts and of the prior, side by side."""
-        own = self.whitened(descriptions) * len(self.whitened.part_cells) ** 0.5
-        return own if self.prior is None else torch.cat([own, self.prior(descriptions)], dim=1)
+        own = self.whitened.whitened_parts(square_roots(descriptions))
+        return torch.cat(own if self.prior is None else [*own, self.prior(descriptions)], dim=1)
 
     def _distances(self, vectors: Tensor) -> Tensor:
         """(kernels, N, n_shapes) distances to the training shapes: cosine's of the parts, and the prior's own."""
@@ -308,3 +325,16 @@ class KernelHead(SizedByData):
         if self.prior is not None:
             found.append(distances_of(self.prior)(split[0][-1], split[1][-1]))
         return torch.stack(found)
+
+
+def _discriminant(vectors: Tensor, members: Tensor) -> Tensor:
+    """How well the cosine distance of unit vectors (N, D) tells pairs of one class (N,) from pairs of two; at least 0.
+
+    Fisher's linear discriminant (1936) of one variable.
+    """
+    i, j = torch.triu_indices(len(vectors), len(vectors), 1, device=vectors.device)
+    distances = (1 - vectors @ vectors.T)[i, j]
+    alike = members[i] == members[j]
+    near, far = distances[alike], distances[~alike]
+    variance = near.var(correction=0) + far.var(correction=0)
+    return ((far.mean() - near.mean()) / variance.clamp_min(_SMALLEST_VARIANCE)).clamp_min(0)
