@@ -1,8 +1,8 @@
 """Eigenpairs of sparse symmetric matrices, with a proof that none is missing.
 
 The room knows nothing of meshes: a stiffness and a mass from any library go in as plain arrays. Each module uses only
-those before it: checks, loops (all that is compiled), ordering, symbolic, factorization, multifrontal, direct, krylov,
-lanczos, eigensolver.
+those before it: checks; tiles, loops and row_loops, which are all that is compiled; ordering, symbolic, factorization,
+multifrontal, direct, krylov, lanczos, eigensolver.
 """
 
 from igps.linalg.eigensolver import Spectrum, eigenpairs

@@ -85,10 +85,10 @@ class Krylov:
         n_vertices = len(zero_mode)
         self._pieces = _pieces(n_vertices, max(1, min(MOST_PIECES, n_vertices // PIECE)))
         self._large = (capacity + 1) * n_vertices > MOST_SINGLE_ENTRIES
+        # and a copy in single precision, to be read in half the time
+        self._single: torch.Tensor | None
         self._allocate(capacity + 1, n_vertices)
         self._basis[0] = torch.from_numpy(zero_mode)
-        # a copy in single precision, to be read in half the time
-        self._single = None if self._large else torch.empty(capacity + 1, n_vertices, dtype=torch.float32)
         if self._single is not None:
             self._single[0] = self._basis[0]
         self._projected = torch.zeros(capacity + 1, capacity + 1, dtype=torch.float64)
@@ -101,9 +101,18 @@ class Krylov:
         self._append(self._orthonormal(self._apply(self._random(block_size)), near=1)[0], swept=True)
 
     def _allocate(self, n_rows: int, n_columns: int) -> None:
-        """A new basis. Of NumPy's memory a part can be given back; but it asks for huge pages, which may be slow."""
+        """A new basis. Of NumPy's memory a part can be given back; but it asks for huge pages, which may be slow.
+
+        A smaller one and its copy are one piece: the C library keeps as much for the next basis as was one piece once.
+        """
         self._memory = np.empty((n_rows if self._large else 0, n_columns))
-        self._basis = torch.from_numpy(self._memory) if self._large else _empty(n_rows, n_columns)
+        if self._large:
+            self._basis, self._single = torch.from_numpy(self._memory), None
+            return
+        size = n_rows * n_columns
+        room = torch.empty(size + (size + 1) // 2, dtype=torch.float64)
+        self._basis = room[:size].view(n_rows, n_columns)
+        self._single = room[size:].view(torch.float32)[:size].view(n_rows, n_columns)
 
     @property
     def size(self) -> int:
@@ -176,7 +185,7 @@ class Krylov:
         vectors = _empty(self._basis.shape[1], len(index)).numpy()
 
         def combine(piece: slice) -> None:
-            vectors[order[piece]] = (coefficients.T @ self._basis[1 : self._stop, piece]).numpy().T
+            vectors[order[piece]] = _combinations(self._basis[1 : self._stop], coefficients, piece)
 
         return vectors, [partial(combine, piece) for piece in self._small_pieces()]
 
@@ -219,11 +228,10 @@ class Krylov:
         stop = self._stop + n_rows
         if stop > len(self._basis):
             capacity = len(self._basis) * 3 // 2 + n_rows
-            basis, projected = self._basis, self._projected
+            basis, single, projected = self._basis, self._single, self._projected
             self._allocate(capacity, basis.shape[1])
             self._basis[: self._stop] = basis[: self._stop]
-            if self._single is not None:
-                single, self._single = self._single, self._single.new_empty(capacity, basis.shape[1])
+            if self._single is not None and single is not None:
                 self._single[: self._swept] = single[: self._swept]
             self._projected = projected.new_zeros(capacity, capacity)
             self._projected[: self._stop, : self._stop] = projected[: self._stop, : self._stop]
@@ -363,6 +371,20 @@ def _subtract(rows: torch.Tensor, factors: torch.Tensor, others: torch.Tensor, p
         row_loops.subtract(rows.numpy(), factors.numpy(), others.numpy(), piece.start, piece.stop)
     else:
         rows[:, piece].sub_(factors @ others[:, piece])
+
+
+def _combinations(rows: torch.Tensor, coefficients: torch.Tensor, piece: slice) -> np.ndarray:
+    """The products (n, K) of n columns, a piece of rows (m, V), with coefficients (m, K)."""
+    if beats_blas():
+        from igps.linalg.tiles import product
+
+        shape = piece.stop - piece.start, coefficients.shape[1], len(rows)
+        found = np.empty(shape[:2])
+        columns = rows.numpy().ravel(), piece.start, rows.shape[1], 1
+        out = found.ravel(), 0, shape[1]
+        product(shape, 1.0, columns, (coefficients.numpy().ravel(), 0, shape[1]), False, out, out)
+        return found
+    return (coefficients.T @ rows[:, piece]).numpy().T
 
 
 def _pieces(size: int, number: int) -> list[slice]:

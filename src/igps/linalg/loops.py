@@ -1,65 +1,29 @@
-"""The loops of `multifrontal`, compiled. Importing this module imports Numba: ask `igps.compiled.is_available` first.
-
-Dense blocks go to the BLAS and LAPACK that SciPy brings, by the addresses of its functions, which the caller hands in:
-an address is no constant, so that the compiled code may be kept on disk. The products are cut into tiles so small that
-no BLAS starts threads for one of them.
-"""
+"""The loops of `multifrontal`, compiled. Importing this imports Numba: ask `igps.compiled.is_available` first."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
 from igps.compiled import compiled
+from igps.linalg.tiles import COLUMNS, ROWS, product
 
-# Multiplications in a product above which OpenBLAS thinks of threads: 2¹⁸
-TILE, DEPTH = 64, 64
-SOLVE_TILE = 128
-NO, TRANSPOSED, LOWER = np.uint8(ord("N")), np.uint8(ord("T")), np.uint8(ord("L"))
-
-
-def _intrinsic() -> Any:
-    from llvmlite import ir
-    from numba import types
-    from numba.core import cgutils
-    from numba.extending import intrinsic
-
-    def fortran(context: Any, address: Any, arguments: Any) -> Any:
-        """Call the subroutine at an address: numbers go by reference, integers as 32 bits, arrays as they lie."""
-
-        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            pointers = []
-            for i, kind in enumerate(arguments.types):
-                value = builder.extract_value(values[1], i)
-                if isinstance(kind, types.Array):
-                    pointers.append(context.make_array(kind)(context, builder, value).data)
-                    continue
-                if isinstance(kind, types.Integer) and kind != types.uint8:
-                    value = context.cast(builder, value, kind, types.int32)
-                pointers.append(cgutils.alloca_once_value(builder, value))
-            function = ir.FunctionType(ir.VoidType(), [pointer.type for pointer in pointers])
-            builder.call(builder.inttoptr(values[0], function.as_pointer()), pointers)
-            return context.get_dummy_value()
-
-        return types.void(address, arguments), generate
-
-    return intrinsic(fortran)
-
-
-fortran = _intrinsic()
+# Unknowns that are eliminated at once inside of a pivot block
+AT_ONCE = COLUMNS
+# What may be missing of an indefinite block times its inverse to the identity, in norm
+MOST_MISSING = 3e-13
 
 
 @compiled()
 def _dissect(orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth: int, window: float) -> np.ndarray:
     """The loops of `ordering.nested_dissection`, part by part; the vertices sorted by each coordinate are overwritten.
 
-    A vertex carries the node of the part it is in, 2 · node + 1 or + 2 on the next level, until a separator takes it.
+    Outside of the part at hand a vertex has rank −1: the largest as an unsigned number, so that neither the highest
+    rank among neighbours nor the lowest asks where they are.
     """
     n_coordinates, n_vertices = orders.shape
-    label = np.zeros(n_vertices, np.int64)
-    node = np.full(n_vertices, -1, np.int64)
-    rank, low, high = (np.empty(n_vertices, np.int32), np.empty(n_vertices, np.int32), np.empty(n_vertices, np.int32))
+    node = np.empty(n_vertices, np.int64)
+    rank = np.full(n_vertices, -1, np.int32)
+    low, high = np.empty(n_vertices, np.int32), np.empty(n_vertices, np.int32)
     whole_before, touched_before = np.empty(n_vertices + 1, np.int32), np.empty(n_vertices + 1, np.int32)
     side = np.empty(n_vertices, np.int8)
     behind = np.empty(n_vertices, orders.dtype)
@@ -79,11 +43,10 @@ def _dissect(orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth:
                 whole_before[: size + 1] = 0
                 touched_before[: size + 1] = 0
                 for i in range(size):
-                    lowest = highest = np.int32(i)
-                    for k in range(indptr[order[i]], indptr[order[i] + 1]):
-                        j = indices[k]
-                        if label[j] == here:
-                            lowest, highest = min(lowest, rank[j]), max(highest, rank[j])
+                    lowest, highest = np.uint32(i), np.int32(i)
+                    for k in range(np.uint64(indptr[order[i]]), np.uint64(indptr[order[i] + 1])):
+                        of_neighbour = rank[np.uint32(indices[k])]
+                        lowest, highest = min(lowest, np.uint32(of_neighbour)), max(highest, of_neighbour)
                     low[i], high[i] = lowest, highest
                     whole_before[highest + 1] += 1
                     touched_before[lowest + 1] += 1
@@ -104,6 +67,8 @@ def _dissect(orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth:
                         side[order[i]] = 2 if cut_before and high[i] >= cut else 0
                     else:
                         side[order[i]] = 2 if not cut_before and low[i] < cut else 1
+            for i in range(first, first + size):
+                rank[orders[0, i]] = -1
             for c in range(n_coordinates):
                 order = orders[c, first : first + size]
                 n_before = n_behind = 0
@@ -117,18 +82,15 @@ def _dissect(orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth:
                         n_behind += 1
                     elif c == 0:
                         node[vertex] = here
-                        label[vertex] = -1
                 for i in range(n_behind):
                     order[n_before + i] = behind[i]
                 if c == 0:
-                    for i in range(n_before + n_behind):
-                        label[order[i]] = 2 * here + (1 if i < n_before else 2)
                     next_begin[2 * part], next_end[2 * part] = first, first + n_before
                     next_begin[2 * part + 1], next_end[2 * part + 1] = first + n_before, first + n_before + n_behind
         begin, end = next_begin, next_end
-    for vertex in range(n_vertices):
-        if node[vertex] < 0:
-            node[vertex] = label[vertex]
+    for part in range(2**depth):
+        for i in range(begin[part], end[part]):
+            node[orders[0, i]] = 2**depth - 1 + part
     return node
 
 
@@ -302,91 +264,73 @@ assemble = _assemble.dispatcher
 
 
 @compiled()
-def _product(
-    gemm: int,
-    transposed_b: np.uint8,
-    shape: tuple[int, int, int],
-    alpha: float,
-    a: np.ndarray,
-    lda: int,
-    b: np.ndarray,
-    ldb: int,
-    beta: float,
-    c: np.ndarray,
-    ldc: int,
-    tile: tuple[int, int, int],
-) -> None:
-    """C ← α A B + β C, or with Bᵀ, in Fortran's order, shape (m, n, k), in tiles no larger than so."""
-    m, n, k = shape
-    for j in range(0, n, tile[1]):
-        for i in range(0, m, tile[0]):
-            for p in range(0, k, tile[2]):
-                fortran(
-                    gemm,
-                    (
-                        NO,
-                        transposed_b,
-                        min(tile[0], m - i),
-                        min(tile[1], n - j),
-                        min(tile[2], k - p),
-                        alpha,
-                        a[i + p * lda :],
-                        lda,
-                        b[j + p * ldb :] if transposed_b == TRANSPOSED else b[p + j * ldb :],
-                        ldb,
-                        beta if p == 0 else 1.0,
-                        c[i + j * ldc :],
-                        ldc,
-                    ),
-                )
+def _invert_pivot(pivot: np.ndarray, size: int) -> int:
+    """Replace a block, rows of AT_ONCE numbers, by its inverse; its negative pivots, -1 if one is 0 or not finite.
+
+    What is behind ``size`` in a row must be finite.
+    """
+    n_negative = 0
+    for q in range(np.uint64(size)):
+        row = q * np.uint64(AT_ONCE)
+        value = pivot[row + q]
+        if not 0.0 < abs(value) < np.inf:
+            return -1
+        n_negative += value < 0
+        pivot[row + q] = 1.0
+        for j in range(np.uint64(AT_ONCE)):
+            pivot[row + j] *= 1.0 / value
+        for i in range(np.uint64(size)):
+            if i != q:
+                other = i * np.uint64(AT_ONCE)
+                factor = pivot[other + q]
+                pivot[other + q] = 0.0
+                for j in range(np.uint64(AT_ONCE)):
+                    pivot[other + j] -= factor * pivot[row + j]
+    return n_negative
 
 
-product = _product.dispatcher
+invert_pivot = _invert_pivot.dispatcher
 
 
 @compiled()
-def _invert(
-    block: np.ndarray,
-    n: int,
-    ld: int,
-    scratch: np.ndarray,
-    work: np.ndarray,
-    pivots: np.ndarray,
-    lapack: np.ndarray,
-) -> int:
-    """Replace the upper triangle of a symmetric matrix by its whole inverse; its negative eigenvalues, -1 if singular.
+def _invert(matrix: np.ndarray, n: int, width: int, rows: np.ndarray, columns: np.ndarray) -> int:
+    """Replace a symmetric matrix (n, width) by its inverse; its negative pivots, -1 if one is 0 or not finite.
 
-    Fortran sees the transposed matrix, and so a lower triangle.
+    Gauss and Jordan's elimination of AT_ONCE unknowns at a time, of which the width is a multiple. As the pivots are
+    taken as they come, the inverse is accurate where the matrix is definite; elsewhere see `_invert_front`.
+
+    Args:
+        matrix: flat.
+        n, width: its size, and that of its rows; what is behind n must be 0.
+        rows: (AT_ONCE · width,) room.
+        columns: ((n + AT_ONCE) · AT_ONCE,) room.
     """
-    for i in range(n):
-        scratch[i * n + i : (i + 1) * n] = block[i * ld + i : i * ld + n]
-    info = np.zeros(1, np.int32)
     n_negative = 0
-    fortran(lapack[1], (LOWER, n, block, ld, info))
-    if info[0] == 0:
-        fortran(lapack[2], (LOWER, n, block, ld, info))
-    else:
-        fortran(lapack[3], (LOWER, n, scratch, n, pivots, work, len(work), info))
-        if info[0] != 0:
+    pivot = columns[n * AT_ONCE :]
+    for k in range(0, n, AT_ONCE):
+        size = min(AT_ONCE, n - k)
+        for i in range(size):
+            for j in range(AT_ONCE):
+                pivot[i * AT_ONCE + j] = matrix[(k + i) * width + k + j]
+        negative = invert_pivot(pivot, size)
+        if negative < 0:
             return -1
-        # a 1×1 pivot counts by its sign, a 2×2 one, marked by two negative indices, has one eigenvalue of either sign
-        n_halves = 0
+        n_negative += negative
+        # the rows that are eliminated, times the inverse of their pivot
+        eliminated, times_inverse = (matrix, k * width, width), (rows, 0, width)
+        product((size, width, size), 1.0, (pivot, 0, AT_ONCE, 1), eliminated, False, times_inverse, times_inverse)
+        for i in range(size):
+            for j in range(size):
+                rows[i * width + k + j] = pivot[i * AT_ONCE + j]
         for i in range(n):
-            if pivots[i] < 0:
-                n_halves += 1
-            elif scratch[i * n + i] < 0:
-                n_negative += 1
-        n_negative += n_halves // 2
-        for i in range(n):
-            block[i * ld : i * ld + n] = 0.0
-            block[i * ld + i] = 1.0
-        fortran(lapack[4], (LOWER, n, n, scratch, n, pivots, block, ld, info))
-        for i in range(n):
-            for j in range(i + 1, n):
-                block[i * ld + j] = (block[i * ld + j] + block[j * ld + i]) / 2
-    for i in range(n):
-        for j in range(i + 1, n):
-            block[j * ld + i] = block[i * ld + j]
+            for j in range(size):
+                columns[i * AT_ONCE + j] = matrix[i * width + k + j]
+                matrix[i * width + k + j] = 0.0
+        for begin, end in ((0, k), (k + size, n)):
+            shape, rest = (end - begin, width, size), (matrix, begin * width, width)
+            product(shape, -1.0, (columns, begin * AT_ONCE, 1, AT_ONCE), times_inverse, True, rest, rest)
+        for i in range(size * width):
+            matrix[k * width + i] = rows[i]
     return n_negative
 
 
@@ -394,8 +338,77 @@ invert = _invert.dispatcher
 
 
 @compiled()
+def _load(matrix: np.ndarray, front: np.ndarray, n: int, front_width: int, width: int, backwards: bool) -> None:
+    """Copy the symmetric matrix (n, width) of which a front has the upper triangle, with zeros behind it."""
+    for i in range(n):
+        for j in range(i, n):
+            value = front[i * front_width + j]
+            row, column = (n - 1 - i, n - 1 - j) if backwards else (i, j)
+            matrix[row * width + column] = matrix[column * width + row] = value
+        for j in range(n, width):
+            matrix[i * width + j] = 0.0
+
+
+@compiled()
+def _missing(matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, room: np.ndarray) -> float:
+    """The Frobenius norm of I − A X."""
+    whole = (room, 0, width)
+    for i in range(n * width):
+        room[i] = 0.0
+    for i in range(n):
+        room[i * width + i] = 1.0
+    product((n, width, n), -1.0, (matrix, 0, width, 1), (inverse, 0, width), True, whole, whole)
+    squares = 0.0
+    for i in range(n * width):
+        squares += room[i] ** 2
+    return np.sqrt(squares)
+
+
+load, missing = _load.dispatcher, _missing.dispatcher
+
+
+@compiled()
+def _invert_front(
+    inverse: np.ndarray,
+    front: np.ndarray,
+    n: int,
+    front_width: int,
+    width: int,
+    copy: np.ndarray,
+    room: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+) -> int:
+    """Write the inverse (n, width) of a front's pivot block; the negative eigenvalues of that, -1 if it cannot tell.
+
+    What is definite is inverted accurately with its pivots in any order. What is not loses digits in one order or the
+    other, rarely in both: how many is seen by A X, which is also why their signs can be believed. Between A and the
+    matrix that X is the inverse of, no eigenvalue passes zero.
+    """
+    for backwards in (False, True):
+        load(inverse, front, n, front_width, width, backwards)
+        n_negative = invert(inverse, n, width, rows, columns)
+        if n_negative > 0:
+            load(copy, front, n, front_width, width, backwards)
+            if not missing(copy, inverse, n, width, room) <= MOST_MISSING:
+                continue
+        if n_negative >= 0:
+            if backwards:
+                for i in range(n // 2 + n % 2):
+                    for j in range(n if i < n // 2 else n // 2):
+                        here, there = i * width + j, (n - 1 - i) * width + n - 1 - j
+                        inverse[here], inverse[there] = inverse[there], inverse[here]
+            return n_negative
+    return -1
+
+
+invert_front = _invert_front.dispatcher
+
+
+@compiled()
 def _eliminate(
     nodes: tuple[int, int],
+    largest: int,
     values: np.ndarray,
     shift: float,
     indptr: np.ndarray,
@@ -413,12 +426,17 @@ def _eliminate(
     front: np.ndarray,
     blocks: np.ndarray,
     block_start: np.ndarray,
-    scratch: np.ndarray,
-    work: np.ndarray,
-    pivots: np.ndarray,
-    lapack: np.ndarray,
-) -> int:
-    """Eliminate a range of nodes with few own unknowns each; their negative pivots, -1 if one is singular."""
+    pivot: np.ndarray,
+    copy: np.ndarray,
+    room: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+) -> tuple[int, int]:
+    """Eliminate the nodes of a range one after another; their negative pivots, and the node at which it stops.
+
+    Before the end of the range it stops at a node, whose front is assembled, that has more than ``largest`` own
+    unknowns, or whose pivots must be taken in another order.
+    """
     n_negative = 0
     for n in range(nodes[0], nodes[1]):
         assemble(
@@ -427,31 +445,32 @@ def _eliminate(
         )  # fmt: skip
         n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
         width = n_own + n_boundary
+        if n_own > largest:
+            return n_negative, n
+        padded = -(-n_own // AT_ONCE) * AT_ONCE
+        negative = invert_front(pivot, front, n_own, width, padded, copy, room, rows, columns)
+        if negative < 0:
+            return n_negative, n
+        n_negative += negative
         block = blocks[block_start[n] :]
         for i in range(n_own):
-            block[i * width + i : i * width + n_own] = front[i * width + i : i * width + n_own]
-        if n_own:
-            here = invert(block, n_own, width, scratch, work, pivots, lapack)
-            if here < 0:
-                return -1
-            n_negative += here
+            for j in range(n_own):
+                block[i * width + j] = pivot[j * padded + i]
         if n_boundary == 0:
             continue
-        update = updates[update_start[n] :]
-        for i in range(n_boundary):
-            row = (n_own + i) * width + n_own
-            update[i * n_boundary + i : (i + 1) * n_boundary] = front[row + i : row + n_boundary]
-        if n_own:
-            coupling, elimination = front[n_own:], block[n_own:]
-            shape, tile = (n_boundary, n_own, n_own), (TILE, TILE, DEPTH)
-            product(lapack[0], NO, shape, -1.0, coupling, width, block, width, 0.0, elimination, width, tile)
-            for i in range(0, n_boundary, TILE):
-                shape = (n_boundary - i, min(TILE, n_boundary - i), n_own)
-                product(
-                    lapack[0], TRANSPOSED, shape, 1.0, elimination[i:], width, coupling[i:], width, 1.0,
-                    update[i * n_boundary + i :], n_boundary, tile,
-                )  # fmt: skip
-    return n_negative
+        coupling, elimination = (front, n_own, width), (blocks, block_start[n] + n_own, width)
+        shape = (n_own, n_boundary, n_own)
+        product(shape, -1.0, (pivot, 0, 1, padded), coupling, False, elimination, elimination)
+        # of the complement the upper triangle, some rows at a time
+        for i in range(0, n_boundary, ROWS):
+            n_rows, begin = min(ROWS, n_boundary - i), max(0, min(i, n_boundary - COLUMNS))
+            product(
+                (n_rows, n_boundary - begin, n_own), 1.0, (front, n_own + i, width, 1),
+                (blocks, block_start[n] + n_own + begin, width), True,
+                (front, (n_own + i) * width + n_own + begin, width),
+                (updates, update_start[n] + i * n_boundary + begin, n_boundary),
+            )  # fmt: skip
+    return n_negative, nodes[1]
 
 
 @compiled()
@@ -481,12 +500,10 @@ def _forward(
     carried: np.ndarray,
     carried_start: np.ndarray,
     largest: int,
-    gemm: int,
 ) -> None:
     """The way up through a range of nodes: x, (V, b) flat, becomes D x; Eᵀ x is carried to the boundary's owners."""
     b = right.shape[1]
     rows = np.empty(largest * b)
-    tile = (max(1, min(b, 16)), SOLVE_TILE, SOLVE_TILE)
     for n in range(nodes[0], nodes[1]):
         n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
         width, own = n_own + n_boundary, x[first[n] * b :]
@@ -503,13 +520,10 @@ def _forward(
                 while k < start[child + 1] - place and parent_row[place + k] < n_own:
                     add_row(own, parent_row[place + k], source, k, b)
                     k += 1
-        if n_own:
-            # D is symmetric: one product with the transposed block gives D x and Eᵀ x
-            shape = (b, width, n_own)
-            product(gemm, TRANSPOSED, shape, 1.0, own, b, blocks[block_start[n] :], width, 0.0, rows, b, tile)
-            own[: n_own * b] = rows[: n_own * b]
-        else:
-            rows[: width * b] = 0.0
+        # D is symmetric: one product with the transposed block gives D x and Eᵀ x
+        block, found = (blocks, block_start[n], width, 1), (rows, 0, b)
+        product((width, b, n_own), 1.0, block, (x, first[n] * b, b), False, found, found)
+        own[: n_own * b] = rows[: n_own * b]
         for side in range(2):
             child = children[n, side]
             if child >= 0:
@@ -533,24 +547,21 @@ def _backward(
     block_start: np.ndarray,
     x: np.ndarray,
     largest: int,
-    gemm: int,
     solution: np.ndarray,
 ) -> None:
     """The way down through a range of nodes: x, (V, b) flat, becomes D x + E x_boundary, the solution (b, V)."""
     b = len(solution)
-    known = np.empty(largest * b)
-    tile = (max(1, min(b, 16)), SOLVE_TILE, SOLVE_TILE)
+    known, found = np.empty(largest * b), np.empty(largest * b)
     for n in range(nodes[1] - 1, nodes[0] - 1, -1):
         n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
-        own = x[first[n] * b :]
-        if n_own and n_boundary:
-            for k in range(n_boundary):
-                to, place = np.uint64(k * b), np.uint64(boundary[start[n] + k]) * np.uint64(b)
-                for c in range(np.uint64(b)):
-                    known[to + c] = x[place + c]
-            block = blocks[block_start[n] + n_own :]
-            shape = (b, n_own, n_boundary)
-            product(gemm, NO, shape, 1.0, known, b, block, n_own + n_boundary, 1.0, own, b, tile)
+        own, width = x[first[n] * b :], n_own + n_boundary
+        for k in range(n_boundary):
+            to, place = np.uint64(k * b), np.uint64(boundary[start[n] + k]) * np.uint64(b)
+            for c in range(np.uint64(b)):
+                known[to + c] = x[place + c]
+        elimination = (blocks, block_start[n] + n_own, 1, width)
+        product((n_own, b, n_boundary), 1.0, elimination, (known, 0, b), True, (x, first[n] * b, b), (found, 0, b))
+        own[: n_own * b] = found[: n_own * b]
         for i in range(n_own):
             place = np.uint64(order[first[n] + i])
             for c in range(np.uint64(b)):

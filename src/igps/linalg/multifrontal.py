@@ -1,27 +1,27 @@
 """The factorization of `factorization` by compiled loops: node by node, depth first, without padding.
 
 A node's Schur complement is added to its parent's front soon after it was made, while the processor's cache still holds
-it, and only the complements along one branch are kept. Pivot blocks of more than LARGE unknowns go to PyTorch.
+it, and only the complements along one branch are kept. Pivot blocks of more than LARGE unknowns go to PyTorch, and so
+do those that are indefinite and ask for pivots in another order.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 import torch
 from scipy import sparse
 
 from igps.linalg.checks import canonical, check_entries
-from igps.linalg.factorization import SINGULAR, SingularMatrixError, invert
+from igps.linalg.factorization import invert
 from igps.linalg.ordering import LEAF_SIZE, checked_graph, nested_dissection
 from igps.threads import ALONE, Team
 
 # Unknowns from which a subtree is worth a thread of its own, and the most subtrees, as a power of two
 SUBTREE, MOST_SUBTREES = 2**13, 3
-# Own unknowns of a node above which its dense algebra is PyTorch's. OpenBLAS starts threads for LAPACK from 64 on.
-LARGE = 63
+# Own unknowns of a node above which its dense algebra is PyTorch's, for which a team can work
+LARGE = 127
 # Rows or columns of such a node that are multiplied at once
 AT_ONCE = 256
 
@@ -117,24 +117,23 @@ class Tree:
             values, shift, self.indptr, self.indices, self.order, self.number, self.first, self.children, self.start,
             self.boundary, self.parent_row, updates, self.update_start, place, front,
         )  # fmt: skip
-        workspace = np.empty(LARGE**2), np.empty(LARGE**2), np.empty(LARGE, dtype=np.int32), _blas_and_lapack()
-        n_negative, next_node = 0, begin
-        for node in [*(begin + np.flatnonzero(n_own > LARGE)).tolist(), end]:
-            n_negative_small = loops.eliminate((next_node, node), *problem, blocks, block_start, *workspace)
-            if n_negative_small < 0:
-                raise SingularMatrixError(SINGULAR)
-            n_negative += n_negative_small
-            next_node = node + 1
-            if node < end:
-                loops.assemble(node, *problem)
-                size, n_bound = int(n_own[node - begin]), int(n_boundary[node - begin])
-                n_negative += _eliminate_large(
-                    torch.from_numpy(front[: (size + n_bound) ** 2].reshape(size + n_bound, size + n_bound)),
-                    torch.from_numpy(blocks[block_start[node] :][: size * (size + n_bound)].reshape(size, -1)),
-                    torch.from_numpy(updates[self.update_start[node] :][: n_bound**2].reshape(n_bound, n_bound)),
-                    team,
-                )
-        return n_negative
+        padded = min(LARGE, int(n_own.max())) + loops.AT_ONCE
+        squares = [np.empty(padded**2) for _ in range(3)]
+        strips = [np.empty(loops.AT_ONCE * (padded + loops.AT_ONCE)) for _ in range(2)]
+        n_negative, node = 0, begin
+        while True:
+            n_more, node = loops.eliminate((node, end), LARGE, *problem, blocks, block_start, *squares, *strips)
+            n_negative += n_more
+            if node == end:
+                return n_negative
+            size, n_bound = int(n_own[node - begin]), int(n_boundary[node - begin])
+            n_negative += _eliminate_alone(
+                torch.from_numpy(front[: (size + n_bound) ** 2].reshape(size + n_bound, size + n_bound)),
+                torch.from_numpy(blocks[block_start[node] :][: size * (size + n_bound)].reshape(size, -1)),
+                torch.from_numpy(updates[self.update_start[node] :][: n_bound**2].reshape(n_bound, n_bound)),
+                team,
+            )
+            node += 1
 
 
 @dataclass(frozen=True)
@@ -155,7 +154,7 @@ class Factors:
         """The solutions (V, b) for right-hand sides (V, b), float64, stored by columns."""
         from igps.linalg import loops
 
-        tree, gemm = self.tree, int(_blas_and_lapack()[0])
+        tree = self.tree
         n_vertices, b = right_hand_sides.shape
         right, solution = right_hand_sides.numpy(), torch.empty(b, n_vertices, dtype=torch.float64)
         x, carried = (torch.empty(n * b, dtype=torch.float64).numpy() for n in (n_vertices, tree.n_carried))
@@ -164,13 +163,13 @@ class Factors:
         def forward(nodes: tuple[int, int]) -> None:
             loops.forward(
                 nodes, right, tree.order, tree.first, tree.children, tree.start, tree.parent_row, self.blocks,
-                tree.block_start, x, carried, tree.carried_start, largest, gemm,
+                tree.block_start, x, carried, tree.carried_start, largest,
             )  # fmt: skip
 
         def backward(nodes: tuple[int, int]) -> None:
             loops.backward(
                 nodes, tree.order, tree.first, tree.start, tree.boundary, self.blocks, tree.block_start, x, largest,
-                gemm, solution.numpy(),
+                solution.numpy(),
             )  # fmt: skip
 
         team.each(forward, tree.subtrees)
@@ -246,7 +245,7 @@ def _stacks(children: np.ndarray, sizes: np.ndarray, ranges: list[tuple[int, int
     return place, end
 
 
-def _eliminate_large(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor, team: Team) -> int:
+def _eliminate_alone(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor, team: Team) -> int:
     """Write D, E and the complement of a front; of both only the upper triangle counts. Its negative pivots."""
     n_own, n_bound = len(block), len(update)
     pivot, coupling = front[:n_own, :n_own].triu(), front[:n_own, n_own:]
@@ -265,13 +264,3 @@ def _eliminate_large(front: torch.Tensor, block: torch.Tensor, update: torch.Ten
     team.each(eliminate, pieces)
     team.each(complement, pieces)
     return n_negative
-
-
-@cache
-def _blas_and_lapack() -> np.ndarray:
-    """Addresses of the functions that the loops call."""
-    from numba.extending import get_cython_function_address
-
-    blas, lapack = "scipy.linalg.cython_blas", "scipy.linalg.cython_lapack"
-    names = (blas, "dgemm"), (lapack, "dpotrf"), (lapack, "dpotri"), (lapack, "dsytrf"), (lapack, "dsytrs")
-    return np.array([get_cython_function_address(*name) for name in names])
