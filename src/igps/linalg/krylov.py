@@ -28,6 +28,8 @@ ROUND_PIVOT = 0.1
 SWEEP_EVERY, SWEEP_LOSS, SINGLE_LOSS = 2, 1e-7, 3e-8
 # Of a larger basis there is no copy in single precision, to save memory: 1 GiB
 MOST_SINGLE_ENTRIES = 2**28
+# Up to here a basis gains by huge pages, which NumPy's memory asks for, a larger one waits longer for them: 256 MiB
+MOST_HUGE_ENTRIES = 2**25
 # Columns of the basis that are turned into eigenvectors at once
 COLUMNS_AT_ONCE = 8192
 # Columns of a piece of the basis, of which a thread computes with one at a time, and the most pieces
@@ -101,7 +103,7 @@ class Krylov:
         self._append(self._orthonormal(self._apply(self._random(block_size)), near=1)[0], swept=True)
 
     def _allocate(self, n_rows: int, n_columns: int) -> None:
-        """A new basis. Of NumPy's memory a part can be given back; but it asks for huge pages, which may be slow.
+        """A new basis. Of NumPy's memory a part can be given back.
 
         A smaller one and its copy are one piece: the C library keeps as much for the next basis as was one piece once.
         """
@@ -110,7 +112,9 @@ class Krylov:
             self._basis, self._single = torch.from_numpy(self._memory), None
             return
         size = n_rows * n_columns
-        room = torch.empty(size + (size + 1) // 2, dtype=torch.float64)
+        length = size + (size + 1) // 2
+        huge = length <= MOST_HUGE_ENTRIES
+        room = torch.from_numpy(np.empty(length)) if huge else torch.empty(length, dtype=torch.float64)
         self._basis = room[:size].view(n_rows, n_columns)
         self._single = room[size:].view(torch.float32)[:size].view(n_rows, n_columns)
 
