@@ -87,7 +87,7 @@ class Krylov:
         n_vertices = len(zero_mode)
         self._pieces = _pieces(n_vertices, max(1, min(MOST_PIECES, n_vertices // PIECE)))
         self._large = (capacity + 1) * n_vertices > MOST_SINGLE_ENTRIES
-        # and a copy in single precision, to be read in half the time
+        # with a copy in single precision, to be read in half the time
         self._single: torch.Tensor | None
         self._allocate(capacity + 1, n_vertices)
         self._basis[0] = torch.from_numpy(zero_mode)
