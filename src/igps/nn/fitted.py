@@ -332,9 +332,8 @@ def _discriminant(vectors: Tensor, members: Tensor) -> Tensor:
 
     Fisher's linear discriminant (1936) of one variable.
     """
-    i, j = torch.triu_indices(len(vectors), len(vectors), 1, device=vectors.device)
-    distances = (1 - vectors @ vectors.T)[i, j]
-    alike = members[i] == members[j]
-    near, far = distances[alike], distances[~alike]
+    distances = 1 - vectors @ vectors.T
+    alike = members[:, None] == members
+    far, near = distances[~alike], distances[alike.fill_diagonal_(False)]
     variance = near.var(correction=0) + far.var(correction=0)
     return ((far.mean() - near.mean()) / variance.clamp_min(_SMALLEST_VARIANCE)).clamp_min(0)
