@@ -45,6 +45,24 @@ def test_formats_keep_vertices_in_order(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_array_equal(mesh.faces, surface.faces)
 
 
+@pytest.mark.parametrize(("suffix", "comment"), [("off", "# {}"), ("obj", "# {}"), ("ply", "comment {}")])
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "shift_jis"])
+def test_comments_may_be_in_any_encoding(tmp_path: Path, suffix: str, comment: str, encoding: str) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=1)
+    options = {"encoding": "ascii"} if suffix == "ply" else {}
+    text = surface.export(file_type=suffix, **options)
+    lines = (text if isinstance(text, str) else text.decode()).split("\n")
+    words = {"utf-8": "Größe – 大きさ", "latin-1": "Größe, né à Paris", "shift_jis": "球の大きさ"}[encoding]
+    lines.insert(2 if suffix == "ply" else 1, comment.format(words))
+    path = tmp_path / f"mesh.{suffix}"
+    path.write_bytes("\n".join(lines).encode(encoding))
+    mesh = load_mesh(path)
+    np.testing.assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, surface.faces)
+    (tmp_path / "cloud.xyz").write_bytes(f"# {words}\n0 0 1\n0 1 0\n".encode(encoding))
+    np.testing.assert_array_equal(read_surface(tmp_path / "cloud.xyz")[0], [[0, 0, 1], [0, 1, 0]])
+
+
 def test_quads_become_triangles(tmp_path: Path) -> None:
     corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
     quads = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]])

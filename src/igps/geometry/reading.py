@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -147,19 +148,32 @@ def read_surface(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int6
 def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
     """Vertices (V, 3), faces (F, 3), none of a cloud of points, and the normals (V, 3) of one that has them."""
     if path.suffix.lower() in POINT_CLOUDS:
-        rows = np.loadtxt(path, ndmin=2, comments=("#", "//"))
+        rows = np.loadtxt(path, ndmin=2, comments=("#", "//"), encoding="latin-1")  # which has a letter for any byte
         if rows.shape[1] not in (3, 6):
             raise ValueError(f"expected lines of 3 numbers, or of 6 with normals, got {rows.shape[1]}")
         return rows[:, :3], np.zeros((0, 3), dtype=np.int64), rows[:, 3:] if rows.shape[1] == 6 else None
     if path.suffix.lower() == ".off" and (plain := _plain_off(path)) is not None:
         return *plain, None
-    scene: Any = trimesh.load(path, process=False, force="scene", **_loader_options(path))
+    scene = _scene(path)
     parts = list(scene.geometry.values())
     if parts and all(isinstance(part, trimesh.PointCloud) for part in parts):
         points = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts])
         return points, np.zeros((0, 3), dtype=np.int64), _normals(scene, len(points))
     mesh = scene.to_mesh()
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces), None
+
+
+def _scene(path: Path) -> Any:
+    """What trimesh reads."""
+    options = {"process": False, "force": "scene", **_loader_options(path)}
+    try:
+        return trimesh.load(path, **options)
+    except UnicodeDecodeError:
+        if path.suffix.lower() != ".ply":
+            raise
+        # of other text it guesses the encoding, but the header of a PLY file must be UTF-8
+        head, end, body = path.read_bytes().partition(b"end_header")
+        return trimesh.load(BytesIO(head.decode("latin-1").encode() + end + body), file_type="ply", **options)
 
 
 def _plain_off(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
