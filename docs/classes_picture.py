@@ -1,4 +1,4 @@
-"""A picture of one shape of each class that `pretrained` was fitted to: python docs/classes_picture.py OUT.png
+"""A picture of one shape of each class that `pretrained` was fitted to: python -m docs.classes_picture OUT.png
 
 It takes minutes, and needs matplotlib, pillow, and the extras of the generator.
 """
@@ -10,9 +10,8 @@ from pathlib import Path
 
 import yaml
 from PIL import Image
-
-from igps.report.gallery import contact_sheet
-from igps.shapes import GradedShapes
+from training.contact_sheet import contact_sheet
+from training.graded import GradedShapes
 
 WIDTH = 1400  # pixels
 

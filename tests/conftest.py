@@ -11,13 +11,19 @@ import pytest
 import torch
 import trimesh
 
-from igps.compiled import is_available
-from igps.geometry import closed_forms, coordinates, far_field, surface_potential
-from igps.geometry.mesh import Mesh
-from igps.geometry.reading import load_mesh
-from igps.linalg import direct, eigensolver, krylov, ordering
-from igps.nn import counted_pairs
+from igps._compiled import is_available
+from igps.mesh.loading import load_mesh
+from igps.mesh.mesh import Mesh
+from igps.nn._kernels import counted_pairs
 from igps.retrieval import distances
+from igps.signature import _closed_forms as closed_forms
+from igps.signature import _far_field as far_field
+from igps.signature import mean_value as coordinates
+from igps.signature import surface_potential
+from igps.spectra import _direct as direct
+from igps.spectra import _krylov as krylov
+from igps.spectra import _ordering as ordering
+from igps.spectra import eigensolver
 
 # The meshes are small: on two threads they are hardly faster, and many times slower where another process takes a core.
 torch.set_num_threads(1)

@@ -16,7 +16,7 @@ import igps
 from igps.data.batch import Body
 from igps.descriptors.gps import gps
 from igps.descriptors.interior import interior
-from igps.nn.needs import Needs
+from igps.nn.requirements import Requirements
 
 SMALL = ["--signature.n_eigenpairs", "20", "--signature.resolution", "10", "--signature.min_samples", "0"]
 SMALL += ["--signature.n_surface_samples", "60", "--n_workers", "1"]
@@ -27,7 +27,7 @@ class Height(igps.BodyDescriptor):
 
     source = "nobody"
     invariant_to = ("motion",)
-    needs = Needs(mesh=True)
+    requirements = Requirements(mesh=True)
 
     def __init__(self, name: str = "height", bad: str = "no such mesh", fault: str = "raise") -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class Root(igps.BodyDescriptor):
     name = "root"
     source = "nobody"
     invariant_to = ("motion",)
-    needs = Needs(mesh=True)
+    requirements = Requirements(mesh=True)
 
     def describe_body(self, body: Body) -> NDArray[np.float32]:
         if body.mesh.allow_open:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from igps.compiled import beats_blas, compiled, is_available
+from igps._compiled import beats_blas, compiled, is_available
 
 
 @compiled()
@@ -40,7 +40,7 @@ def test_a_compiled_loop_is_the_function_that_it_was_made_of():
 
 
 def test_importing_a_compiled_loop_imports_no_compiler():
-    code = "import sys, igps, igps.compiled; igps.compiled.compiled()(lambda x: x); sys.exit('numba' in sys.modules)"
+    code = "import sys, igps, igps._compiled; igps._compiled.compiled()(lambda x: x); sys.exit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 

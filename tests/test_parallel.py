@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 import jobs
-from igps.parallel import Failed, Limits, MachineError, n_cores, run
+from igps._parallel import Failed, Limits, MachineError, n_cores, run
 
 GIB = 2**30
 needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc to see whether a process lives")
@@ -153,7 +153,7 @@ def test_impossible_limits_are_refused(name: str, options: dict[str, int]) -> No
 
 def test_a_script_without_a_main_guard_is_told(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
-    script.write_text("from igps.parallel import run\nlist(run(abs, [1, 2, 3], n_workers=2))\n")
+    script.write_text("from igps._parallel import run\nlist(run(abs, [1, 2, 3], n_workers=2))\n")
     told = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=300, check=False)
     assert told.returncode != 0
     assert "MachineError: no worker process could be started" in told.stderr
@@ -176,7 +176,7 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
         "import os, signal, sys\n"
         f"sys.path.append({str(Path(jobs.__file__).parent)!r})\n"
         "import jobs\n"
-        "from igps.parallel import run\n"
+        "from igps._parallel import run\n"
         "if __name__ == '__main__':\n"
         "    for _, (worker, _) in run(jobs.process, [0, 0], n_workers=2):\n"
         "        print(worker, flush=True)\n"

@@ -19,11 +19,11 @@ from sklearn.utils.estimator_checks import check_estimator
 from igps.data.dataset import SignatureDataset
 from igps.descriptors.d2 import D2
 from igps.descriptors.interior import interior
-from igps.geometry.mesh import Mesh
-from igps.geometry.reading import MeshReading, load_mesh
-from igps.geometry.signature import SignatureConfig
+from igps.mesh.loading import LoadOptions, load_mesh
+from igps.mesh.mesh import Mesh
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
+from igps.signature.signature import SignatureConfig
 from igps.sklearn import VolumetricFeatures
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=12, min_samples=0, n_surface_samples=20)
@@ -105,7 +105,7 @@ def test_reading_is_passed_on(paths: list[Path], tmp_path: Path) -> None:
     path = tmp_path / "soup.stl"
     trimesh.load(paths[0]).export(path)
     features = VolumetricFeatures(
-        D2(), config=CONFIG, reading=MeshReading("never"), cache_dir=tmp_path / "cache", n_workers=1
+        D2(), config=CONFIG, reading=LoadOptions("never"), cache_dir=tmp_path / "cache", n_workers=1
     )
     with pytest.raises(ValueError, match="soup"):
         features.transform([path])
@@ -150,7 +150,7 @@ class OnRows(VolumetricFeatures):
         *,
         square_root: bool = True,
         config: SignatureConfig | None = TINY,
-        reading: MeshReading | None = None,
+        reading: LoadOptions | None = None,
         cache_dir: str | Path | None = None,
         n_workers: int | None = None,
     ) -> None:

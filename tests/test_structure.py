@@ -12,20 +12,21 @@ import igps
 PACKAGE = Path(igps.__file__).parent
 # From the ground up. A room imports only from the floors below its own, and itself; a new room is one more name here.
 FLOORS = (
-    ("threads", "compiled"),
-    ("linalg", "retrieval", "parallel"),
-    ("geometry",),
+    ("_threads", "_compiled"),
+    ("spectra", "retrieval", "_parallel"),
+    ("mesh",),
+    ("signature",),
     ("shapes",),
     ("data",),
     ("nn",),
     ("descriptors",),
     ("gallery",),
-    ("studies",),
+    ("analysis",),
     ("report",),
     ("cli", "sklearn"),
 )
 # Rooms that are one file.
-FILES = ("compiled", "parallel", "sklearn", "threads")
+FILES = ("_compiled", "_parallel", "_threads", "sklearn")
 
 
 def imported_rooms(path: Path) -> set[str]:

@@ -18,15 +18,15 @@ from threadpoolctl import threadpool_info
 from torch.utils.data import DataLoader
 
 import igps
-import igps.threads as threads_module
+import igps._threads as threads_module
 from conftest import torch_threads
+from igps._parallel import on_threads
+from igps._threads import Team, cpu_quota, n_cores, n_threads, one_thread
 from igps.cli import main
 from igps.data.batch import LabelledSignature
-from igps.geometry.mesh import Mesh
-from igps.geometry.signature import SignatureConfig
-from igps.nn.metric import CorrectedDistance, MetricHead
-from igps.parallel import on_threads
-from igps.threads import Team, cpu_quota, n_cores, n_threads, one_thread
+from igps.mesh.mesh import Mesh
+from igps.nn.heads.learned import BlendedDistance, MetricHead
+from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 needs_affinity = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs an affinity to set")
@@ -170,7 +170,7 @@ def test_on_one_core_a_body_is_computed_on_one_thread() -> None:
     """A process of its own, as the affinity is that of all threads."""
     program = (
         "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
-        "import igps, torch, trimesh; from igps.threads import n_cores, n_threads\n"
+        "import igps, torch, trimesh; from igps._threads import n_cores, n_threads\n"
         "ball = trimesh.creation.icosphere(subdivisions=3)\n"
         "config = igps.SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)\n"
         "signature = igps.compute_signature(igps.Mesh(ball.vertices, ball.faces), config)\n"
@@ -349,13 +349,13 @@ def test_calls_on_a_body_leave_the_settings(blob: Mesh) -> None:
 
 def test_a_body_is_computed_on_one_thread(blob: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[int, set[int]]] = []
-    original = igps.geometry.signature.eigenpairs
+    original = igps.signature.signature.eigenpairs
 
     def watched(*arguments: Any, **options: Any) -> Any:
         seen.append((torch.get_num_threads(), set(blas())))
         return original(*arguments, **options)
 
-    monkeypatch.setattr("igps.geometry.signature.eigenpairs", watched)
+    monkeypatch.setattr("igps.signature.signature.eigenpairs", watched)
     igps.compute_signature(blob, CONFIG)
     assert seen == [(1, {1})]
 
@@ -388,7 +388,7 @@ def test_a_training_step_is_computed_on_one_thread(blob: Mesh) -> None:
     signature = igps.compute_signature(blob, CONFIG)
     items = [LabelledSignature(signature, i // 2, str(i)) for i in range(4)]
     described = Watched()
-    learner = igps.RetrievalLearner(described, CorrectedDistance(MetricHead(width=4, n_hidden=8)))
+    learner = igps.RetrievalLearner(described, BlendedDistance(MetricHead(width=4, n_hidden=8)))
     options = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
     trainer = Trainer(max_epochs=1, accumulate_grad_batches=2, enable_model_summary=False, **options)  # type: ignore[arg-type]
     with pytest.warns(UserWarning, match="val_dataloader"):

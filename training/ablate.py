@@ -1,6 +1,6 @@
 """What each learned part gives: bins, spectral filter, dimensions and head, over several seeded splits.
 
-    python training/ablate.py DATA
+    python -m training.ablate DATA
 
 Bins and filter are trained on the training part through a `WhitenedHead`; then heads are fitted to its histograms, and
 the test part is scored once.
@@ -17,16 +17,16 @@ from jsonargparse import auto_cli
 from pytorch_lightning import Trainer, seed_everything
 
 import igps
-from evaluate import score
 from igps.data.datamodule import SignatureDataModule
 from igps.nn.axes import EuclideanDistance, InteriorDistance, PairCosines, Potential
 from igps.nn.description import describe
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.fitted import WhitenedHead
-from igps.nn.histogram import PairHistogram
+from igps.nn.heads.closed_form import WhitenedHead
+from igps.nn.heads.learned import BlendedDistance
+from igps.nn.histograms.pairs import PairHistogram
 from igps.nn.learner import RetrievalLearner
-from igps.nn.metric import CorrectedDistance
+from training.evaluate import score
 
 HEADS = ("none", "whitened", "kernel")
 # Dimensions, and whether bins and spectral filter are learned.
@@ -63,7 +63,7 @@ def ablate(
         cache_dir: folder of cached signatures; the user's cache directory if not given.
     """
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
-    config = layout("oriented", False, False, n_training_samples).needs.completed(igps.SignatureConfig())
+    config = layout("oriented", False, False, n_training_samples).requirements.apply_to(igps.SignatureConfig())
     print(f"{'dimensions':<14}{'learned':<16}" + "".join(f"{head:>14}" for head in HEADS))
     for dimensions, bins, spectrum in ROWS:
         found: dict[str, list[float]] = {head: [] for head in HEADS}
@@ -103,7 +103,7 @@ def layout(dimensions: str, bins: bool, spectrum: bool, n_training_samples: int)
 
 def train(descriptor: HistogramDescriptor, data: SignatureDataModule, n_epochs: int) -> None:
     """Train bins and filters on the training part, in place."""
-    learner = RetrievalLearner(descriptor, CorrectedDistance(WhitenedHead(), share=1.0))
+    learner = RetrievalLearner(descriptor, BlendedDistance(WhitenedHead(), share=1.0))
     trainer = Trainer(
         max_epochs=n_epochs, logger=False, enable_checkpointing=False, enable_progress_bar=False,
         enable_model_summary=False,

@@ -1,6 +1,6 @@
 """Measure what the distances of `pretrained` mean, on generated bodies that it was not fitted to.
 
-    python training/calibrate.py
+    python -m training.calibrate
 
 makes the calibration that the package ships: how far apart copies of a body are (other triangles, half of them, scaled,
 mirrored and turned, another file format, and all of that), poses of a body, bodies of a class, and classes; and from
@@ -21,25 +21,25 @@ from jsonargparse import auto_cli
 from numpy.typing import NDArray
 
 import igps
-from igps.descriptors.pretrained import PRETRAINED, pretrained
+from igps._parallel import on_threads
+from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained
 from igps.gallery.calibration import (
     CALIBRATION,
     FINEST,
     KINDS,
     Calibration,
+    calibration_params,
     quantiles,
     threshold_at,
     threshold_between,
-    told_of,
 )
 from igps.gallery.duplicates import Surfaces, distance_if_alike
 from igps.gallery.gallery import fingerprint
-from igps.geometry.disturbances import move, remesh, scale, simplified
-from igps.geometry.mesh import Mesh
+from igps.mesh.mesh import Mesh
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
-from igps.parallel import on_threads
-from igps.shapes import GradedShapes, body_of
+from training.graded import GradedShapes, body_of
+from training.studies.disturbances import move, remesh, scale, simplified
 
 SUFFIXES = {"triangles": ".off", "half": ".off", "motion": ".ply", "format": ".stl", "all": ".obj", "longer": ".off"}
 """Of the files: what was done to the body, and the format. What was made longer is no copy."""
@@ -121,7 +121,7 @@ def calibrate(
     calibration = Calibration(
         "pretrained",
         fingerprint(descriptor),
-        told_of(shapes.config),
+        calibration_params(shapes.config),
         f"{len(set(classes))} classes of GradedShapes({n_classes}, seed={seed}), {len(set(bodies))} bodies, "
         f"{len(shapes)} poses, {is_copy.sum()} copies, {len(of_longer)} that are longer",
         {kind: quantiles(by_kind[kind]) for kind in KINDS},
@@ -153,7 +153,7 @@ def _generated(
         GradedShapes(n_classes, 4, 4, seed).write(root, progress=True, n_workers=n_workers)
     except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
         print(error)
-    shapes = igps.SignatureDataset(root, descriptor.needs.completed(igps.SignatureConfig()), cache_dir)
+    shapes = igps.SignatureDataset(root, descriptor.requirements.apply_to(igps.SignatureConfig()), cache_dir)
     return shapes.usable(shapes.precompute(n_workers=n_workers))
 
 

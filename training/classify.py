@@ -1,7 +1,7 @@
 """Classification accuracy over several seeded splits, on fixed or on trained histograms.
 
-    python training/classify.py DATA --descriptor rich
-    python training/classify.py DATA --checkpoint build/training/lightning_logs/version_0/checkpoints/X.ckpt
+    python -m training.classify DATA --descriptor rich
+    python -m training.classify DATA --checkpoint build/training/lightning_logs/version_0/checkpoints/X.ckpt
 
 With a checkpoint the features are the histograms of its learned bins and filter, on the checkpoint's own split.
 """
@@ -17,13 +17,13 @@ from jsonargparse import auto_cli
 from torch import Tensor
 
 import igps
-from evaluate import histograms_and_prior
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, split_seen
 from igps.nn.description import describe
-from igps.nn.fitted import KernelHead
-from igps.nn.heads import Head
+from igps.nn.heads.base import Head
+from igps.nn.heads.closed_form import KernelHead
 from igps.nn.learner import RetrievalLearner
+from training.evaluate import histograms_and_prior
 
 
 def classify(
@@ -51,7 +51,7 @@ def classify(
     prior: Head | None = None
     if checkpoint is None:
         module, prior = histograms_and_prior(descriptor)
-        dataset = igps.SignatureDataset(root, module.needs.completed(igps.SignatureConfig()), cache_dir)
+        dataset = igps.SignatureDataset(root, module.requirements.apply_to(igps.SignatureConfig()), cache_dir)
         dataset.precompute(strict=True)
         histograms, part_cells = describe(dataset, module, progress=True), module.part_cells
         seeds = range(first_seed, first_seed + n_splits)

@@ -1,7 +1,7 @@
 """Retrieval scores over several seeded splits, and of a trained checkpoint.
 
-    python training/evaluate.py splits DATA --descriptor rich --protocol unseen
-    python training/evaluate.py checkpoint build/training/lightning_logs/version_0/checkpoints/X.ckpt
+    python -m training.evaluate splits DATA --descriptor rich --protocol unseen
+    python -m training.evaluate checkpoint build/training/lightning_logs/version_0/checkpoints/X.ckpt
 
 Nothing is chosen here: the heads are fitted to the training part with fixed parameters, the test part is scored once.
 Of a descriptor with a metric, such as `pretrained`, that is the heads' prior.
@@ -23,8 +23,8 @@ from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, SplitProtocol, split_seen, split_unseen
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
-from igps.nn.fitted import KernelHead, WhitenedHead
-from igps.nn.heads import Head, distances_of
+from igps.nn.heads.base import Head, distances_of
+from igps.nn.heads.closed_form import KernelHead, WhitenedHead
 from igps.nn.learner import RetrievalLearner
 from igps.report.learned import learned_layout
 from igps.retrieval import chi_square, retrieval_scores
@@ -57,7 +57,7 @@ def splits(
         cache_dir: folder of cached signatures; the user's cache directory if not given.
     """
     module, prior = histograms_and_prior(descriptor)
-    dataset = igps.SignatureDataset(root, module.needs.completed(igps.SignatureConfig()), cache_dir)
+    dataset = igps.SignatureDataset(root, module.requirements.apply_to(igps.SignatureConfig()), cache_dir)
     dataset.precompute(strict=True)
     histograms, labels = describe(dataset, module, progress=True).flatten(1), dataset.labels
     print(f"{descriptor}, {protocol}, n_train={n_train}, {n_splits} splits from seed {first_seed}, percent")

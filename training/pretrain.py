@@ -1,7 +1,7 @@
 """Fit the metric of the descriptor `pretrained` to generated shapes, and measure it where it was not fitted.
 
-    python training/pretrain.py --config configs/pretrain.yaml
-    python training/pretrain.py --config configs/pretrain.yaml --data DATA
+    python -m training.pretrain --config configs/pretrain.yaml
+    python -m training.pretrain --config configs/pretrain.yaml --data DATA
 
 The first makes the file that the package ships; its only check is on held-out families of generated classes, beside the
 plain descriptors. The second scores that metric on a labelled collection too, by the number of generated classes it is
@@ -20,13 +20,13 @@ from jsonargparse import auto_cli
 from torch import Tensor
 
 import igps
-from igps.descriptors.pretrained import PRETRAINED, pretrained_parts, save_pretrained, two_levels
-from igps.geometry.reading import MeshReading
+from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained_parts, save_pretrained, two_levels
+from igps.mesh.loading import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
-from igps.nn.levels import TwoLevelHead
-from igps.shapes import GradedShapes, body_of, family_of, looks_alike
-from transfer import curve, few_labels, report, two_level_scores
+from igps.nn.heads.two_level import TwoLevelHead
+from training.graded import GradedShapes, body_of, family_of, looks_alike
+from training.transfer import curve, few_labels, report, two_level_scores
 
 # Of two classes each part has a single direction, and its vectors are signs, which may cancel.
 _FEWEST = 3
@@ -135,8 +135,8 @@ def _usable(
     root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None, some: list[int] | None = None
 ) -> igps.SignatureDataset:
     """The dataset of the meshes, or some of them, whose signatures could be computed; those that could not are told."""
-    config = descriptor.needs.completed(igps.SignatureConfig())
-    data = igps.SignatureDataset(root, config, cache_dir, reading=MeshReading())
+    config = descriptor.requirements.apply_to(igps.SignatureConfig())
+    data = igps.SignatureDataset(root, config, cache_dir, reading=LoadOptions())
     if some is not None:
         data = data.subset(some)
     failures = data.precompute(n_workers=n_workers)

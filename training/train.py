@@ -1,4 +1,4 @@
-"""Train a descriptor and a metric, or test one: `python training/train.py {fit,test} --config configs/default.yaml`.
+"""Train a descriptor and a metric, or test one: `python -m training.train {fit,test} --config configs/default.yaml`.
 
 Every option of the learner, the data and the trainer can be set in the file or on the command line. A checkpoint holds
 the configuration too: `RetrievalLearner.load_from_checkpoint` and `SignatureDataModule.load_from_checkpoint` read it.

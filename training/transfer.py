@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from igps.data.splits import split_seen
-from igps.nn.fitted import KernelHead
-from igps.nn.heads import Head, distances_of
+from igps.nn.heads.base import Head, distances_of
+from igps.nn.heads.closed_form import KernelHead
 from igps.report.learned import transfer_curve
 from igps.retrieval import chi_square, retrieval_scores
 

@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any
 from igps.data.batch import SignatureBatch, collate
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
-from igps.geometry.mesh import Mesh, MeshError
-from igps.geometry.reading import MeshReading, load_mesh
-from igps.geometry.signature import Signature, SignatureConfig, compute_signature
+from igps.mesh.loading import LoadOptions, load_mesh
+from igps.mesh.mesh import Mesh, MeshError
 from igps.nn.description import describe
 from igps.nn.descriptor import BodyDescriptor, Descriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.fitted import KernelHead, WhitenedHead
-from igps.nn.histogram import PairHistogram
+from igps.nn.heads.closed_form import KernelHead, WhitenedHead
+from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import chi_square, retrieval_scores, search
 from igps.shapes import ArticulatedShapes
+from igps.signature.signature import Signature, SignatureConfig, compute_signature
 
 if TYPE_CHECKING:
     from igps.data.datamodule import SignatureDataModule
@@ -39,9 +39,9 @@ __all__ = [
     "Descriptor",
     "HistogramDescriptor",
     "KernelHead",
+    "LoadOptions",
     "Mesh",
     "MeshError",
-    "MeshReading",
     "PairHistogram",
     "RetrievalLearner",
     "Signature",

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from igps.data.batch import collate
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
-from igps.gallery.gallery import kept_as
-from igps.geometry.mesh import Mesh
-from igps.geometry.reading import MeshReading
-from igps.geometry.signature import SignatureConfig, compute_signature
+from igps.gallery.gallery import cache_tag
+from igps.mesh.loading import LoadOptions
+from igps.mesh.mesh import Mesh
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor, HistogramDescriptor
+from igps.signature.signature import SignatureConfig, compute_signature
 
 try:
     from sklearn.base import BaseEstimator, TransformerMixin
@@ -55,7 +55,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         *,
         square_root: bool = True,
         config: SignatureConfig | None = None,
-        reading: MeshReading | None = None,
+        reading: LoadOptions | None = None,
         cache_dir: str | Path | None = None,
         n_workers: int | None = None,
     ) -> None:
@@ -100,7 +100,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
 
     def _features(self, shapes: list[Any]) -> NDArray[np.float32]:
         chosen = descriptor_of(self.descriptor)
-        config = chosen.needs.completed(self.config or SignatureConfig())
+        config = chosen.requirements.apply_to(self.config or SignatureConfig())
         if isinstance(shapes[0], Mesh):
             with torch.inference_mode():
                 parts = [chosen(collate([compute_signature(mesh, config)], [mesh])) for mesh in shapes]
@@ -108,8 +108,8 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         else:
             dataset = SignatureDataset(shapes, config, self.cache_dir, reading=self.reading)
             dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
-            kept = kept_as(self.descriptor, chosen)
-            features, _ = describe_usable(dataset, chosen, kept_as=kept, n_workers=self.n_workers, strict=True)
+            kept = cache_tag(self.descriptor, chosen)
+            features, _ = describe_usable(dataset, chosen, cache_tag=kept, n_workers=self.n_workers, strict=True)
         cells = features.flatten(1)
         rooted = self.square_root and isinstance(chosen, HistogramDescriptor)
         return (cells.sqrt() if rooted else cells).numpy()

@@ -30,19 +30,20 @@ from describing import save as save_signature
 from scipy import sparse
 
 import igps
-from igps.geometry.coordinates import extend, winding_number
-from igps.geometry.laplacian import laplacian
-from igps.geometry.mesh import Mesh
-from igps.geometry.reading import load_mesh
-from igps.geometry.voxels import grid_axes, inside_grid, interior_samples
-from igps.linalg import eigenpairs
+from igps._threads import n_cores
+from igps.mesh.loading import load_mesh
+from igps.mesh.mesh import Mesh
+from igps.mesh.winding import winding_number
+from igps.nn._kernels.hard_pairs import pair_histogram
 from igps.nn.axes import InteriorDistance, Potential
-from igps.nn.centres import middles
-from igps.nn.hard_pairs import pair_histogram
-from igps.nn.histogram import joint_histogram
-from igps.nn.pair_axes import Distances, OrientedPoints
+from igps.nn.axes.centres import middles
+from igps.nn.axes.pairs import Distances, OrientedPoints
+from igps.nn.histograms.pairs import joint_histogram
 from igps.retrieval import chi_square, euclidean
-from igps.threads import n_cores
+from igps.signature.laplacian import laplacian
+from igps.signature.mean_value import extend
+from igps.signature.voxels import grid_axes, inside_grid, interior_samples
+from igps.spectra import eigenpairs
 
 K = 250
 SPREAD, STEAL, ATTEMPTS = 0.3, 0.05, 3
@@ -351,8 +352,8 @@ def oriented_pairs(data: Path | None) -> Figure:
 def describe_before(data: Path | None) -> dict[str, Figure]:
     """A body from its signature, one thread, over commit 8140bb3 in turn; seconds of the processor."""
     mesh = model(data, 10_000)
-    needs = igps.descriptor("multiscale").needs | igps.descriptor("rich").needs
-    signature = igps.compute_signature(mesh, needs.completed(igps.SignatureConfig()))
+    needs = igps.descriptor("multiscale").requirements | igps.descriptor("rich").requirements
+    signature = igps.compute_signature(mesh, needs.apply_to(igps.SignatureConfig()))
     script = Path(__file__).with_name("describing.py")
     one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     figures = {}
@@ -505,7 +506,7 @@ def work(data: Path | None) -> None:
     """What a `worker` does."""
     mesh = model(data, 3_600)
     descriptor = igps.descriptor("rich")
-    config = descriptor.needs.completed(igps.SignatureConfig())
+    config = descriptor.requirements.apply_to(igps.SignatureConfig())
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "body.off"
         trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
@@ -528,12 +529,12 @@ def training_step(batch: igps.SignatureBatch) -> Callable[[], object]:
     from pytorch_lightning import Trainer
     from torch.utils.data import DataLoader
 
-    from igps.nn.metric import CorrectedDistance, MetricHead
+    from igps.nn.heads.learned import BlendedDistance, MetricHead
 
     axes = [Potential(4, learnable=True), InteriorDistance(64, learnable=True)]
     embedding = igps.SpectralEmbedding(n_eigenpairs=64, n_knots=12)
     descriptor = igps.HistogramDescriptor(igps.PairHistogram(axes, embedding))
-    learner = igps.RetrievalLearner(descriptor, CorrectedDistance(MetricHead(width=16, n_hidden=32)))
+    learner = igps.RetrievalLearner(descriptor, BlendedDistance(MetricHead(width=16, n_hidden=32)))
     batch = replace(batch, labels=torch.tensor([0, 0, 1, 1]))
     loader: DataLoader[igps.SignatureBatch] = DataLoader([batch], batch_size=None)  # type: ignore[arg-type]
     learner.on_train_start = lambda: None  # type: ignore[method-assign]  # the fit of the head is no part of a step

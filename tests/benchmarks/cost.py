@@ -1,7 +1,7 @@
 """What a signature costs by vertices and eigenpairs, for `igps doctor`: `python tests/benchmarks/cost.py`.
 
 Measures the processor time and the peak memory of the signatures of generated bodies, each in a process of its own on
-one thread, fits the constants of `igps.studies.doctor`, prints them as they stand there, and tells how far off they
+one thread, fits the constants of `igps.analysis.doctor`, prints them as they stand there, and tells how far off they
 are, on the bodies they were fitted to and, fitted to the others, on each body that is left out. Run it again when the
 eigensolver or the coordinates change; --table keeps what was measured, and what is there is not measured again.
 """
@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from igps.geometry.reading import load_mesh
-from igps.geometry.signature import SignatureConfig, compute_signature
+from igps.analysis.doctor import expected_cost
+from igps.mesh.loading import load_mesh
 from igps.shapes import ArticulatedShapes
 from igps.shapes.files import off_text
-from igps.studies.doctor import expected_cost
+from igps.signature.signature import SignatureConfig, compute_signature
 
 SIZES = (1_000, 2_500, 6_000, 15_000, 40_000, 100_000)
 EIGENPAIRS = (50, 250)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from igps.geometry.signature import Samples, Signature, SignatureConfig
+from igps.signature.signature import Samples, Signature, SignatureConfig
 
 ROOMS = ("interior", "surface")
 

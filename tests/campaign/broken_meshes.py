@@ -23,13 +23,13 @@ from mutator import Broken, broken_mesh
 from outcome import Row
 from reference import confirm
 
-from igps import MeshError, MeshReading, SignatureConfig, compute_signature, load_mesh
-from igps.geometry import mending
-from igps.geometry.reading import Component
-from igps.geometry.simplification import simplify
-from igps.geometry.watertight import watertight
-from igps.linalg.lanczos import ConvergenceError
-from igps.parallel import Failed, Limits, run
+from igps import LoadOptions, MeshError, SignatureConfig, compute_signature, load_mesh
+from igps._parallel import Failed, Limits, run
+from igps.mesh import mending
+from igps.mesh.loading import Component
+from igps.mesh.simplification import simplify
+from igps.mesh.watertight import watertight
+from igps.spectra._lanczos import ConvergenceError
 
 SEED = 13
 CONFIG = SignatureConfig(n_eigenpairs=6, resolution=9, min_samples=0, n_surface_samples=40)
@@ -101,12 +101,12 @@ def judge(broken: Broken, folder: Path, number: int) -> Verdict:
     return Verdict("wrong", "; ".join(doubts), tuple(checks)) if doubts else Verdict("confirmed", "", tuple(checks))
 
 
-def _reading(number: int) -> tuple[MeshReading, bool]:
+def _reading(number: int) -> tuple[LoadOptions, bool]:
     """How the file of this number is read, and whether that may change the surface."""
     component: Component | None = "largest" if number % 7 == 1 else None
     allow_open = number % 3 == 1
     mend = ("never", "auto", "never", "auto", "never", "auto", "never", "always")[number % 8]
-    return MeshReading(mend=mend, component=component, allow_open=allow_open), mend != "never" or bool(component)  # type: ignore[arg-type]
+    return LoadOptions(mend=mend, component=component, allow_open=allow_open), mend != "never" or bool(component)  # type: ignore[arg-type]
 
 
 def _grid(number: int) -> AbstractContextManager[object]:

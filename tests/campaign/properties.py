@@ -22,10 +22,10 @@ from scipy.spatial.transform import Rotation
 
 from igps import Mesh, Signature, SignatureConfig, collate, compute_signature, descriptor
 from igps.descriptors import NAMES
-from igps.geometry.signature import Samples
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
-from igps.nn.needs import Needs
+from igps.nn.requirements import Requirements
 from igps.retrieval import Distance, cosine
+from igps.signature.signature import Samples
 
 SEED = 13
 
@@ -123,10 +123,10 @@ class Describer:
 
     def __init__(self, names: Sequence[str] = NAMES) -> None:
         self.descriptors: dict[str, Descriptor] = {name: descriptor(name) for name in names}
-        needs = Needs()
+        requirements = Requirements()
         for one in self.descriptors.values():
-            needs = needs | one.needs
-        self.config = needs.completed(CONFIG)
+            requirements = requirements | one.requirements
+        self.config = requirements.apply_to(CONFIG)
         self.signatures = [compute_signature(mesh, self.config) for mesh in bodies()]
         self.whole = [self.describe(s, m) for s, m in zip(self.signatures, bodies(), strict=True)]
         self.median = {}

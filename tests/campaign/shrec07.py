@@ -12,12 +12,12 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from igps import MeshReading, SignatureConfig, SignatureDataset, descriptor, retrieval_scores
+from igps import LoadOptions, SignatureConfig, SignatureDataset, descriptor, retrieval_scores
+from igps.analysis.comparison import pair_distances
 from igps.data.sources import labelled_meshes
 from igps.descriptors import NAMES
 from igps.nn.description import describe_usable
-from igps.nn.needs import Needs
-from igps.studies.comparison import pair_distances
+from igps.nn.requirements import Requirements
 
 EXPECTED = Path(__file__).with_name("shrec07.json")
 SCORES = ("nn", "ft", "st", "dcg")
@@ -30,11 +30,11 @@ Table = Mapping[str, Mapping[str, float]]
 def measure(folder: Path, names: list[str], cache_dir: Path | None, n_workers: int | None) -> Table:
     """The scores in percent, to a tenth, by descriptor; the paper's parameters."""
     descriptors = {name: descriptor(name) for name in names}
-    needs = Needs()
+    requirements = Requirements()
     for one in descriptors.values():
-        needs = needs | one.needs
-    config = needs.completed(SignatureConfig.paper())
-    dataset = SignatureDataset(labelled_meshes(folder), config, cache_dir, reading=MeshReading())
+        requirements = requirements | one.requirements
+    config = requirements.apply_to(SignatureConfig.paper())
+    dataset = SignatureDataset(labelled_meshes(folder), config, cache_dir, reading=LoadOptions())
     dataset.precompute(n_workers=n_workers, strict=True)
     found = {}
     for name, one in descriptors.items():

@@ -21,10 +21,10 @@ from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES, descriptor
 from igps.descriptors.d2 import D2
-from igps.geometry.signature import SignatureConfig
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.retrieval import chi_square, rerank, retrieval_scores
+from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, small_interior
 
 INTERIOR = "own_descriptors:small_interior"

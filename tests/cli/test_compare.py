@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from igps.analysis.comparison import compare
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import NAMES, descriptor
-from igps.geometry.signature import SignatureConfig
 from igps.shapes import ArticulatedShapes
-from igps.studies.comparison import compare
+from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, small_interior, write_egg
 
 KEYS = ["descriptor", "nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map"]

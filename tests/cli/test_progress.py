@@ -97,8 +97,9 @@ def test_merging_indices_shows_a_bar(
 
 
 def test_the_library_is_silent_unless_asked(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from igps.geometry.reading import load_mesh
-    from igps.studies.paper import weld_change
+    from training.studies.paper import weld_change
+
+    from igps.mesh.loading import load_mesh
 
     weld_change(load_mesh(root / "egg" / "0.off"), (0, 3), n_eigenpairs=20, resolution=10)
     assert capsys.readouterr() == ("", "")

@@ -8,9 +8,9 @@ import torch
 import trimesh
 
 from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch, collate
-from igps.geometry.mesh import Mesh
-from igps.geometry.signature import Samples, Signature, SignatureConfig
-from igps.nn.histogram import PairHistogram
+from igps.mesh.mesh import Mesh
+from igps.nn.histograms.pairs import PairHistogram
+from igps.signature.signature import Samples, Signature, SignatureConfig
 
 
 def samples(generator: np.random.Generator, n_points: int, n_eigenpairs: int) -> Samples:

@@ -13,7 +13,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from igps.data.cache import SignatureCache, default_cache_dir
-from igps.geometry.signature import Samples, Signature, SignatureConfig
+from igps.signature.signature import Samples, Signature, SignatureConfig
 
 KEY = "0123456789abcdef"
 

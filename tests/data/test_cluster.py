@@ -16,13 +16,13 @@ from typing import Any
 import pytest
 from bodies_on_disk import write_body
 
+from igps._parallel import MachineError
 from igps.cli import main
 from igps.cli.precompute import dask_executor, part_of
 from igps.data.dataset import SignatureDataset
-from igps.data.recipe import fill_elsewhere
+from igps.data.pipeline import fill_elsewhere
 from igps.data.sources import mesh_files
-from igps.geometry.signature import SignatureConfig
-from igps.parallel import MachineError
+from igps.signature.signature import SignatureConfig
 
 distributed = pytest.importorskip("distributed")
 

@@ -10,9 +10,9 @@ import trimesh
 from bodies_on_disk import write_body
 
 from igps.data.datamodule import SignatureDataModule
-from igps.geometry.mesh import MeshError
-from igps.geometry.reading import MeshReading
-from igps.geometry.signature import SignatureConfig
+from igps.mesh.loading import LoadOptions
+from igps.mesh.mesh import MeshError
+from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface_samples=20)
 
@@ -94,14 +94,14 @@ def test_meshes_are_read_as_asked(root: Path, tmp_path: Path) -> None:
     mesh.update_faces(np.arange(len(mesh.faces)) > 0)
     mesh.export(root / "class1" / "2.off")
 
-    def module(**options: MeshReading) -> SignatureDataModule:
+    def module(**options: LoadOptions) -> SignatureDataModule:
         return SignatureDataModule(
             root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path / "cache", n_workers=1, **options
         )
 
     with pytest.raises(MeshError, match=r"2\.off.*boundary edges"):
-        module(reading=MeshReading("never")).prepare_data()
-    module(reading=MeshReading("never", allow_open=True)).prepare_data()
+        module(reading=LoadOptions("never")).prepare_data()
+    module(reading=LoadOptions("never", allow_open=True)).prepare_data()
 
 
 def test_nothing_to_validate_on_is_no_loader(root: Path, tmp_path: Path) -> None:

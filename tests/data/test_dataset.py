@@ -11,13 +11,13 @@ import torch
 from bodies_on_disk import write_body
 from torch.utils.data import DataLoader
 
-import igps.data.recipe as recipe_module
+import igps.data.pipeline as recipe_module
+from igps._parallel import Failed, Limits
 from igps.data.batch import LabelledSignature, SignatureBatch, collate
 from igps.data.dataset import Failure, SignatureDataset
-from igps.geometry.mesh import MeshError
-from igps.geometry.reading import MeshReading
-from igps.geometry.signature import SignatureConfig
-from igps.parallel import Failed, Limits
+from igps.mesh.loading import LoadOptions
+from igps.mesh.mesh import MeshError
+from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
 
@@ -102,7 +102,7 @@ def test_key_covers_how_the_file_is_read(
     root: Path, tmp_path: Path, counted: list[str], option: dict[str, object]
 ) -> None:
     SignatureDataset(root, CONFIG, tmp_path / "cache")[0]
-    SignatureDataset(root, CONFIG, tmp_path / "cache", reading=MeshReading(**option))[0]  # type: ignore[arg-type]
+    SignatureDataset(root, CONFIG, tmp_path / "cache", reading=LoadOptions(**option))[0]  # type: ignore[arg-type]
     assert len(counted) == 2
 
 

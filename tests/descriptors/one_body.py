@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps.data.batch import Body, collate
-from igps.geometry.mesh import Mesh
-from igps.geometry.signature import Samples, Signature
+from igps.mesh.mesh import Mesh
+from igps.signature.signature import Samples, Signature
 
 
 def of_mesh(mesh: Mesh) -> Body:

@@ -12,6 +12,7 @@ from scipy.stats import special_ortho_group
 from sklearn.manifold import smacof
 
 from conftest import as_mesh
+from igps.descriptors._geodesics import farthest_points, geodesic_distances
 from igps.descriptors.canonical_form import (
     CanonicalForm,
     classical_scaling,
@@ -19,8 +20,7 @@ from igps.descriptors.canonical_form import (
     least_squares_scaling,
     moments,
 )
-from igps.geometry.geodesics import farthest_points, geodesic_distances
-from igps.geometry.mesh import Mesh
+from igps.mesh.mesh import Mesh
 
 
 def distance(a: np.ndarray, b: np.ndarray, descriptor: CanonicalForm) -> float:

@@ -11,8 +11,8 @@ from one_body import of_points, of_signature
 
 from igps.data.batch import Body
 from igps.descriptors.d2 import D2, _angles
-from igps.geometry.mesh import Mesh
-from igps.geometry.signature import SignatureConfig, compute_signature
+from igps.mesh.mesh import Mesh
+from igps.signature.signature import SignatureConfig, compute_signature
 
 
 @pytest.fixture(scope="module")

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 import igps
 from igps.data.batch import Body, SignatureBatch, collate
 from igps.descriptors import NAMES, descriptor
-from igps.geometry.mesh import Mesh
-from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
+from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import EmbeddedDescriptor
-from igps.nn.needs import Needs
+from igps.nn.requirements import Requirements
 from igps.retrieval import cosine
+from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 
 ROTATION = trimesh.transformations.euler_matrix(0.4, 1.1, -0.7)[:3, :3]
 CHANGES = [(name, change) for name in NAMES for change in descriptor(name).invariant_to]
@@ -65,9 +65,9 @@ def body(kind: str) -> SignatureBatch:
     }
     # Mesh turns what a reflection has turned inside out.
     mesh = Mesh(change[kind](rod()), np.asarray(unit_sphere().faces), name=kind)
-    everything = reduce(or_, (descriptor(name).needs for name in NAMES), Needs())
+    everything = reduce(or_, (descriptor(name).requirements for name in NAMES), Requirements())
     config = SignatureConfig(n_eigenpairs=250, resolution=24, min_samples=400, n_surface_samples=600)
-    return collate([compute_signature(mesh, everything.completed(config))], [mesh])
+    return collate([compute_signature(mesh, everything.apply_to(config))], [mesh])
 
 
 def signature(eigenvalues: NDArray[np.float64], interior: Samples, surface: Samples, of: Body) -> Signature:
@@ -170,20 +170,20 @@ def test_who_claims_no_pose_sees_it(name: str) -> None:
 def test_a_batch_without_what_is_needed_is_refused(name: str) -> None:
     found, whole = descriptor(name), body("rod")
     (one,) = whole.bodies()
-    if found.needs.n_eigenpairs:
-        n = found.needs.n_eigenpairs - 1
+    if found.requirements.n_eigenpairs:
+        n = found.requirements.n_eigenpairs - 1
         fewer = [Samples(of.points, of.eigenfunctions[:, :n], of.attributes) for of in (one.interior, one.surface)]
         batch = collate([signature(one.eigenvalues[:n], *fewer, one)], whole.meshes)
         with pytest.raises(ValueError, match=f"^n_eigenpairs: .* at least {n + 1}, got {n}"):
             found(batch)
-    if found.needs.attributes:
+    if found.requirements.attributes:
         bare = [Samples(of.points, of.eigenfunctions) for of in (one.interior, one.surface)]
         batch = collate([signature(one.eigenvalues, *bare, one)], whole.meshes)
         with pytest.raises(
-            ValueError, match=f"^attributes: .* needs signatures with {', '.join(found.needs.attributes)}"
+            ValueError, match=f"^attributes: .* needs signatures with {', '.join(found.requirements.attributes)}"
         ):
             found(batch)
-    if found.needs.mesh:
+    if found.requirements.mesh:
         batch = collate([signature(one.eigenvalues, one.interior, one.surface, one)])
         with pytest.raises(ValueError, match=r"^meshes: this descriptor needs the surfaces too"):
             found(batch)

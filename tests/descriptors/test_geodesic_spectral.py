@@ -9,9 +9,9 @@ from scipy.special import eval_legendre
 from scipy.stats import special_ortho_group
 
 from conftest import as_mesh
+from igps.descriptors._geodesics import geodesic_distances
 from igps.descriptors.geodesic_spectral import GeodesicSpectral, affinity_eigenvalues
-from igps.geometry.geodesics import geodesic_distances
-from igps.geometry.mesh import Mesh
+from igps.mesh.mesh import Mesh
 
 
 def sphere_eigenvalues(count: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from scipy.spatial.distance import cdist
 
 from igps.data.batch import Body
 from igps.descriptors.inner_distance import METRICATION, InnerDistance, inner_distances
-from igps.geometry.signature import Samples, Signature, SignatureConfig
+from igps.signature.signature import Samples, Signature, SignatureConfig
 
 
 def body_of(points: np.ndarray, area: float = 1.0) -> Body:

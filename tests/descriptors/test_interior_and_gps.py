@@ -9,8 +9,8 @@ import torch
 import igps
 from igps.descriptors.gps import gps
 from igps.descriptors.interior import interior
-from igps.geometry.mesh import Mesh
-from igps.geometry.signature import Signature, SignatureConfig, compute_signature
+from igps.mesh.mesh import Mesh
+from igps.signature.signature import Signature, SignatureConfig, compute_signature
 from paper_histogram import paper_histogram
 
 N_EIGENPAIRS = 60
@@ -36,6 +36,6 @@ def test_histograms_are_those_of_the_layout(signature: Signature, samples: str) 
 def test_the_paper_takes_250_eigenpairs(signature: Signature) -> None:
     for name in ("interior", "gps"):
         found = igps.descriptor(name)
-        assert found.needs.n_eigenpairs == 250
+        assert found.requirements.n_eigenpairs == 250
         with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 250, got 80"):
             found(igps.collate([signature]))

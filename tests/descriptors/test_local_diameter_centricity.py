@@ -14,7 +14,7 @@ from igps.descriptors.local_diameter_centricity import (
     centricity,
     local_diameters,
 )
-from igps.geometry.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh, MeshError
 
 
 def centres(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:

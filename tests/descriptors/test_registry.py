@@ -12,8 +12,8 @@ import torch
 import igps
 from igps.descriptors import NAMES
 from igps.descriptors.d2 import D2
-from igps.geometry.signature import SignatureConfig
-from igps.nn.needs import Needs
+from igps.nn.requirements import Requirements
+from igps.signature.signature import SignatureConfig
 
 THIRTEEN = (
     "interior", "gps", "multiscale", "rich", "pretrained", "d2", "shape_dna", "volume_shape_dna",
@@ -103,22 +103,22 @@ def test_what_is_no_descriptor_is_refused(own: str, path: str, message: str) -> 
 
 def test_what_a_descriptor_needs_is_added_or_asked_for() -> None:
     config = SignatureConfig(n_eigenpairs=50, attributes=("electrostatic_potential",))
-    assert igps.descriptor("rich").needs.completed(config) == replace(
+    assert igps.descriptor("rich").requirements.apply_to(config) == replace(
         config, attributes=("electrostatic_potential", "depth", "surface_direction")
     )
-    assert igps.descriptor("d2").needs.completed(config) == config
+    assert igps.descriptor("d2").requirements.apply_to(config) == config
     for name, least in {"pretrained": 64, "rich": 50, "interior": 250, "gps": 250, "multiscale": 250}.items():
-        needs = igps.descriptor(name).needs
+        needs = igps.descriptor(name).requirements
         assert needs.n_eigenpairs == least
-        needs.completed(SignatureConfig(n_eigenpairs=least))
+        needs.apply_to(SignatureConfig(n_eigenpairs=least))
         message = re.escape(f"n_eigenpairs: this descriptor needs signatures of at least {least}, got {least - 1}")
         with pytest.raises(ValueError, match=message):
-            needs.completed(SignatureConfig(n_eigenpairs=least - 1))
+            needs.apply_to(SignatureConfig(n_eigenpairs=least - 1))
 
 
 def test_needs_together_are_the_most_of_each() -> None:
-    one = Needs(n_eigenpairs=5, attributes=("depth",))
-    other = Needs(n_eigenpairs=3, attributes=("surface_direction", "depth"), mesh=True)
-    assert one | other == Needs(5, ("depth", "surface_direction"), mesh=True)
+    one = Requirements(n_eigenpairs=5, attributes=("depth",))
+    other = Requirements(n_eigenpairs=3, attributes=("surface_direction", "depth"), mesh=True)
+    assert one | other == Requirements(5, ("depth", "surface_direction"), mesh=True)
     with pytest.raises(ValueError, match=r"^attributes: .* needs signatures with surface_direction, depth, got \[\]"):
         other.check_config(SignatureConfig(n_eigenpairs=5))

@@ -12,8 +12,8 @@ from one_body import of_points, of_signature
 import igps
 from igps.data.batch import Body
 from igps.descriptors.shape_dna import ShapeDNA
-from igps.geometry.mesh import Mesh
-from igps.geometry.signature import SignatureConfig, compute_signature
+from igps.mesh.mesh import Mesh
+from igps.signature.signature import SignatureConfig, compute_signature
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,8 @@ from igps.descriptors.spectral_gw import (
     quantiles,
     time_weight,
 )
-from igps.geometry.mesh import Mesh
-from igps.geometry.signature import Samples, Signature, SignatureConfig, compute_signature
+from igps.mesh.mesh import Mesh
+from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 
 BOUNDS = ("trace", "signature", "pairs")
 

@@ -13,7 +13,7 @@ from scipy.special import spherical_jn
 
 from conftest import as_mesh
 from igps.descriptors.volume_shape_dna import Boundary, VolumeShapeDNA, volume_spectrum
-from igps.geometry.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh, MeshError
 
 BOUNDARIES: tuple[Boundary, ...] = ("dirichlet", "neumann")
 

@@ -15,13 +15,13 @@ from igps.gallery.calibration import (
     LEVELS,
     Calibration,
     Threshold,
+    calibration_params,
     quantiles,
     threshold_at,
     threshold_between,
-    told_of,
 )
 from igps.gallery.gallery import fingerprint
-from igps.geometry.signature import SignatureConfig
+from igps.signature.signature import SignatureConfig
 from own_descriptors import Same
 
 CONFIG = SignatureConfig(n_eigenpairs=20)
@@ -39,7 +39,7 @@ def calibration(drawn: dict[str, np.ndarray]) -> Calibration:
     return Calibration(
         "same",
         fingerprint(Same()),
-        told_of(CONFIG),
+        calibration_params(CONFIG),
         "random numbers",
         {kind: quantiles(values) for kind, values in drawn.items()},
         dict.fromkeys(KINDS, 5000),
@@ -145,7 +145,7 @@ def test_what_is_no_calibration_is_refused(text: str, tmp_path: Path) -> None:
 
 def test_the_shipped_one_is_of_the_shipped_descriptor() -> None:
     found, module = Calibration.load(), descriptor("pretrained")
-    found.check("pretrained", module, module.needs.completed(SignatureConfig()))
+    found.check("pretrained", module, module.requirements.apply_to(SignatureConfig()))
     medians = [found.distances[kind][LEVELS.index(0.5)] for kind in KINDS]
     assert medians == sorted(medians)
     for kind in KINDS:

@@ -21,14 +21,14 @@ from scipy.spatial.transform import Rotation
 from igps.cli import COMMANDS, main
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
-from igps.gallery.calibration import Calibration, told_of
+from igps.gallery.calibration import Calibration, calibration_params
 from igps.gallery.duplicates import Surfaces, _around_the_finest, compared, duplicates
 from igps.gallery.gallery import Gallery, fingerprint
-from igps.geometry.signature import SignatureConfig
+from igps.signature.signature import SignatureConfig
 from own_descriptors import Same
 
 PROJECT = Path(__file__).parents[2]
-CONFIG = descriptor("pretrained").needs.completed(SignatureConfig())
+CONFIG = descriptor("pretrained").requirements.apply_to(SignatureConfig())
 SAME = {frozenset({"lump.off", "lump.stl"}), frozenset({"bar.off", "bar.ply", "bar.obj"})}
 
 
@@ -199,7 +199,7 @@ def test_coarseness_of_a_ball_falls_with_the_area_of_its_triangles(tmp_path: Pat
 def test_poses_are_grouped_by_the_descriptor_alone(dataset: SignatureDataset) -> None:
     """A descriptor that sees no difference takes all for poses of one body; their surfaces still tell."""
     shipped = Calibration.load()
-    calibration = replace(shipped, descriptor="same", model=fingerprint(Same()), signatures=told_of(CONFIG))
+    calibration = replace(shipped, descriptor="same", model=fingerprint(Same()), signatures=calibration_params(CONFIG))
     all_of_them = duplicates(dataset, Same(), poses=True, calibration=calibration, n_workers=1)
     assert grouped(all_of_them.groups) == {frozenset(dataset.files.names)}
     assert set(all_of_them.pairs.values()) == {0.0}

@@ -15,13 +15,13 @@ import igps
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.gallery.gallery import Gallery, fingerprint
-from igps.geometry.signature import SignatureConfig
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor
-from igps.nn.fitted import WhitenedHead
-from igps.nn.levels import TwoLevelHead
+from igps.nn.heads.closed_form import WhitenedHead
+from igps.nn.heads.two_level import TwoLevelHead
 from igps.retrieval.index import VectorIndex
-from igps.retrieval.search import SearchResult
+from igps.retrieval.ranking import SearchResult
+from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, small_interior
 
 pytest.importorskip("faiss")

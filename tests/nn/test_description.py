@@ -16,9 +16,7 @@ import jobs
 from conftest import torch_threads
 from igps.data.batch import Body, SignatureBatch
 from igps.data.dataset import SignatureDataset
-from igps.geometry.attributes import AttributeName
-from igps.geometry.mesh import MeshError
-from igps.geometry.signature import SignatureConfig
+from igps.mesh.mesh import MeshError
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.description import (
     Description,
@@ -30,8 +28,10 @@ from igps.nn.description import (
 )
 from igps.nn.descriptor import BodyDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histogram import PairHistogram
-from igps.nn.needs import Needs
+from igps.nn.histograms.pairs import PairHistogram
+from igps.nn.requirements import Requirements
+from igps.signature.attributes import AttributeName
+from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface_samples=20)
 
@@ -55,7 +55,7 @@ class Area(BodyDescriptor):
     """The area as the mesh has it, and of one body none."""
 
     name = "area"
-    needs = Needs(mesh=True)
+    requirements = Requirements(mesh=True)
 
     def __init__(self, refused: str = "none", dies: bool = False) -> None:
         super().__init__()
@@ -212,9 +212,9 @@ class Counting(HistogramDescriptor):
         return super().describe(batch)
 
 
-def asked(dataset: SignatureDataset, kept_as: str | None = "one") -> tuple[list[str], Tensor]:
+def asked(dataset: SignatureDataset, cache_tag: str | None = "one") -> tuple[list[str], Tensor]:
     descriptor = Counting()
-    values, failures = describe_usable(dataset, descriptor, kept_as=kept_as, n_workers=1)
+    values, failures = describe_usable(dataset, descriptor, cache_tag=cache_tag, n_workers=1)
     assert failures == []
     return [Path(name).stem for name in descriptor.asked], values
 
@@ -244,16 +244,16 @@ def test_what_has_been_described_is_not_described_again(fresh: SignatureDataset)
 def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDataset) -> None:
     paths = fresh.files.paths
     _, values = asked(fresh)
-    assert asked(fresh, kept_as="other words")[0] == ["0", "1", "2"]
-    assert asked(fresh, kept_as=None)[0] == ["0", "1", "2"]
-    # Served by the same Signatures: another descriptor under the same words would get the histograms otherwise.
+    assert asked(fresh, cache_tag="other words")[0] == ["0", "1", "2"]
+    assert asked(fresh, cache_tag=None)[0] == ["0", "1", "2"]
+    # CacheHit by the same Signatures: another descriptor under the same words would get the histograms otherwise.
     cache = fresh.recipe.cache_dir.with_name("other")
     more = SignatureDataset(paths, replace(CONFIG, attributes=get_args(AttributeName)), cache)
     more.precompute(n_workers=1, progress=False)
     plain = SignatureDataset(paths, CONFIG, cache)
     asked(more)
     assert plain.cached_keys() == more.cached_keys()
-    assert describe_usable(plain, Area(), kept_as="one", n_workers=1)[0].shape == (3, 2)
+    assert describe_usable(plain, Area(), cache_tag="one", n_workers=1)[0].shape == (3, 2)
     with_own = SignatureDataset(paths, CONFIG, fresh.recipe.cache_dir, point_functions={"height": lambda x: x[:, 2]})
     assert asked(with_own)[0] == asked(with_own)[0] == ["0", "1", "2"]
     body = trimesh.creation.icosphere(subdivisions=2)
@@ -268,7 +268,7 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDatase
 def test_a_file_that_changes_meanwhile_is_not_mistaken_for_what_it_was(fresh: SignatureDataset) -> None:
     """Two files change places while they are described: neither description is kept as that of the other."""
     first, second = fresh.files.paths[:2]
-    _, values = asked(fresh, kept_as=None)
+    _, values = asked(fresh, cache_tag=None)
 
     class Meddling(Counting):
         def describe(self, batch: SignatureBatch) -> Tensor:
@@ -279,7 +279,7 @@ def test_a_file_that_changes_meanwhile_is_not_mistaken_for_what_it_was(fresh: Si
                 other.rename(second)
             return super().describe(batch)
 
-    describe_usable(fresh, Meddling(), kept_as="one", n_workers=1)
+    describe_usable(fresh, Meddling(), cache_tag="one", n_workers=1)
     assert torch.equal(asked(fresh)[1], values[[1, 0, 2]])
 
 
@@ -308,7 +308,7 @@ def test_where_descriptions_cannot_be_kept_they_are_made(
 
 def test_failures_are_not_kept(fresh: SignatureDataset) -> None:
     for refused in ("1.off", "2.off"):
-        values, failures = describe_usable(fresh, Area(refused=refused), kept_as="area", n_workers=1)
+        values, failures = describe_usable(fresh, Area(refused=refused), cache_tag="area", n_workers=1)
         assert len(values) + len(failures) == 3
         # What was refused at first is described the second time, and what is kept is not refused any more.
         assert [Path(failure.id).name for failure in failures] == (["1.off"] if refused == "1.off" else [])

@@ -21,9 +21,9 @@ from igps.nn.axes import (
 )
 from igps.nn.descriptor import BodyDescriptor, Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.fitted import WhitenedHead
-from igps.nn.histogram import PairHistogram
-from igps.nn.needs import Needs
+from igps.nn.heads.closed_form import WhitenedHead
+from igps.nn.histograms.pairs import PairHistogram
+from igps.nn.requirements import Requirements
 from igps.retrieval import chi_square, cosine
 
 
@@ -232,7 +232,7 @@ def test_histograms_that_draw_alike_draw_the_same_subset(batch: SignatureBatch) 
 def test_needs_are_those_of_all_histograms(batch: SignatureBatch) -> None:
     descriptor = HistogramDescriptor([[small(5, 2), oriented().histograms[0]], small(9, 1)])  # type: ignore[list-item]
     # The embedding of the oriented one takes all that there are.
-    assert descriptor.needs == Needs(9, ("surface_direction",), whole_spectrum=True)
+    assert descriptor.requirements == Requirements(9, ("surface_direction",), whole_spectrum=True)
     with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 9, got 7"):
         descriptor(batch)
     bare = replace(batch, interior=replace(batch.interior, attributes={}))
@@ -253,7 +253,7 @@ class Extent(BodyDescriptor):
     """The largest distance from the centre, in space and in the embedding; for it the mesh must be there."""
 
     name = "extent"
-    needs = Needs(n_eigenpairs=7, mesh=True)
+    requirements = Requirements(n_eigenpairs=7, mesh=True)
 
     def describe_body(self, body: Body) -> NDArray[np.float32]:
         assert body.mesh is body.surface_mesh
@@ -276,7 +276,7 @@ def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch: SignatureBat
     below = HistogramDescriptor([small(5, 2), small(3, 1)], name="two", invariant_to=("motion", "scale"))
     descriptor = EmbeddedDescriptor(below, WhitenedHead().centre(below(batch)), source="nobody")
     assert (descriptor.name, descriptor.source) == ("embedded", "nobody")
-    assert (descriptor.invariant_to, descriptor.needs) == (below.invariant_to, below.needs)
+    assert (descriptor.invariant_to, descriptor.requirements) == (below.invariant_to, below.requirements)
     embedding = descriptor(batch)
     roots = below(batch).sqrt() - below(batch).sqrt().mean(dim=0)
     torch.testing.assert_close(embedding, roots / roots.norm(dim=1, keepdim=True), atol=1e-5, rtol=0)

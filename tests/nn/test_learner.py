@@ -15,17 +15,17 @@ from torch.utils.data import DataLoader
 
 from igps.data.batch import LabelledSignature, SignatureBatch, collate
 from igps.data.datamodule import SignatureDataModule
-from igps.geometry.signature import SignatureConfig
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.description import describe
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.fitted import KernelHead, WhitenedHead
-from igps.nn.histogram import PairHistogram
+from igps.nn.heads.closed_form import KernelHead, WhitenedHead
+from igps.nn.heads.learned import BlendedDistance, MetricHead
+from igps.nn.histograms.pairs import PairHistogram
 from igps.nn.learner import RetrievalLearner
-from igps.nn.metric import CorrectedDistance, MetricHead
 from igps.retrieval import chi_square, retrieval_scores
 from igps.shapes import ArticulatedShapes
+from igps.signature.signature import SignatureConfig
 
 PROJECT = Path(__file__).parents[2]
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=12, min_samples=0, n_surface_samples=20)
@@ -70,7 +70,7 @@ def two_parts() -> HistogramDescriptor:
 
 def learner(head: torch.nn.Module | None = None) -> RetrievalLearner:
     seed_everything(3, verbose=False)
-    return RetrievalLearner(bins(), CorrectedDistance(head or MetricHead(width=8, n_hidden=16)))
+    return RetrievalLearner(bins(), BlendedDistance(head or MetricHead(width=8, n_hidden=16)))
 
 
 def state_of(model: torch.nn.Module) -> dict[str, torch.Tensor]:
@@ -150,7 +150,7 @@ def test_the_loss_uses_what_the_miner_chose(shapes: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize("validated", [True, False])
 def test_a_head_in_closed_form_follows_the_bins(shapes: Path, tmp_path: Path, validated: bool) -> None:
     seed_everything(3, verbose=False)
-    model = RetrievalLearner(two_parts(), CorrectedDistance(WhitenedHead(4), share=1.0))
+    model = RetrievalLearner(two_parts(), BlendedDistance(WhitenedHead(4), share=1.0))
     module = data(shapes)
     run = trainer(2, tmp_path)
     run.limit_val_batches = 1.0 if validated else 0
@@ -179,7 +179,7 @@ def test_any_loader_of_labelled_batches_trains(
     assert any(not torch.equal(value, before[name]) for name, value in model.descriptor.state_dict().items())
     (checkpoint,) = tmp_path.rglob("*.ckpt")
     loaded = RetrievalLearner.load_from_checkpoint(
-        checkpoint, descriptor=bins(), distance=CorrectedDistance(make())
+        checkpoint, descriptor=bins(), distance=BlendedDistance(make())
     ).eval()
     assert_same(loaded.state_dict(), model.state_dict())
     with torch.no_grad():
@@ -250,7 +250,7 @@ def test_a_checkpoint_that_names_a_foreign_class_is_refused(items: list[Labelled
     model, run = learner(), trainer(1, tmp_path)
     run.fit(model, loader(items))
     run.save_checkpoint(tmp_path / "own.ckpt")
-    made = {"descriptor": bins(), "distance": CorrectedDistance(MetricHead(width=8, n_hidden=16))}
+    made = {"descriptor": bins(), "distance": BlendedDistance(MetricHead(width=8, n_hidden=16))}
     loaded = RetrievalLearner.load_from_checkpoint(tmp_path / "own.ckpt", **made)
     assert loaded.hparams["learning_rate"] == 1e-3
     stored = torch.load(tmp_path / "own.ckpt", weights_only=True)
@@ -273,7 +273,7 @@ def test_a_checkpoint_that_names_a_foreign_class_is_refused(items: list[Labelled
 
 
 def test_a_lazy_head_has_its_size_before_the_optimiser_is_made() -> None:
-    model = RetrievalLearner(two_parts(), CorrectedDistance(MetricHead(width=4)))
+    model = RetrievalLearner(two_parts(), BlendedDistance(MetricHead(width=4)))
     assert not any(isinstance(one, torch.nn.UninitializedParameter) for one in model.parameters())
     assert model.distance.head.layers[1].in_features == 3 * 16 + 9
     assert model.distance.head.training
@@ -291,7 +291,7 @@ def test_any_module_describes(items: list[LabelledSignature], tmp_path: Path) ->
             return (self.cells + batch.interior.points.abs().mean(dim=1)[:, [0, 1, 2, 0, 1]]).softmax(dim=1)
 
     seed_everything(3, verbose=False)
-    model = RetrievalLearner(Plain(), CorrectedDistance(WhitenedHead(2)))
+    model = RetrievalLearner(Plain(), BlendedDistance(WhitenedHead(2)))
     trainer(1, tmp_path).fit(model, loader(items))
     assert model.distance.head.part_cells.tolist() == [5]
     assert (model.descriptor.cells != 0).any()
@@ -305,7 +305,7 @@ def test_several_training_loaders_are_refused(items: list[LabelledSignature], tm
 def test_without_head_the_test_scores_are_the_plain_ones(shapes: Path, tmp_path: Path) -> None:
     module = data(shapes)
     module.prepare_data()
-    model = RetrievalLearner(HistogramDescriptor(PairHistogram()), CorrectedDistance())
+    model = RetrievalLearner(HistogramDescriptor(PairHistogram()), BlendedDistance())
     (logged,) = trainer(1, tmp_path).test(model, module, verbose=False)
     part = module.dataset.subset(module.split.test)
     histograms = describe(part, HistogramDescriptor(PairHistogram()))
@@ -318,7 +318,7 @@ def test_without_head_the_test_scores_are_the_plain_ones(shapes: Path, tmp_path:
 def test_a_repeated_shape_counts_once(shapes: Path, tmp_path: Path) -> None:
     """As a distributed sampler repeats some to give every process the same number."""
     module = data(shapes)
-    model = RetrievalLearner(bins(), CorrectedDistance(), loss=torch.nn.Identity())
+    model = RetrievalLearner(bins(), BlendedDistance(), loss=torch.nn.Identity())
     (once,) = trainer(1, tmp_path).test(model, module, verbose=False)
     module.split = replace(module.split, test=(*module.split.test, *module.split.test[:2]))
     (repeated,) = trainer(1, tmp_path).test(model, module, verbose=False)

@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from igps.nn.hard_pairs import pair_histogram
-from igps.nn.oriented_pairs import oriented_pair_histogram
-from igps.nn.precision import full_precision
-from igps.nn.soft_pairs import soft_pair_histogram
-from igps.nn.view import nearest_directions
+from igps.nn._kernels.hard_pairs import pair_histogram
+from igps.nn._kernels.oriented_pairs import oriented_pair_histogram
+from igps.nn._kernels.soft_pairs import soft_pair_histogram
+from igps.nn._precision import full_precision
+from igps.nn.batch_features import nearest_directions
 
 
 def by_backend(name: str, precision: str) -> Callable[[], None]:

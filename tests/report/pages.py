@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from igps.geometry.mesh import Mesh
-from igps.geometry.signature import SignatureConfig, compute_signature
+from igps.mesh.mesh import Mesh
 from igps.report.surfaces import Surface, surface_of
+from igps.signature.signature import SignatureConfig, compute_signature
 
 EVIL = "<script>window.ran = 1</script>"
 LABELS = ("egg", "egg", "egg", EVIL, EVIL, EVIL, "alone")

@@ -24,7 +24,7 @@ from pages import (
     surfaces,
 )
 
-from igps.geometry.mesh import Mesh
+from igps.mesh.mesh import Mesh
 from igps.report.page import page_of
 from igps.report.page_data import data_of
 from igps.report.results import read_results

@@ -29,7 +29,7 @@ from pages import (
 
 from conftest import as_mesh
 from igps.cli import main
-from igps.geometry.mesh import Mesh
+from igps.mesh.mesh import Mesh
 from igps.report.page import write_page
 from igps.report.results import read_results
 from igps.shapes import ArticulatedShapes

@@ -8,8 +8,7 @@ import trimesh
 
 from conftest import as_mesh, horseshoe
 from igps.data.dataset import SignatureDataset
-from igps.geometry.signature import SignatureConfig, compute_signature
-from igps.geometry.surface import components
+from igps.mesh.surface import components
 from igps.report import surfaces
 from igps.report.surfaces import (
     clustered,
@@ -19,6 +18,7 @@ from igps.report.surfaces import (
     surface_of,
     write_surfaces,
 )
+from igps.signature.signature import SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=400)
 

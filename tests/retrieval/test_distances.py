@@ -15,7 +15,7 @@ from torch.autograd import forward_ad
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from conftest import torch_threads
-from igps import threads
+from igps import _threads as threads
 from igps.retrieval import Distance, chi_square, cosine, distances, euclidean, hellinger
 
 ALL = [chi_square, hellinger, euclidean, cosine]

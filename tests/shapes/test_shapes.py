@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
+from training.contact_sheet import contact_sheet
+from training.graded import GradedShapes
 
-from igps.report.gallery import contact_sheet
-from igps.shapes import ArticulatedShapes, GeneratedShape, GradedShapes
+from igps.shapes import ArticulatedShapes, GeneratedShape
 from igps.shapes.solids import Arc, Box, Cone, Prism, Ring, Solid
 
 pytest.importorskip("skimage", reason="the extra 'shapes' is not installed")
@@ -231,7 +232,7 @@ def test_contact_sheet_shows_mirrored_shapes_right_side_out(tmp_path: Path, monk
     assert {np.linalg.det(shapes[i].motion) > 0 for i in range(len(shapes))} == {True, False}  # some are mirrored
     drawn: list[trimesh.Trimesh] = []
     monkeypatch.setattr(
-        "igps.report.gallery.paint",
+        "training.contact_sheet.paint",
         lambda axis, vertices, faces, colour: drawn.append(trimesh.Trimesh(vertices, faces, process=False)),
     )
     contact_sheet(shapes, tmp_path / "sheet.png", n_shown=2)

@@ -17,10 +17,10 @@ from torch import Tensor
 import igps
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, split_seen, split_unseen
-from igps.descriptors.pretrained import pretrained
+from igps.descriptors.pretrained.descriptor import pretrained
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.descriptor import EmbeddedDescriptor
-from igps.nn.fitted import KernelHead, WhitenedHead
+from igps.nn.heads.closed_form import KernelHead, WhitenedHead
 from igps.nn.learner import RetrievalLearner
 from igps.retrieval import chi_square, retrieval_scores
 from igps.shapes import ArticulatedShapes
@@ -47,7 +47,7 @@ def described(root: Path, name: str) -> tuple[Tensor, Tensor, tuple[int, ...]]:
     """Flat histograms, classes, and the cells of the parts, by the library, from the cache that the scripts filled."""
     module = igps.descriptor(name)
     assert isinstance(module, igps.HistogramDescriptor)
-    config = module.needs.completed(igps.SignatureConfig())
+    config = module.requirements.apply_to(igps.SignatureConfig())
     dataset = igps.SignatureDataset(root / "meshes", config, root / "cache")
     return igps.describe(dataset, module).flatten(1), dataset.labels, module.part_cells
 
@@ -106,7 +106,7 @@ def test_a_metric_is_the_prior_of_the_heads(root: Path) -> None:
     )  # fmt: skip
     module = igps.descriptor("pretrained")
     assert isinstance(module, EmbeddedDescriptor)
-    config = module.needs.completed(igps.SignatureConfig())
+    config = module.requirements.apply_to(igps.SignatureConfig())
     dataset = igps.SignatureDataset(root / "meshes", config, root / "cache")
     vectors, histograms = igps.describe(dataset, module), igps.describe(dataset, module.descriptor).flatten(1)
     split = split_unseen(dataset.labels, 2, seed=100)
@@ -194,7 +194,7 @@ def test_ablation_prints_every_head_of_every_layout(root: Path) -> None:
         [Potential(4, soft=True), InteriorDistance(64)], igps.SpectralEmbedding(n_eigenpairs=50), n_samples=1000
     )
     module = igps.HistogramDescriptor(histogram)
-    config = igps.descriptor("rich").needs.completed(igps.SignatureConfig())
+    config = igps.descriptor("rich").requirements.apply_to(igps.SignatureConfig())
     dataset = igps.SignatureDataset(root / "meshes", config, root / "cache")
     split = split_seen(dataset.labels, 3, seed=100)
     scores = expected(igps.describe(dataset, module).flatten(1), dataset.labels, split, module.part_cells)
@@ -210,7 +210,9 @@ def test_pretraining_saves_a_metric_and_measures_it(root: Path, tmp_path: Path) 
         "--out", tmp_path / "metric.safetensors", "--figures", tmp_path / "figures",
     )  # fmt: skip
     vectors = igps.describe(
-        igps.SignatureDataset(root / "meshes", pretrained().needs.completed(igps.SignatureConfig()), root / "cache"),
+        igps.SignatureDataset(
+            root / "meshes", pretrained().requirements.apply_to(igps.SignatureConfig()), root / "cache"
+        ),
         pretrained(tmp_path / "metric.safetensors"),
     )
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-4, rtol=0)

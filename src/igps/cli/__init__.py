@@ -14,21 +14,18 @@ from typing import Any, get_args, get_origin, get_type_hints
 from docstring_parser import parse
 from jsonargparse import ArgumentParser, Namespace
 
+from igps._parallel import MachineError, is_machines, machines_words
+from igps._threads import one_thread
 from igps.cli.compare import compare
 from igps.cli.completion import completion
-from igps.cli.damage import damage
 from igps.cli.demo import demo
 from igps.cli.doctor import doctor
 from igps.cli.duplicates import distance, duplicates
-from igps.cli.figure import pose, potential, topology
 from igps.cli.index import index_add, index_build, index_merge
 from igps.cli.precompute import precompute
 from igps.cli.reading import FLAGS, Verdict
 from igps.cli.report import report
 from igps.cli.retrieval import extract, query, retrieve
-from igps.cli.robustness import robustness
-from igps.parallel import MachineError, is_machines, machines_words
-from igps.threads import one_thread
 
 Command = Callable[..., Any]
 Commands = Mapping[str, "Command | Commands"]
@@ -44,9 +41,6 @@ COMMANDS: Commands = {
     "distance": distance,
     "demo": demo,
     "compare": compare,
-    "figure": {"pose": pose, "topology": topology, "potential": potential},
-    "robustness": robustness,
-    "damage": damage,
     "doctor": doctor,
     "report": report,
     "completion": completion,
@@ -57,11 +51,16 @@ A command that prints a table returns what it tells, for `--json`.
 """
 
 
-def main() -> None:
-    """Entry point of the `igps` command: status 1 where the input is at fault, 2 where the machine is."""
+def main(commands: Commands = COMMANDS, program: str = "igps") -> None:
+    """Run the command that the words of the command line name: status 1 if the input is at fault, 2 if the machine is.
+
+    Args:
+        commands: by name; those of `igps` if not given.
+        program: what the commands follow on the command line.
+    """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
-    parser = command_parser()
-    command, options = _chosen(parser.instantiate(parser.parse_args()), COMMANDS)
+    parser = command_parser(commands, program)
+    command, options = _chosen(parser.instantiate(parser.parse_args()), commands)
     as_json = options.pop(JSON, False)
     try:
         # With --json, what a reader is told goes where progress goes
@@ -86,10 +85,10 @@ def main() -> None:
         sys.exit(status)
 
 
-def command_parser() -> ArgumentParser:
-    """The parser of all commands."""
-    parser = ArgumentParser(prog="igps", description="Volumetric shape retrieval by interior Global Point Signatures.")
-    _add_commands(parser, COMMANDS)
+def command_parser(commands: Commands = COMMANDS, program: str = "igps") -> ArgumentParser:
+    """The parser of all commands; for the arguments see `main`."""
+    parser = ArgumentParser(prog=program, description="Volumetric shape retrieval by interior Global Point Signatures.")
+    _add_commands(parser, commands)
     return parser
 
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from igps.analysis.comparison import Result
+from igps.analysis.comparison import compare as compare_descriptors
 from igps.cli.reading import signatures, write_notes, write_rows
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
@@ -19,8 +21,6 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.report.sources import write_sources
 from igps.report.tables import comparison_table
 from igps.retrieval import precision_recall_curve
-from igps.studies.comparison import Result
-from igps.studies.comparison import compare as compare_descriptors
 
 
 def compare(

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
+from igps._parallel import Limits
+from igps.analysis.doctor import Finding, examine, usable
 from igps.cli.reading import Verdict, write_rows
 from igps.data.sources import find_meshes
-from igps.geometry.mending import Mending
-from igps.geometry.reading import Component, MeshReading
-from igps.geometry.signature import SignatureConfig
-from igps.parallel import Limits
+from igps.mesh.loading import Component, LoadOptions
+from igps.mesh.mending import Mending
 from igps.report.tables import findings_table
-from igps.studies.doctor import Finding, examine, usable
+from igps.signature.signature import SignatureConfig
 
 _HEADER = (
     "file", "usable", "fault", "mended_by", "notes", "vertices", "vertices_after", "seconds", "megabytes", "error",
@@ -46,7 +46,7 @@ def doctor(
         time_limit: seconds that one file may take; no limit if not given.
         memory_limit: gigabytes of memory that one file may take; no limit if not given.
     """
-    reading = MeshReading(mend, component, allow_open)
+    reading = LoadOptions(mend, component, allow_open)
     limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
     found = examine(find_meshes(root), reading, signature, n_workers=n_workers, limits=limits)
     print(findings_table(found))

@@ -11,9 +11,9 @@ from igps.data.dataset import Failure
 from igps.data.sources import find_meshes
 from igps.descriptors import descriptor as descriptor_of
 from igps.gallery.gallery import Gallery, about_of
-from igps.geometry.reading import MeshReading
-from igps.geometry.signature import SignatureConfig
+from igps.mesh.loading import LoadOptions
 from igps.retrieval.index import check_alike
+from igps.signature.signature import SignatureConfig
 
 
 def index_build(
@@ -84,11 +84,11 @@ def as_indexed(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]:
     config = given.pop("signature", SignatureConfig())
     if given.pop("paper", False):
         config = SignatureConfig.paper()
-    asked = MeshReading(**{name: given.pop(name, default) for name, default in ours.items()})
+    asked = LoadOptions(**{name: given.pop(name, default) for name, default in ours.items()})
     if config != SignatureConfig():
-        wanted = gallery.descriptor.needs.completed(config).resolved()
+        wanted = gallery.descriptor.requirements.apply_to(config).resolved()
         check_alike(gallery.index, {"signature": about_of(wanted, asked, gallery.descriptor)["signature"]})
-    if asked != MeshReading():
+    if asked != LoadOptions():
         check_alike(gallery.index, {"reading": about_of(gallery.config, asked, gallery.descriptor)["reading"]})
     told = gallery.reading
     return {

@@ -12,12 +12,12 @@ from operator import or_
 from pathlib import Path
 from typing import Any
 
+from igps._parallel import Limits, MachineError
 from igps.cli.reading import chosen_dataset, write_rows
-from igps.data.recipe import version
+from igps.data.pipeline import version
 from igps.data.sources import MeshFiles, find_meshes
 from igps.descriptors import descriptor as descriptor_of
-from igps.nn.needs import Needs
-from igps.parallel import Limits, MachineError
+from igps.nn.requirements import Requirements
 
 # Seconds until a scheduler that does not answer is taken for missing.
 _ANSWERS_WITHIN = 15
@@ -55,7 +55,7 @@ def precompute(
     if not len(files):
         print(f"{root}: no mesh in shard {shard}")
         return
-    needs = reduce(or_, (descriptor_of(name).needs for name in descriptors or ["pretrained"]), Needs())
+    needs = reduce(or_, (descriptor_of(name).requirements for name in descriptors or ["pretrained"]), Requirements())
     dataset = chosen_dataset(files, needs, **reading)
     limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
     if cluster is None:

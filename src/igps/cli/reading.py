@@ -11,14 +11,14 @@ from operator import or_
 from pathlib import Path
 from typing import Any
 
+from igps._parallel import Limits
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import MeshFiles
-from igps.geometry.mending import Mending, mended_by
-from igps.geometry.reading import Component, MeshReading
-from igps.geometry.signature import SignatureConfig
+from igps.mesh.loading import Component, LoadOptions
+from igps.mesh.mending import Mending, mended_by
 from igps.nn.descriptor import Descriptor
-from igps.nn.needs import Needs
-from igps.parallel import Limits
+from igps.nn.requirements import Requirements
+from igps.signature.signature import SignatureConfig
 
 FLAGS = {
     "paper": "use the parameters of Rustamov 2010: as the defaults, but the grid is never refined",
@@ -70,7 +70,7 @@ def signatures(
     Raises:
         ValueError: no mesh could be used, or `paper` beside other parameters of the signatures.
     """
-    needs = reduce(or_, (one.needs for one in descriptors), Needs()) if descriptors else None
+    needs = reduce(or_, (one.requirements for one in descriptors), Requirements()) if descriptors else None
     dataset = chosen_dataset(source, needs, cache_dir, signature, paper, mend, component, allow_open)
     limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
     failures = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits)
@@ -84,7 +84,7 @@ def signatures(
 
 def chosen_dataset(
     source: Path | Sequence[Path] | MeshFiles,
-    needs: Needs | None,
+    needs: Requirements | None,
     cache_dir: Path | None = None,
     signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
     paper: bool = False,
@@ -111,8 +111,8 @@ def chosen_dataset(
         raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
     config = SignatureConfig.paper() if paper else signature
     if needs is not None:
-        config = needs.completed(config)
-    return SignatureDataset(source, config, cache_dir, reading=MeshReading(mend, component, allow_open))
+        config = needs.apply_to(config)
+    return SignatureDataset(source, config, cache_dir, reading=LoadOptions(mend, component, allow_open))
 
 
 def mending_summary(dataset: SignatureDataset, n_given: int) -> str:

@@ -23,7 +23,7 @@ def report(
     Small pictures of the meshes are kept in the folder, in surfaces.npz. Meshes that are gone by then have no picture.
 
     Args:
-        results: folder that `igps retrieve`, `igps compare` or `igps robustness` wrote (--out).
+        results: folder that `igps retrieve`, `igps compare` or `python -m training.study robustness` wrote (--out).
         out: the page; report.html in the folder of results if not given.
         meshes: the folder of the meshes, if they were moved since.
         n_workers: processes that make the pictures; all cores if not given.

@@ -12,6 +12,7 @@ import numpy as np
 from torch import Tensor
 from tqdm import tqdm
 
+from igps.analysis.comparison import pair_distances
 from igps.cli.index import as_indexed
 from igps.cli.reading import signatures, write_notes, write_rows
 from igps.cli.report import check_report
@@ -19,14 +20,13 @@ from igps.cli.report import report as write_report
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import MeshFiles, find_meshes, labelled_meshes
 from igps.descriptors import descriptor as descriptor_of
-from igps.gallery.gallery import Gallery, kept_as
+from igps.gallery.gallery import Gallery, cache_tag
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.report.sources import write_sources
 from igps.report.tables import scores_table
 from igps.retrieval import N_RERANKED, RetrievalScores, rank, rerank_found, retrieval_scores, search
 from igps.retrieval import rerank as reranked_distances
-from igps.studies.comparison import pair_distances
 
 
 def retrieve(
@@ -194,7 +194,7 @@ def _described(
     module = descriptor_of(descriptor)
     dataset, unread = signatures(source, [module], n_workers=n_workers, strict=strict, **reading)
     descriptions, undescribed = describe_usable(
-        dataset, module, kept_as=kept_as(descriptor, module), n_workers=n_workers, strict=strict, progress=True
+        dataset, module, cache_tag=cache_tag(descriptor, module), n_workers=n_workers, strict=strict, progress=True
     )
     return dataset.usable(undescribed), descriptions, [*unread, *undescribed]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from igps.geometry.mesh import Mesh
-from igps.geometry.signature import Samples, Signature
+from igps.mesh.mesh import Mesh
+from igps.signature.signature import Samples, Signature
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ class SignatureBatch:
 
     Example:
         >>> import trimesh
-        >>> from igps.geometry.signature import SignatureConfig, compute_signature
+        >>> from igps.signature.signature import SignatureConfig, compute_signature
         >>> bodies = [trimesh.creation.icosphere(subdivisions=2), trimesh.creation.capsule(height=2.0, radius=0.5)]
         >>> config = SignatureConfig(n_eigenpairs=20)
         >>> batch = collate([compute_signature(Mesh(body.vertices, body.faces), config) for body in bodies])
@@ -192,7 +192,7 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
         Bodies differ in the number of their samples, of which the shorter are padded.
 
         >>> import trimesh
-        >>> from igps.geometry.signature import SignatureConfig, compute_signature
+        >>> from igps.signature.signature import SignatureConfig, compute_signature
         >>> config, ball = SignatureConfig(n_eigenpairs=20), trimesh.creation.icosphere(subdivisions=2)
         >>> bodies = [Mesh(ball.vertices * [1, 1, height], ball.faces) for height in (1, 2)]
         >>> batch = collate([compute_signature(body, config) for body in bodies])

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from igps.geometry.signature import Samples, Signature, SignatureConfig
+from igps.signature.signature import Samples, Signature, SignatureConfig
 
 logger = logging.getLogger(__name__)
 

@@ -16,8 +16,8 @@ from igps.data.batch import LabelledSignature, SignatureBatch, collate
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import labelled_meshes
 from igps.data.splits import SplitProtocol, split_seen, split_unseen
-from igps.geometry.reading import MeshReading
-from igps.geometry.signature import Samples, SignatureConfig
+from igps.mesh.loading import LoadOptions
+from igps.signature.signature import Samples, SignatureConfig
 
 
 def has_configuration() -> bool:
@@ -73,7 +73,7 @@ class SignatureDataModule(LightningDataModule):
         shapes_per_class: int = 4,
         n_samples_in_memory: int | None = 1000,
         config: SignatureConfig | None = None,
-        reading: MeshReading | None = None,
+        reading: LoadOptions | None = None,
         cache_dir: Path | None = None,
         n_workers: int | None = None,
     ) -> None:

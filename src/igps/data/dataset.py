@@ -18,15 +18,15 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from tqdm import tqdm
 
+from igps._parallel import Failed, Limits, MachineError, run
 from igps.data.batch import LabelledSignature, SignatureBatch, collate
 from igps.data.cache import SignatureCache, default_cache_dir
-from igps.data.known_files import KnownFiles
-from igps.data.recipe import Recipe, Served, fill_elsewhere, version
+from igps.data.file_stat_cache import FileStatCache
+from igps.data.pipeline import CacheHit, SignaturePipeline, fill_elsewhere, version
 from igps.data.sources import MeshFiles, find_meshes, mesh_files
-from igps.geometry.mesh import Mesh, MeshError
-from igps.geometry.reading import MeshReading
-from igps.geometry.signature import Samples, SignatureConfig
-from igps.parallel import Failed, Limits, MachineError, run
+from igps.mesh.loading import LoadOptions
+from igps.mesh.mesh import Mesh, MeshError
+from igps.signature.signature import Samples, SignatureConfig
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
     Args:
         root_or_paths: a folder (see `find_meshes`), mesh files, or a `MeshFiles`.
         config: parameters of the Signatures; `SignatureConfig()` if None, with 250 eigenpairs. For one descriptor
-            alone, `descriptor.needs.completed(SignatureConfig())` has as many as it needs.
+            alone, `descriptor.requirements.apply_to(SignatureConfig())` has as many as it needs.
         cache_dir: where Signatures are kept; the user's cache directory if None. The key of a file covers the mesh
             file's content, how it is read, every parameter, and the algorithm's version. A Signature with more
             eigenpairs or attributes serves too.
@@ -82,7 +82,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         cache_dir: str | Path | None = None,
         *,
         labels: Sequence[str] | None = None,
-        reading: MeshReading | None = None,
+        reading: LoadOptions | None = None,
         point_functions: Mapping[str, PointFunction] | None = None,
     ) -> None:
         if isinstance(root_or_paths, MeshFiles):
@@ -93,8 +93,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
             self.files = mesh_files([root_or_paths], labels)
         else:
             self.files = mesh_files(root_or_paths, labels)
-        self._recipe = Recipe(
-            (config or SignatureConfig()).resolved(), reading or MeshReading(), Path(cache_dir or default_cache_dir())
+        self._recipe = SignaturePipeline(
+            (config or SignatureConfig()).resolved(), reading or LoadOptions(), Path(cache_dir or default_cache_dir())
         )
         self._point_functions = dict(point_functions or {})
         self.classes: tuple[str, ...] = tuple(sorted(set(self.files.labels or ())))
@@ -105,12 +105,12 @@ class SignatureDataset(Dataset[LabelledSignature]):
         return self._recipe.config
 
     @property
-    def recipe(self) -> Recipe:
+    def recipe(self) -> SignaturePipeline:
         """How a file becomes a Signature."""
         return self._recipe
 
     @property
-    def reading(self) -> MeshReading:
+    def reading(self) -> LoadOptions:
         """How the mesh files are read."""
         return self._recipe.reading
 
@@ -155,7 +155,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """
         if self._point_functions:
             return [None] * len(self)
-        ready = KnownFiles(self._recipe).ready(self.files.paths)
+        ready = FileStatCache(self._recipe).ready(self.files.paths)
         served = (self._served(i) if path not in ready else ready[path] for i, path in enumerate(self.files.paths))
         return [None if one is None else one.key for one in served]
 
@@ -165,7 +165,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def all_notes(self) -> list[tuple[str, ...]]:
         """The notes of all meshes; of files that are known from `precompute` without reading them again."""
-        ready = KnownFiles(self._recipe).ready(self.files.paths)
+        ready = FileStatCache(self._recipe).ready(self.files.paths)
         return [ready[path].notes if path in ready else self.notes(i) for i, path in enumerate(self.files.paths)]
 
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
@@ -205,10 +205,10 @@ class SignatureDataset(Dataset[LabelledSignature]):
             MachineError: the disk is full, or the like; what is done is kept.
         """
         SignatureCache(self._recipe.cache_dir).remove_abandoned()
-        known = KnownFiles(self._recipe)
+        known = FileStatCache(self._recipe)
         ready = known.ready(self.files.paths)
         missing = [i for i, path in enumerate(self.files.paths) if path not in ready]
-        fill: Callable[[Path], Served] = self._recipe.fill
+        fill: Callable[[Path], CacheHit] = self._recipe.fill
         if executor is None:
             served = {i: self._served(i) for i in missing}
             known.remember({self.files.paths[i]: one for i, one in served.items() if one is not None})
@@ -220,7 +220,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
             fill = partial(fill_elsewhere, recipe, version())
             paths = [self.files.paths[i].absolute() for i in missing]
         failures: dict[int, Failure] = {}
-        new: dict[Path, Served] = {}
+        new: dict[Path, CacheHit] = {}
         results = run(fill, paths, n_workers=n_workers, executor=executor, limits=limits)
         with (
             tqdm(total=len(self), initial=len(self) - len(missing), desc="signatures", disable=not progress) as bar,
@@ -244,13 +244,13 @@ class SignatureDataset(Dataset[LabelledSignature]):
                 logger.warning("skipped: %s", failure.error)
         return [failures[i] for i in sorted(failures)]
 
-    def _served(self, index: int) -> Served | None:
+    def _served(self, index: int) -> CacheHit | None:
         try:
             return self._recipe.served(self.files.paths[index])
         except MeshError:  # computing it will say why
             return None
 
-    def _check_visible(self, served: Served, first: bool) -> None:
+    def _check_visible(self, served: CacheHit, first: bool) -> None:
         """Raise a MachineError if what a worker put into its cache does not come to this one, asked at the first."""
         path = SignatureCache(self._recipe.cache_dir).path(served.key)
         deadline = time.monotonic() + _SHARED_WITHIN

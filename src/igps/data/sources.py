@@ -10,7 +10,7 @@ from pathlib import Path
 
 import trimesh
 
-from igps.geometry.reading import NEED_MODULES, POINT_CLOUDS
+from igps.mesh.loading import NEED_MODULES, POINT_CLOUDS
 
 LABELS_FILE = "labels.csv"
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from igps.data.batch import Body
-from igps.geometry.geodesics import farthest_points
-from igps.geometry.ordering import in_order_of_form
-from igps.geometry.simplification import simplify
+from igps.descriptors._geodesics import farthest_points
+from igps.mesh.simplification import simplify
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.needs import Needs
+from igps.nn.requirements import Requirements
 from igps.retrieval.distances import euclidean
+from igps.signature.ordering import in_order_of_form
 
 Scaling = Literal["least squares", "classical"]
 
@@ -50,7 +50,7 @@ class CanonicalForm(BodyDescriptor):
     name = "canonical_form"
     source = "Elad and Kimmel 2003"
     invariant_to = ("motion", "scale", "pose")
-    needs = Needs(mesh=True)
+    requirements = Requirements(mesh=True)
 
     scaling: Scaling = "least squares"
     max_order: int = 4

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from igps.data.batch import Body
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.needs import Needs
+from igps.nn.requirements import Requirements
 
 ShapeFunction = Literal["d2", "a3", "d1"]
 
@@ -44,7 +44,7 @@ class D2(BodyDescriptor):
     name = "d2"
     source = "Osada, Funkhouser, Chazelle and Dobkin 2002"
     invariant_to = ("motion", "scale")
-    needs = Needs()
+    requirements = Requirements()
 
     function: ShapeFunction = "d2"
     n_bins: int = 64

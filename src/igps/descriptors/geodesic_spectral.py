@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps.data.batch import Body
-from igps.geometry.geodesics import farthest_points
-from igps.geometry.ordering import in_order_of_form
-from igps.geometry.simplification import simplify
+from igps.descriptors._geodesics import farthest_points
+from igps.mesh.simplification import simplify
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.needs import Needs
+from igps.nn.requirements import Requirements
+from igps.signature.ordering import in_order_of_form
 
 
 @dataclass(eq=False, repr=False)
@@ -34,7 +34,7 @@ class GeodesicSpectral(BodyDescriptor):
     name = "geodesic_spectral"
     source = "Jain and Zhang 2007"
     invariant_to = ("motion", "scale", "pose")
-    needs = Needs(mesh=True)
+    requirements = Requirements(mesh=True)
 
     n_eigenvalues: int = 20
     n_samples: int = 200

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 
 from igps.data.batch import Body
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.needs import Needs
+from igps.nn.requirements import Requirements
 
 METRICATION = 1.0495
 """Largest ratio of the length of a path of links to the Euclidean distance of its ends, in free space."""
@@ -48,7 +48,7 @@ class InnerDistance(BodyDescriptor):
     name = "inner_distance"
     source = "Liu, Fang and Ramani 2009"
     invariant_to = ("motion", "scale", "pose")
-    needs = Needs()
+    requirements = Requirements()
 
     n_bins: int = 64
     max_distance: float = 3.0

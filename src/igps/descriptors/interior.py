@@ -5,7 +5,7 @@ from __future__ import annotations
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histogram import PairHistogram
+from igps.nn.histograms.pairs import PairHistogram
 
 INVARIANT_TO = ("motion", "scale", "pose")
 

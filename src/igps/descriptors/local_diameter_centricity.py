@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps.data.batch import Body
-from igps.geometry.extras import libigl
-from igps.geometry.geodesics import farthest_points
-from igps.geometry.mesh import Mesh, MeshError
-from igps.geometry.ordering import in_order_of_form
-from igps.geometry.sampling import surface_points
-from igps.geometry.surface import area_vectors, longest_side, unit, vertex_areas
+from igps.descriptors._geodesics import farthest_points
+from igps.mesh._extras import libigl
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.surface import area_vectors, longest_side, unit, vertex_areas
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.needs import Needs
+from igps.nn.requirements import Requirements
+from igps.signature.ordering import in_order_of_form
+from igps.signature.sampling import surface_points
 
 # Rays start so far inside the surface, in units of the bounding box, that they do not meet the face they come from.
 _LIFT = 1e-6
@@ -48,7 +48,7 @@ class LocalDiameterCentricity(BodyDescriptor):
     name = "local_diameter_centricity"
     source = "Gal, Shamir and Cohen-Or 2007"
     invariant_to = ("motion", "scale", "pose")
-    needs = Needs(mesh=True)
+    requirements = Requirements(mesh=True)
 
     n_diameter_bins: int = 32
     n_centricity_bins: int = 32

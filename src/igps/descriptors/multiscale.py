@@ -5,7 +5,7 @@ from __future__ import annotations
 from igps.nn.axes import EmbeddedPairCosines, InteriorDistance, Potential
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histogram import PairHistogram
+from igps.nn.histograms.pairs import PairHistogram
 
 # Of the bodies with the most samples so many tell the histograms well enough, and the time grows with their square.
 N_SAMPLES = 1500

@@ -13,7 +13,7 @@ from igps.descriptors.inner_distance import InnerDistance
 from igps.descriptors.interior import interior
 from igps.descriptors.local_diameter_centricity import LocalDiameterCentricity
 from igps.descriptors.multiscale import multiscale
-from igps.descriptors.pretrained import pretrained
+from igps.descriptors.pretrained.descriptor import pretrained
 from igps.descriptors.rich import rich
 from igps.descriptors.shape_dna import ShapeDNA
 from igps.descriptors.spectral_gw import SpectralGromovWasserstein
@@ -44,7 +44,7 @@ def descriptor(which: str | Descriptor) -> Descriptor:
     """A descriptor by its name, in evaluation mode; one that is given is returned as it is.
 
     Example:
-        >>> descriptor("interior").needs.n_eigenpairs
+        >>> descriptor("interior").requirements.n_eigenpairs
         250
 
     Args:

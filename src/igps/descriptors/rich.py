@@ -14,7 +14,7 @@ from igps.nn.axes import (
 )
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histogram import PairHistogram
+from igps.nn.histograms.pairs import PairHistogram
 
 # Centres of classes; those of the depth have their boundaries at 0.015, 0.03 and 0.06 of √area.
 _DEPTH = (0.0075, 0.0225, 0.0375, 0.0825)

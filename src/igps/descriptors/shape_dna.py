@@ -11,7 +11,7 @@ from torch import Tensor
 
 from igps.data.batch import Body
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.needs import Needs
+from igps.nn.requirements import Requirements
 from igps.retrieval.distances import euclidean
 
 Normalisation = Literal["area", "slope"]
@@ -48,7 +48,7 @@ class ShapeDNA(BodyDescriptor):
             raise ValueError(f"n_eigenvalues: expected at least 1, got {self.n_eigenvalues}.")
         if self.normalisation not in get_args(Normalisation):
             raise ValueError(f"normalisation: expected one of {get_args(Normalisation)}, got {self.normalisation!r}.")
-        self.needs = Needs(n_eigenpairs=self.n_eigenvalues)
+        self.requirements = Requirements(n_eigenpairs=self.n_eigenvalues)
 
     def describe_body(self, body: Body) -> NDArray[np.float32]:
         """(n_eigenvalues,) normalised eigenvalues, ascending, without unit."""

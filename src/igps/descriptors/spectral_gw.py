@@ -23,10 +23,10 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from igps.data.batch import Body
-from igps.geometry.signature import Signature
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.needs import Needs
+from igps.nn.requirements import Requirements
 from igps.retrieval.distances import euclidean
+from igps.signature.signature import Signature
 
 Where = Literal["surface", "interior"]
 Bound = Literal["trace", "signature", "pairs"]
@@ -75,7 +75,7 @@ class SpectralGromovWasserstein(BodyDescriptor):
         for name in ("n_quantiles", "n_eigenpairs"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}.")
-        self.needs = Needs(n_eigenpairs=self.n_eigenpairs)
+        self.requirements = Requirements(n_eigenpairs=self.n_eigenpairs)
 
     def describe_body(self, body: Body) -> NDArray[np.float32]:
         """(times, n_quantiles) quantile functions, with the factor c²(t); (times, 1) for the bound "trace"."""

@@ -26,12 +26,12 @@ from scipy.sparse.linalg import LinearOperator, eigsh, splu
 from torch import Tensor
 
 from igps.data.batch import Body
-from igps.geometry.mesh import Mesh, MeshError
-from igps.geometry.surface import longest_side
-from igps.geometry.voxels import grid_axes, inside_grid
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.surface import longest_side
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.needs import Needs
+from igps.nn.requirements import Requirements
 from igps.retrieval.distances import euclidean
+from igps.signature.voxels import grid_axes, inside_grid
 
 Boundary = Literal["dirichlet", "neumann"]
 
@@ -65,7 +65,7 @@ class VolumeShapeDNA(BodyDescriptor):
     name = "volume_shape_dna"
     source = "Reuter, Wolter and Peinecke 2005"
     invariant_to = ("motion", "scale")
-    needs = Needs(mesh=True)
+    requirements = Requirements(mesh=True)
 
     boundary: Boundary = "dirichlet"
     n_eigenvalues: int = 12

@@ -12,10 +12,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from igps.descriptors.pretrained import PRETRAINED
+from igps.descriptors.pretrained.descriptor import PRETRAINED
 from igps.gallery.gallery import fingerprint, name_of
-from igps.geometry.signature import SignatureConfig
 from igps.nn.descriptor import Descriptor
+from igps.signature.signature import SignatureConfig
 
 CALIBRATION = PRETRAINED.with_name("pretrained.calibration.json")
 """The calibration of `pretrained`, written by training/calibrate.py."""
@@ -133,7 +133,7 @@ class Calibration:
                 f"{self.descriptor}: its calibration was made for other parameters of it. Make one by "
                 "training/calibrate.py."
             )
-        found = told_of(config)
+        found = calibration_params(config)
         for parameter, value in self.signatures.items():
             if found[parameter] != value:
                 raise ValueError(
@@ -163,7 +163,7 @@ class Calibration:
         return one
 
 
-def told_of(config: SignatureConfig) -> dict[str, int]:
+def calibration_params(config: SignatureConfig) -> dict[str, int]:
     """What a calibration keeps of the Signatures that it was made with."""
     return {name: config.as_dict()[name] for name in _DEPENDS_ON}
 

@@ -24,21 +24,21 @@ from scipy.cluster.hierarchy import DisjointSet
 from torch import Tensor
 from tqdm import tqdm
 
+from igps._parallel import Failed, on_threads
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import MeshFiles
 from igps.descriptors import descriptor as descriptor_of
+from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
 from igps.gallery.calibration import Calibration
 from igps.gallery.gallery import Gallery
-from igps.geometry.alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
-from igps.geometry.attributes import AttributeName
-from igps.geometry.mending import Step, mended_by
-from igps.geometry.mesh import Mesh, MeshError
-from igps.geometry.signature import Signature
-from igps.geometry.surface import mean_of_neighbours
+from igps.mesh.mending import Step, mended_by
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.surface import mean_of_neighbours
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor
-from igps.parallel import Failed, on_threads
 from igps.retrieval.distances import Distance, euclidean
+from igps.signature.attributes import AttributeName
+from igps.signature.signature import Signature
 
 # Rows of distances, pairs whose surfaces are compared, samples of surfaces, and surfaces, in memory at once.
 _ROWS, _PAIRS, _SURFACES, _TRIANGLES = 256, 256, 512, 64

@@ -17,16 +17,16 @@ from tqdm import tqdm
 from igps.data.dataset import Failure, SignatureDataset
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
-from igps.geometry.mesh import MeshError
-from igps.geometry.reading import MeshReading
-from igps.geometry.signature import SignatureConfig
+from igps.mesh.loading import LoadOptions
+from igps.mesh.mesh import MeshError
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor
-from igps.nn.heads import distances_of
+from igps.nn.heads.base import distances_of
 from igps.retrieval.distances import cosine
 from igps.retrieval.index import CANDIDATES, Entry, VectorIndex, check_alike, extend_index, merge_indices, write_index
+from igps.retrieval.ranking import SearchResult
 from igps.retrieval.reranking import N_RERANKED, rerank_found
-from igps.retrieval.search import SearchResult
+from igps.signature.signature import SignatureConfig
 
 # So many descriptions are in memory at once.
 _AT_ONCE = 256
@@ -81,7 +81,7 @@ class Gallery:
             )
         parameters = {name: value for name, value in about["signature"].items() if name != "algorithm_version"}
         self.config = SignatureConfig(**{**parameters, "attributes": tuple(parameters["attributes"])})
-        self.reading = MeshReading(**about["reading"])
+        self.reading = LoadOptions(**about["reading"])
 
     @property
     def path(self) -> Path:
@@ -230,7 +230,7 @@ class Gallery:
         return cls(path, descriptor)
 
 
-def about_of(config: SignatureConfig, reading: MeshReading, descriptor: str | Descriptor) -> dict[str, Any]:
+def about_of(config: SignatureConfig, reading: LoadOptions, descriptor: str | Descriptor) -> dict[str, Any]:
     """What an index says of itself: with any other of these, distances would mean nothing."""
     signature = {**asdict(config), "algorithm_version": SignatureConfig.ALGORITHM_VERSION}
     return {
@@ -260,7 +260,7 @@ def fingerprint(descriptor: nn.Module) -> str:
     return found.hexdigest()[:32]
 
 
-def kept_as(descriptor: str | Descriptor, module: Descriptor) -> str | None:
+def cache_tag(descriptor: str | Descriptor, module: Descriptor) -> str | None:
     """All that descriptions depend on beside Signatures, in words, see `igps.nn.description.describe_usable`.
 
     Name and parameters of the descriptor, the library's code, and the versions of what that computes with.

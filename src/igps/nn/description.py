@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from igps._parallel import Failed, n_cores, on_threads, one_thread, run
 from igps.data.cache import DescriptionCache
 from igps.data.dataset import Failure, SignatureDataset
-from igps.geometry.mesh import MeshError
+from igps.mesh.mesh import MeshError
 from igps.nn.descriptor import BodyDescriptor, Descriptor
-from igps.parallel import Failed, n_cores, on_threads, one_thread, run
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ def describe(
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = trimesh.creation.icosphere(subdivisions=2).export(f"{folder}/ball.off")
         ...     _ = trimesh.creation.capsule(height=3.0, radius=0.5).export(f"{folder}/pill.off")
-        ...     config = interior.needs.completed(SignatureConfig())
+        ...     config = interior.requirements.apply_to(SignatureConfig())
         ...     histograms = describe(SignatureDataset(folder, config, f"{folder}/cache"), interior)
         >>> len(histograms), interior.distances(histograms, histograms).argmin(dim=1).tolist()
         (2, [0, 1])
@@ -85,7 +85,7 @@ def describe_usable(
     dataset: SignatureDataset,
     descriptor: Descriptor,
     *,
-    kept_as: str | None = None,
+    cache_tag: str | None = None,
     n_workers: int | None = None,
     strict: bool = False,
     progress: bool = False,
@@ -95,7 +95,7 @@ def describe_usable(
     Args:
         dataset: N meshes.
         descriptor: what describes them.
-        kept_as: all that descriptions depend on beside Signatures, in words. What has been described under the same
+        cache_tag: all that descriptions depend on beside Signatures, in words. What has been described under the same
             words is read from the cache, and all else kept there whose Signature is there before. None to describe all.
         n_workers: see `describe`.
         strict: raise at the first mesh that cannot be described.
@@ -106,7 +106,7 @@ def describe_usable(
         ValueError: the signatures lack what the descriptor needs.
     """
     _check(descriptor, dataset)
-    kept = None if kept_as is None else _Kept(dataset, kept_as)
+    kept = None if cache_tag is None else _Kept(dataset, cache_tag)
     found = {} if kept is None else kept.found()
     failures: dict[int, Failure] = {}
     missing = [i for i in range(len(dataset)) if i not in found]
@@ -137,8 +137,8 @@ def describe_usable(
 class _Kept:
     """The descriptions of a dataset that are in its cache; done without where the cache cannot be written."""
 
-    def __init__(self, dataset: SignatureDataset, kept_as: str) -> None:
-        self._dataset, self._kept_as = dataset, kept_as
+    def __init__(self, dataset: SignatureDataset, cache_tag: str) -> None:
+        self._dataset, self._kept_as = dataset, cache_tag
         self._served = dataset.cached_keys()
         self._cache = DescriptionCache(dataset.recipe.cache_dir)
         self._cache.remove_abandoned()
@@ -189,7 +189,7 @@ def describe_each(
         n_workers: processes; all cores if None.
 
     Raises:
-        MachineError: see `igps.parallel.run`.
+        MachineError: see `igps._parallel.run`.
     """
     small = [(descriptor, dataset.subset([i])) for descriptor, dataset, i in jobs]
     for number, outcome in run(_describe_one, small, n_workers=n_workers):
@@ -217,7 +217,7 @@ def _describe_one(job: tuple[Descriptor, SignatureDataset]) -> Description:
     with one_thread(), torch.inference_mode():
         batch = dataset.batch([0])
         start = time.process_time()
-        if descriptor.needs.mesh:
+        if descriptor.requirements.mesh:
             batch = dataset.batch([0], meshes=True)
         values = descriptor(batch)[0].cpu().numpy()
         seconds = time.process_time() - start
@@ -228,13 +228,13 @@ def _describe_one(job: tuple[Descriptor, SignatureDataset]) -> Description:
 
 def _check(descriptor: nn.Module, dataset: SignatureDataset) -> None:
     if isinstance(descriptor, Descriptor):
-        descriptor.needs.check_config(dataset.config)
+        descriptor.requirements.check_config(dataset.config)
 
 
 def _describe_batch(
     dataset: SignatureDataset, descriptor: nn.Module, device: torch.device, indices: Sequence[int]
 ) -> Tensor:
-    meshes = isinstance(descriptor, Descriptor) and descriptor.needs.mesh
+    meshes = isinstance(descriptor, Descriptor) and descriptor.requirements.mesh
     with torch.inference_mode():  # holds for the thread that enters it
         values: Tensor = descriptor(dataset.batch(indices, meshes).to(device)).cpu()
     return values

@@ -13,27 +13,27 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from igps._threads import one_thread
 from igps.data.batch import Body, SignatureBatch
-from igps.nn.heads import distances_of
-from igps.nn.needs import Needs
-from igps.nn.sample_histogram import SampleHistogram
-from igps.nn.view import Views
+from igps.nn.batch_features import Views
+from igps.nn.heads.base import distances_of
+from igps.nn.histograms.base import SampleHistogram
+from igps.nn.requirements import Requirements
 from igps.retrieval import chi_square
 from igps.retrieval.vectors import MOST_NUMBERS, Comparison
-from igps.threads import one_thread
 
 
 class Descriptor(nn.Module, ABC):
     """A descriptor: a module from a `SignatureBatch` to descriptions (N, ...), with the distance that compares them.
 
-    A descriptor of your own defines `describe`, its `name`, and where the defaults do not fit its `needs` and
+    A descriptor of your own defines `describe`, its `name`, and where the defaults do not fit its `requirements` and
     `distances`. All commands take it as `--descriptor package.module:NAME`, all functions as an object.
 
     Example:
         >>> import trimesh
         >>> from igps.data.batch import collate
-        >>> from igps.geometry.mesh import Mesh
-        >>> from igps.geometry.signature import SignatureConfig, compute_signature
+        >>> from igps.mesh.mesh import Mesh
+        >>> from igps.signature.signature import SignatureConfig, compute_signature
         >>> from igps.retrieval.distances import euclidean
         >>> class Spectrum(Descriptor):  # eigenvalues times the area (Reuter et al. 2006)
         ...     name = "spectrum"
@@ -54,7 +54,7 @@ class Descriptor(nn.Module, ABC):
         source: author, year.
         invariant_to: which of "motion" (rotation, translation, reflection), "scale" and "pose" (isometric bending)
             leave its descriptions as they are, but for discretisation.
-        needs: of a body; all eigenpairs, unless redefined.
+        requirements: of a body; all eigenpairs, unless redefined.
         comparison: "cosine" or "chi_square" where `distances` is that of unit vectors or of histograms, or follows it
             so closely that what is near by `distances` is among the some hundreds that are nearest by it: an index has
             short vectors of these. None for all others, which it compares one by one.
@@ -63,7 +63,7 @@ class Descriptor(nn.Module, ABC):
     name: str = "descriptor"
     source: str = ""
     invariant_to: tuple[str, ...] = ()
-    needs: Needs = Needs(whole_spectrum=True)
+    requirements: Requirements = Requirements(whole_spectrum=True)
     comparison: Comparison | None = None
 
     @abstractmethod
@@ -76,7 +76,7 @@ class Descriptor(nn.Module, ABC):
         Raises:
             ValueError: the batch lacks what the descriptor needs.
         """
-        self.needs.check(batch)
+        self.requirements.check(batch)
         with one_thread():
             return self.describe(batch)
 
@@ -91,8 +91,8 @@ class BodyDescriptor(Descriptor):
     Example:
         >>> import trimesh
         >>> from igps.data.batch import collate
-        >>> from igps.geometry.mesh import Mesh
-        >>> from igps.geometry.signature import SignatureConfig, compute_signature
+        >>> from igps.mesh.mesh import Mesh
+        >>> from igps.signature.signature import SignatureConfig, compute_signature
         >>> class Roundness(BodyDescriptor):
         ...     name = "roundness"
         ...
@@ -125,7 +125,7 @@ class HistogramDescriptor(Descriptor):
     and samples that are the same subset, are computed once for all.
 
     Example:
-        >>> from igps.nn.histogram import PairHistogram
+        >>> from igps.nn.histograms.pairs import PairHistogram
         >>> two = HistogramDescriptor([PairHistogram(), PairHistogram(["interior_distance"])], name="two")
         >>> two.part_cells, two.distances(torch.eye(3)[:1], torch.eye(3)).tolist()
         ((640, 64), [[0.0, 1.0, 1.0]])
@@ -156,7 +156,7 @@ class HistogramDescriptor(Descriptor):
         self.histograms = nn.ModuleList(histogram for group in groups for histogram in group)
         self._sizes = None if isinstance(histograms, SampleHistogram) else tuple(len(group) for group in groups)
         self.name, self.source, self.invariant_to = name, source, tuple(invariant_to)
-        self.needs = reduce(or_, (histogram.needs for group in groups for histogram in group))
+        self.requirements = reduce(or_, (histogram.requirements for group in groups for histogram in group))
 
     @property
     def parts(self) -> tuple[tuple[SampleHistogram, ...], ...]:
@@ -207,7 +207,7 @@ class EmbeddedDescriptor(Descriptor):
         self.head = head
         self.name, self.source = name, source
         self.invariant_to = descriptor.invariant_to if invariant_to is None else tuple(invariant_to)
-        self.needs = descriptor.needs
+        self.requirements = descriptor.requirements
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, D) embeddings of length 1."""

@@ -12,14 +12,14 @@ from pytorch_lightning.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from igps._threads import one_thread
 from igps.data.batch import SignatureBatch
 from igps.data.datamodule import has_configuration
 from igps.nn.description import evaluation_mode
 from igps.nn.descriptor import HistogramDescriptor
-from igps.nn.heads import Head
-from igps.nn.metric import CorrectedDistance
+from igps.nn.heads.base import Head
+from igps.nn.heads.learned import BlendedDistance
 from igps.retrieval.metric import RetrievalScoresMetric
-from igps.threads import one_thread
 
 # Packages whose classes a checkpoint may name without an explicit word.
 _TRUSTED = ("igps", "torch", "pytorch_lightning", "pytorch_metric_learning")
@@ -39,8 +39,8 @@ class RetrievalLearner(LightningModule):
         >>> import tempfile
         >>> from pytorch_lightning import Trainer
         >>> from igps import ArticulatedShapes, HistogramDescriptor, PairHistogram, SignatureConfig, SignatureDataModule
-        >>> from igps.nn.metric import CorrectedDistance, MetricHead
-        >>> learner = RetrievalLearner(HistogramDescriptor(PairHistogram()), CorrectedDistance(MetricHead()))
+        >>> from igps.nn.heads.learned import BlendedDistance, MetricHead
+        >>> learner = RetrievalLearner(HistogramDescriptor(PairHistogram()), BlendedDistance(MetricHead()))
         >>> trainer = Trainer(
         ...     max_epochs=1, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
         ...     enable_model_summary=False,
@@ -71,7 +71,7 @@ class RetrievalLearner(LightningModule):
     def __init__(
         self,
         descriptor: nn.Module,
-        distance: CorrectedDistance,
+        distance: BlendedDistance,
         loss: nn.Module | None = None,
         learning_rate: float = 1e-3,
         bin_rate: float = 1e-2,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.geometry.surface import area_vectors, unit
+from igps.mesh.surface import area_vectors, unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

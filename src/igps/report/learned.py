@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
-from igps.nn.centres import OrderedCentres
+from igps.nn.axes.centres import OrderedCentres
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding, spectral_weights
-from igps.nn.histogram import PairHistogram
+from igps.nn.histograms.pairs import PairHistogram
 from igps.report.drawing import new_figure
 
 

@@ -10,7 +10,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from igps.geometry.disturbances import DISTURBANCES
 from igps.report.confusions import N_WORST
 from igps.report.page_data import data_of, letters
 from igps.report.results import Results
@@ -90,7 +89,7 @@ def page_of(results: Results, surfaces: Mapping[str, Surface]) -> str:
         n_worst=N_WORST,
         plot=(_PLOT_WIDTH, _PLOT_HEIGHT),
         config=_flat(results.config),
-        disturbances={name: one.description for name, one in DISTURBANCES.items()},
+        disturbances=(results.robustness or {}).get("descriptions", {}),
         n_repaired=sum(bool(shape["notes"]) for shape in data["shapes"]),
     )
 

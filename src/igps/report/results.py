@@ -109,7 +109,7 @@ def read_results(folder: Path) -> Results:
     if not written:
         raise FileNotFoundError(
             f"{folder}: no results found. Expected {', '.join(readers)}, which `igps retrieve`, `igps compare` and "
-            "`igps robustness` write with --out."
+            "`python -m training.study robustness` write with --out."
         )
     return readers[max(written, key=lambda name: written[name])](folder)
 

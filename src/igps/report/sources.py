@@ -9,8 +9,8 @@ from typing import Any
 
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import MeshFiles
-from igps.geometry.reading import MeshReading
-from igps.geometry.signature import SignatureConfig
+from igps.mesh.loading import LoadOptions
+from igps.signature.signature import SignatureConfig
 
 MESHES_FILE = "meshes.json"
 _FORMAT = "igps-meshes-1"
@@ -55,7 +55,7 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
             MeshFiles(paths, names, None),
             SignatureConfig(**signature),
             Path(summary["cache_dir"]),
-            reading=MeshReading(**summary["reading"]),
+            reading=LoadOptions(**summary["reading"]),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the format {_FORMAT} ({error}). Run the command again.") from error

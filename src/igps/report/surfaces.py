@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
+from igps._parallel import Failed, run
 from igps.data.dataset import SignatureDataset
-from igps.data.recipe import Recipe
-from igps.geometry.mesh import Mesh, MeshError
-from igps.geometry.signature import Signature
-from igps.geometry.simplification import simplify
-from igps.geometry.surface import compact, longest_side
-from igps.parallel import Failed, run
+from igps.data.pipeline import SignaturePipeline
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.simplification import simplify
+from igps.mesh.surface import compact, longest_side
+from igps.signature.signature import Signature
 
 logger = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | Non
     return found
 
 
-def surface_of_file(recipe: Recipe, path: Path, n_vertices: int) -> Surface:
+def surface_of_file(recipe: SignaturePipeline, path: Path, n_vertices: int) -> Surface:
     """The surface of a mesh file.
 
     Raises:
@@ -198,7 +198,7 @@ def _read(path: Path) -> Iterator[tuple[str, Surface]]:
         start_v, start_f = start_v + n_vertices, start_f + n_faces
 
 
-def _is_current(recipe: Recipe, path: Path, kept: Surface | None) -> bool:
+def _is_current(recipe: SignaturePipeline, path: Path, kept: Surface | None) -> bool:
     """Whether the file is gone, or the one that the surface was made from."""
     if kept is None:
         return False

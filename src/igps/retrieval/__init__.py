@@ -1,6 +1,7 @@
 """Tensors in, numbers out: distances between descriptors, rankings and retrieval scores."""
 
 from igps.retrieval.distances import Distance, chi_square, cosine, euclidean, hellinger
+from igps.retrieval.ranking import SearchResult, rank, search
 from igps.retrieval.reranking import N_RERANKED, rerank, rerank_found
 from igps.retrieval.scores import (
     Labels,
@@ -9,7 +10,6 @@ from igps.retrieval.scores import (
     precision_recall_curve,
     retrieval_scores,
 )
-from igps.retrieval.search import SearchResult, rank, search
 
 __all__ = [
     "N_RERANKED",

@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.compiled import SUMS, compiled
+from igps._compiled import SUMS, compiled
 
 Real = TypeVar("Real", np.float32, np.float64)
 

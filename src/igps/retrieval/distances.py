@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 from torch.autograd.function import once_differentiable
 
-from igps.compiled import is_available
-from igps.threads import Team
+from igps._compiled import is_available
+from igps._threads import Team
 
 Distance = Callable[[Tensor, Tensor], Tensor]
 """A distance function: queries (Q, ...) and gallery (G, ...) to distances (Q, G) ≥ 0, smaller is closer."""

@@ -37,7 +37,7 @@ from igps.retrieval.index_part import (
     flush,
     sizes,
 )
-from igps.retrieval.search import SearchResult, rank
+from igps.retrieval.ranking import SearchResult, rank
 from igps.retrieval.vectors import Comparison, VectorMap
 
 __all__ = ["CANDIDATES", "Entry", "VectorIndex"]

@@ -9,7 +9,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from igps.retrieval.distances import Distance
-from igps.retrieval.search import SearchResult, rank
+from igps.retrieval.ranking import SearchResult, rank
 
 N_RERANKED = 200
 """Nearest entries whose neighbourhoods among each other put those of a single query in order."""

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from igps.retrieval.search import rank
+from igps.retrieval.ranking import rank
 
 Labels = Tensor | Sequence[Any]
 """Class labels: an integer tensor (N,), or a sequence of N integers or strings."""

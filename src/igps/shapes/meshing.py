@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from igps.geometry import surface
+from igps.mesh import surface
 from igps.shapes.skeleton import Placed
 from igps.shapes.solids import Array
 

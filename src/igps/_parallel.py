@@ -1,0 +1,368 @@
+"""Many jobs at once: on processes, where one that fails or kills its process costs no other its result; on threads.
+
+Each worker is a `ProcessPoolExecutor` of one process: where that process dies, the job it had is known by name, and a
+job that takes too long is ended by ending its process. Any other `concurrent.futures.Executor`, such as that of a
+cluster, may do the work instead.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import multiprocessing
+import os
+import queue
+import signal
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from typing import Any, Generic, TypeVar
+
+from igps._threads import n_cores, one_thread, stay_on_one_thread
+from igps._threads import n_threads as available_threads
+
+__all__ = [
+    "Failed",
+    "Limits",
+    "MachineError",
+    "is_machines",
+    "machines_words",
+    "n_cores",
+    "on_threads",
+    "one_thread",
+    "run",
+]
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+# A worker has one thread for linear algebra, or n workers on n cores run n² threads. And glibc's allocator keeps what
+# is freed for the next body: pages that are given back come again one by one, each cleared by the system.
+_WORKERS_ENVIRONMENT = {
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+    "MALLOC_MMAP_THRESHOLD_": str(2**26),
+    "MALLOC_TRIM_THRESHOLD_": str(2**28),
+}
+# A job whose process died is tried once more: an administrator or another program may have been the cause.
+_MOST_DEATHS = 2
+_KILLED = (
+    "the process that worked on it was killed, twice. It may need more memory than there is: use fewer workers, or set "
+    "a memory limit to be told."
+)
+_KILLED_ELSEWHERE = (
+    "the workers that had it were killed, one after the other. It may need more memory than they have: start them with "
+    "more."
+)
+# Enough for the workers of a large cluster, few enough for the memory of who asks.
+_MOST_SUBMITTED = 10_000
+_MACHINES = frozenset(
+    getattr(errno, name, 0)
+    for name in ("ENOSPC", "EDQUOT", "EFBIG", "EIO", "EROFS", "EACCES", "EPERM", "EMFILE", "ENFILE", "ENOMEM")
+)
+_FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
+# A process that is killed while it starts is started once more: an administrator may have been the cause.
+_MOST_STARTS = 2
+
+
+class MachineError(RuntimeError):
+    """The machine, not a job, is at fault: a full disk, no memory, no process. What is done so far is kept."""
+
+
+@dataclass(frozen=True)
+class Failed:
+    """Why a job has no result, in one sentence."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one job may use.
+
+    Args:
+        seconds: of wall time; None for no limit.
+        memory: bytes of data of its process; None for no limit. Linux alone enforces it.
+    """
+
+    seconds: float | None = None
+    memory: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("time_limit", self.seconds), ("memory_limit", self.memory)):
+            if value is not None and not value > 0:
+                raise ValueError(f"{name}: expected None or a positive number, got {value}.")
+
+
+def run(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    *,
+    n_workers: int | None = None,
+    executor: Executor | None = None,
+    limits: Limits | None = None,
+) -> Generator[tuple[int, Result | Failed], None, None]:
+    """The result of every job with its number, as they come.
+
+    Args:
+        function: picklable; the exceptions that it raises, but for those of the machine, are failures of the job.
+        jobs: picklable.
+        n_workers: processes; as many as cores if None. One works in this process, unless there are limits.
+        executor: works in place of these processes.
+        limits: of each job, in processes of ours.
+
+    Raises:
+        MachineError: the disk is full, memory runs out without a limit, or no process can be started.
+    """
+    limits = limits or Limits()
+    limited = limits != Limits()
+    if executor is not None:
+        if limited:
+            raise ValueError("limits: expected none beside an executor, which has its own.")
+        yield from _by_executor(executor, function, jobs)
+        return
+    n_workers = min(n_workers or n_cores(), len(jobs))
+    if n_workers > 1 or (limited and jobs):
+        yield from _by_workers(function, jobs, n_workers, limits)
+        return
+    for number, job in enumerate(jobs):
+        yield number, _attempt(lambda job=job: function(job), limits)  # type: ignore[misc]
+
+
+def on_threads(
+    function: Callable[[Job], Result], jobs: Sequence[Job], n_threads: int | None = None
+) -> Iterator[Result]:
+    """The result of every job in order, each job on one thread of its own, as PyTorch lets many compute at once.
+
+    Splitting each small product over all cores instead makes every one of them wait for the slowest core, which on a
+    machine with other work to do costs many times the product itself.
+
+    Args:
+        function: may run beside itself.
+        jobs: by which it is called.
+        n_threads: as many as `igps._threads.n_threads` if None.
+    """
+    n_threads = min(available_threads() if n_threads is None else n_threads, len(jobs))
+    alone = partial(_alone, function)
+    if n_threads <= 1:
+        yield from map(alone, jobs)
+        return
+    with ThreadPoolExecutor(n_threads, initializer=stay_on_one_thread) as pool:
+        yield from pool.map(alone, jobs)
+
+
+def is_machines(error: OSError) -> bool:
+    """Whether an error tells of the machine and not of a file: no room, no right to write, a broken disk."""
+    return error.errno in _MACHINES
+
+
+def machines_words(error: OSError) -> str:
+    """What to do about it."""
+    remedy = "Choose a folder that can be written" if error.errno in _FORBIDDEN else "Make room"
+    return f"{error}. {remedy} and run again: what is done is kept."
+
+
+def _alone(function: Callable[[Job], Result], job: Job) -> Result:
+    with one_thread():
+        return function(job)
+
+
+def _attempt(result: Callable[[], Result], limits: Limits) -> Result | Failed:
+    """The result; the job's failure in words, where the machine is not at fault."""
+    try:
+        return result()
+    except (BrokenExecutor, CancelledError):
+        raise
+    except MachineError:
+        raise
+    except MemoryError as error:
+        if limits.memory is not None:
+            return Failed(f"it needs more than the memory_limit of {limits.memory / 2**20:.0f} MiB.")
+        raise MachineError("out of memory. Use fewer workers or set a memory limit; what is done is kept.") from error
+    except OSError as error:
+        if is_machines(error):
+            raise MachineError(machines_words(error)) from error
+        return Failed(_sentence(error))
+    except Exception as error:
+        # The exception of Dask, where so many workers were lost with a job that it is not given to another.
+        return Failed(_KILLED_ELSEWHERE if type(error).__name__ == "KilledWorker" else _sentence(error))
+
+
+def _sentence(error: Exception) -> str:
+    return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+
+
+def _by_executor(
+    executor: Executor, function: Callable[[Job], Result], jobs: Sequence[Job]
+) -> Generator[tuple[int, Result | Failed], None, None]:
+    done: queue.SimpleQueue[Future[Result]] = queue.SimpleQueue()
+    numbers: dict[Future[Result], int] = {}
+    waiting = enumerate(jobs)
+
+    def submit(n_more: int) -> None:
+        for number, job in islice(waiting, n_more):
+            try:
+                future = executor.submit(function, job)
+            except RuntimeError as error:  # it takes no work any more
+                raise MachineError(f"the executor broke ({error}). Run again: what is done is kept.") from error
+            numbers[future] = number
+            future.add_done_callback(done.put)
+
+    try:
+        submit(_MOST_SUBMITTED)
+        while numbers:
+            future = done.get()
+            number = numbers.pop(future)
+            try:
+                yield number, _attempt(future.result, Limits())
+            except CancelledError as error:
+                raise MachineError("the executor gave the work up. Run again: what is done is kept.") from error
+            except BrokenExecutor as error:
+                raise MachineError(f"the executor broke ({error}). Run again: what is done is kept.") from error
+            submit(1)
+    finally:
+        for future in numbers:
+            future.cancel()
+
+
+class _Worker(Generic[Job, Result]):
+    """A process, and the job it has."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._pool: ProcessPoolExecutor | None = None
+        self._pid = 0
+        self.number = -1
+        self.future: Future[Result] | None = None
+        self.deadline = float("inf")
+
+    def give(self, number: int, function: Callable[[Job], Result], job: Job) -> None:
+        try:
+            self.future = self.started().submit(function, job)
+        except BrokenExecutor:  # killed while it waited for a job
+            self.end()
+            self.future = self.started().submit(function, job)
+        self.number = number
+        self.deadline = time.monotonic() + (self._limits.seconds or float("inf"))
+
+    def started(self) -> ProcessPoolExecutor:
+        """The process, started if there is none."""
+        context = multiprocessing.get_context("spawn")
+        starts = 0
+        while self._pool is None:
+            starts += 1
+            with _workers_environment():
+                pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(self._limits.memory,))
+                try:
+                    self._pid = pool.submit(os.getpid).result()
+                    self._pool = pool
+                except BrokenExecutor as error:
+                    pool.shutdown()
+                    if starts == _MOST_STARTS:
+                        raise MachineError(
+                            "no worker process could be started. A script that computes on several processes must call "
+                            "it under `if __name__ == '__main__':`; otherwise look for a want of memory, or pass "
+                            "n_workers=1. What is done is kept."
+                        ) from error
+        return self._pool
+
+    def end(self, kill: bool = False) -> None:
+        """End the process, in the midst of its work if need be."""
+        if self._pool is None:
+            return
+        if kill:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._pid, getattr(signal, "SIGKILL", signal.SIGTERM))
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._pool, self.future, self.deadline = None, None, float("inf")
+
+
+def _by_workers(
+    function: Callable[[Job], Result], jobs: Sequence[Job], n_workers: int, limits: Limits
+) -> Generator[tuple[int, Result | Failed], None, None]:
+    waiting = list(range(len(jobs)))[::-1]
+    deaths = [0] * len(jobs)
+    workers: list[_Worker[Job, Result]] = [_Worker(limits) for _ in range(n_workers)]
+    finished = False
+    try:
+        # All at once: a process takes seconds to import what it needs.
+        with _workers_environment(), ThreadPoolExecutor(n_workers) as starters:
+            list(starters.map(lambda worker: worker.started(), workers))
+        while True:
+            for worker in workers:
+                if worker.future is None and waiting:
+                    number = waiting.pop()
+                    worker.give(number, function, jobs[number])
+            busy = {worker.future: worker for worker in workers if worker.future is not None}
+            if not busy:
+                finished = True
+                return
+            soonest = min(worker.deadline for worker in busy.values())
+            timeout = None if soonest == float("inf") else max(0.0, soonest - time.monotonic())
+            done, _ = wait(busy, timeout=timeout, return_when=FIRST_COMPLETED)
+            for future in done:
+                worker = busy[future]
+                worker.future = None
+                try:
+                    yield worker.number, _attempt(future.result, limits)
+                except BrokenExecutor:
+                    worker.end()
+                    deaths[worker.number] += 1
+                    if deaths[worker.number] < _MOST_DEATHS:
+                        waiting.insert(0, worker.number)
+                    else:
+                        yield worker.number, Failed(_KILLED)
+            for worker in busy.values():
+                if worker.future is not None and time.monotonic() >= worker.deadline:
+                    worker.end(kill=True)
+                    yield worker.number, Failed(f"it took longer than the time_limit of {limits.seconds:g} s.")
+    finally:
+        for worker in workers:
+            worker.end(kill=not finished)
+
+
+@contextlib.contextmanager
+def _workers_environment() -> Generator[None, None, None]:
+    """The environment of the processes that are started meanwhile.
+
+    The libraries read it when they are loaded, which in a spawned process is before any initialiser runs.
+    """
+    before: dict[str, Any] = {name: os.environ.get(name) for name in _WORKERS_ENVIRONMENT}
+    os.environ.update(_WORKERS_ENVIRONMENT)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _begin(memory: int | None) -> None:
+    """What a worker does first: bound its memory, and watch its parent, without which it would wait for ever."""
+    if memory is not None:
+        with contextlib.suppress(ImportError, ValueError):
+            import resource
+
+            resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

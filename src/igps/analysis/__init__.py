@@ -1,0 +1,1 @@
+"""Answers about a collection, as functions that return data."""

@@ -1,0 +1,5 @@
+"""The descriptor `pretrained`: its histograms, and the metric that was fitted to generated shapes."""
+
+from igps.descriptors.pretrained.descriptor import pretrained
+
+__all__ = ["pretrained"]

@@ -1,0 +1,1 @@
+"""A file becomes bodies: reading, mending, watertight surfaces, denoising, simplification. Deterministic, float64."""

@@ -1,0 +1,90 @@
+"""A grid around a surface, and the exact distances of its points to the triangles. Lengths are in cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.mesh._extras import libigl
+from igps.mesh.surface import face_areas
+
+# How far from the surface exact distances are needed: marching cubes ask for both ends of the edges that cross it.
+BAND = 1.1
+# Cells around the surface's bounding box.
+MARGIN = 3
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Grid points at whole numbers of cells from the origin."""
+
+    origin: NDArray[np.float64]
+    cell: float
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def around(cls, vertices: NDArray[np.float64], faces: NDArray[np.int64], resolution: int, spacing: float) -> Grid:
+        low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
+        sides = high - low
+        longest = float(sides.max())
+        area = float(face_areas(vertices, faces).sum())
+        # As many cells as the cube, and about as many on the surface as on that of the cube.
+        by_volume = float(np.prod(np.maximum(sides, longest / 1000)) ** (1 / 3)) / resolution
+        by_area = np.sqrt(area / (6 * resolution**2))
+        cell = float(np.clip(max(by_volume, by_area), longest / (2 * resolution), longest / (0.8 * resolution)))
+        cell = max(cell, spacing)
+        counts = np.ceil(sides / cell).astype(int) + 1 + 2 * MARGIN
+        # The body in the middle, so that moving it moves the grid.
+        origin = (low + high) / 2 - (counts - 1) / 2 * cell
+        return cls(origin, cell, (int(counts[0]), int(counts[1]), int(counts[2])))
+
+    def to_cells(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return (points - self.origin) / self.cell
+
+    def from_cells(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return points * self.cell + self.origin
+
+
+def rounded(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices put together within quarters of a cell, and the different triangles that remain."""
+    lattice = np.round(vertices * 4).astype(np.int64)
+    _, index, count = np.unique(lattice, axis=0, return_inverse=True, return_counts=True)
+    index = index.ravel()
+    # The mean of those put together: no vertex of the lattice, which would shift the surface.
+    mean = np.stack([np.bincount(index, weights=vertices[:, i]) for i in range(3)], axis=1) / count[:, None]
+    faces = np.sort(index[faces], axis=1)
+    faces = np.unique(faces[(np.diff(faces, axis=1) > 0).all(axis=1)], axis=0)
+    return mean, faces
+
+
+def distances(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], shape: tuple[int, int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Distance of the grid points in the band around the surface, infinite elsewhere, and the nearest points.
+
+    Blocks of eight cells are halved where the surface may be near.
+
+    Returns:
+        (X, Y, Z) distances and (X, Y, Z, 3) nearest points, cells.
+    """
+    igl = libigl()
+    vertices, faces = np.asfortranarray(vertices), np.asfortranarray(faces)
+    size = 8
+    blocks = np.stack(np.meshgrid(*(np.arange(0, n, size) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    while size > 1:
+        centre = np.asfortranarray(blocks + (size - 1) / 2)
+        squared, _, _ = igl.point_mesh_squared_distance(centre, vertices, faces)
+        near = np.sqrt(squared) <= (size - 1) / 2 * np.sqrt(3) + BAND
+        size //= 2
+        corner = size * np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        blocks = (blocks[near][:, None] + corner).reshape(-1, 3)
+        blocks = blocks[(blocks < shape).all(axis=1)]
+    squared, _, point = igl.point_mesh_squared_distance(np.asfortranarray(blocks.astype(np.float64)), vertices, faces)
+    distance = np.full(shape, np.inf, dtype=np.float32)
+    nearest = np.zeros((*shape, 3), dtype=np.float32)
+    inside = squared <= BAND**2
+    at = tuple(blocks[inside].T)
+    distance[at], nearest[at] = np.sqrt(squared[inside]), point[inside]
+    return distance, nearest

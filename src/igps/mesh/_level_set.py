@@ -1,0 +1,138 @@
+"""A function on a grid that is negative in one body, and zero on its surface. Lengths are in cells."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+
+from igps.mesh._distance_grid import BAND
+from igps.mesh._outside import WALL, OrientedSurface
+
+# Half the thickness that a sheet gets. More than half a cell, because a sheet may lie in the middle between two layers.
+_HALF_SHEET = 0.55
+# No value is closer to zero: marching cubes would make triangles without area.
+LEAST = 0.02
+# Radius of the bars between pieces.
+_BAR = 0.9
+# Pieces of less than this share of the volume are specks.
+_SPECK_VOLUME = 2e-3
+
+
+def level_set(
+    distance: NDArray[np.float32], nearest: NDArray[np.float32], outside: NDArray[np.bool_], surface: OrientedSurface
+) -> NDArray[np.float32]:
+    """The signed distance of solids and, for what has no inside, the distance to a sheet of a cell's thickness."""
+    from skimage.segmentation import watershed
+
+    band = np.isfinite(distance)
+    wall = distance <= WALL
+    at = np.nonzero(band)
+    foot, away = nearest[at], distance[at]
+    way = (np.stack(at, axis=1) - foot) / np.maximum(away, 1e-6)[:, None]
+    # A point of the wall belongs to the side that lies beyond it, away from the surface; where that is all wall, to
+    # that of its deepest neighbours.
+    markers = np.where(wall, 0, np.where(outside, 1, 2)).astype(np.int32)
+    doubtful = np.nonzero(away <= WALL)[0]
+    for step in (0.75, 1.0, 1.25):
+        beyond = _at(markers, foot[doubtful] + step * way[doubtful])
+        sided = doubtful[beyond > 0]
+        markers[tuple(index[sided] for index in at)] = beyond[beyond > 0]
+        doubtful = doubtful[beyond == 0]
+    markers = watershed(-np.where(band, distance, BAND), markers, connectivity=3)
+    inside = markers == 2
+    solid = _has_inside(inside, at, foot, way)
+    if surface.is_nearly_closed and not solid.all():
+        # Walls too thin for the flood.
+        thin = np.stack([index[~solid] for index in at], axis=1)
+        inside[tuple(thin[surface.winding(thin) > 0.5].T)] = True
+        solid = _has_inside(inside, at, foot, way)
+    field = np.where(inside, -1, 1) * np.minimum(distance, np.float32(BAND))
+    sheet = tuple(index[~solid] for index in at)
+    field[sheet] = distance[sheet] - _HALF_SHEET
+    field = np.where(np.abs(field) < LEAST, np.where(field < 0, -LEAST, LEAST), field)
+    return without_bubbles(field.astype(np.float32))
+
+
+def _has_inside(
+    inside: NDArray[np.bool_],
+    at: tuple[NDArray[np.int64], ...],
+    foot: NDArray[np.floating[Any]],
+    way: NDArray[np.floating[Any]],
+) -> NDArray[np.bool_]:
+    """Whether a point is inside or sees an inside when it looks through the surface where that is nearest."""
+    solid = inside[at]
+    for step in (0.25, 0.5, 0.75, 1.0):
+        solid |= _at(inside, foot - step * way)
+    return np.asarray(solid)
+
+
+def _at(values: NDArray[Any], points: NDArray[np.floating[Any]]) -> NDArray[Any]:
+    """The values at the grid points nearest to `points`."""
+    index = np.clip(np.round(points).astype(np.int64), 0, np.array(values.shape) - 1)
+    return np.asarray(values[tuple(index.T)])
+
+
+def without_bubbles(field: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What the outside does not reach is filled."""
+    label, count = ndimage.label(field > 0)
+    if count > 1:
+        field[(field > 0) & (label != label[0, 0, 0])] = -LEAST
+    return field
+
+
+def joined(field: NDArray[np.float32], notes: list[str]) -> NDArray[np.float32]:
+    """The field of one piece: small ones dropped, the others joined by bars where the gaps are narrowest."""
+    label, count = ndimage.label(field < 0)
+    if count < 2:
+        return field
+    volume = np.bincount(label.ravel(), minlength=count + 1)
+    volume[0] = 0
+    small = volume < _SPECK_VOLUME * volume.sum()
+    dropped = np.nonzero(small)[0][1:]
+    if len(dropped) and volume[dropped].sum() < 0.05 * volume.sum():
+        gone = np.isin(label, dropped)
+        field[gone] = -field[gone]
+        label[gone] = 0
+    pieces = np.unique(label)[1:]
+    if len(pieces) < 2:
+        return field
+    away, index = ndimage.distance_transform_edt(label == 0, return_indices=True)
+    owner = label[tuple(index)]
+    first, second, gap, here, there = [], [], [], [], []
+    positions = np.arange(field.size).reshape(field.shape)
+    for axis in range(3):
+        a = tuple(slice(None, -1) if i == axis else slice(None) for i in range(3))
+        b = tuple(slice(1, None) if i == axis else slice(None) for i in range(3))
+        differ = owner[a] != owner[b]
+        first.append(owner[a][differ])
+        second.append(owner[b][differ])
+        gap.append((away[a] + away[b])[differ] + 1)
+        here.append(positions[a][differ])
+        there.append(positions[b][differ])
+    i, j, width, p, q = (np.concatenate(part) for part in (first, second, gap, here, there))
+    order = np.argsort(width, kind="stable")
+    pair = np.minimum(i, j).astype(np.int64) * (count + 1) + np.maximum(i, j)
+    _, narrowest = np.unique(pair[order], return_index=True)
+    chosen = order[narrowest]
+    graph = sparse.csr_array((width[chosen], (i[chosen], j[chosen])), shape=(count + 1,) * 2)
+    tree = sparse.csgraph.minimum_spanning_tree(graph).tocoo()
+    lookup = {(int(i[k]), int(j[k])): k for k in chosen}
+    for row, column in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
+        k = lookup[row, column]
+        ends = [np.array([index[d].ravel()[position] for d in range(3)], dtype=np.float64) for position in (p[k], q[k])]
+        _add_bar(field, ends[0], ends[1])
+    notes.append(f"joined {len(pieces)} pieces by bars")
+    return without_bubbles(field)
+
+
+def _add_bar(field: NDArray[np.float32], a: NDArray[np.float64], b: NDArray[np.float64]) -> None:
+    low = np.maximum(np.minimum(a, b).astype(int) - 2, 0)
+    high = np.minimum(np.maximum(a, b).astype(int) + 3, field.shape)
+    box = tuple(slice(low[d], high[d]) for d in range(3))
+    points = np.stack(np.meshgrid(*(np.arange(low[d], high[d]) for d in range(3)), indexing="ij"), axis=-1)
+    along = np.clip(((points - a) @ (b - a)) / max(float((b - a) @ (b - a)), 1e-9), 0, 1)
+    distance = np.linalg.norm(points - a - along[..., None] * (b - a), axis=-1)
+    field[box] = np.minimum(field[box], distance - _BAR)

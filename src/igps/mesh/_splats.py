@@ -1,0 +1,68 @@
+"""A surface from a cloud of points: a disc around each."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from igps.mesh.mesh import MeshError
+from igps.mesh.surface import longest_side
+
+# Points beyond which they are thinned out first.
+_MANY_POINTS = 200_000
+# Points that are so much less spread across than along are on a line, whatever single precision did to them.
+_LINE = 1e-5
+
+
+def splats(
+    points: NDArray[np.float64], normals: NDArray[np.float64] | None, resolution: int, name: str
+) -> tuple[NDArray[np.float64], NDArray[np.int64], float]:
+    """A disc (a hexagon) around each point of a cloud, and the spacing of the points."""
+    if len(points) < 10:
+        raise MeshError(
+            f"{name}: a cloud of {len(points)} points; at least 10 are needed for a surface. Check that the file holds "
+            "faces, or scan more points."
+        )
+    side = longest_side(points)
+    if side == 0:
+        raise MeshError(f"{name}: all points are in one place; a surface was expected. Check the file.")
+    from_middle = points - points.mean(axis=0)
+    _, across, along = np.linalg.eigvalsh(from_middle.T @ from_middle)
+    if across < _LINE**2 * along:
+        raise MeshError(
+            f"{name}: all {len(points)} points are on one line; a surface was expected. If the file holds lines, give "
+            "them thickness."
+        )
+    if len(points) > _MANY_POINTS:
+        # One point in each half of a cell.
+        lattice = np.floor((points - points.min(axis=0)) / (side / (4 * resolution))).astype(np.int64)
+        _, first = np.unique(lattice, axis=0, return_index=True)
+        points, normals = points[first], None if normals is None else normals[first]
+    tree = cKDTree(points)
+    away, neighbours = tree.query(points, k=min(13, len(points)))
+    # A disc reaches the third ring of neighbours or so in an even cloud; where points are rare, it does not run wild.
+    own = away[:, min(6, away.shape[1] - 1)]
+    spacing = float(np.median(own))
+    radius = np.clip(own, spacing / 2, 2 * spacing)
+    if normals is None:
+        local = points[neighbours] - points[neighbours].mean(axis=1, keepdims=True)
+        _, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", local, local))
+        normals = axes[:, :, 0]
+    normals = np.asarray(normals, dtype=np.float64)
+    if normals.shape != points.shape or not np.isfinite(normals).all():
+        raise MeshError(f"{name}: normals: expected finite numbers of shape {points.shape}. Leave them out.")
+    # Two directions of the plane: the axis least along the normal gives the first.
+    axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    u = np.cross(normals, axis)
+    u /= np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-12)
+    v = np.cross(normals, u)
+    v /= np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-12)
+    angle = np.arange(6) * np.pi / 3
+    rim = points[:, None] + radius[:, None, None] * (
+        np.cos(angle)[:, None] * u[:, None] + np.sin(angle)[:, None] * v[:, None]
+    )
+    corner = np.arange(6)
+    fan = np.stack([corner[[0, 0, 0, 0]], corner[[1, 2, 3, 4]], corner[[2, 3, 4, 5]]], axis=1)
+    faces = (6 * np.arange(len(points))[:, None, None] + fan).reshape(-1, 3)
+    return rim.reshape(-1, 3), faces, spacing / 2

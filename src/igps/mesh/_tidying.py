@@ -1,0 +1,146 @@
+"""The triangles of a surface tidied up: welded, turned alike, without fins, specks and what is hidden inside."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.surface import compact, diagonal, face_areas, face_parts, undirected_edges
+from igps.mesh.winding import winding_number
+
+# Vertices closer than this share of the bounding box's diagonal are one.
+_WELD = 1e-8
+# Parts of less than this share of the area are specks, unless all of them together have ten times as much.
+SPECK = 2e-3
+# Fins may have this share of the area.
+_FINS = 0.05
+
+
+def welded(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Coincident vertices made one, degenerate and doubled faces and unused vertices dropped, neighbours turned alike.
+
+    Vertices and faces that stay keep their order. What was done is added to `notes`.
+    """
+    # Welding happens on a lattice in units of the bounding box, so that the unit of length does not matter.
+    lattice = np.round((vertices - vertices.mean(axis=0)) / (_WELD * max(diagonal(vertices), np.finfo(float).tiny)))
+    _, first, index = np.unique(lattice.astype(np.int64), axis=0, return_index=True, return_inverse=True)
+    if len(first) < len(vertices):
+        notes.append(f"welded {len(vertices) - len(first)} coincident vertices")
+        faces = first[index.ravel()][faces]
+    sharp = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    if not sharp.all():
+        notes.append(f"dropped {int((~sharp).sum())} degenerate faces")
+        faces = faces[sharp]
+    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    if len(once) < len(faces):
+        notes.append(f"dropped {len(faces) - len(once)} duplicate faces")
+        faces = faces[np.sort(once)]
+    unused = len(first) - len(np.unique(faces))
+    if unused:
+        notes.append(f"dropped {unused} unreferenced vertices")
+    vertices, faces = compact(vertices, faces)
+    return vertices, oriented(faces, notes)
+
+
+def oriented(faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.int64]:
+    """The faces turned so that neighbours agree, as far as the surface can be oriented.
+
+    From the first face of each part in the order of a breadth-first search; the smaller side is turned.
+    """
+    if not len(faces):
+        return faces
+    n = len(faces)
+    _, edge_of_side = undirected_edges(faces, int(faces.max()) + 1)
+    by_edge = np.argsort(edge_of_side, kind="stable")
+    count = np.bincount(edge_of_side)
+    at = (np.cumsum(count) - count)[count == 2]
+    one, two = by_edge[at], by_edge[at + 1]
+    start = faces.ravel()
+    differ = start[one] == start[two]  # both run along the edge in the same direction
+    one, two = one // 3, two // 3
+    # One edge of two is enough where faces share two: of the matrix entries for a pair, 1 agrees and 2 differs.
+    pair, where = np.unique(np.minimum(one, two) * n + np.maximum(one, two), return_index=True)
+    graph = sparse.csr_array((np.where(differ[where], 2, 1), (pair // n, pair % n)), shape=(n, n))
+    graph = (graph + graph.T).tocsr()
+    n_parts, part = connected_components(graph, directed=False)
+    # One search through all parts: a root is joined to the first face of each.
+    _, first = np.unique(part, return_index=True)
+    root = sparse.csr_array((np.ones(n_parts, dtype=int), (np.zeros(n_parts, dtype=int), first)), shape=(1, n))
+    whole = sparse.vstack([sparse.hstack([graph, sparse.csr_array((n, 1), dtype=int)]), sparse.hstack([root, [[0]]])])
+    _, before = breadth_first_order(whole.tocsr(), n, directed=True)
+    before[n] = n
+    flip = np.zeros(n + 1, dtype=bool)
+    child = np.nonzero(before[:n] != n)[0]
+    if len(child):  # of none SciPy makes a matrix
+        flip[child] = np.asarray(graph[child, before[child]]).ravel() == 2
+    # Parity along the way to the root, by doubling.
+    while (before != n).any():
+        flip ^= flip[before]
+        before = before[before]
+    turn = flip[:n]
+    mostly = np.bincount(part, weights=turn, minlength=n_parts) > np.bincount(part, minlength=n_parts) / 2
+    turn ^= mostly[part]
+    if turn.any():
+        notes.append(f"turned {int(turn.sum())} faces to orient the surface")
+        faces = np.where(turn[:, None], faces[:, ::-1], faces)
+    return faces
+
+
+def tidied(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Without fins and specks."""
+    kept = _without_fins(vertices, faces)
+    if len(kept) < len(faces):
+        notes.append(f"dropped {len(faces) - len(kept)} faces of fins")
+        faces = kept
+    part, areas = face_parts(vertices, faces)
+    specks = areas < SPECK * areas.sum()
+    if specks.any() and areas[specks].sum() < 10 * SPECK * areas.sum():
+        notes.append(f"dropped {int(specks.sum())} specks")
+        faces = faces[~specks[part]]
+    # Only now is it plain which faces are neighbours.
+    vertices, faces = compact(vertices, faces)
+    return vertices, oriented(faces, notes)
+
+
+def _without_fins(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Without the faces that hang on an edge of two others, peeled from their free edges; all, if they are many."""
+    kept = faces
+    while len(kept):
+        _, edge_of_side = undirected_edges(kept, len(vertices))
+        count = np.bincount(edge_of_side)[edge_of_side].reshape(-1, 3)
+        fin = (count == 1).any(axis=1) & (count > 2).any(axis=1)
+        if not fin.any():
+            # A face with a second free edge that was left of a larger fin does no harm: it hangs on nothing crowded.
+            break
+        kept = kept[~fin]
+    left = face_areas(vertices, kept).sum()
+    return kept if left >= (1 - _FINS) * face_areas(vertices, faces).sum() else faces
+
+
+def without_hidden(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Without the parts that lie inside the largest, if that is closed."""
+    part, areas = face_parts(vertices, faces)
+    if len(areas) < 2:
+        return vertices, faces
+    largest = int(np.argmax(areas))
+    try:
+        body = Mesh(*compact(vertices, faces[part == largest]))
+    except MeshError:
+        return vertices, faces
+    others = np.unique(faces[part != largest])
+    within = np.zeros(len(vertices), dtype=bool)
+    within[others] = winding_number(body.vertices, body.faces, vertices[others]) > 0.5
+    hidden = np.bincount(part, weights=~within[faces].all(axis=1), minlength=len(areas)) == 0
+    if not hidden.any():
+        return vertices, faces
+    notes.append(f"dropped {int(hidden.sum())} parts hidden inside")
+    return compact(vertices, faces[~hidden[part]])

@@ -1,0 +1,140 @@
+"""One surface of parts that overlap: the outer shape, exactly, where a grid would only come near it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.mesh._extras import libigl
+from igps.mesh._hole_filling import with_small_holes_filled
+from igps.mesh._tidying import SPECK, oriented, tidied, welded
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.surface import area_vectors, compact, diagonal, face_areas, face_parts, face_patches, unit
+
+# A place sees the outside if so many of the directions on one of its sides meet nothing.
+_OPEN = 0.03
+_DIRECTIONS, _PLACES_PER_PATCH = 100, 30
+# Surfaces that are so near to each other, in units of the bounding box's diagonal, are one.
+_COINCIDENT = 1e-6
+# Surfaces of more patches or parts are heaps of triangles, for which a grid is the quicker way.
+_MOST_PATCHES, _MOST_PARTS = 200, 200
+
+
+def without_walls(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Without the walls inside the body, and the sheets that lie on another, where more than two faces meet in an edge.
+
+    Parts that overlap and have vertices in common leave them, as a body does that was cut and put together again. A
+    patch, faces that share an edge with each other alone, goes only if that opens no hole, because two others meet
+    wherever it ends, and if nothing is lost that sees the outside, because what of it does is covered by the others.
+    What sees the least goes first, then the smallest.
+    """
+    n_patches = int(face_patches(faces, len(vertices))[0].max()) + 1
+    if not 1 < n_patches <= _MOST_PATCHES:
+        return vertices, faces
+    points = np.ascontiguousarray((vertices - vertices.mean(axis=0)) / diagonal(vertices))
+    places, at, sees = _places(points, faces)
+    areas, kept = face_areas(points, faces), np.arange(len(faces))
+    n_dropped = 0
+    while (number := _superfluous(points, faces[kept], areas[kept], places, _inverse(kept, len(faces))[at], sees)) >= 0:
+        kept = kept[face_patches(faces[kept], len(points))[0] != number]
+        n_dropped += 1
+    if not n_dropped:
+        return vertices, faces
+    notes.append(f"dropped {n_dropped} walls inside")
+    vertices, faces = compact(vertices, faces[kept])
+    return vertices, oriented(faces, notes)
+
+
+def _superfluous(
+    points: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    areas: NDArray[np.float64],
+    places: NDArray[np.float64],
+    at: NDArray[np.int64],
+    sees: NDArray[np.bool_],
+) -> int:
+    """The patch that may go first, or −1; `places` lie on the faces `at`, −1 on one that is gone."""
+    patch, ends_at_others = face_patches(faces, len(points))
+    size = np.bincount(patch, areas)
+    of_patch = np.where(at >= 0, patch[at], -1)
+    there = of_patch >= 0
+    n_places = np.maximum(np.bincount(of_patch[there], minlength=len(size)), 1)
+    seeing = np.bincount(of_patch[there], sees[there], len(size)) / n_places
+    for number in np.lexsort((size, seeing)).tolist():
+        if not ends_at_others[number]:
+            continue
+        shown = np.ascontiguousarray(places[(of_patch == number) & sees])
+        rest = faces[patch != number]
+        squared = libigl().point_mesh_squared_distance(shown, points, rest)[0] if len(shown) else np.zeros(1)
+        if np.max(squared) <= _COINCIDENT**2:
+            return number
+    return -1
+
+
+def _places(
+    points: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Places (S, 3) on each patch, evenly by area and always the same; the faces (S,) they are on; who sees outside."""
+    patch, _ = face_patches(faces, len(points))
+    areas = face_areas(points, faces)
+    generator = np.random.default_rng(0)
+    chosen = []
+    for number in range(int(patch.max()) + 1):
+        members = np.nonzero((patch == number) & (areas > 0))[0]
+        if len(members):
+            chosen.append(generator.choice(members, _PLACES_PER_PATCH, p=areas[members] / areas[members].sum()))
+    at = np.concatenate(chosen)
+    weights = generator.dirichlet(np.ones(3), len(at))
+    places = np.einsum("sc,scx->sx", weights, points[faces[at]])
+    normals = unit(area_vectors(points, faces[at]))
+    occluded = [
+        np.asarray(libigl().ambient_occlusion(points, faces, places, np.ascontiguousarray(side), _DIRECTIONS)).ravel()
+        for side in (normals, -normals)
+    ]
+    return places, at, 1 - np.minimum(*occluded) > _OPEN
+
+
+def _inverse(kept: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """Where each of `n` is among those kept, −1 if it is not."""
+    where = np.full(n, -1)
+    where[kept] = np.arange(len(kept))
+    return where
+
+
+def united(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The outer surface of parts that are closed each by itself and overlap, by manifold3d.
+
+    Each part is tidied on its own, and turned outward. The surface as it is, and no note, if a part is not closed, if
+    they do not overlap, are too many or only one, or without manifold3d, the extra ``[manifold]``.
+    """
+    try:
+        import manifold3d
+    except ImportError:
+        return vertices, faces
+    part, areas = face_parts(vertices, faces)
+    speck = areas < SPECK * areas.sum()
+    if not 1 < int((~speck).sum()) <= _MOST_PARTS:
+        return vertices, faces
+    solids = []
+    for number in np.nonzero(~speck)[0]:
+        points, triangles = compact(vertices, faces[part == number])
+        for step in (welded, tidied, with_small_holes_filled):
+            points, triangles = step(points, triangles, [])
+        try:
+            body = Mesh(points, triangles)
+        except MeshError:
+            return vertices, faces
+        solid = manifold3d.Manifold(manifold3d.Mesh64(body.vertices.copy(), body.faces.astype(np.uint64)))
+        if solid.status() != manifold3d.Error.NoError:
+            return vertices, faces
+        solids.append(solid)
+    whole = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
+    if whole.status() != manifold3d.Error.NoError or len(whole.decompose()) != 1:
+        return vertices, faces
+    mesh = whole.to_mesh64()
+    notes.append(f"united {len(solids)} closed parts that overlap")
+    return np.asarray(mesh.vert_properties)[:, :3].copy(), np.asarray(mesh.tri_verts, dtype=np.int64)

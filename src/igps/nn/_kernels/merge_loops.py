@@ -1,0 +1,78 @@
+"""A loop that Numba compiles for `merge_tree`; it is also what runs, slowly, where Numba is not installed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps._compiled import compiled
+
+
+@compiled()
+def merge(
+    order: NDArray[np.int64], neighbours: NDArray[np.int64], counts: NDArray[np.int64], ends: NDArray[np.int64],
+    pieces: NDArray[np.int64],
+) -> int:  # fmt: skip
+    """Write the branches and the pieces of a function on a graph; how many branches there are.
+
+    Args:
+        order: (P,) points, the highest first.
+        neighbours: (P, k) of each point; a pair is joined if either names the other.
+        counts: (L,) ascending: pieces are told when so many points have been reached.
+        ends: (P, 2), filled with the highest point of each branch and the point where it joins a higher one, or the
+            lowest point of all.
+        pieces: (L, P) of −1, filled with the highest point of the piece that each point reached belongs to.
+    """
+    n_points, n_neighbours = neighbours.shape
+    place = np.empty(n_points, np.int64)
+    for k in range(n_points):
+        place[order[k]] = k
+    # of each point the others that name it, one list after the other
+    starts = np.zeros(n_points + 1, np.int64)
+    for i in range(n_points):
+        for j in range(n_neighbours):
+            starts[neighbours[i, j] + 1] += 1
+    starts = np.cumsum(starts)
+    filled = starts[:-1].copy()
+    naming = np.empty(n_points * n_neighbours, np.int64)
+    for i in range(n_points):
+        for j in range(n_neighbours):
+            named = neighbours[i, j]
+            naming[filled[named]] = i
+            filled[named] += 1
+    parent = np.arange(n_points)
+    n_branches = level = 0
+    for reached in range(n_points):
+        point = order[reached]
+        for j in range(n_neighbours + starts[point + 1] - starts[point]):
+            other = neighbours[point, j] if j < n_neighbours else naming[starts[point] + j - n_neighbours]
+            if place[other] >= reached:
+                continue
+            first, second = point, other
+            while parent[first] != first:
+                parent[first] = parent[parent[first]]
+                first = parent[first]
+            while parent[second] != second:
+                parent[second] = parent[parent[second]]
+                second = parent[second]
+            if first == second:
+                continue
+            if place[first] < place[second]:
+                first, second = second, first
+            parent[first] = second  # the higher peak lives on
+            if first != point:
+                ends[n_branches, 0], ends[n_branches, 1] = first, point
+                n_branches += 1
+        while level < len(counts) and counts[level] == reached + 1:
+            for k in range(reached + 1):
+                root = order[k]
+                while parent[root] != root:
+                    root = parent[root]
+                pieces[level, order[k]] = root
+            level += 1
+    for k in range(n_points):
+        point = order[k]
+        if parent[point] == point:
+            ends[n_branches, 0], ends[n_branches, 1] = point, order[n_points - 1]
+            n_branches += 1
+    return n_branches

@@ -1,0 +1,198 @@
+"""Axes of pairs: the bins that the pairs of samples of a body are sorted into.
+
+By interior distance, by Euclidean distance, or by the cosines that tell how two samples lie to each other and to the
+surface next to them.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from torch import Tensor, nn
+
+from igps.nn.axes.centres import OrderedCentres, middles
+from igps.nn.batch_features import View
+from igps.nn.requirements import Requirements, embedding_requirements
+
+
+@dataclass(frozen=True)
+class Distances:
+    """Points whose Euclidean distances are counted between centres.
+
+    Args:
+        points: (P, D); or (N, P, D) of N shapes.
+        centres: (B,) ascending.
+        equal: whether the centres are known to be the middles of equal intervals from 0 on.
+    """
+
+    points: Tensor
+    centres: Tensor
+    equal: bool
+
+    def of_shape(self, i: int, real: Tensor | slice) -> Distances:
+        """Those of one shape."""
+        return Distances(self.points[i, real], self.centres, self.equal)
+
+
+@dataclass(frozen=True)
+class OrientedPoints:
+    """Points and directions, the three `point_pair_features` of whose pairs are counted between centres.
+
+    Args:
+        points: (P, D); or (N, P, D) of N shapes.
+        directions: the same, of length 1.
+        towards: (A,) centres of the cosines that tell how directions lie to the line between two points.
+        between: (A,) centres of the cosine between two directions.
+    """
+
+    points: Tensor
+    directions: Tensor
+    towards: Tensor
+    between: Tensor
+
+    def of_shape(self, i: int, real: Tensor | slice) -> OrientedPoints:
+        """Those of one shape."""
+        return OrientedPoints(self.points[i, real], self.directions[i, real], self.towards, self.between)
+
+
+class PairAxis(nn.Module, ABC):
+    """Bins of pairs, shared out linearly: a pair counts in the two bins whose centres surround its value."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Bins, along each dimension that this axis adds to the histogram."""
+
+    def requirements(self, embedding: nn.Module) -> Requirements:
+        """Of a body, with this embedding for the histogram."""
+        return Requirements()
+
+    @abstractmethod
+    def pairs(self, view: View, embedding: nn.Module) -> Distances | OrientedPoints:
+        """What is counted, of N shapes."""
+
+
+class DistanceAxis(PairAxis):
+    """Bins of a distance: `n_bins` equal intervals of [0, `reach`] at the start."""
+
+    def __init__(self, n_bins: int, reach: float, learnable: bool) -> None:
+        super().__init__()
+        if n_bins < 2:
+            raise ValueError(f"n_bins: expected at least 2, got {n_bins}.")
+        self.reach = reach
+        self.centres = OrderedCentres(middles(n_bins, reach, "bins"), learnable)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(B,)."""
+        return (len(self.centres.start),)
+
+    def _distances(self, points: Tensor) -> Distances:
+        return Distances(points, self.centres(), self.centres.log_gap is None)
+
+
+class InteriorDistance(DistanceAxis):
+    """Bins of the interior distance, the Euclidean distance of embeddings (Rustamov 2010, equation 5).
+
+    Args:
+        n_bins: B.
+        reach: end of the last bin; what lies beyond counts in the last bin.
+        embedding: other than the histogram's: for a second scale.
+        learnable: whether the centres are parameters.
+    """
+
+    def __init__(
+        self, n_bins: int = 64, reach: float = 4.0, *, embedding: nn.Module | None = None, learnable: bool = False
+    ) -> None:
+        super().__init__(n_bins, reach, learnable)
+        self.embedding = embedding
+
+    def requirements(self, embedding: nn.Module) -> Requirements:
+        """Those of the embedding, its own or the histogram's."""
+        return embedding_requirements(self.embedding or embedding)
+
+    def pairs(self, view: View, embedding: nn.Module) -> Distances:
+        """Embedded samples."""
+        return self._distances(view.embedded(self.embedding or embedding))
+
+
+class EuclideanDistance(DistanceAxis):
+    """Bins of the distance in space, over √area.
+
+    Args:
+        n_bins: B.
+        reach: end of the last bin; what lies beyond counts in the last bin.
+        learnable: whether the centres are parameters.
+    """
+
+    def __init__(self, n_bins: int = 16, reach: float = 1.0, *, learnable: bool = False) -> None:
+        super().__init__(n_bins, reach, learnable)
+
+    def pairs(self, view: View, embedding: nn.Module) -> Distances:
+        """Samples over √area."""
+        return self._distances(view.positions())
+
+
+class _CosineAxes(PairAxis):
+    def __init__(self, n_bins: int, learnable: bool) -> None:
+        super().__init__()
+        if n_bins < 2:
+            raise ValueError(f"n_bins: expected at least 2, got {n_bins}.")
+        cosines = middles(n_bins, 2.0, "bins") - 1
+        self.towards_centres = OrderedCentres(cosines, learnable)
+        self.between_centres = OrderedCentres(cosines, learnable)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(A, A, A)."""
+        return (len(self.between_centres.start),) * 3
+
+    def _oriented(self, points: Tensor, directions: Tensor) -> OrientedPoints:
+        return OrientedPoints(points, directions, self.towards_centres(), self.between_centres())
+
+
+class PairCosines(_CosineAxes):
+    """Bins of the three cosines of point pair features in space (Wahl et al. 2003; Drost et al. 2010).
+
+    The direction of a sample is that to the nearest point of the surface, on the surface the outward normal. They see
+    corners, hollows and symmetry, which distances alone tell little of.
+
+    Args:
+        n_bins: A, of each cosine.
+        learnable: whether the centres are parameters.
+    """
+
+    def __init__(self, n_bins: int = 5, *, learnable: bool = False) -> None:
+        super().__init__(n_bins, learnable)
+
+    def requirements(self, embedding: nn.Module) -> Requirements:
+        """The directions."""
+        return Requirements(attributes=("surface_direction",))
+
+    def pairs(self, view: View, embedding: nn.Module) -> OrientedPoints:
+        """Samples over √area, and the directions to the surface."""
+        return self._oriented(view.positions(), view.attribute("surface_direction"))
+
+
+class EmbeddedPairCosines(_CosineAxes):
+    """`PairCosines` between the embedded samples: made of interior distances alone, they hardly change with pose.
+
+    The direction of an interior sample is to the embedded surface samples nearest to it, that of a surface sample away
+    from the interior ones.
+
+    Args:
+        n_bins: A, of each cosine.
+        learnable: whether the centres are parameters.
+    """
+
+    def __init__(self, n_bins: int = 5, *, learnable: bool = False) -> None:
+        super().__init__(n_bins, learnable)
+
+    def requirements(self, embedding: nn.Module) -> Requirements:
+        """Those of the embedding."""
+        return embedding_requirements(embedding)
+
+    def pairs(self, view: View, embedding: nn.Module) -> OrientedPoints:
+        """Embedded samples, and the directions between them and the embedded samples of the other kind."""
+        return self._oriented(view.embedded(embedding), view.embedded_directions(embedding))

@@ -1,0 +1,188 @@
+"""Axes of points: classes of the samples of a body, by their potential, the balls that touch them, or an attribute."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+
+from igps.nn.axes.centres import OrderedCentres, middles
+from igps.nn.batch_features import View
+from igps.nn.embedding import barycentroid_potential
+from igps.nn.requirements import Requirements, embedding_requirements
+from igps.signature.attributes import AttributeName
+
+
+class PointAxis(nn.Module, ABC):
+    """Classes of points.
+
+    Args:
+        centres: (C,) of the classes, ascending.
+        soft: whether a point belongs to the two classes whose centres surround its value, in linear proportion, or to
+            the nearest alone.
+        learnable: whether the centres are parameters; implies `soft`, as only soft classes have gradients.
+    """
+
+    def __init__(self, centres: Tensor | Sequence[float], soft: bool, learnable: bool) -> None:
+        super().__init__()
+        self.centres = OrderedCentres(centres, learnable)
+        self.soft = soft or learnable
+
+    @property
+    def n_classes(self) -> int:
+        """C."""
+        return len(self.centres.start)
+
+    def requirements(self, embedding: nn.Module) -> Requirements:
+        """Of a body, with this embedding for the histogram."""
+        return Requirements()
+
+    @abstractmethod
+    def values(self, view: View, embedding: nn.Module) -> Tensor:
+        """(N, P) of the samples."""
+
+    def memberships(self, values: Tensor) -> Tensor:
+        """(P, C) non-negative, rows of sum 1, from (P,) values.
+
+        Raises:
+            ValueError: values that are not finite.
+        """
+        if not torch.isfinite(values).all():
+            raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
+        return soft_memberships(values, self.centres()) if self.soft else _nearest(values, self.centres())
+
+
+class Potential(PointAxis):
+    """Classes of the barycentroid potential U, the norm of the embedding (Rustamov 2010, section 4).
+
+    Args:
+        n_classes: C equal intervals of [0, `reach`], with their centres in the middle.
+        reach: end of the last interval; what lies beyond counts in the last class.
+        embedding: other than the histogram's: for a second scale.
+        soft, learnable: see `PointAxis`.
+    """
+
+    def __init__(
+        self,
+        n_classes: int = 4,
+        reach: float = 1.5,
+        *,
+        embedding: nn.Module | None = None,
+        soft: bool = False,
+        learnable: bool = False,
+    ) -> None:
+        super().__init__(middles(n_classes, reach, "classes"), soft, learnable)
+        self.embedding = embedding
+
+    def requirements(self, embedding: nn.Module) -> Requirements:
+        """Those of the embedding, its own or the histogram's."""
+        return embedding_requirements(self.embedding or embedding)
+
+    def values(self, view: View, embedding: nn.Module) -> Tensor:
+        """(N, P) potential."""
+        return barycentroid_potential(view.embedded(self.embedding or embedding))
+
+
+class BallRadius(PointAxis):
+    """Classes of the radius of the largest ball that touches the surface at a sample, from inside or from outside.
+
+    From inside it is half the local thickness, from outside it tells how narrow the hollow is in which a sample lies.
+    Both are pose-invariant but near joints, and tell a plate from a rod and a block, and a bowl from a dome. See
+    `ball_radii`. Surface samples alone have such balls.
+
+    Args:
+        side: "inside" or "outside".
+        smallest, largest: centres of the first and last class, over √area; the others lie between them in a geometric
+            progression, along which points are in linear proportion in two classes.
+        n_classes: C.
+    """
+
+    def __init__(
+        self, side: Literal["inside", "outside"] = "inside", smallest: float = 0.022, largest: float = 0.25,
+        n_classes: int = 4,
+    ) -> None:  # fmt: skip
+        if side not in ("inside", "outside"):
+            raise ValueError(f"side: expected 'inside' or 'outside', got {side!r}.")
+        if not 0 < smallest < largest < math.inf or n_classes < 2:
+            raise ValueError(
+                f"smallest, largest, n_classes: expected 0 < smallest < largest, and at least two classes, got "
+                f"{smallest}, {largest} and {n_classes}."
+            )
+        super().__init__(torch.linspace(math.log(smallest), math.log(largest), n_classes), soft=True, learnable=False)
+        self.side = side
+
+    def requirements(self, embedding: nn.Module) -> Requirements:
+        """The directions."""
+        return Requirements(attributes=("surface_direction",))
+
+    def values(self, view: View, embedding: nn.Module) -> Tensor:
+        """(N, P) logarithms of the radii over √area.
+
+        Raises:
+            ValueError: interior samples.
+        """
+        if view.kind != "surface":
+            raise ValueError("samples: expected surface samples, which balls touch, got interior ones.")
+        return view.ball_radii()[..., ("inside", "outside").index(self.side)].log()
+
+    def extra_repr(self) -> str:
+        return repr(self.side)
+
+
+class Attribute(PointAxis):
+    """Classes of a scalar attribute of the samples: "depth", "electrostatic_potential", or one of your own.
+
+    Args:
+        name: of the attribute.
+        centres: of the classes, ascending, in the attribute's unit.
+        soft, learnable: see `PointAxis`.
+    """
+
+    def __init__(self, name: str, centres: Sequence[float], *, soft: bool = False, learnable: bool = False) -> None:
+        super().__init__(centres, soft, learnable)
+        self.name = name
+
+    def requirements(self, embedding: nn.Module) -> Requirements:
+        """The attribute, if it is one that Signatures are computed with."""
+        return Requirements(attributes=tuple(name for name in get_args(AttributeName) if name == self.name))
+
+    def values(self, view: View, embedding: nn.Module) -> Tensor:
+        """(N, P) of the attribute.
+
+        Raises:
+            ValueError: the samples have no such attribute, or it is a direction.
+        """
+        values = view.attribute(self.name)
+        if values.ndim != 2:
+            raise ValueError(f"attributes: expected a scalar to split by, but {self.name!r} is a direction.")
+        return values
+
+    def extra_repr(self) -> str:
+        return repr(self.name)
+
+
+def soft_memberships(values: Tensor, centres: Tensor) -> Tensor:
+    """Soft classes: linear kernels (hats) around ascending centres; all in the first below it, in the last beyond it.
+
+    Args:
+        values: (..., P) of the points.
+        centres: (C,) ascending.
+
+    Returns:
+        (..., P, C) non-negative, rows of sum 1; differentiable in both arguments.
+    """
+    # How far past each centre on the way to the next, 0 to 1: successive differences are the hats, and sum to 1.
+    passed = ((values.unsqueeze(-1) - centres[:-1]) / centres.diff()).clamp(0, 1)
+    one, none = torch.ones_like(values).unsqueeze(-1), torch.zeros_like(values).unsqueeze(-1)
+    return torch.cat([one, passed], dim=-1) - torch.cat([passed, none], dim=-1)
+
+
+def _nearest(values: Tensor, centres: Tensor) -> Tensor:
+    """(P, C) memberships, 1 in the class whose centre is nearest."""
+    between = (centres[1:] + centres[:-1]) / 2
+    return one_hot(torch.bucketize(values.detach(), between, right=True), len(centres)).to(values.dtype)

@@ -1,0 +1,145 @@
+"""What histograms look at in a batch, each thing computed once however many of them ask for it."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from igps.data.batch import SampleBatch, SignatureBatch
+from igps.nn._kernels.balls import ball_radii
+from igps.nn._kernels.merge_tree import nearest
+from igps.nn._precision import full_precision
+from igps.nn.embedding import barycentroid_potential
+
+SampleKind = Literal["interior", "surface"]
+
+_N_NEAREST = 8
+
+
+def check_kind(samples: str) -> None:
+    """Raise a ValueError that says which kinds of samples there are, unless this is one."""
+    if samples not in get_args(SampleKind):
+        raise ValueError(f"samples: expected 'interior' or 'surface', got {samples!r}.")
+
+
+class View:
+    """Some samples of the shapes of a batch, and what derives from them.
+
+    Args:
+        batch: N shapes.
+        kind: of the samples.
+        samples: all of that kind, or a subset.
+    """
+
+    def __init__(self, batch: SignatureBatch, kind: SampleKind, samples: SampleBatch) -> None:
+        self.batch = batch
+        self.kind = kind
+        self.samples = samples
+        self._embedded: dict[nn.Module, Tensor] = {}
+        self._ball_radii: Tensor | None = None
+        self._neighbours: dict[nn.Module, list[Tensor]] = {}
+
+    def embedded(self, embedding: nn.Module) -> Tensor:
+        """(N, P, D) embedding of the samples."""
+        if embedding not in self._embedded:
+            self._embedded[embedding] = embedding(self.samples.eigenfunctions, self.batch.eigenvalues, self.batch.area)
+        return self._embedded[embedding]
+
+    def positions(self) -> Tensor:
+        """(N, P, 3) of the samples in units of √area."""
+        points = self.samples.points
+        return points / self.batch.area.sqrt().to(points.dtype)[:, None, None]
+
+    def attribute(self, name: str) -> Tensor:
+        """(N, P) or (N, P, 3) of the samples.
+
+        Raises:
+            ValueError: they have no such attribute.
+        """
+        if name not in self.samples.attributes:
+            raise ValueError(
+                f"attributes: expected {name!r} among those of the {self.kind} samples, got "
+                f"{sorted(self.samples.attributes)}. Name it in SignatureConfig(attributes=...), or give its function "
+                "to SignatureDataset(point_functions=...)."
+            )
+        return self.samples.attributes[name]
+
+    def ball_radii(self) -> Tensor:
+        """(N, P, 2) `ball_radii` of surface samples, over √area; 1 where padded.
+
+        Raises:
+            ValueError: they have no directions.
+        """
+        if self._ball_radii is None:
+            points, directions = self.positions(), self.attribute("surface_direction")
+            self._ball_radii = torch.ones_like(points[..., :2])
+            for i, real in enumerate(self.samples.mask):
+                self._ball_radii[i, real] = ball_radii(points[i, real], directions[i, real])
+        return self._ball_radii
+
+    def log_potential(self, embedding: nn.Module) -> Tensor:
+        """(N, P) logarithms of the barycentroid potential."""
+        potential = barycentroid_potential(self.embedded(embedding))
+        return potential.clamp_min(torch.finfo(potential.dtype).tiny).log()
+
+    def neighbours(self, embedding: nn.Module) -> list[Tensor]:
+        """Of each shape, (P, k) the other samples that are nearest to each in the embedding, padding left out."""
+        if embedding not in self._neighbours:
+            coordinates = self.embedded(embedding)
+            self._neighbours[embedding] = [nearest(coordinates[i, real]) for i, real in enumerate(self.samples.mask)]
+        return self._neighbours[embedding]
+
+    def embedded_directions(self, embedding: nn.Module) -> Tensor:
+        """(N, P, D) unit vectors from interior samples to the surface in the embedding, or out of it on the surface."""
+        other, outward = (self.batch.surface, 1) if self.kind == "interior" else (self.batch.interior, -1)
+        targets = embedding(other.eigenfunctions, self.batch.eigenvalues, self.batch.area)
+        coordinates = self.embedded(embedding)
+        return torch.stack(
+            [outward * nearest_directions(coordinates[i], targets[i, real]) for i, real in enumerate(other.mask)]
+        )
+
+
+class Views:
+    """The views of a batch by kind and number of samples, so that histograms of one descriptor share theirs.
+
+    Args:
+        batch: N shapes.
+        training: draw subsets of samples anew; otherwise a subset is always the same.
+    """
+
+    def __init__(self, batch: SignatureBatch, training: bool) -> None:
+        self._batch = batch
+        self._training = training
+        self._views: dict[tuple[SampleKind, int | None, bool], View] = {}
+
+    def of(self, kind: SampleKind, n_samples: int | None, n_training_samples: int | None) -> View:
+        """The view of at most `n_samples`, in training of `n_training_samples` drawn at random; None takes all."""
+        drawn = self._training and n_training_samples is not None
+        n_wanted = n_training_samples if drawn else n_samples
+        key = (kind, n_wanted, drawn)
+        if key not in self._views:
+            samples = self._batch.interior if kind == "interior" else self._batch.surface
+            if n_wanted is not None:
+                samples = samples.subset(n_wanted, seed=None if drawn else 0)
+            self._views[key] = View(self._batch, kind, samples)
+        return self._views[key]
+
+
+def nearest_directions(points: Tensor, targets: Tensor, n_nearest: int = _N_NEAREST) -> Tensor:
+    """Unit vectors from points to the mean of the targets nearest to them.
+
+    Args:
+        points: (P, D).
+        targets: (T, D).
+        n_nearest: how many of the targets; all if there are fewer.
+
+    Returns:
+        (P, D); zero where the mean is the point itself.
+    """
+    with full_precision():
+        distances = torch.cdist(points.detach(), targets.detach())
+    nearest = distances.topk(min(n_nearest, len(targets)), largest=False).indices
+    return functional.normalize(targets[nearest].mean(dim=1) - points, dim=1)

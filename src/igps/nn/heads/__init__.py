@@ -1,0 +1,8 @@
+"""Heads: what turns descriptions into vectors whose distances answer a question, fitted or trained on labels."""
+
+from igps.nn.heads.base import Head
+from igps.nn.heads.closed_form import KernelHead, WhitenedHead
+from igps.nn.heads.learned import BlendedDistance, MetricHead
+from igps.nn.heads.two_level import TwoLevelHead, WCCNHead
+
+__all__ = ["BlendedDistance", "Head", "KernelHead", "MetricHead", "TwoLevelHead", "WCCNHead", "WhitenedHead"]

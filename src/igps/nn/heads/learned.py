@@ -1,0 +1,110 @@
+"""What gradients learn on top of histograms: an embedding, and a correction of the plain distance by it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from igps.nn.heads.base import SizedByData, check_cells, square_roots
+from igps.retrieval.distances import Distance, chi_square, cosine
+
+
+class MetricHead(SizedByData):
+    """Descriptions to unit vectors whose cosine distance is learned by gradients.
+
+    The square root of a histogram is a unit vector too (its distances are Hellinger's), which tames its largest cells.
+    The first layer takes its size from the first descriptions that it sees.
+
+    Args:
+        width: D of the embedding.
+        n_hidden: units of the hidden layer; 0 makes the head linear.
+        dropout: share of hidden units dropped in training.
+        cell_dropout: share of cells dropped in training.
+    """
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, width: int = 64, n_hidden: int = 256, dropout: float = 0.5, cell_dropout: float = 0.2) -> None:
+        super().__init__()
+        if width < 1:
+            raise ValueError(f"width: expected at least 1, got {width}.")
+        self.register_buffer("mean", torch.zeros(0))
+        self.register_buffer("scale", torch.ones(()))
+        layers: list[nn.Module] = [nn.Dropout(cell_dropout), nn.LazyLinear(n_hidden or width)]
+        if n_hidden:
+            layers += [nn.GELU(), nn.Dropout(dropout), nn.Linear(n_hidden, width)]
+        self.layers = nn.Sequential(*layers)
+
+    @torch.no_grad()
+    def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
+        """Centre and scale the inputs by the histograms (N, ...) of the training shapes, N at least 2.
+
+        The layers are trained by gradients; labels and parts are not needed here.
+        """
+        roots = square_roots(descriptions)
+        if len(roots) < 2:
+            raise ValueError(f"descriptions: expected those of at least two training shapes, got {len(roots)}.")
+        self.mean = roots.mean(dim=0)
+        # One scale for all cells: a scale for each would blow up the cells that are nearly always empty.
+        self.scale.copy_(roots.std(dim=0).mean().clamp_min(torch.finfo(roots.dtype).tiny))
+        return self
+
+    def forward(self, descriptions: Tensor) -> Tensor:
+        """(N, ...) histograms to (N, D) of length 1."""
+        roots = square_roots(descriptions)
+        if len(self.mean):
+            check_cells(roots, len(self.mean))
+            roots = (roots - self.mean) / self.scale
+        return functional.normalize(self.layers(roots), dim=1)
+
+
+class BlendedDistance(nn.Module):
+    """A plain distance, corrected by a head: a weighted sum of the two, each in units of its median in training.
+
+    A free metric forgets what it was not trained on; as a correction it may gain on classes never seen as well. Without
+    a head this is the plain distance.
+
+    Args:
+        head: descriptions to embeddings, or None.
+        plain: (Q, ...) and (G, ...) descriptions to (Q, G) distances, such as `Descriptor.distances`; χ² if None.
+        share: of the head's distance in the sum, from 0 (plain) to 1 (the head alone).
+    """
+
+    plain_unit: Tensor
+    learned_unit: Tensor
+
+    def __init__(self, head: nn.Module | None = None, plain: Distance | None = None, share: float = 0.5) -> None:
+        super().__init__()
+        if not 0 <= share <= 1:
+            raise ValueError(f"share: expected a number from 0 to 1, got {share}.")
+        self.head = head
+        self.plain = chi_square if plain is None else plain
+        self.share = share
+        self.register_buffer("plain_unit", torch.ones(()))
+        self.register_buffer("learned_unit", torch.ones(()))
+
+    @torch.no_grad()
+    def calibrate(self, descriptions: Tensor) -> None:
+        """Take the units from the descriptions (N, ...) of the training shapes, after the head is trained."""
+        if self.head is None:
+            return
+        pairs = tuple(torch.triu_indices(len(descriptions), len(descriptions), 1))
+        embedding = self.head(descriptions)
+        for unit, distances in (
+            (self.plain_unit, self.plain(descriptions, descriptions)),
+            (self.learned_unit, cosine(embedding, embedding)),
+        ):
+            unit.copy_(distances[pairs].median().clamp_min(torch.finfo(distances.dtype).tiny))
+
+    def forward(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        """(Q, ...) and (G, ...) descriptions to (Q, G) distances."""
+        plain = self.plain(queries, gallery)
+        if self.head is None:
+            return plain
+        learned = cosine(self.head(queries), self.head(gallery))
+        return (1 - self.share) * plain / self.plain_unit + self.share * learned / self.learned_unit

@@ -1,0 +1,79 @@
+"""Joint histograms over the samples of a body, as products of axes of points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from operator import or_
+
+import torch
+from torch import Tensor, nn
+
+from igps.nn.axes.points import PointAxis
+from igps.nn.batch_features import SampleKind, View
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histograms.base import SampleHistogram, counted, joint, present
+from igps.nn.requirements import Requirements
+
+
+class PointHistogram(SampleHistogram):
+    """The joint histogram of the samples of each body along some axes of points: how much of it is of each kind.
+
+    Example:
+        >>> from igps.nn.axes import BallRadius, Potential
+        >>> PointHistogram([BallRadius("inside"), Potential(6, soft=True)]).shape
+        (4, 6)
+
+    Args:
+        axes: of points, in the order of the histogram's dimensions.
+        embedding: see `PairHistogram`.
+        samples, n_samples, n_training_samples: see `SampleHistogram`.
+
+    Raises:
+        ValueError: no axis, or one that is not of points.
+    """
+
+    def __init__(
+        self,
+        axes: Sequence[PointAxis],
+        embedding: nn.Module | None = None,
+        samples: SampleKind = "surface",
+        *,
+        n_samples: int | None = None,
+        n_training_samples: int | None = None,
+    ) -> None:
+        super().__init__(samples, n_samples, n_training_samples)
+        if not axes or not all(isinstance(one, PointAxis) for one in axes):
+            raise ValueError(
+                f"axes: expected at least one, and all of points, got {[type(one).__name__ for one in axes]}. Axes of "
+                "pairs belong to a PairHistogram."
+            )
+        self.axes = nn.ModuleList(axes)
+        self.embedding: nn.Module = embedding or SpectralEmbedding()
+
+    @property
+    def point_axes(self) -> list[PointAxis]:
+        """The axes."""
+        return [one for one in self.axes if isinstance(one, PointAxis)]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Classes along each axis."""
+        return tuple(one.n_classes for one in self.point_axes)
+
+    @property
+    def requirements(self) -> Requirements:
+        """What all axes together need of a body."""
+        return reduce(or_, (axis.requirements(self.embedding) for axis in self.point_axes))
+
+    def of_view(self, view: View) -> Tensor:
+        """(N, C, ...) histograms of the samples in a view."""
+        values = [one.values(view, self.embedding) for one in self.point_axes]
+        return torch.stack(
+            [self._of_shape([value[i, real] for value in values]) for i, real in enumerate(present(view))]
+        )
+
+    def _of_shape(self, values: list[Tensor]) -> Tensor:
+        first, *others = (one.memberships(value) for one, value in zip(self.point_axes, values, strict=True))
+        rest = joint(others) if others else torch.ones_like(first[:, :1])
+        return counted(first, rest).view(self.shape)

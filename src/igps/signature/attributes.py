@@ -1,0 +1,122 @@
+"""Scalars and directions of samples that a histogram may be split by, beside the potential."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.mesh.mesh import Mesh
+from igps.mesh.surface import area_vectors, unit
+from igps.signature.surface_potential import surface_potential
+
+AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
+
+
+def interior_attributes(
+    mesh: Mesh, points: NDArray[np.float64], names: Sequence[AttributeName]
+) -> Mapping[str, NDArray[np.float32]]:
+    """Named attributes of points inside, (P,) or (P, 3), dimensionless and the same for a scaled or moved body.
+
+    Raises:
+        ValueError: unknown name.
+        ImportError: "depth" or "surface_direction" without libigl.
+    """
+    check_attributes(names)
+    functions = {
+        "depth": depth,
+        "electrostatic_potential": electrostatic_potential,
+        "surface_direction": surface_direction,
+    }
+    return {name: functions[name](mesh, points).astype(np.float32) for name in names}
+
+
+def surface_attributes(
+    mesh: Mesh, faces: NDArray[np.int64], names: Sequence[AttributeName]
+) -> Mapping[str, NDArray[np.float32]]:
+    """Those of the named attributes that points of the surface have: "surface_direction", the outward normal.
+
+    Args:
+        mesh: F faces, oriented outwards.
+        faces: (P,) the face of each point.
+        names: see `interior_attributes`.
+    """
+    check_attributes(names)
+    if "surface_direction" not in names:
+        return {}
+    normals = area_vectors(mesh.vertices, mesh.faces)[faces]
+    return {"surface_direction": unit(normals).astype(np.float32)}
+
+
+def check_attributes(names: Sequence[str]) -> None:
+    """Raise a ValueError that says which names there are, unless all of `names` are known and none comes twice."""
+    known = get_args(AttributeName)
+    if not set(names) <= set(known) or len(set(names)) < len(names):
+        raise ValueError(f"attributes: expected different ones of {', '.join(known)}, got {', '.join(names)}.")
+
+
+def depth(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance of points to the surface over √area: 0 on the surface, 0.28 in the centre of a ball, its maximum.
+
+    Args:
+        mesh: V vertices, F faces.
+        points: (P, 3), length.
+
+    Returns:
+        (P,) dimensionless.
+
+    Raises:
+        ImportError: libigl is not installed.
+    """
+    return np.linalg.norm(_to_surface(mesh, points), axis=1) / np.sqrt(mesh.area)
+
+
+def surface_direction(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit vectors from points to the nearest point of the surface; near it, the outward normal.
+
+    Where several points of the surface are nearest, as on the axis of a tube, it is one of their directions.
+
+    Args:
+        mesh: V vertices, F faces.
+        points: (P, 3) inside, length.
+
+    Returns:
+        (P, 3); zero for a point on the surface.
+
+    Raises:
+        ImportError: libigl is not installed.
+    """
+    return unit(_to_surface(mesh, points))
+
+
+def _to_surface(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    try:
+        import igl
+    except ImportError as error:
+        raise ImportError(
+            'depth, surface_direction: these attributes need libigl: pip install "interior-gps[igl]".'
+        ) from error
+    *_, nearest = igl.point_mesh_squared_distance(
+        np.ascontiguousarray(points), np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
+    )
+    return np.asarray(nearest) - points
+
+
+def electrostatic_potential(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Electrostatic potential of a uniform unit charge on the surface, (1/√area) ∫ dS/|x − s|: √4π in a ball.
+
+    It is high where much surface is near: deep in thick parts and among folded ones, low in thin limbs and at their
+    tips. Rustamov 2010, section 4, names electrostatic potentials as a further dimension; where a body has charges of
+    its own (a protein), pass that potential as an attribute instead. It does not depend on how the surface is cut into
+    triangles; on the surface it is finite. See `surface_potential` for the method and its error.
+
+    Args:
+        mesh: V vertices, F faces.
+        points: (P, 3), length.
+
+    Returns:
+        (P,) dimensionless.
+    """
+    return surface_potential(mesh.vertices, mesh.faces, points) / np.sqrt(mesh.area)

@@ -1,0 +1,104 @@
+"""The Laplace–Beltrami operator of a triangle mesh: positive semi-definite stiffness and lumped mass."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from igps.mesh.mesh import Mesh
+from igps.mesh.surface import longest_side
+
+Backend = Literal["cotangent", "robust"]
+
+# A face thinner than this (twice its area over its longest edge squared) gets mollified edge lengths.
+_DEGENERATE = 1e-8
+# Added to each edge of such a face, in units of its longest edge: makes its cotangents at most about a thousand.
+_MOLLIFIER = 1e-6
+
+
+def laplacian(mesh: Mesh, backend: Backend = "cotangent") -> tuple[sparse.csr_matrix, NDArray[np.float64]]:
+    """Stiffness and mass of the generalised eigenproblem `stiffness φ = λ mass φ`.
+
+    Args:
+        mesh: V vertices.
+        backend: "cotangent" is the paper's operator: cotangent stiffness (Pinkall and Polthier 1993) with mixed Voronoi
+            mass (Meyer et al. 2002). "robust" is the tufted intrinsic-Delaunay Laplacian (Sharp and Crane 2020), for
+            surfaces with many sliver triangles.
+
+    Returns:
+        stiffness (V, V), symmetric positive semi-definite with rows that sum to zero, dimensionless; mass (V,) > 0,
+        length², which sums to the surface area.
+
+    Raises:
+        ImportError: backend "robust" without `robust-laplacian` installed.
+    """
+    if backend == "cotangent":
+        return _cotangent(mesh)
+    if backend == "robust":
+        try:
+            import robust_laplacian
+        except ImportError as error:
+            raise ImportError('backend="robust" needs robust-laplacian: pip install "interior-gps[robust]".') from error
+        # In unit scale, because the library's mollification is an absolute length.
+        scale = longest_side(mesh.vertices)
+        centred = (mesh.vertices - mesh.vertices.mean(axis=0)) / scale
+        stiffness, mass = robust_laplacian.mesh_laplacian(centred, np.asarray(mesh.faces))
+        return stiffness.tocsr(), mass.diagonal() * scale**2
+    raise ValueError(f"backend: expected 'cotangent' or 'robust', got {backend!r}.")
+
+
+def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, NDArray[np.float64]]:
+    corners = mesh.vertices[mesh.faces]
+    # Column i is the edge opposite corner i.
+    edges = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
+    squared = np.einsum("fij,fij->fi", edges, edges)
+    double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    thin = double_area <= _DEGENERATE * squared.max(axis=1)
+    if thin.any():
+        # Intrinsic mollification (Sharp and Crane 2020) of the degenerate faces alone: the cotangent matrix stays
+        # positive semi-definite, and a vertex whose faces all have zero area keeps a positive mass.
+        longest = np.sqrt(squared[thin].max(axis=1, keepdims=True))
+        lengths = np.sqrt(squared[thin]) + _MOLLIFIER * longest
+        squared[thin] = lengths**2
+        double_area[thin] = 2 * _heron(lengths)
+    # cot at corner i = (b·b + c·c − a·a) / (4 area), a the edge opposite i.
+    cotangents = (squared.sum(axis=1, keepdims=True) - 2 * squared) / (2 * double_area[:, None])
+    return _stiffness(mesh.faces, cotangents, len(mesh.vertices)), _mixed_voronoi_mass(
+        mesh.faces, cotangents, squared, double_area / 2, len(mesh.vertices)
+    )
+
+
+def _heron(lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    c, b, a = np.sort(lengths, axis=1).T  # Kahan's arrangement, stable for needles
+    return np.sqrt((a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))) / 4
+
+
+def _stiffness(faces: NDArray[np.int64], cotangents: NDArray[np.float64], n_vertices: int) -> sparse.csr_matrix:
+    # Half of the cotangent of each corner, at one of the two entries of the edge opposite it.
+    shape = n_vertices, n_vertices
+    ends = faces[:, [1, 2, 0]].ravel(), faces[:, [2, 0, 1]].ravel()
+    halves = sparse.csr_matrix((cotangents.ravel() / 2, ends), shape=shape)
+    weights = halves + halves.T
+    return sparse.diags(np.asarray(weights.sum(axis=1)).ravel(), format="csr") - weights
+
+
+def _mixed_voronoi_mass(
+    faces: NDArray[np.int64],
+    cotangents: NDArray[np.float64],
+    squared: NDArray[np.float64],
+    area: NDArray[np.float64],
+    n_vertices: int,
+) -> NDArray[np.float64]:
+    # Meyer et al. 2002, section 3.3. The Voronoi share of corner i takes an eighth of edge² · cot of the angle that
+    # faces the edge, over the two edges at i; in an obtuse face the corners take fixed shares instead.
+    share = squared * cotangents / 8
+    voronoi = share.sum(axis=1, keepdims=True) - share
+    obtuse = cotangents < 0
+    fixed = np.where(obtuse, area[:, None] / 2, area[:, None] / 4)
+    corner = np.where(obtuse.any(axis=1, keepdims=True), fixed, voronoi)
+    mass = np.zeros(n_vertices)
+    np.add.at(mass, faces, corner)
+    return mass

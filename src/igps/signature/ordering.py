@@ -1,0 +1,132 @@
+"""An order of the points of a body that depends on its form alone, and choices along it.
+
+Samples come in the order of a grid, faces and vertices in that of a file. What is chosen by such an order changes when
+the body is turned or its mesh numbered anew. Here points are ordered by one number each, which consists of distances in
+a spectral embedding, or in space, and so does not depend on place, numbering, or sign and basis of eigenfunctions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from igps.mesh.mesh import Mesh
+from igps.mesh.surface import face_areas
+
+__all__ = ["crowding", "in_order_of_form", "one_in_each_share", "places", "places_in_space", "shares_around"]
+
+# λ·area at which the embedding's weights have fallen to 1/e of the commute time's: the eigenfunctions from the 60th on
+# count for nothing, and it does not matter whether the last ones are all of a multiplet.
+_CUTOFF = 100.0
+_N_NEAREST = 32
+_ROWS_AT_ONCE = 1024
+_LEAST_WEIGHT = 1e-4
+# Of the distances from the anchors, beside the potential. They are no multiples of each other, so that two points have
+# the same place only by chance.
+_MARK_SHARE = 0.03
+_ANCHOR_SHARES = 0.1 / np.sqrt([1.0, 2.0, 3.0, 5.0])
+
+
+def places(
+    eigenfunctions: NDArray[np.floating],
+    eigenvalues: NDArray[np.float64],
+    area: float,
+    marks: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
+    """One number for each of some points of a body, by which they can be ordered whatever the order they come in.
+
+    The barycentroid potential (Rustamov 2010) in a smooth low-pass embedding, and shares of the distances from four
+    anchors. These are among the points: the one of greatest potential, then each time one far from those before. In a
+    body with symmetries many points have one potential, and the anchors tell them apart; which of several like points
+    becomes an anchor is decided by rounding, but whichever it is, all that follows is like what would follow another.
+
+    Args:
+        eigenfunctions: (P, K) at the points, 1/length.
+        eigenvalues: (K,) positive ascending, 1/length².
+        area: of the surface, length².
+        marks: (P,) of the order of 1: what else tells points apart. A body's symmetries need not be those of the points
+            that stand for it: around the axis of a vase the surface is the same, the grid or the triangles are not.
+
+    Returns:
+        (P,) dimensionless.
+    """
+    scaled = eigenvalues * area
+    weights = np.sqrt(area / scaled) * np.exp(-scaled / _CUTOFF)
+    n_kept = int((weights > _LEAST_WEIGHT * weights[0]).sum())  # the first: weights fall
+    return _by_anchors(eigenfunctions[:, :n_kept] * weights[:n_kept], marks)
+
+
+def places_in_space(mesh: Mesh) -> NDArray[np.float64]:
+    """(V,) the same for the vertices of a mesh, by straight distances from the surface's centroid and from anchors.
+
+    This needs no eigenfunctions, but changes with pose.
+    """
+    areas = face_areas(mesh.vertices, mesh.faces)
+    centres = mesh.vertices[mesh.faces].mean(axis=1)
+    embedding = mesh.vertices - areas @ centres / areas.sum()
+    embedding /= np.linalg.norm(embedding, axis=1).max()
+    return _by_anchors(embedding, shares_around(mesh.faces, areas))
+
+
+def in_order_of_form(mesh: Mesh) -> Mesh:
+    """The mesh with vertices, faces and the first corner of each in an order that its numbering does not change."""
+    found = places_in_space(mesh)
+    order = np.argsort(found, kind="stable")
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    corners = rank[mesh.faces]
+    first = corners.argmin(axis=1)[:, None]
+    corners = np.take_along_axis(corners, (first + np.arange(3)) % 3, axis=1)
+    return replace(mesh, vertices=mesh.vertices[order], faces=corners[np.lexsort(corners.T[::-1])])
+
+
+def _by_anchors(embedding: NDArray[np.float64], marks: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    found = _distances(embedding, np.zeros(embedding.shape[1]))
+    if marks is not None:
+        found += _MARK_SHARE * marks
+    anchor, nearest = int(np.argmax(found)), np.full(len(found), np.inf)
+    for share in _ANCHOR_SHARES:
+        distance = _distances(embedding, embedding[anchor])
+        found += share * distance
+        nearest = np.minimum(nearest, distance)
+        # Not the nearest alone: that of two points may agree where the distances from the other anchors do not.
+        anchor = int(np.argmax(nearest + found))
+    return found
+
+
+def _distances(points: NDArray[np.float64], from_point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P,) of points (P, D), by so many at once that the differences stay in the processor's cache."""
+    pieces = [slice(start, start + _ROWS_AT_ONCE) for start in range(0, len(points), _ROWS_AT_ONCE)]
+    return np.concatenate([np.linalg.norm(points[piece] - from_point, axis=1) for piece in pieces])
+
+
+def crowding(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean distance of each of some points (P, 3) from its nearest ones, over that of all: marks for `places`."""
+    n_nearest = min(_N_NEAREST + 1, len(points))
+    distance = cKDTree(points).query(points, n_nearest)[0].reshape(len(points), n_nearest).mean(axis=1)
+    return distance / max(distance.mean(), np.finfo(float).tiny)
+
+
+def shares_around(faces: NDArray[np.int64], areas: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Area of the faces (F, 3) around each vertex, over the mean: marks for `places`."""
+    around = np.bincount(faces.ravel(), weights=np.repeat(areas, 3))
+    return around / around.mean()
+
+
+def one_in_each_share(sizes: NDArray[np.float64], n: int, generator: np.random.Generator) -> NDArray[np.int64]:
+    """Draw n of some things laid end to end, each as often as its size asks: one at random in each n-th of the length.
+
+    Args:
+        sizes: (F,) non-negative, in their order.
+        n: how many to draw.
+        generator: of the draws.
+
+    Returns:
+        (n,) ascending indices; a large thing is drawn several times.
+    """
+    ends = np.cumsum(sizes)
+    position = (np.arange(n) + generator.random(n)) * (ends[-1] / n)
+    return np.minimum(np.searchsorted(ends, position, side="right"), np.flatnonzero(sizes)[-1])

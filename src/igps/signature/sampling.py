@@ -1,0 +1,67 @@
+"""Random points of a surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.mesh.mesh import Mesh
+from igps.mesh.surface import face_areas
+from igps.signature.ordering import one_in_each_share
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points on the faces of a mesh.
+
+    Args:
+        mesh: V vertices, F faces.
+        face: (P,) int64 the face of each point.
+        weights: (P, 3) float64 its barycentric coordinates there.
+    """
+
+    mesh: Mesh
+    face: NDArray[np.int64]
+    weights: NDArray[np.float64]
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """(P, 3) length."""
+        return self.interpolate(self.mesh.vertices)
+
+    def interpolate(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(P, D) linear interpolation of values (V, D) at the vertices."""
+        return np.einsum("pi,pid->pd", self.weights, values[self.mesh.faces[self.face]])
+
+
+def surface_points(mesh: Mesh, n_points: int, seed: int, places: NDArray[np.float64] | None = None) -> SurfacePoints:
+    """Random points evenly distributed over the surface.
+
+    Args:
+        mesh: the surface.
+        n_points: how many.
+        seed: the same seed gives the same points.
+        places: (V,) of the vertices, by which faces and corners are taken in an order that does not depend on how they
+            are numbered, see `igps.signature.ordering`. One point is then drawn in each of `n_points` equal shares of
+            the area, and the points come in that order.
+    """
+    generator = np.random.default_rng(seed)
+    area = face_areas(mesh.vertices, mesh.faces)
+    if places is None:
+        face = generator.choice(len(area), size=n_points, p=area / area.sum())
+        return SurfacePoints(mesh, face, _in_triangles(n_points, generator))
+    at_corners = places[mesh.faces]
+    order = np.argsort(at_corners.sum(axis=1), kind="stable")
+    face = order[one_in_each_share(area[order], n_points, generator)]
+    weights = np.empty((n_points, 3))
+    np.put_along_axis(weights, np.argsort(at_corners, axis=1)[face], _in_triangles(n_points, generator), axis=1)
+    return SurfacePoints(mesh, face, weights)
+
+
+def _in_triangles(n_points: int, generator: np.random.Generator) -> NDArray[np.float64]:
+    """(P, 3) barycentric coordinates, uniform in a triangle (Osada et al. 2002, equation 1)."""
+    r = np.sqrt(generator.random(n_points))
+    s = generator.random(n_points)
+    return np.stack([1 - r, r * (1 - s), r * s], axis=1)

@@ -1,0 +1,182 @@
+"""Which cells of a cubic grid lie inside a surface: scan lines along three axes, winding numbers in doubt."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.mesh.limits import check_grid
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.surface import box_sides, directed_edges, longest_side
+from igps.mesh.winding import winding_number
+
+# A cell centre closer to the surface than this share of a cell lies on it, and does not count as inside. It is far
+# above rounding, so that a moved or turned mesh keeps its samples.
+_ON_SURFACE = 1e-6
+# The finest grid that `min_samples` may ask for, and the most cells of one: some 40 bytes each while it is scanned.
+_MAX_RESOLUTION = 512
+_MAX_CELLS = 2**25
+
+
+def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> NDArray[np.float64]:
+    """Centres of the cubic voxels inside the mesh (Rustamov 2010, section 3).
+
+    The grid is centred on the bounding box, with cells of 1/`resolution` of its longest side, so that moving the mesh,
+    or turning it by the symmetries of the grid, moves and turns the samples.
+
+    Args:
+        mesh: the body.
+        resolution: cells along the longest side of the bounding box.
+        min_samples: refine the grid until at least so many cells are inside; 0 keeps `resolution`.
+
+    Returns:
+        (P, 3) points in the mesh's coordinates, length.
+
+    Raises:
+        MeshError: no cell centre is inside, `min_samples` is out of reach, or the grid would fill the memory.
+    """
+    if resolution < 1:
+        raise ValueError(f"resolution: expected at least 1, got {resolution}.")
+    if min_samples < 0:
+        raise ValueError(f"min_samples: expected at least 0, got {min_samples}.")
+    finest = _finest_resolution(mesh)
+    if resolution > finest:
+        raise MeshError(
+            f"{mesh.name}: a grid of {resolution} cells along the longest side has more than the {_MAX_CELLS} cells "
+            f"that are held in memory at once. Lower the resolution to {finest}."
+        )
+    while True:
+        axes = grid_axes(mesh, resolution)
+        check_grid(len(axes[0]) * len(axes[1]) * len(axes[2]), mesh.name)
+        inside = inside_grid(mesh, axes)
+        count = int(inside.sum())
+        if count >= max(min_samples, 1):
+            index = np.nonzero(inside)
+            return np.stack([axis[i] for axis, i in zip(axes, index, strict=True)], axis=1)
+        if min_samples == 0 or resolution >= finest:
+            wanted = f"at least {min_samples} samples" if min_samples else "an interior sample"
+            raise MeshError(
+                f"{mesh.name}: {count} cells of a grid of {resolution} along the longest side lie inside, {wanted} "
+                "expected. The body is too thin for this grid: raise the resolution, or set min_samples to refine it."
+            )
+        # The count grows with the cube of the resolution for a body, with less for a thin one: approach from below.
+        growth = (min_samples / max(count, 1)) ** (1 / 3)
+        resolution = min(int(np.ceil(resolution * min(max(growth, 1.05), 2.0))), finest)
+
+
+def _finest_resolution(mesh: Mesh) -> int:
+    """The largest resolution whose grid is within the limits."""
+    sides = box_sides(mesh.vertices) / longest_side(mesh.vertices)
+    resolution = _MAX_RESOLUTION
+    while np.prod(np.ceil(sides * resolution).clip(1)) > _MAX_CELLS:
+        resolution -= 1
+    return resolution
+
+
+def grid_axes(mesh: Mesh, resolution: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Coordinates of the cell centres along x, y and z of the cubic grid centred on the mesh's bounding box."""
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    cell = (high - low).max() / resolution
+    # The small slack keeps a side of exactly n cells at n cells, whatever the rounding.
+    counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1).astype(int)
+    x, y, z = ((low[i] + high[i]) / 2 + (np.arange(counts[i]) - (counts[i] - 1) / 2) * cell for i in range(3))
+    return x, y, z
+
+
+def inside_grid(
+    mesh: Mesh, axes: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+) -> NDArray[np.bool_]:
+    """For each point of the grid spanned by `axes`, whether the mesh's winding number there is above one half.
+
+    Along each axis the signed crossings of every grid line are summed from both ends. On a closed mesh the six sums
+    agree, and are the winding number. Where a hole lets one line through, the other five outvote it; where more
+    disagree, the winding number is computed from solid angles (Jacobson et al. 2013). Points on the surface are out.
+
+    Returns:
+        (X, Y, Z) booleans.
+    """
+    shape = tuple(len(axis) for axis in axes)
+    votes = np.zeros(shape, dtype=np.int8)
+    on_surface = np.zeros(shape, dtype=bool)
+    for i in range(3):
+        order = (i, (i + 1) % 3, (i + 2) % 3)
+        line = tuple(axes[k] for k in order)
+        after, before, touched = _scan(mesh.vertices[:, order], mesh.faces, line)
+        back = np.argsort(order)
+        votes += ((after > 0).astype(np.int8) + (before > 0)).transpose(back)
+        on_surface |= touched.transpose(back)
+    inside = votes >= 5
+    doubtful = np.nonzero((votes > 1) & (votes < 5) & ~on_surface)
+    if len(doubtful[0]):
+        points = np.stack([axis[i] for axis, i in zip(axes, doubtful, strict=True)], axis=1)
+        inside[doubtful] = winding_number(mesh.vertices, mesh.faces, points) > 0.5
+    return inside & ~on_surface
+
+
+def _scan(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    axes: tuple[NDArray[np.float64], ...],
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
+    """Signed crossings of the grid lines along the first axis, after and before each point, and the points touched.
+
+    Every comparison belongs to one edge and gives the same answer in both faces of that edge, so that a line through an
+    edge or a vertex crosses exactly one of the faces that meet there: ties are decided as if the line were moved by an
+    infinitesimal amount (Edelsbrunner and Mücke 1990), never by rounding.
+    """
+    x_axis, y_axis, z_axis = axes
+    # Rows: where each edge crosses each plane z = const, half-open in z. The edge runs from its lower to its upper end
+    # whatever the face, so both faces compute the same point.
+    start, end = directed_edges(faces)
+    upward = vertices[start, 2] < vertices[end, 2]
+    low, high = np.where(upward, start, end), np.where(upward, end, start)
+    first = np.searchsorted(z_axis, vertices[low, 2], side="left")
+    last = np.searchsorted(z_axis, vertices[high, 2], side="left")
+    half_edge, row = _ranges(first, last)
+    a, b = vertices[low[half_edge]], vertices[high[half_edge]]
+    t = (z_axis[row] - a[:, 2]) / (b[:, 2] - a[:, 2])
+    y = a[:, 1] + t * (b[:, 1] - a[:, 1])
+    x = a[:, 0] + t * (b[:, 0] - a[:, 0])
+    # A plane that crosses a face crosses exactly two of its edges, one up and one down: pair them.
+    order = np.lexsort((upward[half_edge], row, half_edge // 3))
+    down, up = order[0::2], order[1::2]
+    row = row[up]
+
+    # Columns: the points of each such segment on the lines y = const, half-open in y.
+    column_down, column_up = np.searchsorted(y_axis, y[down], "left"), np.searchsorted(y_axis, y[up], "left")
+    segment, column = _ranges(np.minimum(column_down, column_up), np.maximum(column_down, column_up))
+    # The face is seen from its outside, looking along −x, where its upward edge lies on the larger y.
+    sign = np.where(column_up > column_down, 1, -1)[segment].astype(np.int32)
+    y0, y1, x0, x1 = (values[segment] for values in (y[down], y[up], x[down], x[up]))
+    crossing = x0 + (y_axis[column] - y0) / (y1 - y0) * (x1 - x0)
+
+    # A crossing at x counts for every point of its line that lies on its left: put it where the suffix sum starts.
+    position = np.searchsorted(x_axis, crossing, "left")
+    size = (len(x_axis) + 1, len(y_axis), len(z_axis))
+    flat = np.ravel_multi_index((position, column, row[segment]), size)
+    at = np.bincount(flat, weights=sign, minlength=int(np.prod(size))).reshape(size).astype(np.int32)
+    # The points on the left of a crossing have indices below its position.
+    after = np.cumsum(at[::-1], axis=0)[::-1][1:]
+    before = -np.cumsum(at, axis=0)[:-1]
+
+    touched = np.zeros(size, dtype=bool)
+    cell = _cell(axes, vertices)
+    for neighbour in (position - 1, position):
+        clipped = np.clip(neighbour, 0, len(x_axis) - 1)
+        close = np.abs(x_axis[clipped] - crossing) < _ON_SURFACE * cell
+        touched[clipped[close], column[close], row[segment][close]] = True
+    return after, before, touched[:-1]
+
+
+def _cell(axes: tuple[NDArray[np.float64], ...], vertices: NDArray[np.float64]) -> float:
+    """The grid's cell: the first axis tells it, or where that has one point, as across a flat body, the next does."""
+    steps = (float(axis[1] - axis[0]) for axis in axes if len(axis) > 1)
+    return next(steps, longest_side(vertices))
+
+
+def _ranges(first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The pairs (i, k) with first[i] ≤ k < last[i], in order."""
+    length = np.maximum(last - first, 0)
+    owner = np.repeat(np.arange(len(first)), length)
+    start = np.cumsum(length) - length
+    return owner, np.arange(len(owner)) - start[owner] + first[owner]

@@ -1,0 +1,405 @@
+"""A block Krylov basis that grows block by block, and the eigenpairs of the operator projected on it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+import torch
+from scipy.linalg import qr
+
+from igps._compiled import beats_blas
+from igps._threads import ALONE, Team
+from igps.spectra._checks import ROUNDING
+from igps.spectra._direct import Factors
+
+# Below this, relative to what it came from, a pivot makes a Cholesky factor inaccurate
+CHOLESKY_QR_PIVOT = 1e-6
+# Below this, dividing by a pivot makes too much of what rounding left of the basis to wait for the next sweep
+QUICK_PIVOT = 1e-4
+# Above this, relative to the largest pivot, a Cholesky factor makes rows orthonormal but for rounding
+ROUND_PIVOT = 0.1
+# So many blocks go by between two sweeps, or one where a sweep has found a larger loss of orthogonality; a smaller one
+# may be taken out in single precision
+SWEEP_EVERY, SWEEP_LOSS, SINGLE_LOSS = 2, 1e-7, 3e-8
+# Of a larger basis there is no copy in single precision, to save memory: 1 GiB
+MOST_SINGLE_ENTRIES = 2**28
+# Up to here a basis gains by huge pages, which NumPy's memory asks for, a larger one waits longer for them: 256 MiB
+MOST_HUGE_ENTRIES = 2**25
+# Columns of the basis that are turned into eigenvectors at once
+COLUMNS_AT_ONCE = 8192
+# Columns of a piece of the basis, of which a thread computes with one at a time, and the most pieces
+PIECE, MOST_PIECES = 2**12, 8
+
+
+@dataclass(frozen=True)
+class RitzPairs:
+    """Eigenpairs of the projected problem, in the order of their eigenvalues.
+
+    Attributes:
+        eigenvalues: (m,) of A.
+        residuals: (m,) ‖A y − λ y‖ of the Ritz vectors after one more application of the operator.
+        coefficients: (m + b, m) of those Ritz vectors, not normalised, in the basis with its next block.
+        below_shift: (m,) whether θ < 0.
+    """
+
+    eigenvalues: torch.Tensor
+    residuals: torch.Tensor
+    coefficients: torch.Tensor
+    below_shift: torch.Tensor
+
+    def leading(self, n_below: int, tolerance: float) -> torch.Tensor:
+        """Indices of the pairs up to the first that has not converged; none if fewer than n_below lie below σ."""
+        converged = (self.residuals <= tolerance * self.eigenvalues) & (self.eigenvalues > 0)
+        below = torch.nonzero(converged & self.below_shift).flatten()
+        if len(below) < n_below:
+            return below[:0]
+        above = torch.nonzero(~self.below_shift).flatten()
+        n_above = int(torch.cumprod(converged[above].int(), 0).sum())
+        return torch.cat([below, above[:n_above]])
+
+
+class Krylov:
+    """Orthonormal basis of a block Krylov space of (A − σI)⁻¹, grown block by block, and the operator projected on it.
+
+    Vectors are stored as rows, since products of the basis with a block are fastest so. The first row is the zero mode:
+    the others stay orthogonal to it, and the projected problem leaves it out. The columns are cut into pieces, which a
+    team works on side by side; how many depends on their number alone, so that a team changes no bit.
+    """
+
+    def __init__(
+        self,
+        factors: Factors,
+        zero_mode: np.ndarray,
+        block_size: int,
+        capacity: int,
+        generator: np.random.Generator,
+        team: Team = ALONE,
+    ) -> None:
+        self._factors = factors
+        self._team = team
+        self._generator = generator
+        self._block_size = block_size
+        n_vertices = len(zero_mode)
+        self._pieces = _pieces(n_vertices, max(1, min(MOST_PIECES, n_vertices // PIECE)))
+        self._large = (capacity + 1) * n_vertices > MOST_SINGLE_ENTRIES
+        # with a copy in single precision, to be read in half the time
+        self._single: torch.Tensor | None
+        self._allocate(capacity + 1, n_vertices)
+        self._basis[0] = torch.from_numpy(zero_mode)
+        if self._single is not None:
+            self._single[0] = self._basis[0]
+        self._projected = torch.zeros(capacity + 1, capacity + 1, dtype=torch.float64)
+        # rows previous:current and current:stop of the basis are the last two blocks, the last not yet multiplied; rows
+        # before swept are orthogonal to all before them, those behind it to their neighbours
+        self._previous = self._current = self._stop = self._swept = 1
+        self._every = SWEEP_EVERY
+        self._coupling = torch.empty(0, 0, dtype=torch.float64)
+        # a random vector is mostly high frequencies: one application leaves what matters
+        self._append(self._orthonormal(self._apply(self._random(block_size)), near=1)[0], swept=True)
+
+    def _allocate(self, n_rows: int, n_columns: int) -> None:
+        """A new basis. Of NumPy's memory a part can be given back.
+
+        A smaller one and its copy are one piece: the C library keeps as much for the next basis as was one piece once.
+        """
+        self._memory = np.empty((n_rows if self._large else 0, n_columns))
+        if self._large:
+            self._basis, self._single = torch.from_numpy(self._memory), None
+            return
+        size = n_rows * n_columns
+        length = size + (size + 1) // 2
+        huge = length <= MOST_HUGE_ENTRIES
+        room = torch.from_numpy(np.empty(length)) if huge else torch.empty(length, dtype=torch.float64)
+        self._basis = room[:size].view(n_rows, n_columns)
+        self._single = room[size:].view(torch.float32)[:size].view(n_rows, n_columns)
+
+    @property
+    def size(self) -> int:
+        """Dimension m of the projected problem."""
+        return self._current - 1
+
+    @property
+    def loses_basis(self) -> bool:
+        """Whether the basis must make place for the eigenvectors."""
+        return self._large
+
+    def expand(self) -> None:
+        """Multiply the last block, and append what is new in the product as the next block."""
+        last = slice(self._current, self._stop)
+        near = self._basis[self._previous : self._stop]
+        product = self._apply(self._basis[last])
+        (projection,) = self._sums(lambda piece: (_overlaps(product, near, piece),))
+        diagonal = projection[:, self._current - self._previous :]
+
+        def leave_new(piece: slice) -> tuple[torch.Tensor]:
+            product[:, piece].addmm_(projection, near[:, piece], alpha=-1)
+            return (_overlaps(product, product, piece),)
+
+        (remainder,) = self._sums(leave_new)
+        # the longest row of the product, by Pythagoras: what the recurrence took from it, and what is left
+        scale = math.sqrt(float((remainder.diagonal() + projection.square().sum(1)).max()))
+        quick = self._factor_quickly(product, remainder, scale)
+        if quick is None:
+            self._sweep()
+        block, coupling = quick or self._orthonormal(product, near=self._previous, scale=scale)
+        self._projected[last, last] = (diagonal + diagonal.T) / 2
+        self._previous, self._current = self._current, self._stop
+        self._append(block, swept=quick is None)
+        new = slice(self._current, self._stop)
+        self._projected[new, last] = coupling
+        self._projected[last, new] = coupling.T
+        self._coupling = coupling
+        if self._stop - self._swept >= self._every * len(block) and self._sweep() > SWEEP_LOSS:
+            self._every = 1
+
+    def widen(self) -> None:
+        """Enlarge the last block, and those that follow, by random vectors: they see what the start block did not."""
+        self._sweep()
+        block, _ = self._orthonormal(self._random(self._block_size), near=self._previous)
+        self._append(block, swept=True)
+        self._coupling = torch.cat([self._coupling, self._coupling.new_zeros(len(block), self._coupling.shape[1])])
+
+    def ritz_pairs(self, shift: float) -> RitzPairs:
+        self._sweep()
+        inside = slice(1, self._current)
+        theta, coefficients = torch.linalg.eigh(self._projected[inside, inside])
+        outside = self._coupling @ coefficients[-self._coupling.shape[1] :]
+        eigenvalues = shift + 1 / theta
+        order = torch.argsort(eigenvalues)
+        return RitzPairs(
+            eigenvalues=eigenvalues[order],
+            residuals=(torch.linalg.norm(outside, dim=0) / theta**2)[order],
+            coefficients=torch.cat([coefficients, outside / theta])[:, order],
+            below_shift=(theta < 0)[order],
+        )
+
+    def eigenvectors(
+        self, ritz: RitzPairs, index: torch.Tensor, order: np.ndarray
+    ) -> tuple[np.ndarray, list[Callable[[], None]]]:
+        """(V, K) for the eigenvectors of the Ritz pairs with these indices, and the steps that fill it, in any order.
+
+        Entry i of a vector becomes row ``order[i]``.
+        """
+        coefficients = _coefficients(ritz, index)
+        vectors = _empty(self._basis.shape[1], len(index)).numpy()
+
+        def combine(piece: slice) -> None:
+            vectors[order[piece]] = _combinations(self._basis[1 : self._stop], coefficients, piece)
+
+        return vectors, [partial(combine, piece) for piece in self._small_pieces()]
+
+    def eigenvectors_in_place(self, ritz: RitzPairs, index: torch.Tensor, order: np.ndarray) -> np.ndarray:
+        """The same eigenvectors (V, K), never in memory beside the basis, which is lost; see `loses_basis`."""
+        coefficients = _coefficients(ritz, index)
+        n_vertices, n_vectors = self._basis.shape[1], coefficients.shape[1]
+        for piece in self._small_pieces():
+            self._basis[:n_vectors, piece] = coefficients.T @ self._basis[1 : self._stop, piece]
+        rows = self._memory
+        self._basis, self._memory = self._basis.new_empty(0, n_vertices), np.empty((0, n_vertices))
+        # gives back what lies behind; no other array looks into it any more
+        rows.resize((n_vectors, n_vertices), refcheck=False)
+        vectors = np.empty((n_vertices, n_vectors))
+        for piece in self._small_pieces():
+            vectors[order[piece]] = rows[:, piece].T
+        return vectors
+
+    def _small_pieces(self) -> list[slice]:
+        n_vertices = self._basis.shape[1]
+        return _pieces(n_vertices, -(-n_vertices // COLUMNS_AT_ONCE))
+
+    def _random(self, n_rows: int) -> torch.Tensor:
+        return torch.from_numpy(self._generator.standard_normal((n_rows, self._basis.shape[1])))
+
+    def _apply(self, block: torch.Tensor) -> torch.Tensor:
+        """The products (b, V) of the operator with b rows."""
+        return self._factors.solve(block.T, self._team).T.contiguous()
+
+    def _sums(self, parts: Callable[[slice], tuple[torch.Tensor, ...]]) -> tuple[torch.Tensor, ...]:
+        """What each piece of the columns contributes, added in the order of the pieces."""
+        first, *others = self._team.each(parts, self._pieces)
+        for other in others:
+            for total, part in zip(first, other, strict=True):
+                total.add_(part)
+        return first
+
+    def _room(self, n_rows: int) -> torch.Tensor:
+        """The rows of the basis behind the last, which a block is written to before it is appended."""
+        stop = self._stop + n_rows
+        if stop > len(self._basis):
+            capacity = len(self._basis) * 3 // 2 + n_rows
+            basis, single, projected = self._basis, self._single, self._projected
+            self._allocate(capacity, basis.shape[1])
+            self._basis[: self._stop] = basis[: self._stop]
+            if self._single is not None and single is not None:
+                self._single[: self._swept] = single[: self._swept]
+            self._projected = projected.new_zeros(capacity, capacity)
+            self._projected[: self._stop, : self._stop] = projected[: self._stop, : self._stop]
+        return self._basis[self._stop : stop]
+
+    def _append(self, block: torch.Tensor, *, swept: bool) -> None:
+        room = self._room(len(block))
+        if block.data_ptr() != room.data_ptr():
+            room.copy_(block)
+        self._stop += len(block)
+        if swept:
+            self._mark_swept()
+
+    def _mark_swept(self) -> None:
+        rows = slice(self._swept, self._stop)
+
+        def copy(piece: slice) -> None:
+            if self._single is not None:
+                self._single[rows, piece] = self._basis[rows, piece]
+
+        self._team.each(copy, self._pieces)
+        self._swept = self._stop
+
+    def _sweep(self) -> float:
+        """Make the rows since the last sweep orthogonal to all before them, and orthonormal; how far they were from it.
+
+        The recurrence leaves of older rows what rounding left in the last two blocks, times the ratio of the largest θ
+        to the spread of the others: with each block some hundred times as much. Two blocks go by before it is swept
+        out, in both at once, as products of the basis with twice as many columns take less than twice the time. The
+        projection is then wrong by the square of what was lost (Simon 1984), which is below rounding. Single precision
+        takes out exactly enough of what is that small; then the rows are mostly still orthonormal.
+        """
+        old, new = self._basis[: self._swept], self._basis[self._swept : self._stop]
+        if not len(new):
+            return 0.0
+        (lost,) = self._sums(lambda piece: (_overlaps(new, old, piece),))
+        largest = float(lost.abs().max())
+        single = self._single if largest <= SINGLE_LOSS else None
+
+        def take_out(piece: slice) -> tuple[torch.Tensor]:
+            if single is None:
+                new[:, piece].addmm_(lost, old[:, piece], alpha=-1)
+            else:
+                _subtract(new, lost.float(), single[: self._swept], piece)
+            return (_overlaps(new, new, piece),)
+
+        (squares,) = self._sums(take_out)
+        if float((squares - torch.eye(len(new))).abs().max()) > ROUNDING:
+            self._multiply(_inverse(torch.linalg.cholesky(squares)), new, new)
+        self._mark_swept()
+        return largest
+
+    def _multiply(self, factor: torch.Tensor, rows: torch.Tensor, out: torch.Tensor) -> None:
+        """The product of a matrix (b, b) with rows (b, V), which ``out`` may be."""
+
+        def multiply(piece: slice) -> None:
+            if out is rows:
+                rows[:, piece] = factor @ rows[:, piece]
+            else:
+                torch.mm(factor, rows[:, piece], out=out[:, piece])
+
+        self._team.each(multiply, self._pieces)
+
+    def _orthonormal(
+        self, block: torch.Tensor, near: int, scale: float | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rows Q orthonormal and orthogonal to the basis, and R with block = Qᵀ R + what the basis spans, by columns.
+
+        ``scale`` is how long the longest row was before something of the basis was taken from it.
+
+        The recurrence says that only the basis from row ``near`` on contributes, the full pass after it sweeps out
+        what rounding has left. Together that costs one product with the basis and one back.
+        """
+        scale = float(torch.linalg.norm(block, dim=1).max()) if scale is None else scale
+        first: torch.Tensor | None = None
+        for rows in (self._basis[near : self._stop], self._basis[: self._stop]):
+            block = torch.addmm(block, (rows @ block.T).T, rows, alpha=-1)
+            block, factor = self._factor_rows(block, scale)
+            first, scale = (factor, 1.0) if first is None else (factor @ first, 1.0)
+        assert first is not None
+        return block, first
+
+    def _factor_rows(self, block: torch.Tensor, scale: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """Orthonormal rows Q and R with blockᵀ = Qᵀ R; for a direction lost in rounding a random row and no R."""
+        factor, failed = torch.linalg.cholesky_ex(block @ block.T)
+        if not failed and torch.diagonal(factor).min() > CHOLESKY_QR_PIVOT * scale:
+            return _inverse(factor) @ block, factor.T
+        q, r, order = qr(block.T.numpy(), mode="economic", pivoting=True)
+        lost = np.abs(np.diag(r)) <= ROUNDING * scale
+        r[lost] = 0
+        rows = torch.from_numpy(np.ascontiguousarray(q.T))
+        if lost.any():
+            rows[torch.from_numpy(lost)] = self._random(int(lost.sum())) / math.sqrt(block.shape[1])
+        return rows, torch.from_numpy(r[:, np.argsort(order)])
+
+    def _factor_quickly(
+        self, block: torch.Tensor, squares: torch.Tensor, scale: float
+    ) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """As `_factor_rows`, in the room of the basis, given the rows' products; again where rounding asks for it.
+
+        None if a pivot is small.
+        """
+        first, failed = torch.linalg.cholesky_ex(squares)
+        smallest, largest = torch.aminmax(torch.diagonal(first))
+        if failed or not smallest > QUICK_PIVOT * scale:
+            return None
+        rows = self._room(len(block))
+        self._multiply(_inverse(first), block, rows)
+        if smallest > ROUND_PIVOT * largest:
+            return rows, first.T
+        (squares,) = self._sums(lambda piece: (_overlaps(rows, rows, piece),))
+        second = torch.linalg.cholesky(squares)
+        self._multiply(_inverse(second), rows, rows)
+        return rows, second.T @ first.T
+
+
+def _coefficients(ritz: RitzPairs, index: torch.Tensor) -> torch.Tensor:
+    """(m + b, K) of the Ritz pairs with these indices, of length 1."""
+    coefficients = ritz.coefficients[:, index]
+    return coefficients / torch.linalg.norm(coefficients, dim=0)
+
+
+def _overlaps(rows: torch.Tensor, others: torch.Tensor, piece: slice) -> torch.Tensor:
+    """The products (n, m) of rows with others, over a piece of the columns."""
+    if beats_blas():
+        from igps.spectra import _row_loops as row_loops
+
+        return torch.from_numpy(row_loops.overlaps(rows.numpy(), others.numpy(), piece.start, piece.stop))
+    return (others[:, piece] @ rows[:, piece].T).T  # the many first: MKL is faster so
+
+
+def _subtract(rows: torch.Tensor, factors: torch.Tensor, others: torch.Tensor, piece: slice) -> None:
+    """Take factors (n, m) times others from rows, in a piece of the columns; in the precision of the others."""
+    if beats_blas():
+        from igps.spectra import _row_loops as row_loops
+
+        row_loops.subtract(rows.numpy(), factors.numpy(), others.numpy(), piece.start, piece.stop)
+    else:
+        rows[:, piece].sub_(factors @ others[:, piece])
+
+
+def _combinations(rows: torch.Tensor, coefficients: torch.Tensor, piece: slice) -> np.ndarray:
+    """The products (n, K) of n columns, a piece of rows (m, V), with coefficients (m, K)."""
+    if beats_blas():
+        from igps.spectra._tiles import product
+
+        shape = piece.stop - piece.start, coefficients.shape[1], len(rows)
+        found = np.empty(shape[:2])
+        columns = rows.numpy().ravel(), piece.start, rows.shape[1], 1
+        out = found.ravel(), 0, shape[1]
+        product(shape, 1.0, columns, (coefficients.numpy().ravel(), 0, shape[1]), False, out, out)
+        return found
+    return (coefficients.T @ rows[:, piece]).numpy().T
+
+
+def _pieces(size: int, number: int) -> list[slice]:
+    cuts = np.linspace(0, size, number + 1).astype(int).tolist()
+    return [slice(begin, end) for begin, end in pairwise(cuts)]
+
+
+def _empty(n_rows: int, n_columns: int) -> torch.Tensor:
+    return torch.empty(n_rows, n_columns, dtype=torch.float64)
+
+
+def _inverse(factor: torch.Tensor) -> torch.Tensor:
+    """Of a lower triangular matrix."""
+    return torch.linalg.solve_triangular(factor, torch.eye(len(factor), dtype=factor.dtype), upper=False)

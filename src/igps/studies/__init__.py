@@ -1,1 +1,0 @@
-"""What takes many descriptors or many bodies, as functions that return data."""

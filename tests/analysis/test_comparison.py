@@ -1,0 +1,160 @@
+"""`compare`: rows, failures and distances of descriptors side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from igps.analysis import comparison
+from igps.analysis.comparison import Result, compare
+from igps.data.dataset import SignatureDataset
+from igps.descriptors import descriptor
+from igps.descriptors.d2 import D2
+from igps.nn.descriptor import Descriptor
+from igps.retrieval import retrieval_scores
+from igps.signature.signature import SignatureConfig
+from own_descriptors import Broken, Height, Slow, write_egg
+
+KEYS = ["descriptor", "nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map"]
+KEYS += ["seconds_per_mesh", "n_models", "invariant_to"]
+CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three balls and three long eggs; the last ball is an egg by its height."""
+    folder = tmp_path_factory.mktemp("collection")
+    for label, heights in (("ball", (1.0, 1.1, 2.3)), ("egg", (2.2, 2.4, 2.6))):
+        for i, height in enumerate(heights):
+            write_egg(folder / "meshes" / label / f"{i}.off", height, subdivisions=2)
+    return folder / "meshes"
+
+
+@pytest.fixture(scope="module")
+def dataset(root: Path) -> SignatureDataset:
+    collection = SignatureDataset(root, CONFIG, root.parent / "cache")
+    assert collection.precompute(n_workers=1, progress=False) == []
+    return collection
+
+
+def run(dataset: SignatureDataset, *chosen: Descriptor, n_workers: int = 1) -> dict[str, Result]:
+    results = list(compare(dataset, chosen, n_workers=n_workers, progress=False))
+    assert [result.descriptor for result in results] == list(chosen)
+    return {result.descriptor.name: result for result in results}
+
+
+def test_result_is_what_heights_give(dataset: SignatureDataset) -> None:
+    result = run(dataset, Height("tall"))["tall"]
+    heights = torch.tensor([1.0, 1.1, 2.3, 2.2, 2.4, 2.6]) * 2
+    assert result.distances is not None
+    torch.testing.assert_close(result.distances, (heights[:, None] - heights).abs(), atol=1e-5, rtol=0)
+    assert result.names == dataset.files.names
+    assert result.labels == ("ball", "ball", "ball", "egg", "egg", "egg")
+    row = result.row()
+    assert list(row) == KEYS
+    expected = retrieval_scores((heights[:, None] - heights).abs(), result.labels).mean()
+    assert {name: row[name] for name in expected} == pytest.approx(expected)
+    assert 0 < row["nn"] < 1
+    assert (row["descriptor"], row["n_models"], row["invariant_to"]) == ("tall", 6, ["motion"])
+    assert not result.failures
+    assert result.error is None
+
+
+@pytest.mark.parametrize(("fault", "reason"), [("raise", "a height of 4.8 is too much"), ("nan", "not finite")])
+def test_a_mesh_that_one_descriptor_cannot_describe_is_its_failure_alone(
+    dataset: SignatureDataset, fault: str, reason: str
+) -> None:
+    results = run(dataset, Height("picky", "egg/1.off", fault), Height("fine"))
+    (failure,) = results["picky"].failures
+    assert failure.id == "egg/1.off"
+    assert reason in failure.error
+    assert "1.off" in failure.error
+    assert results["picky"].row()["n_models"] == 5
+    assert results["picky"].labels == ("ball", "ball", "ball", "egg", "egg")
+    alone = run(dataset.subset([0, 1, 2, 3, 5]), Height("fine"))["fine"]
+    assert results["picky"].row()["map"] == pytest.approx(alone.row()["map"])
+    assert results["fine"].row()["n_models"] == 6
+
+
+def test_strict_stops_at_the_first_failure(dataset: SignatureDataset) -> None:
+    chosen = [Height("fine"), Height("picky", "egg/1.off")]
+    results = compare(dataset, chosen, n_workers=1, strict=True, progress=False)
+    assert next(results).descriptor.name == "fine"
+    with pytest.raises(ValueError, match=r"picky: .*too much"):
+        next(results)
+
+
+@pytest.mark.parametrize(
+    ("hopeless", "described", "reason"),
+    [
+        (Height("hopeless", "off"), 0, "no mesh could be described"),
+        (Broken("hopeless"), 6, "RuntimeError: out of order"),
+        (Height("hopeless", "egg/1.off", "shape"), 6, "shape"),
+    ],
+)
+def test_a_descriptor_without_scores_does_not_stop_the_others(
+    dataset: SignatureDataset, hopeless: Height, described: int, reason: str
+) -> None:
+    results = run(dataset, hopeless, Height("fine"))
+    row = results["hopeless"].row()
+    assert list(row) == KEYS
+    assert all(row[key] is None for key in KEYS[1:9])
+    assert row["n_models"] == described
+    assert reason in (results["hopeless"].error or "")
+    assert results["fine"].scores is not None
+
+
+def test_seconds_are_the_processor_time_of_a_description(dataset: SignatureDataset) -> None:
+    seconds = run(dataset.subset([0, 1]), Slow("slow"))["slow"].seconds_per_mesh
+    assert seconds is not None
+    assert 0.05 <= seconds < 0.3
+
+
+def test_distances_by_blocks_are_the_same(dataset: SignatureDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = run(dataset, Height("tall"))["tall"].distances
+    sizes: list[tuple[int, int]] = []
+    plain = Height.distances
+
+    def remember(self: Height, queries: Tensor, gallery: Tensor) -> Tensor:
+        sizes.append((len(queries), len(gallery)))
+        return plain(self, queries, gallery)
+
+    monkeypatch.setattr(Height, "distances", remember)
+    monkeypatch.setattr(comparison, "_BLOCK_ENTRIES", 24)
+    parts = run(dataset, Height("tall"))["tall"].distances
+    assert sizes == [(4, 6), (2, 6)]
+    assert whole is not None
+    assert parts is not None
+    torch.testing.assert_close(parts, whole, rtol=0, atol=0)
+
+
+def test_processes_give_what_one_does_and_those_that_are_killed_cost_one_mesh_each(dataset: SignatureDataset) -> None:
+    chosen = [Height("fine"), Height("deadly", "0.off", "kill")]
+    results = run(dataset, *chosen, n_workers=2)
+    assert [failure.id for failure in results["deadly"].failures] == ["ball/0.off", "egg/0.off"]
+    assert all("killed" in failure.error for failure in results["deadly"].failures)
+    assert results["deadly"].names == ("ball/1.off", "ball/2.off", "egg/1.off", "egg/2.off")
+    expected = run(dataset, Height("fine"))["fine"].distances
+    assert expected is not None
+    assert results["fine"].distances is not None
+    torch.testing.assert_close(results["fine"].distances, expected, rtol=0, atol=0)
+
+
+def test_signatures_without_what_a_descriptor_needs_are_refused_before_work(dataset: SignatureDataset) -> None:
+    with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs signatures of at least 250, got 20"):
+        next(compare(dataset, [Height(), descriptor("interior")], progress=False))
+
+
+def test_two_of_one_name_are_refused(dataset: SignatureDataset) -> None:
+    """They would be one row of a table, and one file."""
+    with pytest.raises(ValueError, match=r"descriptors: expected one of each name, got several of d2"):
+        next(compare(dataset, [D2(), Height(), D2(n_bins=8)], progress=False))
+
+
+def test_collection_without_classes_is_refused(root: Path) -> None:
+    plain = SignatureDataset([root / "egg" / "0.off"], CONFIG, root.parent / "cache")
+    with pytest.raises(ValueError, match="classes"):
+        next(compare(plain, [Height("tall")]))

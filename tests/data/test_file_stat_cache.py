@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import logging
+import os
+import sqlite3
+import time
+from pathlib import Path
+
+import pytest
+from bodies_on_disk import write_body
+
+import igps.data.pipeline as recipe_module
+from igps.data.dataset import SignatureDataset
+from igps.signature.signature import SignatureConfig
+
+CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
+LONG_AGO = time.time() - 1000
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> SignatureDataset:
+    for i in range(3):
+        write_body(tmp_path / "meshes" / f"{i}.off", 1.0 + 0.1 * i, 1.5)
+        make_old(tmp_path / "meshes" / f"{i}.off")
+    return SignatureDataset(tmp_path / "meshes", CONFIG, tmp_path / "cache")
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time at which names and rights changed cannot be set: let a moment be long ago."""
+    monkeypatch.setattr("igps.data.file_stat_cache._YOUNG", 0)
+
+
+@pytest.fixture
+def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the mesh files that are read for their key."""
+    names: list[str] = []
+    content = recipe_module._content
+
+    def reading(path: Path) -> bytes:
+        names.append(path.name)
+        return content(path)
+
+    monkeypatch.setattr(recipe_module, "_content", reading)
+    return names
+
+
+def make_old(path: Path) -> None:
+    os.utime(path, (LONG_AGO, LONG_AGO))
+
+
+def test_files_that_did_not_change_are_not_read_again(dataset: SignatureDataset, read: list[str]) -> None:
+    dataset.precompute(n_workers=1, progress=False)
+    assert set(read) == {"0.off", "1.off", "2.off"}
+    read.clear()
+    dataset.precompute(n_workers=1, progress=False)
+    assert dataset.all_notes() == [()] * 3
+    assert read == []
+    assert dataset.all_notes() == [dataset.notes(i) for i in range(3)]
+
+
+def test_a_file_that_changed_is(dataset: SignatureDataset, read: list[str], tmp_path: Path) -> None:
+    """Even to another of the same size, with the old time given back to it."""
+    dataset.precompute(n_workers=1, progress=False)
+    first, second = (tmp_path / "meshes" / f"{i}.off" for i in range(2))
+    size = first.stat().st_size
+    first.write_bytes(second.read_bytes()[:size].ljust(size, b"\n"))
+    make_old(first)
+    read.clear()
+    dataset.precompute(n_workers=1, progress=False)
+    assert set(read) == {"0.off"}
+    assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 4 - (first.read_bytes() == second.read_bytes())
+
+
+def test_a_file_that_changed_a_moment_ago_is_not_remembered(
+    dataset: SignatureDataset, read: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("igps.data.file_stat_cache._YOUNG", 1000 * 10**9)
+    dataset.precompute(n_workers=1, progress=False)
+    read.clear()
+    dataset.precompute(n_workers=1, progress=False)
+    assert set(read) == {"0.off", "1.off", "2.off"}
+
+
+@pytest.mark.parametrize("left", [None, 100])
+def test_a_lost_signature_is_computed_again(dataset: SignatureDataset, tmp_path: Path, left: int | None) -> None:
+    dataset.precompute(n_workers=1, progress=False)
+    before = {path: path.read_bytes() for path in (tmp_path / "cache").rglob("*.safetensors")}
+    path = sorted(before)[0]
+    path.unlink() if left is None else path.write_bytes(before[path][:left])
+    dataset.precompute(n_workers=1, progress=False)
+    assert {path: path.read_bytes() for path in (tmp_path / "cache").rglob("*.safetensors")} == before
+
+
+def test_other_parameters_are_other_files(dataset: SignatureDataset, tmp_path: Path) -> None:
+    dataset.precompute(n_workers=1, progress=False)
+    other = SignatureDataset(tmp_path / "meshes", SignatureConfig(n_eigenpairs=21, resolution=10), tmp_path / "cache")
+    other.precompute(n_workers=1, progress=False)
+    assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 6
+
+
+@pytest.mark.parametrize("fault", ["garbage", "another table", "a folder"])
+def test_without_the_memory_all_goes_on(
+    dataset: SignatureDataset, tmp_path: Path, read: list[str], caplog: pytest.LogCaptureFixture, fault: str
+) -> None:
+    dataset.precompute(n_workers=1, progress=False)
+    memory = tmp_path / "cache" / "known_files.sqlite"
+    memory.unlink()
+    if fault == "garbage":
+        memory.write_bytes(b"no database" * 1000)
+    elif fault == "a folder":
+        memory.mkdir()
+    else:
+        with sqlite3.connect(memory) as database:
+            database.execute("CREATE TABLE file (x)")
+        database.close()
+    read.clear()
+    with caplog.at_level(logging.WARNING):
+        assert dataset.precompute(n_workers=1, progress=False) == []
+    assert "known_files.sqlite: not usable" in caplog.text
+    assert set(read) == {"0.off", "1.off", "2.off"}
+    dataset.precompute(n_workers=1, progress=False)

@@ -1,0 +1,130 @@
+"""How samples lie to principal axes, against loops, and what must not change it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from batches import alone, embedded, scaled, two_bodies
+from loops import hat
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from igps.data.batch import SignatureBatch
+from igps.descriptors.pretrained.axial_histogram import AxialHistogram, principal_axes
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.requirements import Requirements
+
+EMBEDDING = SpectralEmbedding(n_eigenpairs=6)
+
+
+def moved(batch: SignatureBatch, motion: Tensor, shift: Tensor) -> SignatureBatch:
+    surface = batch.surface
+    directions = surface.attributes["surface_direction"] @ motion
+    return replace(
+        batch,
+        surface=replace(surface, points=surface.points @ motion + shift, attributes={"surface_direction": directions}),
+    )
+
+
+def test_it_is_the_share_of_samples_in_each_cell() -> None:
+    """One sample, axis and cell at a time; the axes by NumPy's weighted covariance."""
+    batch = two_bodies()
+    n_bins = (5, 4, 3, 2)
+    found = AxialHistogram(EMBEDDING, n_bins=n_bins)(batch)
+    assert found.shape == (2, 3, *n_bins)
+    along, beside = np.linspace(-2.2, 2.2, 5).tolist(), np.linspace(0, 2.2, 4).tolist()
+    cosine, outward = np.linspace(-1, 1, 3).tolist(), np.linspace(-1, 1, 2).tolist()
+    for i in range(2):
+        real = batch.surface.mask[i]
+        points = batch.surface.points[i, real].double().numpy()
+        directions = batch.surface.attributes["surface_direction"][i, real].double().numpy()
+        weights = embedded(batch, i, "surface", 6).norm(dim=1).numpy() ** -4.0
+        centre = np.average(points, axis=0, weights=weights)
+        _, axes = np.linalg.eigh(np.cov(points.T, aweights=weights, ddof=0))
+        places = points - centre
+        places /= np.sqrt((places**2).sum() / len(places))
+        expected = np.zeros((3, *n_bins))
+        for k in range(3):
+            axis = axes[:, 2 - k]
+            axis = axis if ((places @ axis) ** 3).sum() > 0 else -axis
+            for place, direction in zip(places, directions, strict=True):
+                height = place @ axis
+                aside = place - height * axis
+                distance = np.linalg.norm(aside)
+                towards = direction @ axis * (1 if height >= 0 else -1)
+                cells = [hat(height, along), hat(distance, beside), hat(towards, cosine),
+                         hat(direction @ aside / distance, outward)]  # fmt: skip
+                expected[k] += np.einsum("a,b,c,d->abcd", *cells)
+        np.testing.assert_allclose(found[i], expected / (3 * len(points)), atol=1e-6)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_neither_motion_nor_reflection_nor_scale_change_it(mirrored: bool) -> None:
+    batch, histogram = two_bodies(), AxialHistogram(EMBEDDING)
+    motion = torch.from_numpy(Rotation.random(random_state=0).as_matrix()).float() * (-1 if mirrored else 1)
+    expected = histogram(batch)
+    found = histogram(scaled(moved(batch, motion, torch.tensor([1.0, -2.0, 0.5])), 2.0))
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+
+
+def test_padding_changes_nothing() -> None:
+    batch, histogram = two_bodies(), AxialHistogram(EMBEDDING)
+    found = histogram(batch)
+    torch.testing.assert_close(found.flatten(1).sum(dim=1), torch.ones(2))
+    for i in range(2):
+        torch.testing.assert_close(histogram(alone(batch, i))[0], found[i])
+
+
+def test_axes_are_those_of_a_brick_the_longest_first_and_point_to_its_heavy_end() -> None:
+    generator = torch.Generator().manual_seed(0)
+    brick = (torch.rand(20000, 3, generator=generator, dtype=torch.float64) - 0.5) * torch.tensor([1.0, 3.0, 2.0])
+    far = torch.tensor([[0.0, -4.0, 0.0]], dtype=torch.float64)
+    turn = torch.from_numpy(Rotation.from_euler("xyz", (0.3, 0.5, -0.2)).as_matrix())
+    points = torch.cat([brick, far.expand(50, 3)]) @ turn.T + 7
+    weights = torch.ones(len(points), dtype=torch.float64)
+    weights[len(brick) :] = 1e-9  # what is far off tells the direction, not the axes
+    centre, axes = principal_axes(points, weights)
+    np.testing.assert_allclose(centre, [7, 7, 7], atol=0.05)
+    np.testing.assert_allclose((turn.T @ axes).abs(), np.eye(3)[[1, 2, 0]].T, atol=0.05)
+    assert float((turn.T @ axes)[1, 0]) < -0.99
+
+
+def test_a_limb_that_moves_hardly_turns_the_axes() -> None:
+    """A trunk of low potential, and a heavy limb of high potential that sweeps a right angle."""
+    generator = torch.Generator().manual_seed(1)
+    trunk = (torch.rand(600, 3, generator=generator, dtype=torch.float64) - 0.5) * torch.tensor([0.6, 2.0, 0.4])
+    limb = torch.rand(400, 1, generator=generator, dtype=torch.float64) * 2
+    weights = torch.cat([torch.full((600,), 0.4), torch.full((400,), 1.0)]).double() ** -4
+    axes, plain = [], []
+    for direction in ([1.0, 1.0, 0.0], [1.0, -0.2, 0.0]):
+        points = torch.cat([trunk, limb * torch.tensor(direction)])
+        axes.append(principal_axes(points, weights)[1][:, 0])
+        plain.append(principal_axes(points, torch.ones(1000, dtype=torch.float64))[1][:, 0])
+    turned = [float(torch.rad2deg(torch.arccos((one @ other).abs()))) for one, other in (axes, plain)]
+    assert turned[0] < 10 < 30 < turned[1]
+
+
+def test_it_has_gradients_of_places_and_directions() -> None:
+    batch = two_bodies()
+    points = batch.surface.points.clone().requires_grad_()
+    histogram = AxialHistogram(EMBEDDING)(replace(batch, surface=replace(batch.surface, points=points)))
+    histogram.square().sum().backward()
+    assert points.grad is not None
+    assert torch.isfinite(points.grad).all()
+    assert float(points.grad.abs().max()) > 0
+
+
+def test_needs_and_errors() -> None:
+    assert AxialHistogram(EMBEDDING).requirements == Requirements(n_eigenpairs=6, attributes=("surface_direction",))
+    with pytest.raises(ValueError, match="n_bins: expected four numbers, each at least 2"):
+        AxialHistogram(EMBEDDING, n_bins=(8, 5, 4, 1))
+    with pytest.raises(ValueError, match="n_samples: expected None or at least 2"):
+        AxialHistogram(EMBEDDING, n_samples=1)
+    batch = two_bodies()
+    points = batch.surface.points.clone()
+    points[0, 0, 0] = torch.nan
+    with pytest.raises(ValueError, match="AxialHistogram: expected finite values"):
+        AxialHistogram(EMBEDDING)(replace(batch, surface=replace(batch.surface, points=points)))

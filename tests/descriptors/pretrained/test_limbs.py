@@ -1,0 +1,203 @@
+"""Histograms of branches and of pieces, against loops over components, and on bodies whose limbs are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from batches import alone, batch_of, embedded, scaled, two_bodies
+from loops import hat
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from igps.data.batch import SignatureBatch
+from igps.descriptors.pretrained.branch_histogram import BranchHistogram
+from igps.descriptors.pretrained.piece_histogram import PieceHistogram
+from igps.nn._kernels.merge_tree import N_NEIGHBOURS
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histograms.base import SampleHistogram
+from igps.nn.requirements import Requirements
+
+EMBEDDING = SpectralEmbedding(n_eigenpairs=5)
+LEVELS = (0.1, 0.3, 0.6)
+
+Maker = Callable[..., SampleHistogram]
+BOTH = pytest.mark.parametrize("make", [BranchHistogram, PieceHistogram])
+
+
+def joined(coordinates: np.ndarray) -> list[set[int]]:
+    """Of each point those that it is joined to: the nearest, and those to which it is near."""
+    found: list[set[int]] = [set() for _ in coordinates]
+    _, nearest = cKDTree(coordinates).query(coordinates, N_NEIGHBOURS + 1)
+    for i, row in enumerate(nearest.tolist()):
+        for j in row[1:]:
+            found[i].add(j)
+            found[j].add(i)
+    return found
+
+
+def pieces_of(kept: set[int], graph: list[set[int]]) -> list[set[int]]:
+    left, found = set(kept), []
+    while left:
+        piece, front = set(), {left.pop()}
+        while front:
+            piece |= front
+            front = {k for point in front for k in graph[point]} & left
+            left -= front
+        found.append(piece)
+    return found
+
+
+def test_branches_are_as_long_as_pieces_stay_apart() -> None:
+    """As the level falls from point to point: of the pieces that become one, that with the highest peak lives on."""
+    batch = two_bodies()
+    found = BranchHistogram(EMBEDDING, n_branches=4)(batch)
+    for i in range(2):
+        coordinates = embedded(batch, i, "surface", 5).numpy()
+        heights = np.log(np.linalg.norm(coordinates, axis=1))
+        graph = joined(coordinates)
+        living: dict[int, float] = {}
+        lengths = []
+        order = np.argsort(-heights).tolist()
+        for n, point in enumerate(order):
+            peaks = {max(piece, key=lambda k: heights[k]) for piece in pieces_of(set(order[: n + 1]), graph)}
+            lengths += [height - heights[point] for peak, height in living.items() if peak not in peaks]
+            living = {peak: heights[peak] for peak in peaks}
+        lengths += [height - heights.min() for height in living.values()]
+        expected = np.sort(lengths)[::-1][:4]
+        expected = np.pad(expected, (0, 4 - len(expected)))
+        np.testing.assert_allclose(found[i], expected / expected.sum(), atol=1e-5)
+
+
+def test_pieces_count_by_their_sizes_and_lengths() -> None:
+    """One level, piece and cell at a time."""
+    batch = two_bodies()
+    found = PieceHistogram(LEVELS, EMBEDDING, n_bins=(4, 3))(batch)
+    assert found.shape == (2, 3, 4, 3)
+    sizes, lengths = np.linspace(-6, -0.5, 4).tolist(), np.linspace(-1, 2.5, 3).tolist()
+    for i in range(2):
+        points = batch.surface.points[i, batch.surface.mask[i]].numpy() / np.sqrt(float(batch.area[i]))
+        coordinates = embedded(batch, i, "surface", 5).numpy()
+        graph, order = joined(coordinates), np.argsort(-np.linalg.norm(coordinates, axis=1)).tolist()
+        expected = np.zeros((3, 4, 3))
+        for level, share in enumerate(LEVELS):
+            for piece in pieces_of(set(order[: round(share * len(order))]), graph):
+                size, places = len(piece) / len(order), points[sorted(piece)]
+                length = 2.0**-9
+                if len(piece) >= 4:
+                    length = float(np.sqrt(12 * np.linalg.eigvalsh(np.cov(places.T, ddof=0))[-1] / size))
+                cell = np.outer(hat(float(np.log2(size)), sizes), hat(float(np.log2(length)), lengths))
+                expected[level] += len(piece) * cell
+        np.testing.assert_allclose(found[i], expected / expected.sum(), atol=1e-5)
+
+
+def star(n_arms: int, length: float, seed: int) -> SignatureBatch:
+    """Arms that start at 1 from the origin and reach to exp(length), in an embedding of as many dimensions."""
+    generator = torch.Generator().manual_seed(seed)
+    along = torch.linspace(0, length, 60).exp()
+    arms = [torch.zeros(60, n_arms).index_fill(1, torch.tensor([k]), 1.0) * along[:, None] for k in range(n_arms)]
+    middle = torch.nn.functional.normalize(torch.rand(200, n_arms, generator=generator), dim=1) * 0.999
+    points = torch.cat([*arms, middle])
+    noise = 1e-4 * torch.rand(points.shape, generator=generator)
+    return batch_of((points + noise)[None], points=points[None, :, :3].contiguous())
+
+
+@pytest.mark.parametrize("n_arms", [3, 5])
+def test_as_many_shares_are_large_as_there_are_arms(n_arms: int) -> None:
+    found = BranchHistogram(SpectralEmbedding())(star(n_arms, 1.0, seed=n_arms))[0]
+    assert (found[:n_arms] > 0.8 / n_arms).all()
+    assert float(found[n_arms:].sum()) < 0.1
+
+
+def test_pieces_are_the_arms_and_as_large_as_they_are() -> None:
+    """Of three arms and 200 other points, arms are 60 of 380 each: 2^−2.66, between the last two centres."""
+    found = PieceHistogram((180 / 380,), SpectralEmbedding(), n_bins=(6, 5))(star(3, 1.0, seed=3))[0, 0]
+    of_sizes = np.array(hat(float(np.log2(60 / 380)), np.linspace(-6, -0.5, 6).tolist()))
+    np.testing.assert_allclose(found.sum(dim=1), of_sizes, atol=0.02)
+    assert float(found[:, 3:].sum()) > 0.9  # rods
+
+
+@BOTH
+def test_padding_and_scale_change_nothing(make: Maker) -> None:
+    batch, histogram = two_bodies(), make(embedding=EMBEDDING)
+    found = histogram(batch)
+    assert found.shape == (2, *histogram.shape)
+    torch.testing.assert_close(found.flatten(1).sum(dim=1), torch.ones(2))
+    for i in range(2):
+        torch.testing.assert_close(histogram(alone(batch, i))[0], found[i])
+    torch.testing.assert_close(histogram(scaled(batch, 3.0)), found, atol=1e-5, rtol=0)
+
+
+@BOTH
+def test_the_order_of_samples_changes_nothing(make: Maker) -> None:
+    batch, histogram = alone(two_bodies(), 0), make(embedding=EMBEDDING)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(5))
+    surface = batch.surface
+    other = replace(surface, points=surface.points[:, order], eigenfunctions=surface.eigenfunctions[:, order])
+    torch.testing.assert_close(histogram(replace(batch, surface=other)), histogram(batch))
+
+
+@BOTH
+def test_a_subset_of_the_samples_is_told(make: Maker) -> None:
+    batch = two_bodies()
+    expected = make(embedding=EMBEDDING)(replace(batch, surface=batch.surface.subset(20, seed=0)))
+    torch.testing.assert_close(make(embedding=EMBEDDING, n_samples=20)(batch), expected)
+    interior = make(embedding=EMBEDDING, samples="interior")(batch)
+    torch.testing.assert_close(interior, make(embedding=EMBEDDING)(replace(batch, surface=batch.interior)))
+
+
+@BOTH
+def test_a_body_that_is_the_same_everywhere_is_one_piece(make: Maker) -> None:
+    same = batch_of(torch.ones(1, 10, 3), points=torch.ones(1, 10, 3))
+    found = make()(same)
+    torch.testing.assert_close(found.sum(), torch.tensor(1.0))
+    assert torch.isfinite(found).all()
+    if make is BranchHistogram:
+        assert found[0, 0] == 1
+
+
+@BOTH
+def test_needs_and_what_is_refused(make: Maker) -> None:
+    assert make(embedding=EMBEDDING).requirements == Requirements(n_eigenpairs=5)
+    with pytest.raises(ValueError, match="n_samples: expected None or at least 2, got 1"):
+        make(n_samples=1)
+    batch = two_bodies()
+    none = replace(batch.surface, mask=torch.zeros_like(batch.surface.mask))
+    with pytest.raises(ValueError, match="samples: expected at least one of each body, got none"):
+        make(embedding=EMBEDDING)(replace(batch, surface=none))
+    broken = replace(batch.surface, eigenfunctions=torch.full_like(batch.surface.eigenfunctions, torch.nan))
+    with pytest.raises(ValueError, match="expected finite numbers, got NaN or infinity"):
+        make(embedding=EMBEDDING)(replace(batch, surface=broken))
+
+
+def test_layouts_that_are_none_are_named() -> None:
+    with pytest.raises(ValueError, match="n_branches: expected at least 2, got 1"):
+        BranchHistogram(n_branches=1)
+    for levels in ((), (0.5, 0.2), (0.0, 0.5), (0.5, 1.5)):
+        with pytest.raises(ValueError, match="levels: expected shares above 0 and up to 1, ascending"):
+            PieceHistogram(levels)
+    with pytest.raises(ValueError, match="n_bins: expected two numbers, each at least 2"):
+        PieceHistogram(n_bins=(1, 5))
+    batch = two_bodies()
+    broken = replace(batch.surface, points=torch.full_like(batch.surface.points, torch.inf))
+    with pytest.raises(ValueError, match="PieceHistogram: expected finite places"):
+        PieceHistogram(embedding=EMBEDDING)(replace(batch, surface=broken))
+
+
+def test_gradients_are_those_of_differences() -> None:
+    generator = torch.Generator().manual_seed(7)
+    embedding = torch.randn(1, 12, 3, generator=generator, dtype=torch.float64)
+    points = torch.rand(1, 12, 3, generator=generator, dtype=torch.float64)
+
+    def branches(values: Tensor) -> Tensor:
+        return BranchHistogram(SpectralEmbedding(), n_branches=3).double()(batch_of(values))
+
+    def pieces(values: Tensor) -> Tensor:
+        return PieceHistogram((0.5, 0.9), SpectralEmbedding()).double()(batch_of(embedding, points=values))
+
+    assert torch.autograd.gradcheck(branches, embedding.requires_grad_())
+    embedding.requires_grad_(False)
+    assert torch.autograd.gradcheck(pieces, points.requires_grad_())

@@ -1,0 +1,182 @@
+"""`rich` is its parts side by side; `pretrained` is the shipped metric on top of its own parts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from torch.nn.functional import normalize
+from training.graded import GradedShapes
+
+import igps
+from igps.data.dataset import SignatureDataset
+from igps.descriptors.pretrained.descriptor import (
+    BODY_PARTS,
+    CLASS_PARTS,
+    PRETRAINED,
+    pretrained,
+    pretrained_parts,
+    save_pretrained,
+    two_levels,
+)
+from igps.descriptors.rich import rich
+from igps.nn.description import describe
+from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.heads.two_level import TwoLevelHead
+from igps.retrieval import chi_square, cosine, retrieval_scores
+from igps.shapes import ArticulatedShapes
+from igps.signature.signature import SignatureConfig
+
+# Of `rich`: six histograms in its first part, two oriented ones.
+CELLS = (25920, 750, 750)
+# Of `pretrained_parts`
+PART_CELLS = (640, 750, 750, 1000, 1920, 576, 16, 180, 63)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataset:
+    """Shapes of a seed that the pretrained metric was not fitted to."""
+    root = tmp_path_factory.mktemp("shapes")
+    ArticulatedShapes(n_classes=24, n_per_class=3, seed=7, n_vertices=1500).write(root)
+    needs = rich().requirements | pretrained_parts().requirements
+    config = needs.apply_to(SignatureConfig(n_eigenpairs=64, n_surface_samples=1000))
+    return SignatureDataset(root, config, root / "cache")
+
+
+@pytest.fixture(scope="module")
+def histograms(dataset: SignatureDataset) -> torch.Tensor:
+    return describe(dataset, igps.descriptor("rich"))
+
+
+def test_rich_is_its_histograms_side_by_side_with_equal_shares(
+    dataset: SignatureDataset, histograms: torch.Tensor
+) -> None:
+    """Each computed alone, without what they share."""
+    found = igps.descriptor("rich")
+    assert isinstance(found, HistogramDescriptor)
+    assert found.part_cells == CELLS
+    batch = dataset.batch([0, 7])
+    expected = []
+    with torch.inference_mode():
+        for part in found.parts:
+            expected += [histogram(batch).flatten(1) / (3 * len(part)) for histogram in part]
+    torch.testing.assert_close(histograms[[0, 7]], torch.cat(expected, dim=1), rtol=1e-4, atol=1e-7)
+    for part in histograms.split(CELLS, dim=1):
+        torch.testing.assert_close(part.sum(dim=1), torch.full((len(part),), 1 / 3), rtol=1e-4, atol=0)
+    # The distance of the whole is then the mean of those of the parts, each a histogram of sum 1.
+    of_parts = [chi_square(3 * part, 3 * part) for part in histograms.split(CELLS, dim=1)]
+    whole = found.distances(histograms, histograms)
+    torch.testing.assert_close(whole, torch.stack(of_parts).mean(dim=0), rtol=1e-4, atol=1e-6)
+
+
+def test_a_class_is_closer_to_itself(dataset: SignatureDataset, histograms: torch.Tensor) -> None:
+    """Far beyond what labels dealt out at random give: 2 of the 71 others, 3 %, are of a shape's class."""
+    scores = retrieval_scores(igps.descriptor("rich").distances(histograms, histograms), dataset.labels).mean()
+    shuffled = dataset.labels[torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))]
+    by_chance = retrieval_scores(chi_square(histograms, histograms), shuffled).mean()
+    assert scores["nn"] > 0.9
+    assert scores["ft"] > 0.7
+    assert by_chance["ft"] < 0.3
+
+
+def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> None:
+    """Written down from the stored numbers: roots, directions and lengths part by part, the pole of the bodies."""
+    part = dataset.subset(range(4))
+    module = pretrained()
+    roots = describe(part, module.descriptor).double().sqrt()
+    stored = {name: tensor.double() for name, tensor in load_file(PRETRAINED).items()}
+
+    def level(name: str, parts: tuple[int, ...]) -> Tensor:
+        of_level = {key.rsplit(".", 1)[1]: tensor for key, tensor in stored.items() if f".{name}." in key}
+        assert of_level["part_cells"].long().tolist() == list(PART_CELLS)
+        sizes = [PART_CELLS[i] for i in parts]
+        seen = torch.cat([roots.split(PART_CELLS, dim=1)[i] for i in parts], dim=1)
+        projected = [
+            part @ directions[: part.shape[1]].T
+            for part, directions in zip(
+                (seen - of_level["mean"]).split(sizes, dim=1), of_level["directions"].split(sizes, dim=1), strict=True
+            )
+        ]
+        if of_level["lengths"]:
+            (vectors,) = projected
+            return torch.cat([vectors, (1 - vectors.square().sum(dim=1, keepdim=True)).sqrt()], dim=1)
+        return normalize(torch.cat([normalize(one) for one in projected], dim=1))
+
+    classes = level("of_classes", CLASS_PARTS)
+    bodies = [level(f"of_bodies.{k}", (part,)) for k, part in enumerate(BODY_PARTS)]
+    share, reaches = (stored[f"head.{name}"] for name in ("share", "reaches"))
+    root = (share / len(bodies)).sqrt()
+    found = describe(part, module)
+    expected = torch.cat([(1 - share).sqrt() * classes, *(root * one for one in bodies)], dim=1)
+    torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=0)
+    compared = [one[:, :-1] for one in bodies]
+    from_mean = torch.stack([one.square().sum(dim=1) for one in compared]).mean(dim=0).sqrt()
+    shorter = (torch.outer(from_mean, from_mean).sqrt() / (0.5 / 2**0.5)).sqrt()
+    apart = torch.zeros(4, 4, dtype=torch.float64)
+    for one, reach in zip(compared, reaches, strict=True):
+        apart += (torch.cdist(one, one, compute_mode="donot_use_mm_for_euclid_dist") * shorter / reach) ** 10
+    distances = (1 - classes @ classes.T) * (1 - torch.exp(-apart))
+    torch.testing.assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)
+
+
+def test_pretrained_gives_unit_vectors_and_short_ones(dataset: SignatureDataset) -> None:
+    """The short ones, by their cosine, lose little of what the whole ones find by theirs."""
+    module = pretrained()
+    found = describe(dataset, module)
+    assert isinstance(module.head, TwoLevelHead)
+    short = module.head.short(found)
+    assert short.shape == (len(dataset), 256)
+    for vectors in (found, short):
+        torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(dataset)), atol=1e-5, rtol=0)
+    whole, of_short = (retrieval_scores(cosine(one, one), dataset.labels).mean()["ft"] for one in (found, short))
+    assert of_short > whole - 0.02
+
+
+def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
+    """Over the plain distance of `rich`, and over that of its own histograms: on classes that are hard to tell apart.
+
+    Of another seed than those that it was fitted to, and without the twelve templates, which all descriptors tell.
+    """
+    GradedShapes(12, 4, 1, seed=3, look_alikes=False).write(tmp_path, n_workers=None)
+    module, plain = pretrained(), rich()
+    config = (module.requirements | plain.requirements).apply_to(SignatureConfig(n_eigenpairs=64))
+    dataset = SignatureDataset(tmp_path, config, tmp_path / "cache")
+    assert not dataset.precompute()
+
+    def first_tier(distances: Tensor) -> float:
+        return retrieval_scores(distances, dataset.labels).mean()["ft"]
+
+    own, others = describe(dataset, module.descriptor), describe(dataset, plain)
+    embedded = module.head(own)
+    learned = first_tier(module.distances(embedded, embedded))
+    assert learned > first_tier(chi_square(others, others)) + 0.1
+    assert learned > first_tier(chi_square(own, own)) + 0.1
+
+
+def test_a_metric_of_ones_own_is_stored_and_loaded(dataset: SignatureDataset, tmp_path: Path) -> None:
+    dataset = dataset.subset(range(20))
+    descriptor = pretrained_parts().eval()
+    described = describe(dataset, descriptor)
+    head = two_levels().fit(described, dataset.labels, descriptor.part_cells)
+    save_pretrained(EmbeddedDescriptor(descriptor, head), tmp_path / "metric.safetensors")
+    loaded = pretrained(tmp_path / "metric.safetensors")
+    assert not loaded.training
+    torch.testing.assert_close(describe(dataset, loaded), head(described), atol=5e-3, rtol=0)
+    shipped = pretrained().head(described)
+    assert shipped.shape[1] != head(described).shape[1] or not torch.allclose(shipped, head(described), atol=0.1)
+
+
+def test_shipped_file_is_small() -> None:
+    assert PRETRAINED.stat().st_size < 5e6
+
+
+def test_a_file_of_another_metric_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "other.safetensors"
+    save_file({"head.mean": torch.zeros(3)}, path)
+    with pytest.raises(ValueError, match=r"other\.safetensors: expected the parameters of `pretrained`"):
+        pretrained(path)
+    with pytest.raises(FileNotFoundError):
+        pretrained(tmp_path / "missing.safetensors")

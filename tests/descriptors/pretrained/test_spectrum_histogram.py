@@ -1,0 +1,51 @@
+"""Shares of eigenvalues against a loop, on scaled and padded bodies, and where Weyl's law knows them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from batches import N_EIGENPAIRS, alone, scaled, two_bodies
+
+from igps.descriptors.pretrained.spectrum_histogram import SpectrumHistogram
+from igps.nn.descriptor import HistogramDescriptor
+from igps.nn.requirements import Requirements
+
+
+def test_shares_are_those_of_a_loop() -> None:
+    batch = two_bodies()
+    found = SpectrumHistogram(6)(batch)
+    assert found.shape == (2, 5)
+    assert found.dtype == torch.float32
+    for i in range(2):
+        over_number = [float(batch.eigenvalues[i, k - 1]) / k for k in range(2, 7)]
+        expected = torch.tensor([one / sum(over_number) for one in over_number])
+        torch.testing.assert_close(found[i], expected)
+
+
+def test_a_spectrum_that_follows_weyl_has_equal_shares() -> None:
+    batch = two_bodies()
+    line = 4 * torch.pi * torch.arange(1, 13, dtype=torch.float64) / batch.area[:, None]
+    found = SpectrumHistogram(12)(replace(batch, eigenvalues=line))
+    torch.testing.assert_close(found, torch.full((2, 11), 1 / 11))
+
+
+def test_padding_scale_and_the_first_eigenvalue_change_nothing() -> None:
+    batch, histogram = two_bodies(), SpectrumHistogram(min(N_EIGENPAIRS))
+    found = histogram(batch)
+    torch.testing.assert_close(found.sum(dim=1), torch.ones(2))
+    for i in range(2):
+        torch.testing.assert_close(histogram(alone(batch, i))[0], found[i])
+    torch.testing.assert_close(histogram(scaled(batch, 3.0)), found)
+    first = batch.eigenvalues.clone()
+    first[:, 0] /= 2
+    torch.testing.assert_close(histogram(replace(batch, eigenvalues=first)), found)
+
+
+def test_needs_and_what_is_refused() -> None:
+    assert SpectrumHistogram(20).requirements == Requirements(n_eigenpairs=20)
+    with pytest.raises(ValueError, match="n_eigenpairs: expected at least 3, got 2"):
+        SpectrumHistogram(2)
+    with pytest.raises(ValueError, match="needs signatures of at least 8, got 7"):
+        HistogramDescriptor(SpectrumHistogram(8))(two_bodies())

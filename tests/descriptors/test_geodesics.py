@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+import igl
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.distance import cdist
+
+from conftest import as_mesh
+from igps.descriptors._geodesics import farthest_points, geodesic_distances
+from igps.mesh.mesh import Mesh
+
+
+def unit_cube(subdivisions: int) -> Mesh:
+    """The cube [0, 1]³, refined."""
+    surface = trimesh.creation.box((1, 1, 1))
+    for _ in range(subdivisions):
+        surface = surface.subdivide()
+    return as_mesh(trimesh.Trimesh(surface.vertices + 0.5, surface.faces, process=False), "cube")
+
+
+def corner_distances(points: np.ndarray) -> np.ndarray:
+    """From (0, 0, 0) to points of the cube's surface, by unfolding two neighbouring faces into a plane."""
+    distances = np.full(len(points), np.inf)
+    for i in range(3):
+        u, v, w = points[:, i], points[:, (i + 1) % 3], points[:, (i + 2) % 3]
+        here = np.where(u == 0, np.hypot(v, w), np.inf)
+        across = np.where(u == 1, np.minimum(np.hypot(1 + v, w), np.hypot(1 + w, v)), np.inf)
+        distances = np.minimum(distances, np.minimum(here, across))
+    return distances
+
+
+def exact(mesh: Mesh, source: int) -> np.ndarray:
+    none = np.array([], dtype=np.int64)
+    vertices, faces = np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces)
+    return igl.exact_geodesic(vertices, faces, np.array([source]), none, np.arange(len(vertices)), none)
+
+
+def test_great_circles_of_the_sphere(sphere: Mesh) -> None:
+    sources = np.array([0, 100, 2000])
+    distances = geodesic_distances(sphere, sources)
+    arcs = np.arccos(np.clip(sphere.vertices[sources] @ sphere.vertices.T, -1, 1))
+    off = arcs > 0
+    assert distances.shape == (3, 2562)
+    assert distances.dtype == np.float64
+    np.testing.assert_array_equal(distances[np.arange(3), sources], 0)
+    ratio = distances[off] / arcs[off]
+    assert ratio.min() > 1 - 2e-3  # the polyhedron lies inside the sphere
+    assert ratio.max() < 1.04
+    assert ratio.mean() < 1.015
+
+
+@pytest.mark.parametrize(("points_per_edge", "error"), [(0, 0.7), (2, 0.09), (5, 0.025)])
+def test_unfolded_paths_of_the_cube(points_per_edge: int, error: float) -> None:
+    cube = unit_cube(3)
+    corner = int(np.argmin(cube.vertices.sum(axis=1)))
+    distances = geodesic_distances(cube, [corner], points_per_edge)[0]
+    expected = corner_distances(cube.vertices)
+    opposite = int(np.argmax(cube.vertices.sum(axis=1)))
+    assert expected[opposite] == pytest.approx(np.sqrt(5))
+    excess = distances - expected
+    assert excess.min() > -1e-12
+    assert error / 2 < excess.max() < error
+
+
+def test_never_shorter_than_the_exact_polyhedral_distance(blob: Mesh) -> None:
+    for source in (3, 400):
+        reference = exact(blob, source)
+        distances = geodesic_distances(blob, [source])[0]
+        assert (distances >= reference - 1e-12).all()
+        np.testing.assert_allclose(distances, reference, rtol=0.05)
+
+
+def test_thin_triangles_do_no_harm() -> None:
+    cube = unit_cube(3)
+    needles = Mesh(cube.vertices * [1, 1, 40], cube.faces)
+    distances = geodesic_distances(needles, [0])[0]
+    reference = exact(needles, 0)
+    np.testing.assert_allclose(distances, reference, atol=0.03 * reference.max())
+
+
+def test_a_metric(blob: Mesh) -> None:
+    distances = geodesic_distances(blob, np.arange(len(blob.vertices)))
+    np.testing.assert_allclose(distances, distances.T, rtol=1e-12)
+    assert (distances + np.diag(np.full(len(distances), np.inf)) > 0).all()
+    straight = cdist(blob.vertices, blob.vertices)
+    assert (distances >= straight - 1e-12).all()
+    for through in (7, 311):
+        assert (distances <= distances[:, [through]] + distances[[through]] + 1e-12).all()
+
+
+def test_more_points_on_the_edges_shorten_nested_paths(blob: Mesh) -> None:
+    coarse, fine = (geodesic_distances(blob, [5], n)[0] for n in (1, 3))
+    assert (fine <= coarse + 1e-12).all()
+    assert fine.sum() < 0.995 * coarse.sum()
+
+
+def test_equivariance(blob: Mesh) -> None:
+    order = np.random.default_rng(0).permutation(len(blob.vertices))
+    new = np.argsort(order)
+    moved = Mesh(3 * blob.vertices[order][:, [1, 2, 0]] + 5, new[blob.faces])
+    np.testing.assert_allclose(
+        geodesic_distances(moved, new[[5, 9]])[:, new], 3 * geodesic_distances(blob, [5, 9]), rtol=1e-12
+    )
+
+
+def test_farthest_points_are_greedy(blob: Mesh) -> None:
+    samples = farthest_points(blob, 30)
+    np.testing.assert_allclose(samples.distances, geodesic_distances(blob, samples.vertices), rtol=1e-12)
+    for i in range(1, 30):
+        nearest = samples.distances[:i].min(axis=0)
+        assert nearest[samples.vertices[i]] == nearest.max()
+    # The first is an end of a long path: a step from it to the farthest and one from there do not lead much farther.
+    length = samples.distances[0].max()
+    everywhere = geodesic_distances(blob, np.arange(len(blob.vertices)))
+    assert everywhere[samples.vertices[0]].max() == pytest.approx(length, rel=1e-12)
+    assert length > 0.95 * everywhere.max()
+    np.testing.assert_array_equal(samples.mutual, samples.mutual.T)
+    np.testing.assert_allclose(samples.mutual, samples.distances[:, samples.vertices], rtol=1e-12)
+
+
+def renumbered(mesh: Mesh, seed: int) -> tuple[Mesh, np.ndarray]:
+    """The mesh with vertices, faces and their corners in another order, and the new number of each vertex."""
+    generator = np.random.default_rng(seed)
+    order = generator.permutation(len(mesh.vertices))
+    new = np.argsort(order)
+    faces = generator.permutation(new[mesh.faces])
+    first = generator.integers(3, size=(len(faces), 1))
+    faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+    return Mesh(mesh.vertices[order], faces, mesh.name), new
+
+
+def test_farthest_points_do_not_depend_on_numbers(blob: Mesh) -> None:
+    samples = farthest_points(blob, 60)
+    for seed in range(3):
+        mesh, new = renumbered(blob, seed)
+        np.testing.assert_array_equal(farthest_points(mesh, 60).vertices, new[samples.vertices])
+
+
+def test_rounding_does_not_decide_between_equally_far_points() -> None:
+    # A body with three planes of symmetry, whose triangles have them too: most points have equals.
+    octahedron = trimesh.creation.icosphere(subdivisions=2)
+    mesh = as_mesh(octahedron.apply_scale([3.0, 2.0, 1.0]))
+    expected = np.sort(farthest_points(mesh, 40).mutual, axis=None)
+    for number, factor in enumerate((0.1, 1 / 3, 7.7)):
+        moved, _ = renumbered(Mesh(mesh.vertices * factor + factor, mesh.faces), number)
+        np.testing.assert_allclose(np.sort(farthest_points(moved, 40).mutual, axis=None), factor * expected, rtol=1e-9)
+
+
+def test_all_vertices_can_be_sampled() -> None:
+    cube = unit_cube(1)
+    n_vertices = len(cube.vertices)
+    assert sorted(farthest_points(cube, n_vertices).vertices) == list(range(n_vertices))
+
+
+@pytest.mark.parametrize("sources", [[], [-1], [642], [0.5], [[0, 1]]])
+def test_sources_are_checked(blob: Mesh, sources: list) -> None:  # type: ignore[type-arg]
+    with pytest.raises(ValueError, match="sources"):
+        geodesic_distances(blob, sources)
+
+
+def test_counts_are_checked(blob: Mesh) -> None:
+    with pytest.raises(ValueError, match="points_per_edge"):
+        geodesic_distances(blob, [0], -1)
+    for n_samples in (0, 643):
+        with pytest.raises(ValueError, match="n_samples"):
+            farthest_points(blob, n_samples)

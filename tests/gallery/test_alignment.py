@@ -1,0 +1,212 @@
+"""Surfaces laid onto each other: what a known motion leaves, and closed forms of how far apart they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
+
+Array = NDArray[np.float64]
+
+
+def even_directions(n: int, seed: int = 0) -> Array:
+    """(n, 3) spread evenly over the sphere by the golden angle, turned at random."""
+    z = 1 - (2 * np.arange(n) + 1) / n
+    angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
+    ring = np.sqrt(1 - z**2)
+    directions = np.column_stack([ring * np.cos(angle), ring * np.sin(angle), z])
+    return Rotation.random(random_state=seed).apply(directions)
+
+
+def ellipsoid(axes: tuple[float, float, float], n: int = 1500, seed: int = 0) -> SurfaceSamples:
+    """Samples of an ellipsoid, denser where it is pointed."""
+    directions = even_directions(n, seed)
+    normals = directions / axes
+    return SurfaceSamples.of(directions * axes, normals / np.linalg.norm(normals, axis=1, keepdims=True), 1.0)
+
+
+def bumpy(amplitude: float, n: int = 2000, seed: int = 0) -> SurfaceSamples:
+    """The surface r = 1 + a·P₄(cos θ), P₄ of Legendre, with the normals of its level set."""
+    directions = even_directions(n, seed)
+    z = directions[:, 2]
+    value, slope = (35 * z**4 - 30 * z**2 + 3) / 8, (140 * z**3 - 60 * z) / 8
+    radius = 1 + amplitude * value
+    # ∇(|x| − a·P₄(z/|x|)) = u − a·P₄′·(e_z − z·u)/r
+    normals = directions - amplitude * (slope / radius)[:, None] * (np.eye(3)[2] - z[:, None] * directions)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return SurfaceSamples.of(radius[:, None] * directions, normals, 4 * np.pi)
+
+
+def moved(samples: SurfaceSamples, seed: int, mirror: bool, scale: float) -> SurfaceSamples:
+    turn = Rotation.random(random_state=seed).as_matrix() * (-1 if mirror else 1)
+    shuffled = np.random.default_rng(seed).permutation(len(samples.points))
+    points = (scale * samples.points @ turn.T + [3.0, -1.0, 2.0])[shuffled]
+    return SurfaceSamples.of(points, (samples.normals @ turn.T)[shuffled], scale**2)
+
+
+@pytest.mark.parametrize(("seed", "mirror", "scale"), [(1, False, 1.0), (2, True, 7.0), (3, True, 0.05)])
+def test_a_motion_a_mirror_and_a_scale_leave_nothing(seed: int, mirror: bool, scale: float) -> None:
+    """Of a body without any symmetry: two ellipsoids beside each other."""
+    one, other = ellipsoid((1.0, 0.6, 0.4)), ellipsoid((0.5, 0.3, 0.7), 500, seed=4)
+    beside = other.points + np.array([0.9, 0.5, 0.3])
+    body = SurfaceSamples.of(np.concatenate([one.points, beside]), np.concatenate([one.normals, other.normals]), 1.0)
+    again = moved(body, seed, mirror, scale)
+    np.testing.assert_allclose(again.extents, body.extents, rtol=1e-9)
+    assert surface_distance(body, again) < 1e-5
+
+
+def test_other_samples_of_one_surface_are_nearer_than_the_gaps_between_them() -> None:
+    one, other = ellipsoid((1.0, 0.6, 0.4), seed=1), ellipsoid((1.0, 0.6, 0.4), seed=2)
+    assert surface_distance(one, other) < 0.1 * one.gap
+
+
+@pytest.mark.parametrize("amplitude", [0.05, 0.1])
+def test_a_ball_and_a_bumpy_one_are_as_far_apart_as_the_bumps_are_high(amplitude: float) -> None:
+    """P₄ is orthogonal to all that a shift or a scale does to a ball, so that its mean square, 1/9, stays."""
+    expected = amplitude / 3 / np.sqrt(4 * np.pi)
+    assert surface_distance(bumpy(0.0), bumpy(amplitude, seed=5)) == pytest.approx(expected, rel=0.15)
+
+
+def test_what_is_round_in_every_direction_but_for_its_bumps_is_found_in_any_place() -> None:
+    """The principal axes of such a body say nothing of how it is turned."""
+    body = bumpy(0.15)
+    again = moved(body, 7, mirror=True, scale=2.0)
+    assert surface_distance(body, again) < 0.1 * surface_distance(body, bumpy(0.0, seed=3))
+
+
+def rough(amplitude: float, n: int, seed: int) -> tuple[Array, Array]:
+    """Points and normals of an ellipsoid that is ruffled along one axis, by waves much shorter than a patch."""
+    axes, wave = np.array([1.0, 0.7, 0.45]), 0.02
+    directions = even_directions(n, seed)
+    smooth = directions / axes
+    steepness = np.linalg.norm(smooth, axis=1, keepdims=True)
+    phase = 2 * np.pi * (directions * axes)[:, :1] / wave
+    points = directions * axes + amplitude * np.cos(phase) * smooth / steepness
+    return points, smooth / steepness
+
+
+def test_lost_relief_cancels_where_another_shape_does_not() -> None:
+    """What goes in and out within a patch of ten samples, by a root mean square of amplitude/√2."""
+    amplitude, area = 0.01, 6.1
+    plain, ruffled = (SurfaceSamples.of(*rough(a, 2000, seed), area) for a, seed in ((0.0, 1), (amplitude, 2)))
+    high = amplitude / np.sqrt(2) / np.sqrt(area)
+    lost = surface_distance(plain, ruffled)
+    assert lost < 0.55 * high
+    # The same height, all of it outward in one half of the body and inward in the other.
+    shifted, normals = rough(0.0, 2000, 3)
+    turned = shifted * [1, 1, 1] + 2 * high * np.sqrt(area) * normals * np.sin(3 * shifted[:, :1])
+    assert surface_distance(plain, SurfaceSamples.of(turned, normals, area)) > 2 * lost
+
+
+def triangles(axes: tuple[float, float, float], subdivisions: int) -> tuple[Array, NDArray[np.int64]]:
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return np.asarray(ball.vertices * axes), np.asarray(ball.faces)
+
+
+def test_the_surface_itself_tells_more_than_samples() -> None:
+    """Few samples of a curved surface leave their tangent planes; the surface leaves what its triangles do."""
+    axes = (1.0, 0.6, 0.4)
+    vertices, faces = triangles(axes, 5)
+    few = [ellipsoid(axes, 300, seed) for seed in (1, 2)]
+    with_surface = [replace(one, surface=lambda: TriangleSurface(vertices, faces)) for one in few]
+    assert surface_distance(*with_surface) < 0.05 * surface_distance(*few)
+
+
+def test_nearest_points_of_a_surface() -> None:
+    """Against trimesh's loop over all triangles, and above the middle of each face, where its normal stands."""
+    vertices, faces = triangles((1.0, 0.6, 0.4), 2)
+    surface, body = TriangleSurface(vertices, faces), trimesh.Trimesh(vertices, faces, process=False)
+    anywhere = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    expected, _, _ = trimesh.proximity.closest_point_naive(body, anywhere)
+    np.testing.assert_allclose(surface.nearest(SurfaceSamples(anywhere, anywhere))[0], expected, atol=1e-12)
+    above = body.triangles_center + 0.01 * body.face_normals
+    points, normals = surface.nearest(SurfaceSamples(above, body.face_normals))
+    np.testing.assert_allclose(points, body.triangles_center, atol=1e-12)
+    np.testing.assert_allclose(normals, body.face_normals, atol=1e-9)
+
+
+def test_in_place_nothing_is_moved() -> None:
+    """A ball and itself moved by h along a line: h/√3, the root mean square of h·cos θ; laid onto itself, nothing."""
+    vertices, faces = triangles((1.0, 1.0, 1.0), 5)
+    step = np.array([0.0, 0.0, 0.02])
+    ball = replace(ellipsoid((1.0, 1.0, 1.0)), surface=lambda: TriangleSurface(vertices, faces))
+    beside = SurfaceSamples(ball.points + step, ball.normals, lambda: TriangleSurface(vertices + step, faces))
+    assert offset_in_place(ball, TriangleSurface(vertices + step, faces)) == pytest.approx(0.02 / np.sqrt(3), rel=0.03)
+    assert surface_distance(ball, beside) < 1e-4
+
+
+def test_what_lies_beyond_an_edge_is_as_far_as_the_edge() -> None:
+    """Not as far as the plane of either side: there are no gaps in a surface, as there are between samples."""
+    box = trimesh.creation.box((1.0, 1.0, 0.1))
+    x = np.linspace(-0.4, 0.4, 30)
+    points = np.column_stack([x, np.full(30, 0.53), np.full(30, 0.09)])
+    beyond = SurfaceSamples(points, np.tile([0.0, 0.6, 0.8], (30, 1)))
+    assert offset_in_place(beyond, TriangleSurface(box.vertices, box.faces)) == pytest.approx(0.05)
+
+
+def wheel(thinned: float, seed: int) -> SurfaceSamples:
+    """A flat body with five bumps around it, one of them higher; fewer samples at either end of a diameter.
+
+    Its principal axes follow the samples, and not the bumps, at whatever angle the diameter has.
+    """
+    z, angle = np.random.default_rng(seed).uniform([-0.3, 0], [0.3, 2 * np.pi], size=(6000, 2)).T
+    bumps = np.cos(5 * angle) * (1 + np.exp(-20 * (1 - np.cos(angle))))
+    slope = np.gradient(bumps[np.argsort(angle)], np.sort(angle))[np.argsort(np.argsort(angle))]
+    radius, turning = 1 + 0.06 * bumps, 0.06 * slope
+    points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+    normals = np.column_stack(
+        [radius * np.cos(angle) + turning * np.sin(angle), radius * np.sin(angle) - turning * np.cos(angle), 0 * z]
+    )
+    kept = (np.abs(np.cos(angle - thinned)) < 0.6) | (np.arange(len(z)) % 4 == 0)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return SurfaceSamples.of(points[kept], normals[kept], 4.0)
+
+
+def test_axes_that_mislead_are_not_trusted() -> None:
+    """From the axes the bumps fall onto each other, but the high one onto a low one: near, and not the nearest."""
+    one, other = wheel(0.0, 1), wheel(2 * np.pi / 5, 2)
+    steps = [samples.extents[1:] / samples.extents[:-1] for samples in (one, other)]
+    assert min(map(min, steps)) > 1.1
+    assert surface_distance(one, other) < 0.05 * one.gap
+
+
+def test_thin_sheets_of_other_widths_are_told_apart() -> None:
+    """Every sample of the smaller one lies in the planes of the larger: what lies off to the side must count."""
+
+    def sheet(length: float, width: float) -> SurfaceSamples:
+        n = 40
+        x, y = np.meshgrid((np.arange(n) + 0.5) / n * length, (np.arange(n) + 0.5) / n * width)
+        top = np.column_stack([x.ravel(), y.ravel(), np.full(n * n, 0.003 * length)])
+        up = np.tile([0.0, 0.0, 1.0], (n * n, 1))
+        points = np.concatenate([top, top * [1, 1, -1]])
+        return SurfaceSamples.of(points, np.concatenate([up, -up]), 2 * length * width)
+
+    same = surface_distance(sheet(2.0, 1.0), sheet(4.0, 2.0))
+    assert same < 1e-5
+    # Of unit area they reach to 0.5 and 0.61, of which a scale of a tenth leaves 0.53 and 0.58: what lies farther off
+    # than the gap of 0.044 makes √(0.011²/3 · 0.02 / 2) at least, and √(0.068²/3 · 0.11 / 2) without a scale.
+    assert 0.0006 < surface_distance(sheet(2.0, 1.0), sheet(3.0, 1.0)) < 0.009
+
+
+def test_the_search_ends_where_it_is_enough() -> None:
+    one, other = ellipsoid((1.0, 0.6, 0.4)), ellipsoid((1.0, 0.5, 0.4), seed=2)
+    best = surface_distance(one, other)
+    assert best <= surface_distance(one, other, enough=2 * best) <= 2 * best
+
+
+def test_what_is_hopeless_stays_beyond_that() -> None:
+    one, other = ellipsoid((1.0, 0.6, 0.4)), ellipsoid((1.0, 0.3, 0.3), seed=2)
+    far = surface_distance(one, other)
+    assert surface_distance(one, other, hopeless=far / 4) > far / 4
+    assert surface_distance(one, other, hopeless=4 * far) == far
+
+
+def test_samples_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"points, normals: expected both \(P, 3\) .* got \(5, 3\) and \(4, 3\)"):
+        SurfaceSamples.of(np.zeros((5, 3)), np.zeros((4, 3)), 1.0)

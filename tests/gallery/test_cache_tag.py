@@ -1,0 +1,66 @@
+"""Under which words descriptions are kept: whatever changes them, changes the words."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from igps.descriptors import NAMES, descriptor
+from igps.gallery import gallery
+from igps.gallery.gallery import cache_tag
+
+
+@pytest.fixture(autouse=True)
+def _forgotten() -> Iterator[None]:
+    gallery._code.cache_clear()
+    yield
+    gallery._code.cache_clear()
+
+
+def words() -> str:
+    found = cache_tag("d2", descriptor("d2"))
+    assert found is not None
+    return found
+
+
+def test_every_descriptor_has_words_of_its_own() -> None:
+    assert len({cache_tag(name, descriptor(name)) for name in NAMES} - {None}) == len(NAMES)
+    assert words() == words()
+
+
+def test_what_is_not_the_librarys_has_none() -> None:
+    own = descriptor("interior")
+    assert cache_tag(own, own) is None
+    assert cache_tag("package.module:interior", own) is None
+
+
+def test_parameters_change_the_words() -> None:
+    changed = descriptor("interior")
+    with torch.no_grad():
+        next(changed.buffers()).mul_(1.5)
+    assert cache_tag("interior", changed) != cache_tag("interior", descriptor("interior"))
+
+
+def test_the_code_changes_the_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = words()
+    copied = tmp_path / "igps"
+    shutil.copytree(Path(gallery.__file__).parents[1], copied)
+    monkeypatch.setattr(gallery, "__file__", str(copied / "gallery" / "gallery.py"))
+    gallery._code.cache_clear()
+    assert words() == before
+    with (copied / "nn" / "histogram.py").open("a") as source:
+        source.write("# one more line\n")
+    gallery._code.cache_clear()
+    assert words() != before
+
+
+def test_versions_change_the_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = words()
+    gallery._code.cache_clear()
+    version = gallery.importlib.metadata.version
+    monkeypatch.setattr(gallery.importlib.metadata, "version", lambda name: version(name) + (name == "torch") * "+1")
+    assert words() != before

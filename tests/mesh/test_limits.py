@@ -1,0 +1,142 @@
+"""The number of triangles is told before a file is read, and too many are refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from igps.mesh import limits
+from igps.mesh.limits import available_memory, check_memory, expected_faces
+from igps.mesh.mesh import Mesh, MeshError
+from igps.signature.voxels import interior_samples
+
+
+@pytest.mark.parametrize("kind", ["off", "ply", "stl"])
+def test_announced_numbers(tmp_path: Path, kind: str) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=4)
+    surface.export(tmp_path / f"ball.{kind}")
+    assert expected_faces(tmp_path / f"ball.{kind}") == len(surface.faces)
+
+
+@pytest.mark.parametrize("name", ["ball.obj", "ball_ascii.stl"])
+def test_numbers_from_the_size(tmp_path: Path, name: str) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=5)
+    kind = "stl_ascii" if "ascii" in name else None
+    surface.export(tmp_path / name, file_type=kind)
+    assert 0.5 < expected_faces(tmp_path / name) / len(surface.faces) < 3
+
+
+def test_headers_with_comments_and_lies(tmp_path: Path) -> None:
+    file = tmp_path / "a.off"
+    file.write_text("OFF\n# made by hand\n8 12 0\n" + "0 0 0\n" * 8)
+    assert expected_faces(file) == 12
+    file.write_text("OFF 8 12 0\n" + "0 0 0\n" * 8)
+    assert expected_faces(file) == 12
+    file.write_text("OFF\n8 99999999999 0\n")
+    assert expected_faces(file) < 20
+    file.write_text("nonsense\n")
+    assert expected_faces(file) == 0
+
+
+@pytest.mark.parametrize("limit", ["RLIMIT_AS", "RLIMIT_DATA"])
+def test_ten_million_triangles_in_two_gibibytes(tmp_path: Path, limit: str) -> None:
+    file = tmp_path / "huge.stl"
+    with file.open("wb") as stream:  # a sparse file: only its head is on the disk
+        stream.write(bytes(80) + (10_000_000).to_bytes(4, "little"))
+        stream.truncate(84 + 50 * 10_000_000)
+    program = (
+        "import resource, sys; from pathlib import Path; from igps.mesh.limits import check_memory\n"
+        "resource.setrlimit(getattr(resource, sys.argv[2]), (2 << 30, 2 << 30))\n"
+        "check_memory(Path(sys.argv[1]))"
+    )
+    pytest.importorskip("resource")
+    words = [sys.executable, "-c", program, str(file), limit]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    message = done.stderr.strip().splitlines()[-1]
+    assert "huge.stl: about 10,000,000 triangles need 10.0 GB" in message
+    assert "Simplify" in message
+
+
+def test_what_fits_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "ball.off"
+    trimesh.creation.icosphere(subdivisions=6).export(file)
+    check_memory(file)
+    monkeypatch.setattr(limits, "available_memory", lambda: 1000)
+    with pytest.raises(MeshError, match=r"ball\.off: about 81,920 triangles"):
+        check_memory(file)
+    monkeypatch.setattr(limits, "available_memory", lambda: None)
+    check_memory(file)
+
+
+@pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="the system does not tell")
+def test_some_memory_is_available() -> None:
+    free = available_memory()
+    assert free is not None
+    assert 0 < free < 1 << 50
+
+
+def group(folder: Path, version: int, most: object, used: int, cached: int) -> None:
+    """Files of a control group."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = ("memory.max", "memory.current") if version == 2 else ("memory.limit_in_bytes", "memory.usage_in_bytes")
+    for name, value in zip(names, (most, used), strict=True):
+        (folder / name).write_text(f"{value}\n")
+    cache = "inactive_file" if version == 2 else "total_inactive_file"
+    (folder / "memory.stat").write_text(f"active_file 7\nsome_{cache} 3\n{cache} {cached}\n")
+
+
+def test_the_groups_around_a_process_bound_its_memory(tmp_path: Path) -> None:
+    own, root = tmp_path / "own", tmp_path / "groups"
+    own.write_text("0::/job/step\n")
+    assert limits._of_group(root, own) is None
+    group(root / "job" / "step", 2, "max", 300, 0)
+    assert limits._of_group(root, own) is None
+    group(root / "job", 2, 1000, 400, 150)  # of all steps together; files that were read can go
+    assert limits._of_group(root, own) == 1000 - 400 + 150
+    group(root / "job" / "step", 2, 500, 300, 0)
+    assert limits._of_group(root, own) == 200
+
+
+def test_a_container_has_its_group_as_the_root(tmp_path: Path) -> None:
+    own, root = tmp_path / "own", tmp_path / "groups"
+    own.write_text("9:name=systemd:/\n4:cpu,memory:/docker/0815\n")
+    group(root / "memory", 1, 2000, 1500, 100)
+    assert limits._of_group(root, own) == 600
+    group(root / "memory" / "docker" / "0815", 1, 1000, 900, 0)
+    assert limits._of_group(root, own) == 100
+    assert limits._of_group(tmp_path / "nowhere", tmp_path / "nothing") is None
+
+
+@pytest.mark.parametrize("kind", ["RLIMIT_AS", "RLIMIT_DATA"])
+def test_the_limits_of_the_process_bound_its_memory(kind: str) -> None:
+    pytest.importorskip("resource")
+    program = (
+        "import resource\nfrom igps.mesh.limits import available_memory\nbefore = available_memory()\n"
+        f"resource.setrlimit(resource.{kind}, (1 << 33, 1 << 33))\n"
+        "assert before is None or 0 < available_memory() <= min(before, 1 << 33) + (1 << 26)\n"
+        "block = bytearray(1 << 29)\n"
+        f"assert available_memory() < (1 << 33) - (1 << 29)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
+def test_a_grid_that_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    mesh = Mesh(ball.vertices, ball.faces, name="ball")
+    free = 100 * 2**20
+    monkeypatch.setattr(limits, "available_memory", lambda: free)
+    assert len(interior_samples(mesh, 100)) > 100_000  # 40 MB
+    with pytest.raises(
+        MeshError, match=r"ball: a grid of 8,000,000 cells needs 0\.3 GB of memory, and 0\.1 GB are free"
+    ):
+        interior_samples(mesh, 200)
+    # Nor is a grid refined into what does not fit.
+    with pytest.raises(MeshError, match="use fewer workers"):
+        interior_samples(mesh, 60, min_samples=3_000_000)
+    free = 10**10
+    assert len(interior_samples(mesh, 150)) > 10**6

@@ -1,0 +1,241 @@
+"""Meshes from files: formats, clouds of points, mending, and what makes a file unusable."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from conftest import FACES, TETRAHEDRON
+from igps.mesh.loading import LoadOptions, load_mesh, read_surface
+from igps.mesh.mesh import MeshError
+
+
+def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
+    lines = ["OFF", f"{len(vertices)} {len(faces)} 0", *(" ".join(map(str, v)) for v in vertices)]
+    lines += [" ".join(map(str, [len(f), *f])) for f in faces]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_missing_and_unreadable_files(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"nowhere\.off: no such file"):
+        load_mesh(tmp_path / "nowhere.off")
+    for name, text in (("blank.off", "\n"), ("words.off", "hello"), ("cut.ply", "ply\nformat ascii 1.0\n")):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(MeshError, match=rf"{name}: not readable"):
+            load_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl", "glb", "xyz", "3mf"])
+def test_an_empty_file_is_called_empty(tmp_path: Path, suffix: str) -> None:
+    (tmp_path / f"none.{suffix}").write_bytes(b"")
+    with pytest.raises(MeshError, match=rf"none\.{suffix}: the file is empty \(0 bytes\)\. Export it again"):
+        load_mesh(tmp_path / f"none.{suffix}")
+
+
+@pytest.mark.parametrize("suffix", ["off", "obj", "ply", "glb"])
+def test_formats_keep_vertices_in_order(tmp_path: Path, suffix: str) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=1)
+    surface.export(tmp_path / f"mesh.{suffix}")
+    mesh = load_mesh(tmp_path / f"mesh.{suffix}")
+    np.testing.assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, surface.faces)
+
+
+@pytest.mark.parametrize(("suffix", "comment"), [("off", "# {}"), ("obj", "# {}"), ("ply", "comment {}")])
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "shift_jis"])
+def test_comments_may_be_in_any_encoding(tmp_path: Path, suffix: str, comment: str, encoding: str) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=1)
+    options = {"encoding": "ascii"} if suffix == "ply" else {}
+    text = surface.export(file_type=suffix, **options)
+    lines = (text if isinstance(text, str) else text.decode()).split("\n")
+    words = {"utf-8": "Größe – 大きさ", "latin-1": "Größe, né à Paris", "shift_jis": "球の大きさ"}[encoding]
+    lines.insert(2 if suffix == "ply" else 1, comment.format(words))
+    path = tmp_path / f"mesh.{suffix}"
+    path.write_bytes("\n".join(lines).encode(encoding))
+    mesh = load_mesh(path)
+    np.testing.assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, surface.faces)
+    (tmp_path / "cloud.xyz").write_bytes(f"# {words}\n0 0 1\n0 1 0\n".encode(encoding))
+    np.testing.assert_array_equal(read_surface(tmp_path / "cloud.xyz")[0], [[0, 0, 1], [0, 1, 0]])
+
+
+def test_quads_become_triangles(tmp_path: Path) -> None:
+    corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
+    quads = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]])
+    mesh = load_mesh(write_off(tmp_path / "cube.off", corners, quads))
+    assert mesh.faces.shape == (12, 3)
+    assert mesh.volume == pytest.approx(1)
+    assert mesh.area == pytest.approx(6)
+
+
+def test_off_files_are_read_as_trimesh_reads_them(tmp_path: Path) -> None:
+    """Plain ones are read without it; these are plain, or have faults and liberties of all kinds."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    plain = ball.export(file_type="off")
+    lines = plain.splitlines()
+    random = np.random.default_rng(0)
+    texts = [
+        plain,
+        plain.replace("\n", "\r\n"),
+        plain.replace("\n", " \n\t"),
+        plain.replace("\n", "\n\n"),
+        plain.replace("OFF\n", "OFF "),
+        "# a ball\n" + plain,
+        plain + "# a ball\n",
+        plain + "3 0 1 2\n",
+        "\n".join(lines[:-1]),
+        "\n".join([*lines[:5], *lines[6:]]),
+        "\n".join([lines[0], lines[1], *(line + " 0 0 1" for line in lines[2:44]), *lines[44:]]),
+        "\n".join([*lines[:44], *(line + " 255 0 0" for line in lines[44:])]),
+        "\n".join([*lines[:44], "4 0 1 2 3", *lines[45:]]),
+        "\n".join([*lines[:44], "3 0 1 2.5", *lines[45:]]),
+        "\n".join([*lines[:44], "3 0 1 42", *lines[45:]]),
+        "\n".join([*lines[:44], "3 0 1 -1", *lines[45:]]),
+        "\n".join(["OFF", "1 0 0", "0 0 0"]),
+        "OFF\n0 0 0\n",
+        "OFF\n5 3 0\n",
+        "OFF\n5 3 0\n\n\n\n\n\n3 0 1 2\n",
+    ]
+    alphabet = [*"0123456789.-+eEnaif #\n\t,x", "٣", "\x0c"]
+    for _ in range(1500):
+        text = list(plain)
+        for place in random.integers(0, len(text), random.integers(1, 4)):
+            text[place] = random.choice(["", random.choice(alphabet), text[place] + random.choice(alphabet)])
+        texts.append("".join(text))
+    outcomes = []
+    for text in texts:
+        path = tmp_path / "ball.off"
+        path.write_text(text)
+        try:
+            expected = trimesh.load(path, process=False, force="scene").to_mesh()
+        except Exception:  # of any kind
+            expected = None
+        try:
+            vertices, faces, _ = read_surface(path)
+        except MeshError:
+            vertices = faces = None
+        assert (faces is None) == (expected is None), text
+        if expected is not None:
+            np.testing.assert_array_equal(vertices, expected.vertices)
+            np.testing.assert_array_equal(faces, expected.faces)
+        outcomes.append(expected is not None)
+    assert 300 < sum(outcomes) < len(texts) - 300
+
+
+def test_texture_seams_do_not_split_vertices(tmp_path: Path) -> None:
+    lines = [f"v {x} {y} {z}" for x, y, z in TETRAHEDRON] + ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
+    lines += [f"f {a + 1}/{i % 4 + 1} {b + 1}/2 {c + 1}/3" for i, (a, b, c) in enumerate(FACES)]
+    (tmp_path / "seams.obj").write_text("\n".join(lines) + "\n")
+    np.testing.assert_allclose(load_mesh(tmp_path / "seams.obj").vertices, TETRAHEDRON)
+
+
+def test_stl_needs_and_gets_welding(tmp_path: Path) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=2)
+    surface.export(tmp_path / "mesh.stl")
+    with pytest.raises(MeshError, match="boundary edges"):
+        load_mesh(tmp_path / "mesh.stl", LoadOptions("never"))
+    mesh = load_mesh(tmp_path / "mesh.stl")
+    assert len(mesh.vertices) == len(surface.vertices)
+    assert mesh.volume == pytest.approx(surface.volume, rel=1e-6)
+    assert any("welded" in note for note in mesh.notes)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_each_fault_is_mended_at_any_scale(tmp_path: Path, scale: float) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=2)
+    vertices, faces = np.asarray(surface.vertices), np.asarray(surface.faces)
+    faulty = faces.copy()
+    faulty[::3] = faulty[::3, ::-1]
+    faulty[5, 0] = len(vertices)
+    faulty = np.vstack([faulty, faulty[7], [[0, 0, 1]]])
+    vertices = np.vstack([vertices, vertices[faces[5, 0] if 5 % 3 else faces[5, 2]], [[4, 4, 4]]]) * scale
+    mesh = load_mesh(write_off(tmp_path / "faulty.off", vertices, faulty))
+    assert mesh.volume == pytest.approx(surface.volume * scale**3, rel=1e-6)
+    assert len(mesh.vertices) == len(surface.vertices)
+    said = " ".join(mesh.notes)
+    assert all(word in said for word in ("welded 1", "degenerate", "duplicate", "unreferenced", "orient"))
+
+
+def test_largest_component_is_that_of_the_largest_area(tmp_path: Path) -> None:
+    fine, large = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.box((5, 5, 5))
+    vertices = np.vstack([fine.vertices + 20, large.vertices])
+    faces = np.vstack([fine.faces, large.faces + len(fine.vertices)])
+    path = write_off(tmp_path / "two.off", vertices, faces)
+    with pytest.raises(MeshError, match="2 connected components"):
+        load_mesh(path, LoadOptions("never"))
+    mesh = load_mesh(path, LoadOptions("never", component="largest"))
+    assert mesh.volume == pytest.approx(125)
+    assert any("largest of 2 components" in note for note in mesh.notes)
+
+
+def test_open_files_are_read_when_allowed(tmp_path: Path) -> None:
+    path = write_off(tmp_path / "open.off", TETRAHEDRON, FACES[:3])
+    with pytest.raises(MeshError, match="3 boundary edges"):
+        load_mesh(path, LoadOptions("never"))
+    mesh = load_mesh(path, LoadOptions(allow_open=True))
+    assert mesh.allow_open
+    assert len(mesh.faces) == 3
+
+
+def test_unknown_component_is_refused() -> None:
+    with pytest.raises(ValueError, match="component: expected 'largest' or None, got 'smallest'"):
+        LoadOptions(component="smallest")  # type: ignore[arg-type]
+
+
+def test_unknown_way_to_mend_is_refused() -> None:
+    with pytest.raises(ValueError, match="mend: expected 'auto', 'never' or 'always', got 'please'"):
+        LoadOptions(mend="please")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("normals", [False, True])
+@pytest.mark.parametrize("suffix", ["xyz", "ply"])
+def test_a_cloud_of_points_becomes_the_body_it_was_taken_from(tmp_path: Path, suffix: str, normals: bool) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=4)
+    rows = np.asarray(surface.vertices) * [1, 0.8, 1.3]
+    names = ["x", "y", "z"]
+    if normals:
+        rows, names = np.hstack([rows, surface.vertex_normals]), [*names, "nx", "ny", "nz"]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(rows)}", *(f"property float {n}" for n in names)]
+    lines = [*header, "end_header"] if suffix == "ply" else []
+    lines += [" ".join(f"{x:.7f}" for x in row) for row in rows]
+    path = tmp_path / f"cloud.{suffix}"
+    path.write_text("\n".join(lines) + "\n")
+    mesh = load_mesh(path)
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * 1.04, rel=0.02)
+    assert mesh.genus == 0
+    assert any("watertight" in note for note in mesh.notes)
+    with pytest.raises(MeshError, match=r"cloud.*no faces"):
+        load_mesh(path, LoadOptions("never"))
+
+
+def test_a_body_is_left_as_it_is_bit_for_bit(tmp_path: Path) -> None:
+    surface = trimesh.creation.icosphere(subdivisions=3)
+    path = write_off(tmp_path / "body.off", surface.vertices, surface.faces)
+    mended, untouched = load_mesh(path), load_mesh(path, LoadOptions("never"))
+    np.testing.assert_array_equal(mended.vertices, untouched.vertices)
+    np.testing.assert_array_equal(mended.faces, untouched.faces)
+    assert mended.notes == ()
+
+
+def test_too_few_vertices_for_the_eigenpairs_are_made_more(tmp_path: Path) -> None:
+    box = trimesh.creation.box()
+    path = write_off(tmp_path / "box.off", box.vertices, box.faces)
+    mesh = load_mesh(path, least_vertices=100)
+    assert len(mesh.vertices) >= 100
+    assert mesh.volume == pytest.approx(1)
+    assert mesh.area == pytest.approx(6)
+
+
+def test_a_format_without_its_module_says_which_extra_has_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "part.3mf").write_bytes(b"PK")
+
+    def missing(*_: object, **__: object) -> None:
+        raise ImportError("No module named 'lxml'")
+
+    monkeypatch.setattr(trimesh, "load", missing)
+    with pytest.raises(MeshError, match=r"part\.3mf.*lxml.*interior-gps\[formats\]"):
+        load_mesh(tmp_path / "part.3mf")

@@ -1,0 +1,284 @@
+"""The ladder of mending: each step where it is needed, none where it is not, and the body that comes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+from training.studies.damages import DAMAGES, halves, holes
+
+from igps.mesh._hole_filling import with_small_holes_filled
+from igps.mesh._tidying import welded
+from igps.mesh.mending import mend, mended_by
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.subdivision import subdivided
+from igps.mesh.surface import area_vectors
+from igps.mesh.watertight import watertight
+
+pytest.importorskip("igl")
+pytest.importorskip("skimage")
+pytest.importorskip("manifold3d")
+
+
+def box() -> Mesh:
+    surface = trimesh.creation.box((1, 2, 3))
+    return Mesh(np.asarray(surface.vertices), np.asarray(surface.faces), name="box")
+
+
+def area(vertices: np.ndarray, faces: np.ndarray) -> float:
+    return float(np.linalg.norm(area_vectors(vertices, faces), axis=1).sum())
+
+
+def same_surface(a: Mesh, b: Mesh) -> bool:
+    """The same triangles, whatever their order and the numbers of their corners."""
+
+    def canonical(mesh: Mesh) -> np.ndarray:
+        corners = np.round(mesh.vertices, 5)[mesh.faces]
+        first = np.lexsort(corners.reshape(-1, 3).T[::-1])
+        rank = np.empty(len(first), dtype=int)
+        rank[first] = np.arange(len(first))
+        start = rank.reshape(-1, 3).argmin(axis=1)
+        turned = corners[np.arange(len(corners))[:, None], (start[:, None] + np.arange(3)) % 3].reshape(-1, 9)
+        return turned[np.lexsort(turned.T[::-1])]
+
+    return len(a.faces) == len(b.faces) and bool(np.allclose(canonical(a), canonical(b), atol=2e-5))
+
+
+def test_a_body_is_left_as_it_is(blob: Mesh) -> None:
+    mesh = mend(blob.vertices, blob.faces)
+    np.testing.assert_array_equal(mesh.vertices, blob.vertices)
+    np.testing.assert_array_equal(mesh.faces, blob.faces)
+    assert mesh.notes == ()
+    assert mended_by(mesh.notes) == ()
+
+
+@pytest.mark.parametrize("name", ["soup", "turned", "fins", "parts"])
+def test_welding_and_dropping_gives_the_very_surface(blob: Mesh, name: str) -> None:
+    mesh = mend(*DAMAGES[name].apply(blob, 3))
+    assert mended_by(mesh.notes) == ("welded",)
+    assert same_surface(mesh, blob)
+
+
+def test_holes_are_filled_where_the_surface_was(sphere: Mesh) -> None:
+    mesh = mend(*holes(sphere, seed=1))
+    assert mended_by(mesh.notes) == ("filled",)
+    assert mesh.notes == ("filled 3 small holes",)
+    # The old vertices stay, and the new ones go on like the sphere.
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.01
+    assert mesh.volume == pytest.approx(sphere.volume, rel=2e-3)
+    sides = mesh.vertices[mesh.faces]
+    length = np.linalg.norm(sides - np.roll(sides, 1, axis=1), axis=2)
+    assert length.max() < 3 * np.median(length)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_holes_that_touch_are_filled_one_by_one(sphere: Mesh, seed: int) -> None:
+    """Rims that meet in a vertex are taken apart: after it, each edge has two faces again."""
+    kept = np.ones(len(sphere.faces), dtype=bool)
+    kept[np.random.default_rng(seed).choice(len(kept), len(kept) // 20, replace=False)] = False
+    _, faces = with_small_holes_filled(sphere.vertices, sphere.faces[kept], [])
+    _, counts = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    assert (counts == 2).all()
+
+
+def test_a_patch_has_as_many_vertices_as_its_rim_asks_for(sphere: Mesh) -> None:
+    """Those of a disc of radius r = n / 2π steps that are one step apart: about π r² = n² / 4π."""
+    away = np.linalg.norm(sphere.vertices - sphere.vertices[0], axis=1)
+    kept = sphere.faces[(away[sphere.faces] > 0.11 * np.ptp(sphere.vertices)).all(axis=1)]
+    used, faces = np.unique(kept, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    _, counts = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    n = int((counts == 1).sum())
+    assert n > 15
+    vertices, _ = with_small_holes_filled(sphere.vertices[used], faces, [])
+    assert len(vertices) - len(used) == pytest.approx(n**2 / (4 * np.pi), rel=0.35)
+
+
+def test_halves_that_overlap_are_the_body_again(blob: Mesh) -> None:
+    mesh = mend(*halves(blob))
+    assert mended_by(mesh.notes) == ("united",)
+    assert mesh.volume == pytest.approx(blob.volume, rel=1e-9)
+    assert mesh.area == pytest.approx(blob.area, rel=1e-9)
+
+
+def test_halves_that_overlap_and_are_always_made_watertight_come_near_it(blob: Mesh) -> None:
+    mesh = mend(*halves(blob), how="always")
+    assert mended_by(mesh.notes) == ("watertight",)
+    assert mesh.volume == pytest.approx(blob.volume, rel=0.01)
+    assert mesh.area == pytest.approx(blob.area, rel=0.01)
+
+
+def test_all_at_once(blob: Mesh) -> None:
+    mesh = mend(*DAMAGES["everything"].apply(blob, 0))
+    assert mended_by(mesh.notes)[-1] == "watertight"
+    assert mesh.volume == pytest.approx(blob.volume, rel=0.03)
+
+
+def test_a_cup_is_not_filled() -> None:
+    surface = trimesh.creation.icosphere(subdivisions=3)
+    open_faces = np.asarray(surface.faces)[surface.triangles_center[:, 2] < 0.2]
+    mesh = mend(np.asarray(surface.vertices), open_faces)
+    assert mended_by(mesh.notes) == ("welded", "watertight")  # the cap's vertices were left unused
+    assert mesh.volume < 0.1 * surface.volume
+
+
+def test_a_part_that_sticks_out_is_not_hidden() -> None:
+    surface, knob = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.icosphere(subdivisions=2, radius=0.3)
+    knob.apply_translation([1, 0, 0])
+    whole = trimesh.util.concatenate([surface, knob])
+    mesh = mend(np.asarray(whole.vertices), np.asarray(whole.faces))
+    assert mended_by(mesh.notes) == ("united",)
+    assert mesh.vertices[:, 0].max() == pytest.approx(1.3, abs=1e-9)
+
+
+def test_too_few_vertices_are_more_on_the_same_surface() -> None:
+    mesh = mend(box().vertices, box().faces, least_vertices=52)
+    assert mended_by(mesh.notes) == ("subdivided",)
+    assert len(mesh.vertices) >= 52
+    assert mesh.volume == pytest.approx(6, rel=1e-12)
+    assert mesh.area == pytest.approx(22, rel=1e-12)
+    # All on the surface of the box.
+    assert np.isclose(np.abs(mesh.vertices), [0.5, 1, 1.5]).any(axis=1).all()
+    np.testing.assert_array_equal(mesh.vertices[:8], box().vertices)
+
+
+@pytest.mark.parametrize("n_vertices", [9, 100, 333])
+def test_longest_edges_are_cut_first(n_vertices: int) -> None:
+    mesh = subdivided(box(), n_vertices)
+    assert len(mesh.vertices) == n_vertices
+    sides = mesh.vertices[mesh.faces]
+    length = np.linalg.norm(sides - np.roll(sides, 1, axis=1), axis=2)
+    if n_vertices > 50:
+        assert length.max() < 4.5 * np.sqrt(22 / n_vertices)
+    assert (np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1) > 1e-6).all()
+
+
+def test_never_refuses_and_always_makes_watertight(blob: Mesh) -> None:
+    vertices, faces = holes(blob)
+    with pytest.raises(MeshError, match="open surface"):
+        mend(vertices, faces, how="never")
+    mesh = mend(vertices, faces, how="always")
+    assert mended_by(mesh.notes) == ("watertight",)
+    assert mesh.volume == pytest.approx(blob.volume, rel=0.01)
+    with pytest.raises(ValueError, match="how"):
+        mend(vertices, faces, how="sometimes")  # type: ignore[arg-type]
+
+
+def test_always_leaves_the_boundary_of_one_body_as_it_is(blob: Mesh) -> None:
+    mesh = mend(blob.vertices, blob.faces, how="always")
+    assert mesh.notes == ()
+    np.testing.assert_array_equal(mesh.vertices, blob.vertices)
+    np.testing.assert_array_equal(mesh.faces, blob.faces)
+
+
+def test_what_lies_side_by_side_stays_apart_always() -> None:
+    """Two turns of a coil, half a cell from each other: a grid joins them."""
+    near = coil(turns=2.2, pitch=0.41)
+    assert watertight(near.vertices, near.faces).area < 0.97 * near.area
+    for vertices, faces in ((near.vertices, near.faces), DAMAGES["soup"].apply(near, 0)):
+        mesh = mend(vertices, faces, how="always")
+        assert "watertight" not in mended_by(mesh.notes)
+        assert mesh.area == pytest.approx(near.area, rel=1e-6)
+
+
+def test_a_closed_surface_that_crosses_itself_passes_and_is_always_made_watertight() -> None:
+    """A coil with less room than it is thick; the union of its balls is the oracle for the volume."""
+    crossing = coil(turns=2.2, pitch=0.3)
+    assert mend(crossing.vertices, crossing.faces).notes == ()
+    mesh = mend(crossing.vertices, crossing.faces, how="always")
+    assert mended_by(mesh.notes) == ("watertight",)
+    points = np.random.default_rng(0).uniform(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), (100_000, 3))
+    turn = np.linspace(0, 2.2, 3000)
+    middles = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn), 0.3 * turn], axis=1)
+    away, nearest = cKDTree(middles).query(points)
+    # Without the half balls beyond the flat ends; the radius is that of a circle of the polygon's area.
+    inside = (away < 0.2 * np.sqrt(8 / np.pi * np.sin(np.pi / 8))) & (nearest > 0) & (nearest < len(middles) - 1)
+    assert mesh.volume == pytest.approx(inside.mean() * np.prod(np.ptp(mesh.vertices, axis=0)), rel=0.02)
+    assert mesh.volume < 0.95 * crossing.volume
+
+
+def coil(turns: float, pitch: float, radius: float = 0.2) -> Mesh:
+    """A tube around a helix of radius 1, with flat ends."""
+    n, around = round(90 * turns), 16
+    turn = np.linspace(0, turns, n)[:, None]
+    angle = 2 * np.pi * turn
+    middles = np.hstack([np.cos(angle), np.sin(angle), pitch * turn])
+    along = np.hstack([-np.sin(angle), np.cos(angle), np.full_like(turn, pitch / (2 * np.pi))])
+    outward = np.hstack([np.cos(angle), np.sin(angle), np.zeros_like(turn)])
+    upward = np.cross(outward, along / np.linalg.norm(along, axis=1, keepdims=True))
+    phase = 2 * np.pi * np.arange(around) / around
+    rings = np.cos(phase)[:, None] * outward[:, None] + np.sin(phase)[:, None] * upward[:, None]
+    vertices = np.vstack([(middles[:, None] + radius * rings).reshape(-1, 3), middles[[0, -1]]])
+    i, j = np.meshgrid(np.arange(n - 1), np.arange(around), indexing="ij")
+    a, b = i * around + j, i * around + (j + 1) % around
+    c, d = a + around, b + around
+    walls = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(-1, 3)
+    ring, following = np.arange(around), (np.arange(around) + 1) % around
+    last = (n - 1) * around
+    start = np.stack([following, ring, np.full(around, n * around)], axis=1)
+    end = np.stack([last + ring, last + following, np.full(around, n * around + 1)], axis=1)
+    return Mesh(vertices, np.vstack([walls, start, end]))
+
+
+def test_a_cloud_is_a_surface(sphere: Mesh) -> None:
+    mesh = mend(sphere.vertices, None)
+    assert mesh.volume == pytest.approx(sphere.volume, rel=0.03)
+    assert mended_by(mesh.notes) == ("watertight",)
+
+
+def test_neighbours_are_turned_alike_in_every_part(blob: Mesh) -> None:
+    n = len(blob.vertices)
+    vertices = np.vstack([blob.vertices, blob.vertices + 10])
+    faces = np.vstack([blob.faces, blob.faces + n])
+    generator = np.random.default_rng(0)
+    flipped = faces.copy()
+    chosen = generator.random(len(faces)) < 0.4
+    flipped[chosen] = flipped[chosen, ::-1]
+    notes: list[str] = []
+    again, turned = welded(vertices, flipped, notes)
+    np.testing.assert_array_equal(again, vertices)
+    np.testing.assert_array_equal(turned, np.where(chosen[:, None], faces[:, ::-1][:, ::-1], faces))
+    assert notes == [f"turned {int(chosen.sum())} faces to orient the surface"]
+
+
+def test_welding_agrees_with_trimesh(blob: Mesh) -> None:
+    vertices, faces = DAMAGES["soup"].apply(blob, 0)
+    by_trimesh = trimesh.Trimesh(vertices, faces, process=True)
+    again, _ = welded(vertices, faces, [])
+    assert len(again) == len(by_trimesh.vertices) == len(blob.vertices)
+
+
+UNUSABLE: dict[str, tuple[Callable[[], tuple[np.ndarray, np.ndarray | None]], str]] = {
+    "empty": (lambda: (np.zeros((0, 3)), np.zeros((0, 3), dtype=int)), "is empty"),
+    "triangle": (lambda: (np.eye(3), np.array([[0, 1, 2]])), "a single triangle"),
+    "line": (
+        lambda: (np.outer(np.arange(4.0), [1, 2, 3]), np.array([[0, 1, 2], [1, 2, 3]])),
+        "no triangle has an area",
+    ),
+    "point": (lambda: (np.ones((4, 3)), np.array([[0, 1, 2], [1, 2, 3]])), "in one point"),
+    "five": (lambda: (np.random.default_rng(0).random((5, 3)), None), "a cloud of 5 points"),
+    "line of points": (
+        lambda: (np.outer(np.linspace(0, 1, 30), [1, 2, 3]).astype(np.float32) + 5, None),
+        "all 30 points are on one line",
+    ),
+    "huge": (lambda: (1e200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])), "1e-30 to 1e\\+30 expected"),
+    "tiny": (lambda: (1e-200 * np.eye(3)[[0, 1, 2, 0]], np.array([[0, 1, 2], [1, 2, 3]])), "1e-30 to 1e\\+30 expected"),
+    "huge cloud": (lambda: (1e200 * np.random.default_rng(0).random((400, 3)), None), "1e-30 to 1e\\+30 expected"),
+    "tiny cloud": (lambda: (1e-200 * np.random.default_rng(0).random((400, 3)), None), "1e-30 to 1e\\+30 expected"),
+    "nan": (lambda: (np.full((4, 3), np.nan), np.array([[0, 1, 2], [1, 2, 3]])), "NaN"),
+    "nan cloud": (lambda: (np.full((40, 3), np.nan), None), "NaN"),
+    "out of range": (lambda: (np.eye(3), np.array([[0, 1, 9], [0, 1, 2]])), "out of range"),
+}
+
+
+@pytest.mark.parametrize("case", sorted(UNUSABLE))
+@pytest.mark.parametrize("how", ["auto", "always"])
+def test_what_cannot_be_mended_is_named(case: str, how: str) -> None:
+    make, words = UNUSABLE[case]
+    vertices, faces = make()
+    with pytest.raises(MeshError, match=words) as error:
+        mend(vertices, faces, how=how, name="some/file.obj")  # type: ignore[arg-type]
+    assert str(error.value).startswith("some/file.obj: ")

@@ -1,0 +1,75 @@
+"""A mesh is checked when made, and what is wrong is named with its remedy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from training.studies.weld import weld_gap
+
+from conftest import FACES, TETRAHEDRON, as_mesh, horseshoe, surface_genus
+from igps.mesh.mesh import Mesh, MeshError
+
+
+def test_closed_forms_of_area_and_volume() -> None:
+    mesh = Mesh(TETRAHEDRON, FACES)
+    assert mesh.volume == pytest.approx(1 / 6)
+    assert mesh.area == pytest.approx(1.5 + np.sqrt(3) / 2)
+
+
+def test_mesh_copies_and_freezes_its_arrays() -> None:
+    vertices = TETRAHEDRON.copy()
+    mesh = Mesh(vertices, FACES)
+    vertices[0] = 9
+    assert mesh.vertices[0, 0] == 0
+    with pytest.raises(ValueError, match="read-only"):
+        mesh.vertices[0] = 1
+
+
+def test_inside_out_mesh_is_turned_and_says_so() -> None:
+    mesh = Mesh(TETRAHEDRON, FACES[:, ::-1])
+    assert mesh.volume == pytest.approx(1 / 6)
+    assert any("inside out" in note for note in mesh.notes)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "message"),
+    [
+        (TETRAHEDRON, np.empty((0, 3), dtype=int), "no faces"),
+        (TETRAHEDRON[:, :2], FACES, r"expected shape \(V, 3\)"),
+        (np.where(TETRAHEDRON == 1, np.nan, TETRAHEDRON), FACES, "3 vertices have NaN"),
+        (np.where(TETRAHEDRON == 1, np.inf, TETRAHEDRON), FACES, "3 vertices have NaN or infinite"),
+        (TETRAHEDRON, FACES + 1, "3 faces refer to vertices out of range"),
+        (TETRAHEDRON, FACES - 1, "out of range"),
+        (TETRAHEDRON, FACES[:3], "3 boundary edges"),
+        (TETRAHEDRON, np.vstack([FACES[:3], FACES[3:, ::-1]]), "inconsistent orientation, 3 edges"),
+        (TETRAHEDRON, np.vstack([FACES, [[0, 0, 1]]]), "1 faces use a vertex twice"),
+        (np.vstack([TETRAHEDRON, [[5, 5, 5]]]), FACES, "1 vertices belong to no face"),
+        (np.vstack([TETRAHEDRON, [[5, 5, 5]]]), np.vstack([FACES, [[0, 1, 4]]]), "1 non-manifold edges"),
+        (np.vstack([TETRAHEDRON, TETRAHEDRON + 3]), np.vstack([FACES, FACES + 4]), "2 connected components"),
+        (TETRAHEDRON * [1, 1, 0], FACES, "encloses no volume"),
+    ],
+)
+def test_bad_mesh_is_named_and_explained(vertices: np.ndarray, faces: np.ndarray, message: str) -> None:
+    with pytest.raises(MeshError, match=rf"(?s)bad\.off: .*{message}"):
+        Mesh(vertices, faces, name="bad.off")
+
+
+def test_every_message_of_a_repairable_fault_names_the_remedy() -> None:
+    for faces in (FACES[:3], np.vstack([FACES, [[0, 0, 1]]]), np.vstack([FACES[:3], FACES[3:, ::-1]])):
+        with pytest.raises(MeshError, match="mend="):
+            Mesh(TETRAHEDRON, faces)
+
+
+def test_open_mesh_passes_when_allowed() -> None:
+    mesh = Mesh(TETRAHEDRON, FACES[:3], allow_open=True)
+    assert len(mesh.faces) == 3
+
+
+def test_genus_and_diagonal() -> None:
+    ring = as_mesh(trimesh.creation.torus(1, 0.1, major_sections=64, minor_sections=16))
+    for mesh, expected in ((Mesh(TETRAHEDRON, FACES), 0), (ring, 1), (horseshoe(), 0), (weld_gap(horseshoe()), 1)):
+        assert mesh.genus == surface_genus(mesh) == expected
+    assert Mesh(TETRAHEDRON * [1, 2, 2], FACES).diagonal == pytest.approx(3)
+    with pytest.raises(MeshError, match="open surface has no genus"):
+        _ = Mesh(TETRAHEDRON, FACES[:3], allow_open=True).genus

@@ -1,0 +1,53 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from igps.nn.axes.centres import OrderedCentres, middles, position
+
+
+def test_middles_are_those_of_equal_intervals() -> None:
+    edges = np.linspace(0, 1.5, 5)
+    np.testing.assert_allclose(middles(4, 1.5, "classes"), (edges[1:] + edges[:-1]) / 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("n", "largest"), [(0, 1.0), (3, 0.0), (3, float("inf")), (3, float("nan"))])
+def test_impossible_intervals_are_refused(n: int, largest: float) -> None:
+    with pytest.raises(ValueError, match=f"at least one of bins and a positive range, got n_bins={n}"):
+        middles(n, largest, "bins")
+
+
+def test_position_interpolates_the_numbers_of_the_centres() -> None:
+    centres = torch.tensor([-0.5, 0.25, 0.3, 2.0], dtype=torch.float64)
+    values = torch.linspace(-1, 3, 77, dtype=torch.float64).view(7, 11)
+    np.testing.assert_allclose(position(values, centres), np.interp(values, centres, np.arange(4)), atol=1e-14)
+    np.testing.assert_allclose(position(centres, centres), np.arange(4), atol=1e-14)
+
+
+@pytest.mark.parametrize("start", [[0.1, 0.2, 0.5, 0.6], [-3.0, -1.0, 0.0, 7.0], [0.4]])
+def test_learned_centres_stay_in_order(start: list[float]) -> None:
+    centres = OrderedCentres(start, learnable=True)
+    assert centres.log_gap is not None
+    np.testing.assert_allclose(centres().detach(), start, atol=1e-6)
+    generator = torch.Generator().manual_seed(0)
+    for spread in (1.0, 30.0, 1000.0):
+        with torch.no_grad():
+            centres.log_gap.copy_(torch.randn(len(start), generator=generator) * spread)
+        values = centres()
+        assert (values.diff() > 0).all()
+        assert start[0] < 0 or values[0] > 0
+
+
+def test_fixed_centres_are_a_copy_and_no_parameters() -> None:
+    start = torch.tensor([0.1, 0.4])
+    centres = OrderedCentres(start)
+    start += 1
+    torch.testing.assert_close(centres(), torch.tensor([0.1, 0.4]))
+    assert list(centres.parameters()) == []
+
+
+@pytest.mark.parametrize("start", [[0.2, 0.1], [0.1, 0.1], [], [0.1, float("nan")], [[0.1, 0.2]]])
+def test_centres_that_do_not_ascend_are_refused(start: list[float]) -> None:
+    with pytest.raises(ValueError, match="start: expected finite values in ascending order"):
+        OrderedCentres(start)

@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from igps.nn.heads.base import Head
+from igps.nn.heads.learned import BlendedDistance, MetricHead
+from igps.retrieval import chi_square, hellinger
+from igps.retrieval.distances import euclidean
+
+
+@pytest.fixture
+def histograms() -> torch.Tensor:
+    counts = torch.rand(12, 3, 8, generator=torch.Generator().manual_seed(0)).pow(3)
+    counts[:, 1, :3] = 0
+    return counts / counts.sum(dim=(1, 2), keepdim=True)
+
+
+def test_head_gives_unit_vectors_and_finite_gradients_at_empty_cells(histograms: torch.Tensor) -> None:
+    torch.manual_seed(0)
+    head = MetricHead(width=5, n_hidden=16)
+    histograms.requires_grad_()
+    embedding = head(histograms)
+    torch.testing.assert_close(embedding.norm(dim=1), torch.ones(12))
+    embedding[:, 0].sum().backward()
+    assert histograms.grad is not None
+    assert histograms.grad.isfinite().all()
+    assert histograms.grad.abs().max() > 0
+
+
+def test_linear_head_with_identity_weights_ranks_like_hellinger(histograms: torch.Tensor) -> None:
+    head = MetricHead(width=24, n_hidden=0).eval()
+    head(histograms)  # which tells its size
+    with torch.no_grad():
+        head.layers[1].weight.copy_(torch.eye(24))  # type: ignore[union-attr]
+        head.layers[1].bias.zero_()  # type: ignore[union-attr]
+    embedding = head(histograms)
+    # ‖√a − √b‖² = 2 − 2 Σ √(ab), and Hellinger's distance is its root over √2.
+    squared = torch.cdist(embedding, embedding).square() / 2
+    torch.testing.assert_close(squared, hellinger(histograms, histograms).square(), atol=1e-6, rtol=1e-5)
+
+
+def test_fit_centres_and_scales(histograms: torch.Tensor) -> None:
+    head = MetricHead(width=3, n_hidden=0).eval()
+    assert head.fit(histograms, torch.zeros(12), part_cells=(4, 20)) is head
+    inputs = (histograms.flatten(1).sqrt() - head.mean) / head.scale
+    torch.testing.assert_close(inputs.mean(dim=0), torch.zeros(24), atol=1e-5, rtol=0)
+    torch.testing.assert_close(inputs.std(dim=0).mean(), torch.ones(()))
+    linear = head.layers[1]
+    embedding = head(histograms)
+    torch.testing.assert_close(embedding, torch.nn.functional.normalize(linear(inputs), dim=1))
+
+
+def test_sizes_come_from_the_data(histograms: torch.Tensor) -> None:
+    head = MetricHead(width=5, n_hidden=7)
+    assert isinstance(head, Head)
+    assert isinstance(head.layers[1].weight, torch.nn.UninitializedParameter)  # type: ignore[union-attr]
+    assert head(histograms).shape == (12, 5)
+    assert head.layers[1].weight.shape == (7, 24)  # type: ignore[union-attr]
+
+
+def test_wrong_number_of_cells_is_named(histograms: torch.Tensor) -> None:
+    head = MetricHead().fit(histograms, torch.zeros(12))
+    with pytest.raises(ValueError, match="descriptions: expected 24 cells as in training, got 16"):
+        head(histograms[:, :2])
+
+
+def test_impossible_inputs_are_refused(histograms: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match="width: expected at least 1, got 0"):
+        MetricHead(width=0)
+    with pytest.raises(ValueError, match="at least two training shapes, got 1"):
+        MetricHead().fit(histograms[:1], torch.zeros(1))
+    with pytest.raises(ValueError, match="descriptions: expected histograms, entries ≥ 0, got a negative one"):
+        MetricHead()(histograms - 0.5)
+
+
+def test_share_goes_from_plain_to_learned(histograms: torch.Tensor) -> None:
+    torch.manual_seed(1)
+    head = MetricHead(width=4).eval()
+    embedding = head(histograms)
+    learned = 1 - embedding @ embedding.T
+    for share, expected in ((0.0, chi_square(histograms, histograms)), (1.0, learned)):
+        distance = BlendedDistance(head, share=share)
+        distance.calibrate(histograms)
+        pairs = torch.triu_indices(12, 12, 1).unbind()
+        result = distance(histograms, histograms)
+        torch.testing.assert_close(result, expected / expected[pairs].median(), atol=1e-5, rtol=1e-4)
+
+
+def test_without_head_it_is_the_paper(histograms: torch.Tensor) -> None:
+    distance = BlendedDistance()
+    distance.calibrate(histograms)
+    torch.testing.assert_close(distance(histograms, histograms), chi_square(histograms, histograms), atol=0, rtol=0)
+
+
+def test_plain_distance_may_be_another(histograms: torch.Tensor) -> None:
+    flat = histograms.flatten(1)
+    torch.testing.assert_close(BlendedDistance(plain=euclidean)(flat, flat), euclidean(flat, flat), atol=0, rtol=0)
+    head = MetricHead(width=4).eval()
+    head(flat)
+    distance = BlendedDistance(head, euclidean, share=0.0)
+    distance.calibrate(flat)
+    expected = euclidean(flat, flat) / euclidean(flat, flat)[torch.triu_indices(12, 12, 1).unbind()].median()
+    torch.testing.assert_close(distance(flat, flat), expected)
+
+
+def test_state_round_trips_into_one_without_sizes(histograms: torch.Tensor) -> None:
+    torch.manual_seed(2)
+    one = BlendedDistance(MetricHead().eval())
+    one.head.fit(histograms, torch.zeros(12))  # type: ignore[union-attr, operator]
+    one.calibrate(histograms)
+    state = {name: value.clone() for name, value in one.state_dict().items()}
+    other_size = BlendedDistance(MetricHead().fit(histograms[:, :1], torch.zeros(12)).eval())
+    for two in (BlendedDistance(MetricHead().eval()), other_size):
+        two.load_state_dict(state)
+        torch.testing.assert_close(two(histograms, histograms), one(histograms, histograms), atol=0, rtol=0)
+        for name, value in two.state_dict().items():
+            assert torch.equal(value, state[name]), name
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1])
+def test_share_out_of_range_is_refused(share: float) -> None:
+    with pytest.raises(ValueError, match="share"):
+        BlendedDistance(share=share)

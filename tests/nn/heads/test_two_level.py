@@ -1,0 +1,220 @@
+"""The head of two levels against SciPy's generalised eigenproblem, its kernel's formula, and what it promises."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import sqrtm
+from torch import Tensor
+
+from igps.nn.heads.base import Head
+from igps.nn.heads.two_level import TwoLevelHead, WCCNHead
+from igps.retrieval import cosine, retrieval_scores
+
+N_CLASSES, N_BODIES, N_POSES, N_CELLS = 16, 4, 5, 40
+
+
+@pytest.fixture
+def collection() -> tuple[Tensor, Tensor, Tensor]:
+    """Histograms, classes and bodies; bodies of all classes differ along the same directions, poses along others."""
+    generator = torch.Generator().manual_seed(0)
+    kinds = torch.randn(N_CLASSES, 1, 1, N_CELLS, generator=generator)
+    of_bodies = torch.randn(N_CLASSES, N_BODIES, 1, 4, generator=generator) @ torch.randn(
+        4, N_CELLS, generator=generator
+    )
+    of_poses = torch.randn(N_CLASSES, N_BODIES, N_POSES, 2, generator=generator) @ torch.randn(
+        2, N_CELLS, generator=generator
+    )
+    noise = 0.02 * torch.randn(N_CLASSES, N_BODIES, N_POSES, N_CELLS, generator=generator)
+    cells = (0.3 * kinds + 0.4 * of_bodies + 0.3 * of_poses + noise).exp().flatten(0, 2)
+    bodies = torch.arange(N_CLASSES * N_BODIES).repeat_interleave(N_POSES)
+    return cells / cells.sum(dim=1, keepdim=True), bodies // N_BODIES, bodies
+
+
+def ft(vectors: Tensor, labels: Tensor) -> float:
+    return retrieval_scores(cosine(vectors, vectors), labels).mean()["ft"]
+
+
+def projected(histograms: Tensor, bodies: Tensor, shrinkage: float) -> np.ndarray:
+    """(N, 10) centred roots, whitened within bodies, along the directions in which the means vary most."""
+    roots = histograms.double().sqrt().numpy()
+    members = bodies.numpy()
+    means = np.stack([roots[members == b].mean(axis=0) for b in range(members.max() + 1)])
+    residuals = roots - means[members]
+    within = residuals.T @ residuals
+    rank = min(len(roots) - len(means), N_CELLS)
+    relative = within * rank / within.trace()
+    whitening = np.real(sqrtm(shrinkage * np.linalg.inv(shrinkage * np.eye(N_CELLS) + relative)))
+    centred = roots - roots.mean(axis=0)
+    # of 40 cells the roots span all: nothing but the mean is taken off
+    _, _, axes = np.linalg.svd((means - roots.mean(axis=0)) @ whitening, full_matrices=False)
+    return centred @ whitening @ axes[:10].T
+
+
+def test_a_level_is_the_projection_of_the_whitened_roots_on_their_means(
+    collection: tuple[Tensor, Tensor, Tensor],
+) -> None:
+    """Written down with SciPy's matrix functions; the signs and the basis of the vectors are free, cosines are not."""
+    histograms, _, bodies = collection
+    expected = projected(histograms, bodies, 0.2)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    head = WCCNHead(n_directions=10, shrinkage=0.2).fit(histograms.double(), bodies)
+    found = head(histograms.double()).numpy()
+    np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-6)
+
+
+def test_parts_have_equal_shares_and_others_do_not_count(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    histograms, classes, _ = collection
+    cells = (12, 18, 10)
+    alone = [WCCNHead().fit(part, classes)(part) for part in histograms.split(cells, dim=1)]
+    head = WCCNHead((0, 2)).fit(histograms, classes, cells)
+    expected = (cosine(alone[0], alone[0]) + cosine(alone[2], alone[2])) / 2
+    found = head(histograms)
+    assert found.shape == (len(histograms), 12 + 10)  # as many numbers as cells, where directions would be more
+    torch.testing.assert_close(cosine(found, found), expected, atol=2e-4, rtol=0)
+    changed = histograms.clone()
+    changed[:, 12:30] = torch.rand(len(changed), 18, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(head(changed), found, atol=1e-6, rtol=0)
+
+
+def test_with_lengths_distances_are_those_of_mahalanobis(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    """Written down with SciPy's matrix functions, up to one factor; and a number that makes the length 1."""
+    histograms, _, bodies = collection
+    expected = torch.from_numpy(projected(histograms, bodies, 0.2))
+    head = WCCNHead(n_directions=10, shrinkage=0.2, lengths=True).fit(histograms.double(), bodies)
+    found = head(histograms.double())
+    assert found.shape == (len(histograms), 11)
+    torch.testing.assert_close(found.norm(dim=1), torch.ones(len(found), dtype=torch.float64))
+    own, theirs = torch.pdist(found[:, :10]), torch.pdist(expected)
+    torch.testing.assert_close(own / own.median(), theirs / theirs.median(), atol=1e-6, rtol=1e-6)
+    assert float(own.median()) == pytest.approx(0.5, rel=1e-6)
+
+
+def test_what_is_far_beyond_all_training_shapes_is_a_unit_vector_too(
+    collection: tuple[Tensor, Tensor, Tensor],
+) -> None:
+    histograms, _, bodies = collection
+    head = WCCNHead(n_directions=10, lengths=True).fit(histograms, bodies)
+    alone = torch.zeros(N_CELLS, N_CELLS).fill_diagonal_(1.0)  # all in one cell, where training shapes have all 40
+    torch.testing.assert_close(head(alone).norm(dim=1), torch.ones(N_CELLS), atol=1e-5, rtol=0)
+
+
+def test_the_distance_is_that_of_the_classes_where_any_witness_tells_two_bodies_apart(
+    collection: tuple[Tensor, Tensor, Tensor],
+) -> None:
+    """Written down from the vectors of the heads, of which the last number, with lengths, is no part of a distance."""
+    histograms, classes, bodies = collection
+    of_classes = WCCNHead(n_directions=20)
+    witnesses = WCCNHead((0,), n_directions=6, lengths=True), WCCNHead((1,), n_directions=5, lengths=True)
+    head = TwoLevelHead(of_classes, witnesses, reaches=(0.7, 0.3), share=0.3)
+    vectors = head.fit(histograms, classes, (15, 25), bodies=bodies)(histograms)
+    torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
+    x, y, z = (one(histograms).double() for one in (of_classes, *witnesses))
+    products = 0.7 * x @ x.T + 0.15 * y @ y.T + 0.15 * z @ z.T
+    torch.testing.assert_close((vectors @ vectors.T).double(), products, atol=1e-5, rtol=0)
+    y, z = y[:, :-1], z[:, :-1]
+    first, second = (torch.cdist(one, one, compute_mode="donot_use_mm_for_euclid_dist") for one in (y, z))
+    usual, from_mean = 0.5 / 2**0.5, ((y.norm(dim=1) ** 2 + z.norm(dim=1) ** 2) / 2).sqrt()
+    shorter = (torch.outer(from_mean, from_mean).sqrt() / usual).sqrt()
+    same = torch.exp(-((first * shorter / 0.7) ** 10) - (second * shorter / 0.3) ** 10)
+    found = head.distances(vectors, vectors).double()
+    torch.testing.assert_close(found, (1 - x @ x.T) * (1 - same), atol=1e-4, rtol=0)
+    torch.testing.assert_close(head.distances(vectors[:7], vectors[3:]).double(), found[:7, 3:], atol=1e-5, rtol=0)
+    assert same.min() < 0.1  # nor is it 1 throughout
+    assert ((same > 0.2) & (same < 0.9)).any()
+    assert ((first < 0.5) & (second > 0.4) & (same < 0.1)).any()  # by the second witness alone
+    assert ((shorter < 0.95) | (shorter > 1.05)).double().mean() > 0.5
+
+
+def test_short_vectors_are_the_best_of_so_many_numbers(
+    collection: tuple[Tensor, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of NumPy's singular value decomposition; and where there is room for all, cosines stay what they are."""
+    histograms, classes, bodies = collection
+    head = TwoLevelHead().fit(histograms, classes, bodies=bodies)
+    vectors = head(histograms)
+    short = head.short(vectors)
+    assert short.shape[1] <= vectors.shape[1] <= 256
+    torch.testing.assert_close(cosine(short, short), cosine(vectors, vectors), atol=1e-5, rtol=0)
+    monkeypatch.setattr("igps.nn.heads.two_level.MOST_NUMBERS", 7)
+    found = head.fit(histograms, classes, bodies=bodies).short(vectors)
+    assert found.shape == (len(vectors), 7)
+    _, _, axes = np.linalg.svd(vectors.double().numpy(), full_matrices=False)
+    expected = vectors.double().numpy() @ axes[:7].T
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-4)
+
+
+def test_both_levels_are_ordered(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    """On classes that it was not fitted to: each better than by the head of the other level alone."""
+    histograms, classes, bodies = collection
+    seen = classes < N_CLASSES // 2
+    head = TwoLevelHead().fit(histograms[seen], classes[seen], bodies=bodies[seen])
+    assert isinstance(head, Head)
+    rest, of_class, of_body = histograms[~seen], classes[~seen], bodies[~seen]
+    vectors = head(rest)
+    distances = head.distances(vectors, vectors)
+    found = {
+        level: retrieval_scores(distances, labels).mean()["ft"] for level, labels in (("b", of_body), ("c", of_class))
+    }
+    assert found["b"] > ft(head.of_classes(rest), of_body) + 0.05
+    assert found["c"] > ft(head.witnesses[0](rest), of_class) + 0.05
+
+
+def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    histograms, classes, bodies = collection
+    fitted = TwoLevelHead(WCCNHead((0,), 5), [WCCNHead((1,), 6, lengths=True)], reaches=[0.3], share=0.3)
+    fitted.fit(histograms, classes, (15, 25), bodies=bodies)
+    other = TwoLevelHead(WCCNHead((0,)), [WCCNHead((1,), lengths=True)])
+    other.load_state_dict(fitted.state_dict())
+    torch.testing.assert_close(other(histograms), fitted(histograms))
+    vectors = other(histograms)
+    assert vectors.shape == (len(histograms), 5 + 6 + 1)
+    torch.testing.assert_close(other.distances(vectors, vectors), fitted.distances(vectors, vectors))
+    torch.testing.assert_close(other.short(vectors), fitted.short(vectors))
+    level = WCCNHead((1,))  # whether lengths count is stored too
+    level.load_state_dict(fitted.witnesses[0].state_dict())
+    torch.testing.assert_close(level(histograms), fitted.witnesses[0](histograms))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"parts": (0, 2)}, r"parts: expected some of 0 to 1"),
+        ({"n_directions": 0}, "n_directions: expected at least 1, got 0"),
+        ({"shrinkage": 0.0}, "shrinkage: expected a positive number"),
+    ],
+)
+def test_wrong_arguments_of_a_level_are_named(
+    arguments: dict[str, object], message: str, collection: tuple[Tensor, Tensor, Tensor]
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        WCCNHead(**arguments).fit(collection[0], collection[1], (20, 20))  # type: ignore[arg-type]
+
+
+def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    histograms, classes, _ = collection
+    with pytest.raises(ValueError, match="part_cells: expected cells that add up to 40"):
+        WCCNHead().fit(histograms, classes, (3, 4))
+    with pytest.raises(ValueError, match="labels: expected one for each of 320 descriptions"):
+        WCCNHead().fit(histograms, classes[:3])
+    with pytest.raises(ValueError, match="as many labels as shapes"):
+        WCCNHead().fit(histograms, torch.arange(len(histograms)))
+    with pytest.raises(RuntimeError, match="expected to be fitted first"):
+        WCCNHead()(histograms)
+    with pytest.raises(ValueError, match=r"reaches, share: .* got \(0.0,\) and 0.5"):
+        TwoLevelHead(reaches=[0.0])
+    with pytest.raises(ValueError, match=r"a positive number for each of 1 heads of bodies, .* got \(0.1, 0.2\)"):
+        TwoLevelHead(reaches=[0.1, 0.2])
+    with pytest.raises(ValueError, match=r"one between 0 and 1, got \(0.1,\) and 1"):
+        TwoLevelHead(share=1)
+    with pytest.raises(ValueError, match="of_bodies: expected heads with lengths"):
+        TwoLevelHead(of_bodies=[WCCNHead()])
+    with pytest.raises(RuntimeError, match="TwoLevelHead: expected to be fitted first"):
+        TwoLevelHead().short(histograms)
+    fitted = TwoLevelHead().fit(histograms, classes)
+    with pytest.raises(ValueError, match="expected 40 cells as in training, got 39"):
+        fitted(histograms[:, :39])
+    with pytest.raises(ValueError, match=r"vectors: expected \d+ numbers each, got 40"):
+        fitted.short(histograms)

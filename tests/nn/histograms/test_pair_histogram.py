@@ -1,0 +1,584 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from batches import N_POINTS, batch_of, embedded, two_bodies
+from loops import (
+    Axis,
+    cosines,
+    distances,
+    equal_bins,
+    hard_classes,
+    pair_histogram_by_loops,
+    product,
+    soft_classes,
+)
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+import igps.nn.histograms.pairs as histogram_module
+from igps.data.batch import SignatureBatch
+from igps.nn._kernels.hard_pairs import pair_histogram
+from igps.nn.axes import (
+    Attribute,
+    EmbeddedPairCosines,
+    EuclideanDistance,
+    InteriorDistance,
+    PairAxis,
+    PairCosines,
+    PointAxis,
+    Potential,
+)
+from igps.nn.axes.pairs import Distances, OrientedPoints
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histograms.pairs import PairHistogram, joint_histogram
+from igps.nn.requirements import Requirements
+
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")),
+]
+FINE, COARSE = SpectralEmbedding(n_eigenpairs=6), SpectralEmbedding(n_eigenpairs=2)
+DEPTH = (0.2, 0.5, 0.9)
+ANGLES = equal_bins(3, 2.0)
+
+
+@pytest.fixture(scope="module")
+def batch() -> SignatureBatch:
+    return two_bodies()
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the axes measure of one shape, by their definitions."""
+
+    batch: SignatureBatch
+    i: int
+    kind: str = "interior"
+
+    def embedding(self, n: int = 6, kind: str | None = None) -> Tensor:
+        return embedded(self.batch, self.i, kind or self.kind, n)
+
+    def positions(self) -> Tensor:
+        samples = getattr(self.batch, self.kind)
+        return samples.points[self.i, samples.mask[self.i]].double() / self.batch.area[self.i].sqrt()
+
+    def attribute(self, name: str) -> Tensor:
+        samples = getattr(self.batch, self.kind)
+        return samples.attributes[name][self.i, samples.mask[self.i]]
+
+    def interior(self, n_bins: int, reach: float = 4.0, n: int = 6) -> Axis:
+        return distances(self.embedding(n)), equal_bins(n_bins, reach)
+
+    def euclidean(self, n_bins: int, reach: float = 1.0) -> Axis:
+        return distances(self.positions()), equal_bins(n_bins, reach)
+
+    def in_space(self) -> list[Axis]:
+        features = cosines(self.positions(), self.attribute("surface_direction"))
+        return [(values, [angle - 1 for angle in ANGLES]) for values in features]
+
+    def in_embedding(self) -> list[Axis]:
+        own, sign = self.embedding(), 1 if self.kind == "interior" else -1
+        other = self.embedding(kind="surface" if self.kind == "interior" else "interior")
+        directions = []
+        for point in own:
+            nearest = sorted(other, key=lambda target, point=point: float((target - point).norm()))[:8]  # type: ignore[misc]
+            directions.append(sign * normalize(torch.stack(nearest).mean(dim=0) - point, dim=0))
+        return [(values, [a - 1 for a in ANGLES]) for values in cosines(own, torch.stack(directions))]
+
+    def potential(self, n_classes: int, soft: bool = False) -> np.ndarray:
+        potential = self.embedding().norm(dim=1)
+        if soft:
+            return soft_classes(potential, equal_bins(n_classes, 1.5))
+        return hard_classes(potential, [k * 1.5 / n_classes for k in range(1, n_classes)])
+
+    def depth(self, soft: bool = False) -> np.ndarray:
+        depth = self.attribute("depth")
+        return soft_classes(depth, DEPTH) if soft else hard_classes(depth, [(0.2 + 0.5) / 2, (0.5 + 0.9) / 2])
+
+
+# What a histogram is made of, and classes and pairs of one shape by the definition.
+Case = tuple[
+    Callable[[], Sequence[PointAxis | PairAxis]], Callable[[Look], list[np.ndarray]], Callable[[Look], list[Axis]]
+]
+CASES: dict[str, Case] = {
+    "potential × interior": (
+        lambda: [Potential(3), InteriorDistance(7)],
+        lambda look: [look.potential(3)],
+        lambda look: [look.interior(7)],
+    ),
+    "soft potential × interior": (
+        lambda: [Potential(3, soft=True), InteriorDistance(7)],
+        lambda look: [look.potential(3, soft=True)],
+        lambda look: [look.interior(7)],
+    ),
+    "interior alone": (lambda: [InteriorDistance(9, 2.0)], lambda look: [], lambda look: [look.interior(9, 2.0)]),
+    "Euclidean alone": (lambda: [EuclideanDistance(5)], lambda look: [], lambda look: [look.euclidean(5)]),
+    "potential × depth × interior": (
+        lambda: [Potential(2), Attribute("depth", DEPTH), InteriorDistance(5)],
+        lambda look: [look.potential(2), look.depth()],
+        lambda look: [look.interior(5)],
+    ),
+    "depth × soft potential × interior": (
+        lambda: [Attribute("depth", DEPTH), Potential(2, soft=True), InteriorDistance(5)],
+        lambda look: [look.depth(), look.potential(2, soft=True)],
+        lambda look: [look.interior(5)],
+    ),
+    "soft depth × soft potential × Euclidean": (
+        lambda: [Attribute("depth", DEPTH, soft=True), Potential(2, soft=True), EuclideanDistance(5)],
+        lambda look: [look.depth(soft=True), look.potential(2, soft=True)],
+        lambda look: [look.euclidean(5)],
+    ),
+    "potential × interior × Euclidean": (
+        lambda: [Potential(3), InteriorDistance(6), EuclideanDistance(4)],
+        lambda look: [look.potential(3)],
+        lambda look: [look.interior(6), look.euclidean(4)],
+    ),
+    "Euclidean × interior": (
+        lambda: [EuclideanDistance(4), InteriorDistance(6)],
+        lambda look: [],
+        lambda look: [look.euclidean(4), look.interior(6)],
+    ),
+    "interior × interior of another embedding": (
+        lambda: [InteriorDistance(6), InteriorDistance(5, 2.0, embedding=COARSE)],
+        lambda look: [],
+        lambda look: [look.interior(6), look.interior(5, 2.0, n=2)],
+    ),
+    "soft potential × interior × interior × Euclidean": (
+        lambda: [Potential(2, soft=True), InteriorDistance(4), InteriorDistance(3, embedding=COARSE),
+                 EuclideanDistance(2)],
+        lambda look: [look.potential(2, soft=True)],
+        lambda look: [look.interior(4), look.interior(3, n=2), look.euclidean(2)],
+    ),
+    "interior × cosines": (
+        lambda: [InteriorDistance(4), PairCosines(3)],
+        lambda look: [],
+        lambda look: [look.interior(4), *look.in_space()],
+    ),
+    "Euclidean × cosines": (
+        lambda: [EuclideanDistance(4), PairCosines(3)],
+        lambda look: [],
+        lambda look: [look.euclidean(4), *look.in_space()],
+    ),
+    "cosines alone": (lambda: [PairCosines(3)], lambda look: [], lambda look: look.in_space()),
+    "interior × cosines in the embedding": (
+        lambda: [InteriorDistance(4), EmbeddedPairCosines(3)],
+        lambda look: [],
+        lambda look: [look.interior(4), *look.in_embedding()],
+    ),
+    "potential × interior × cosines": (
+        lambda: [Potential(2), InteriorDistance(4), PairCosines(3)],
+        lambda look: [look.potential(2)],
+        lambda look: [look.interior(4), *look.in_space()],
+    ),
+    "soft potential × depth × interior × cosines in the embedding": (
+        lambda: [Potential(2, soft=True), Attribute("depth", DEPTH), InteriorDistance(2), EmbeddedPairCosines(3)],
+        lambda look: [look.potential(2, soft=True), look.depth()],
+        lambda look: [look.interior(2), *look.in_embedding()],
+    ),
+    "cosines × interior, the other way round": (
+        lambda: [PairCosines(3), InteriorDistance(4), Potential(2)],
+        lambda look: [look.potential(2)],
+        lambda look: [look.interior(4), *look.in_space()],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["interior", "surface"])
+@pytest.mark.parametrize("name", CASES)
+def test_product_of_axes_equals_brute_force_loop(batch: SignatureBatch, name: str, kind: str) -> None:
+    make, classes, pairs = CASES[name]
+    histogram = PairHistogram(make(), FINE, kind)  # type: ignore[arg-type]
+    result = histogram(batch)
+    assert result.shape == (2, *histogram.shape)
+    assert result[0].numel() == histogram.n_cells
+    assert (result >= 0).all()
+    for i, n in enumerate(N_POINTS):
+        look = Look(batch, i, kind)
+        memberships = product(*(classes(look) or [np.ones((n, 1))]))
+        np.testing.assert_allclose(result[i], pair_histogram_by_loops(memberships, pairs(look)), atol=1e-6)
+
+
+def learn(*modules: nn.Module) -> None:
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():
+        for module in modules:
+            for parameter in module.parameters():
+                parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
+
+
+@pytest.mark.parametrize("with_cosines", [False, True])
+def test_learned_axes_equal_brute_force_loop(batch: SignatureBatch, with_cosines: bool) -> None:
+    """The centres are wherever the parameters take them."""
+    potential, depth = Potential(2, learnable=True), Attribute("depth", DEPTH, learnable=True)
+    interior, euclidean = InteriorDistance(4, learnable=True), EuclideanDistance(3, learnable=True)
+    angles = PairCosines(3, learnable=True)
+    axes = [potential, depth, interior, angles] if with_cosines else [potential, depth, interior, euclidean]
+    learn(*axes)
+    result = PairHistogram(axes, FINE)(batch)
+    assert result.requires_grad
+    for i in range(2):
+        look = Look(batch, i)
+        memberships = product(
+            soft_classes(look.embedding().norm(dim=1), potential.centres().tolist()),
+            soft_classes(look.attribute("depth"), depth.centres().tolist()),
+        )
+        pairs = [(look.interior(2)[0], interior.centres().tolist())]
+        if with_cosines:
+            towards, between = angles.towards_centres().tolist(), angles.between_centres().tolist()
+            pairs += [(look.in_space()[k][0], centres) for k, centres in enumerate((towards, towards, between))]
+        else:
+            pairs.append((look.euclidean(2)[0], euclidean.centres().tolist()))
+        expected = pair_histogram_by_loops(memberships, pairs)
+        np.testing.assert_allclose(result[i].detach(), expected, atol=1e-6)
+
+
+def test_defaults_are_the_papers_histogram(batch: SignatureBatch) -> None:
+    result = PairHistogram()(batch)
+    assert result.shape == (2, 10, 64)
+    for i in range(2):
+        embedding = embedded(batch, i)
+        expected = pair_histogram(embedding, embedding.norm(dim=1), n_classes=4, n_bins=64)
+        np.testing.assert_allclose(result[i], expected, atol=1e-5)
+
+
+def test_names_are_axes(batch: SignatureBatch) -> None:
+    named = PairHistogram(["potential", "interior_distance", "euclidean_distance"])
+    made = PairHistogram([Potential(4), InteriorDistance(64), EuclideanDistance(16)])
+    assert torch.equal(named(batch), made(batch))
+
+
+@pytest.mark.parametrize(
+    ("axes", "shape"),
+    [
+        ([InteriorDistance(5)], (1, 5)),
+        ([Potential(3), InteriorDistance(5)], (6, 5)),
+        ([InteriorDistance(5), Potential(3), EuclideanDistance(2), Attribute("depth", DEPTH)], (45, 5, 2)),
+        ([EuclideanDistance(2), InteriorDistance(5)], (1, 2, 5)),
+        ([PairCosines(3), EuclideanDistance(2), Potential(2), InteriorDistance(5)], (3, 2, 5, 3, 3, 3)),
+        ([PairCosines(2), EmbeddedPairCosines(3)], (1, 2, 2, 2, 3, 3, 3)),
+    ],
+)
+def test_order_of_the_dimensions(batch: SignatureBatch, axes: list[PointAxis | PairAxis], shape: tuple) -> None:
+    """Pairs of classes; distances in the given order; cosines in the given order."""
+    histogram = PairHistogram(axes)
+    assert histogram.shape == shape
+    assert histogram.n_cells == np.prod(shape)
+    assert histogram(batch).shape == (2, *shape)
+
+
+def test_needs_are_those_of_all_axes() -> None:
+    far = SpectralEmbedding(n_eigenpairs=30)
+    axes = [Attribute("depth", DEPTH), Attribute("my own", [1.0]), EuclideanDistance(), PairCosines()]
+    assert PairHistogram(axes, far).requirements == Requirements(0, ("depth", "surface_direction"))
+    assert PairHistogram([*axes, InteriorDistance(embedding=COARSE)], far).requirements.n_eigenpairs == 2
+    assert PairHistogram([Potential(), InteriorDistance(embedding=COARSE)], far).requirements.n_eigenpairs == 30
+    assert PairHistogram([InteriorDistance(embedding=far)], COARSE).requirements == Requirements(30)
+
+
+def test_summing_a_dimension_out_leaves_the_rest(batch: SignatureBatch) -> None:
+    """Whatever the algorithm that counts it."""
+    interior, euclidean = InteriorDistance(32), EuclideanDistance(16)
+    joint = PairHistogram([Potential(4), interior, euclidean])(batch)
+    torch.testing.assert_close(joint.sum(dim=3), PairHistogram([Potential(4), interior])(batch), atol=1e-6, rtol=0)
+    torch.testing.assert_close(joint.sum(dim=2), PairHistogram([Potential(4), euclidean])(batch), atol=1e-6, rtol=0)
+    for angles in (PairCosines(3), EmbeddedPairCosines(3)):
+        oriented = PairHistogram([Potential(4), interior, angles])(batch)
+        expected = PairHistogram([Potential(4), interior])(batch)
+        torch.testing.assert_close(oriented.sum(dim=(3, 4, 5)), expected, atol=1e-6, rtol=0)
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Which algorithms were used."""
+    used: list[str] = []
+    for name in ("hard_pair_histogram", "soft_pair_histogram", "oriented_pair_histogram"):
+        function = getattr(histogram_module, name)
+
+        def counting(*arguments: object, name: str = name, function: Callable = function) -> Tensor:
+            used.append(name.partition("_")[0])
+            return function(*arguments)
+
+        monkeypatch.setattr(histogram_module, name, counting)
+    return used
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("n_classes", [1, 3])
+def test_fast_and_differentiable_paths_give_the_same_numbers(
+    counted: list[str], n_classes: int, dtype: torch.dtype
+) -> None:
+    generator = torch.Generator().manual_seed(2)
+    points = torch.randn(300, 5, generator=generator, dtype=dtype)
+    memberships = torch.eye(n_classes, dtype=dtype)[torch.randint(n_classes, (300,), generator=generator)]
+    centres = torch.tensor(equal_bins(11, 4.0), dtype=dtype)
+    fast = joint_histogram(memberships, [Distances(points, centres, equal=True)])
+    general = joint_histogram(memberships, [Distances(points, centres, equal=False)])
+    leaf = points.clone().requires_grad_()
+    differentiable = joint_histogram(memberships, [Distances(leaf, centres, equal=True)])
+    with torch.no_grad():
+        without = joint_histogram(memberships, [Distances(leaf, centres, equal=True)])
+    # A single direction for all, so that what is summed out is nothing.
+    along = torch.zeros_like(points).index_fill(1, torch.tensor(0), 1.0)
+    angles = torch.tensor([-1.0, 1.0], dtype=dtype)
+    oriented = joint_histogram(
+        memberships, [Distances(points, centres, equal=True), OrientedPoints(points, along, angles, angles)]
+    ).sum(dim=(2, 3, 4))
+    assert counted == ["hard", "soft", "soft", "hard", "oriented"]
+    assert differentiable.requires_grad
+    assert not without.requires_grad
+    assert torch.equal(fast, without)
+    for other in (general, differentiable.detach(), oriented):
+        torch.testing.assert_close(other, fast, atol=1e-6, rtol=0)
+
+
+def test_soft_memberships_and_several_distances_take_the_general_path(counted: list[str]) -> None:
+    points, centres = torch.rand(20, 3), torch.tensor([0.25, 0.75])
+    one = Distances(points, centres, equal=True)
+    joint_histogram(torch.full((20, 2), 0.5), [one])
+    joint_histogram(torch.ones(20, 1), [one, one])
+    assert counted == ["soft", "soft"]
+
+
+def test_a_trained_module_is_counted_fast_without_gradient(batch: SignatureBatch, counted: list[str]) -> None:
+    histogram = PairHistogram([Potential(3), InteriorDistance(8)], SpectralEmbedding(n_knots=5))
+    learn(histogram.embedding)
+    with_gradient = histogram(batch)
+    with torch.no_grad():
+        without = histogram(batch)
+    assert counted == ["soft", "soft", "hard", "hard"]
+    torch.testing.assert_close(with_gradient.detach(), without, atol=1e-6, rtol=0)
+
+
+def test_batch_equals_single_shapes_whatever_the_padding() -> None:
+    generator = torch.Generator().manual_seed(3)
+    embedding = torch.randn(90, 6, generator=generator, dtype=torch.float64) * 0.7
+    mask = torch.zeros(2, 90, dtype=torch.bool)
+    mask[0], mask[1, ::3] = True, True
+    padded = embedding.repeat(2, 1, 1)
+    padded[~mask] = torch.nan
+    result = PairHistogram()(batch_of(padded, mask))
+    for i, points in enumerate((embedding, embedding[::3])):
+        np.testing.assert_allclose(result[i], pair_histogram(points, points.norm(dim=1)), atol=1e-14)
+
+
+def some(n_points: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Embedding, positions and directions of one shape, float64."""
+    generator = torch.Generator().manual_seed(seed)
+    embedding = torch.randn(n_points, 4, generator=generator, dtype=torch.float64) * 0.6
+    directions = normalize(torch.randn(n_points, 3, generator=generator, dtype=torch.float64), dim=1)
+    return embedding, torch.rand(n_points, 3, generator=generator, dtype=torch.float64), directions
+
+
+@pytest.mark.parametrize(
+    ("make", "padding"),
+    [
+        (lambda: [Potential(soft=True), InteriorDistance(8)], torch.nan),
+        (lambda: [Potential(learnable=True), InteriorDistance(8, learnable=True), EuclideanDistance(4)], torch.nan),
+        (lambda: [Potential(2, learnable=True), InteriorDistance(4), PairCosines(3, learnable=True)], torch.nan),
+        (lambda: [InteriorDistance(4), EmbeddedPairCosines(3)], 0.0),
+        (lambda: [InteriorDistance(4), EmbeddedPairCosines(3)], 9.0),
+    ],
+)
+def test_padding_has_no_part_in_result_or_gradient(
+    make: Callable[[], list[PointAxis | PairAxis]], padding: float
+) -> None:
+    embedding, points, directions = some(40)
+    mask = torch.zeros(2, 40, dtype=torch.bool)
+    mask[0], mask[1, ::3] = True, True
+    padded, places = embedding.repeat(2, 1, 1), points.repeat(2, 1, 1)
+    padded[~mask] = places[~mask] = padding
+    padded.requires_grad_()
+    layer = PairHistogram(make())
+    batch = layer(batch_of(padded, mask, places, {"surface_direction": directions.repeat(2, 1, 1)}))
+    single = embedding[::3].clone().requires_grad_()
+    alone = layer(batch_of(single[None], None, points[None, ::3], {"surface_direction": directions[None, ::3]}))
+    torch.testing.assert_close(batch[1], alone[0], rtol=0, atol=1e-14)
+    (expected,) = torch.autograd.grad(alone.square().sum(), single)
+    (gradient,) = torch.autograd.grad(batch[1].square().sum(), padded)
+    torch.testing.assert_close(gradient[1, ::3], expected, rtol=0, atol=1e-12)
+    assert expected.abs().max() > 1e-6
+
+
+def test_gradient_through_classes_and_layout() -> None:
+    """By the parameters of a learned layout and the embedding, the potential being the embedding's norm."""
+    embedding = some(9, seed=2)[0].requires_grad_()
+    layer = PairHistogram([Potential(3, learnable=True), InteriorDistance(4, 2.0, learnable=True)]).double()
+    names = ["axes.1.centres.log_gap", "axes.0.centres.log_gap"]
+
+    def histogram(embedding: Tensor, *parameters: Tensor) -> Tensor:
+        return torch.func.functional_call(
+            layer, dict(zip(names, parameters, strict=True)), (batch_of(embedding[None]),)
+        )
+
+    generator = torch.Generator().manual_seed(3)
+    parameters = [torch.randn(n, generator=generator, dtype=torch.float64, requires_grad=True) for n in (4, 3)]
+    leaves = (embedding, *parameters)
+    for gradient in torch.autograd.grad(histogram(*leaves).square().sum(), leaves):
+        assert (gradient.abs() > 1e-6).any()
+    assert torch.autograd.gradcheck(histogram, leaves)
+
+
+def test_gradient_of_learned_cosines_is_that_of_finite_differences() -> None:
+    embedding, points, directions = some(7)
+    angles = PairCosines(3, learnable=True)
+    layer = PairHistogram([Potential(2, learnable=True), InteriorDistance(3, 4.0, learnable=True), angles]).double()
+    weights = torch.randn(layer.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    batch = batch_of(embedding[None], None, points[None], {"surface_direction": directions[None]})
+    parameters = list(layer.parameters())
+    assert len(parameters) == 4
+
+    def loss() -> Tensor:
+        return (layer(batch)[0] * weights).sum()
+
+    for parameter, gradient in zip(parameters, torch.autograd.grad(loss(), parameters), strict=True):
+        entry = int(gradient.abs().argmax())
+        moved = []
+        with torch.no_grad():
+            for step in (1e-6, -2e-6):
+                parameter.view(-1)[entry] += step
+                moved.append(float(loss()))
+            parameter.view(-1)[entry] += 1e-6
+        assert gradient.view(-1)[entry] != 0
+        assert gradient.view(-1)[entry] == pytest.approx((moved[0] - moved[1]) / 2e-6, rel=1e-4)
+
+
+def test_soft_classes_tend_to_hard_ones() -> None:
+    """Where every potential is at the centre of its class, the soft layout is the hard one."""
+    directions = normalize(some(60)[0], dim=1)
+    centres = (torch.arange(4, dtype=torch.float64) + 0.5) * 1.5 / 4
+    potential = centres[torch.randint(4, (60,), generator=torch.Generator().manual_seed(0))]
+    embedding = directions * potential[:, None]
+    result = PairHistogram([Potential(soft=True), InteriorDistance(16)]).double()(batch_of(embedding[None]))[0]
+    np.testing.assert_allclose(result, pair_histogram(embedding, potential, n_bins=16), atol=1e-8)
+
+
+def test_values_beyond_the_ranges_stay_in_the_last_cells() -> None:
+    embedding, points, _ = some(50)
+    axes = [Potential(learnable=True), InteriorDistance(learnable=True), EuclideanDistance(4, learnable=True)]
+    result = PairHistogram(axes)(batch_of(embedding[None] * 1000, None, points[None] * 1000))[0].detach()
+    assert float(result.sum()) == pytest.approx(1)
+    assert float(result[-1, -1, -1]) > 0.9
+
+
+def two_layouts(options: dict[str, bool], *more: Callable[..., PairAxis]) -> PairHistogram:
+    learned = {"learnable": options.get("learnable", False)}
+    points = [Potential(**options), Attribute("depth", [-0.1, 0.2, 0.5], **options)]  # type: ignore[arg-type]
+    return PairHistogram([*points, InteriorDistance(**learned), *(axis(**learned) for axis in more)])
+
+
+@pytest.mark.parametrize(
+    "more", [(), (EuclideanDistance,), (partial(PairCosines, 3),), (partial(EmbeddedPairCosines, 3),)]
+)
+def test_learned_layout_starts_as_the_fixed_one(more: tuple[Callable[..., PairAxis], ...]) -> None:
+    embedding, points, directions = (value[None].float() for value in some(30))
+    attributes = {"depth": points[:, :, 0], "surface_direction": directions}
+    batch = batch_of(embedding, None, points, attributes)
+    fixed, learned = (two_layouts(options, *more)(batch) for options in ({"soft": True}, {"learnable": True}))
+    assert not fixed.requires_grad
+    assert learned.requires_grad
+    np.testing.assert_allclose(learned.detach(), fixed, atol=1e-6)
+
+
+def test_training_moves_a_layout_and_keeps_its_order() -> None:
+    batch = batch_of(some(60)[0].float()[None])
+    layer = PairHistogram([Potential(learnable=True), InteriorDistance(8, learnable=True)])
+    axes = [axis.centres for axis in layer.axes]
+    start = [centres().detach() for centres in axes]
+    optimiser = torch.optim.SGD(layer.parameters(), lr=10.0)
+    losses = []
+    for _ in range(15):
+        loss = (layer(batch) - 1 / 80).square().sum()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.8 * losses[0]
+    for centres, before in zip(axes, start, strict=True):
+        assert (centres().diff() > 0).all()
+        assert (centres() - before).abs().max() > 0.01
+
+
+def test_layout_survives_its_state() -> None:
+    def made(reach: float) -> PairHistogram:
+        depth = Attribute("depth", [0.1, 0.3], learnable=True)
+        pairs = [InteriorDistance(6, reach, learnable=True), EuclideanDistance(5, learnable=True)]
+        return PairHistogram([Potential(learnable=True), depth, *pairs])
+
+    layer, fresh = made(4.0), made(9.0)
+    learn(layer)
+    fresh.load_state_dict(layer.state_dict())
+    embedding, points, _ = some(30)
+    batch = batch_of(embedding[None], None, points[None], {"depth": points[None, :, 0]})
+    assert torch.equal(fresh(batch), layer(batch))
+    assert not torch.equal(made(4.0)(batch), layer(batch))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("cosines", [False, True])
+def test_half_precision_and_autocast_count_in_single(device: str, cosines: bool) -> None:
+    embedding = some(60)[0].to(device, torch.bfloat16)
+    more = [EmbeddedPairCosines(3, learnable=True)] if cosines else []
+    layer = PairHistogram([Potential(learnable=True), InteriorDistance(16, learnable=True), *more]).to(device)
+
+    def run(points: Tensor) -> tuple[Tensor, list[Tensor]]:
+        leaf = points.clone().requires_grad_()
+        result = layer(batch_of(leaf[None]))
+        return result, list(torch.autograd.grad(result.square().sum(), [leaf, *layer.parameters()]))
+
+    expected, expected_gradients = run(embedding.float())
+    with torch.autocast(device, torch.bfloat16):
+        result, gradients = run(embedding)
+        hard = PairHistogram()(batch_of(embedding[None]))
+    assert result.dtype == hard.dtype == torch.float32
+    torch.testing.assert_close(result, expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(hard, PairHistogram()(batch_of(embedding.float()[None])))
+    # What comes by way of the directions is rounded before it is summed, and partly cancels.
+    rounding = 0.01 * float(expected_gradients[0].abs().max()) if cosines else 1e-6
+    torch.testing.assert_close(gradients[0].float(), expected_gradients[0], rtol=0.01, atol=rounding)
+    torch.testing.assert_close(gradients[1:], expected_gradients[1:], rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("name", CASES)
+def test_cuda_equals_cpu(batch: SignatureBatch, name: str) -> None:
+    histogram = PairHistogram(CASES[name][0](), SpectralEmbedding(n_eigenpairs=6))
+    expected = histogram(batch)
+    torch.testing.assert_close(histogram.cuda()(batch.to("cuda")).cpu(), expected, rtol=0, atol=1e-6)
+
+
+def test_impossible_histograms_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"axes: expected one of potential, interior_distance, .*got 'depth'"):
+        PairHistogram(["depth", "interior_distance"])
+    with pytest.raises(ValueError, match="axes: expected axes of points or of pairs, got SpectralEmbedding"):
+        PairHistogram([SpectralEmbedding()])  # type: ignore[list-item]
+    for axes in ([], ["potential"]):
+        with pytest.raises(ValueError, match="axes: expected at least one of pairs, such as 'interior_distance'"):
+            PairHistogram(axes)
+    with pytest.raises(ValueError, match="samples: expected 'interior' or 'surface', got 'volume'"):
+        PairHistogram(samples="volume")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("argument", ["n_samples", "n_training_samples"])
+def test_a_single_sample_forms_no_pair(argument: str) -> None:
+    with pytest.raises(ValueError, match=f"{argument}: expected None or at least 2"):
+        PairHistogram(**{argument: 1})  # type: ignore[arg-type]
+
+
+def test_bad_batch_is_refused(batch: SignatureBatch) -> None:
+    with pytest.raises(ValueError, match=r"expected 'charge' among .* got \['depth', 'surface_direction'\]"):
+        PairHistogram([Attribute("charge", [0.1, 0.2]), InteriorDistance()])(batch)
+    broken = batch_of(torch.rand(1, 5, 3), None, None, {"depth": torch.full((1, 5), torch.nan)})
+    with pytest.raises(ValueError, match="Attribute: expected finite values"):
+        PairHistogram([Attribute("depth", [0.1, 0.2]), EuclideanDistance()])(broken)
+    points = replace(batch.interior, points=batch.interior.points * torch.inf)
+    for axes in (["euclidean_distance"], ["interior_distance", "pair_cosines"]):
+        with pytest.raises(ValueError, match="finite"):
+            PairHistogram(axes)(replace(batch, interior=points))
+    with pytest.raises(ValueError, match="at least two points to form a pair, got 1"):
+        PairHistogram()(batch_of(torch.rand(1, 1, 3)))

@@ -1,0 +1,87 @@
+"""Histograms of samples, against a loop over samples and cells."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from batches import alone, embedded, scaled, two_bodies
+from loops import product, soft_classes
+
+from igps.nn._kernels.balls import ball_radii
+from igps.nn.axes import BallRadius, EuclideanDistance, Potential
+from igps.nn.batch_features import View
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histograms.points import PointHistogram
+from igps.nn.requirements import Requirements
+
+
+def layout(**options: int) -> PointHistogram:
+    axes = [
+        BallRadius("inside", 0.05, 0.6, n_classes=3),
+        BallRadius("outside", 0.05, 0.9, n_classes=2),
+        Potential(3, 1.5, embedding=SpectralEmbedding(n_eigenpairs=2), soft=True),
+        Potential(4, 2.0, soft=True),
+    ]
+    return PointHistogram(axes, SpectralEmbedding(n_eigenpairs=5), **options)  # type: ignore[arg-type]
+
+
+def test_it_is_the_share_of_samples_in_each_cell() -> None:
+    batch = two_bodies()
+    histogram = layout()
+    found = histogram(batch)
+    assert found.shape == (2, *histogram.shape) == (2, 3, 2, 3, 4)
+    for i in range(2):
+        real = batch.surface.mask[i]
+        points = batch.surface.points[i, real] / batch.area[i].sqrt().float()
+        radii = ball_radii(points, batch.surface.attributes["surface_direction"][i, real]).log()
+        inside, outside = ([math.log(a) + k * math.log(b / a) / (n - 1) for k in range(n)] for a, b, n in
+                           ((0.05, 0.6, 3), (0.05, 0.9, 2)))  # fmt: skip
+        memberships = product(
+            soft_classes(radii[:, 0], inside),
+            soft_classes(radii[:, 1], outside),
+            soft_classes(embedded(batch, i, "surface", 2).norm(dim=1), [0.25, 0.75, 1.25]),
+            soft_classes(embedded(batch, i, "surface", 5).norm(dim=1), [0.25, 0.75, 1.25, 1.75]),
+        )
+        np.testing.assert_allclose(found[i].flatten(), memberships.mean(axis=0), atol=1e-6)
+
+
+def test_padding_and_scale_change_nothing() -> None:
+    batch, histogram = two_bodies(), layout()
+    found = histogram(batch)
+    torch.testing.assert_close(found.flatten(1).sum(dim=1), torch.ones(2))
+    for i in range(2):
+        torch.testing.assert_close(histogram(alone(batch, i))[0], found[i])
+    torch.testing.assert_close(histogram(scaled(batch, 3.0)), found, atol=1e-5, rtol=0)
+
+
+def test_a_subset_of_the_samples_is_counted() -> None:
+    batch = two_bodies()
+    expected = layout()(replace(batch, surface=batch.surface.subset(20, seed=0)))
+    torch.testing.assert_close(layout(n_samples=20)(batch), expected)
+
+
+def test_needs() -> None:
+    assert layout().requirements == Requirements(n_eigenpairs=5, attributes=("surface_direction",))
+
+
+def test_what_it_cannot_count_is_named() -> None:
+    with pytest.raises(
+        ValueError, match=r"axes: expected at least one, and all of points, got \['EuclideanDistance'\]"
+    ):
+        PointHistogram([EuclideanDistance()])  # type: ignore[list-item]
+    with pytest.raises(ValueError, match="axes: expected at least one"):
+        PointHistogram([])
+    batch = two_bodies()
+    with pytest.raises(ValueError, match="samples: expected surface samples, which balls touch, got interior ones"):
+        BallRadius().values(View(batch, "interior", batch.interior), SpectralEmbedding())
+    with pytest.raises(ValueError, match="side: expected 'inside' or 'outside', got 'left'"):
+        BallRadius("left")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="expected 0 < smallest < largest"):
+        BallRadius("inside", 0.3, 0.2)
+    none = replace(batch.surface, mask=torch.zeros_like(batch.surface.mask))
+    with pytest.raises(ValueError, match="expected at least 3 of each body, which tell its balls, got 0"):
+        layout()(replace(batch, surface=none))

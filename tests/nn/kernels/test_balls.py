@@ -1,0 +1,109 @@
+"""Radii of the largest balls that touch samples, against their definition and where they are known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from igps.nn._kernels import balls
+
+
+def on(mesh: trimesh.Trimesh, n: int) -> tuple[Tensor, Tensor]:
+    points, faces = trimesh.sample.sample_surface(mesh, n, seed=0)
+    return torch.from_numpy(np.array(points)), torch.from_numpy(np.array(mesh.face_normals[faces]))
+
+
+def by_definition(points: Tensor, directions: Tensor, side: int) -> list[float]:
+    """The third smallest ball that touches x and passes through another point, but for those next to its plane."""
+    radii = []
+    for i, (x, n) in enumerate(zip(points.tolist(), directions.tolist(), strict=True)):
+        found = []
+        for j, y in enumerate(points.tolist()):
+            depth = side * sum(a * (b - c) for a, b, c in zip(n, x, y, strict=True))
+            if j != i and depth > 0.1 * math.dist(x, y):
+                found.append(math.dist(x, y) ** 2 / (2 * depth))
+        found = [*sorted(found), math.inf, math.inf, math.inf]
+        radii.append(min(max(found[2], 1e-3), 10.0))
+    return radii
+
+
+@pytest.fixture(params=["compiled", "tensors"])
+def ball_radii(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Callable[[Tensor, Tensor], Tensor]:
+    """By the compiled loop, and by products of tensors where nothing can be compiled or a gradient is asked for."""
+    if request.param == "tensors":
+        monkeypatch.setattr("igps.nn._kernels.balls.can_count", lambda *_: False)
+    else:
+        pytest.importorskip("numba")
+    return balls.ball_radii
+
+
+Radii = Callable[[Tensor, Tensor], Tensor]
+
+
+def test_radii_are_those_of_the_definition(ball_radii: Radii) -> None:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(60, 3, generator=generator, dtype=torch.float64)
+    directions = normalize(torch.randn(60, 3, generator=generator, dtype=torch.float64), dim=1)
+    found = ball_radii(points, directions)
+    for side, column in ((1, 0), (-1, 1)):
+        np.testing.assert_allclose(found[:, column], by_definition(points, directions, side), rtol=1e-6)
+
+
+def test_a_ball_has_its_own_radius_inside_and_none_outside(ball_radii: Radii) -> None:
+    points = normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    radii = ball_radii(0.3 * points, points)
+    torch.testing.assert_close(radii[:, 0], torch.full((500,), 0.3), rtol=1e-3, atol=0)
+    assert (radii[:, 1] == 10).all()
+
+
+def test_a_rod_is_as_thick_as_it_is(ball_radii: Radii) -> None:
+    points, directions = on(trimesh.creation.cylinder(radius=0.05, height=1.0, sections=64), 2000)
+    middle = (points[:, 2].abs() < 0.3) & (directions[:, 2].abs() < 0.5)
+    radii = ball_radii(points, directions)[middle, 0]
+    assert 0.045 < float(radii.median()) < 0.055
+
+
+def test_two_plates_have_half_their_thickness_inside_and_half_their_gap_outside(ball_radii: Radii) -> None:
+    plates = [trimesh.creation.box((0.6, 0.6, 0.1)) for _ in range(2)]
+    plates[1].apply_translation((0, 0, 0.3))  # a gap of 0.2
+    points, directions = on(trimesh.util.concatenate(plates), 4000)
+    inner = points[:, :2].abs().amax(dim=1) < 0.15
+    radii = ball_radii(points, directions)
+    assert float(radii[inner, 0].median()) == pytest.approx(0.05, rel=0.1)
+    into_the_gap = inner & (((points[:, 2] - 0.05).abs() < 1e-6) | ((points[:, 2] - 0.25).abs() < 1e-6))
+    assert float(radii[into_the_gap, 1].median()) == pytest.approx(0.1, rel=0.1)
+
+
+def test_a_sample_with_a_wrong_direction_makes_no_ball_small(ball_radii: Radii) -> None:
+    """A ball of radius 1 of which two points lie deep inside, as noise would have it."""
+    points = normalize(torch.randn(400, 3, generator=torch.Generator().manual_seed(2)), dim=1)
+    directions = points.clone()
+    points[:2] *= 0.5
+    radii = ball_radii(points, directions)[2:, 0]
+    torch.testing.assert_close(radii, torch.ones(398), rtol=1e-3, atol=0)
+
+
+def test_three_samples_are_enough_and_two_are_not(ball_radii: Radii) -> None:
+    points, outward = torch.eye(3), torch.tensor([0.0, 0.0, 1.0])
+    assert ball_radii(points, outward.expand(3, 3)).tolist() == [[10.0, 10.0]] * 3
+    with pytest.raises(ValueError, match="samples: expected at least 3 of each body, which tell its balls, got 2"):
+        ball_radii(points[:2], outward.expand(2, 3))
+
+
+def test_points_that_coincide_touch_no_ball(ball_radii: Radii) -> None:
+    points = torch.zeros(5, 3)
+    assert (ball_radii(points, torch.tensor([0.0, 0.0, 1.0]).expand(5, 3)) == 10).all()
+
+
+def test_what_is_not_finite_is_refused(ball_radii: Radii) -> None:
+    points = torch.eye(3)
+    points[1, 1] = torch.nan
+    with pytest.raises(ValueError, match="expected finite points and directions, got NaN or infinity"):
+        ball_radii(points, torch.eye(3))

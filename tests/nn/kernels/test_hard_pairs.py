@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from igps.nn._kernels.hard_pairs import class_pairs, pair_histogram
+
+pytestmark = pytest.mark.usefixtures("both_ways")
+
+
+def by_loops(embedding: np.ndarray, potential: np.ndarray, d_max: float, u_max: float, c: int, b: int) -> np.ndarray:
+    """The definition, one pair at a time."""
+    rows = {pair: i for i, pair in enumerate(class_pairs(c))}
+    histogram = np.zeros((len(rows), b))
+    level = [min(int(u / (u_max / c)), c - 1) for u in potential]
+    for i in range(len(embedding)):
+        for j in range(i):
+            position = math.dist(embedding[i], embedding[j]) / (d_max / b) - 0.5
+            position = min(max(position, 0.0), b - 1.0)
+            row, lower = rows[tuple(sorted((level[i], level[j])))], int(position)
+            histogram[row, lower] += 1 - (position - lower)
+            if lower + 1 < b:
+                histogram[row, lower + 1] += position - lower
+    return histogram / histogram.sum()
+
+
+@pytest.fixture(scope="module")
+def cloud() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    embedding = torch.randn(90, 6, generator=generator, dtype=torch.float64) * 0.7
+    return embedding, embedding.norm(dim=1)
+
+
+@pytest.mark.parametrize(("n_classes", "n_bins"), [(1, 64), (4, 64), (3, 7), (8, 2)])
+def test_equals_brute_force_loop(cloud: tuple[torch.Tensor, torch.Tensor], n_classes: int, n_bins: int) -> None:
+    embedding, potential = cloud
+    expected = by_loops(embedding.numpy(), potential.numpy(), 4.0, 1.5, n_classes, n_bins)
+    result = pair_histogram(embedding, potential, n_classes=n_classes, n_bins=n_bins)
+    np.testing.assert_allclose(result, expected, atol=1e-12)
+    single = pair_histogram(embedding.float(), potential.float(), n_classes=n_classes, n_bins=n_bins)
+    assert single.dtype == torch.float32
+    np.testing.assert_allclose(single, expected, atol=1e-6)
+
+
+def test_values_beyond_the_ranges_stay_in_the_last_cells(cloud: tuple[torch.Tensor, torch.Tensor]) -> None:
+    embedding, potential = cloud
+    far = pair_histogram(embedding * 100, potential * 100)
+    assert far.sum() == pytest.approx(1)
+    expected = by_loops(embedding.numpy() * 100, potential.numpy() * 100, 4.0, 1.5, 4, 64)
+    np.testing.assert_allclose(far, expected, atol=1e-12)
+    assert far[-1, -1] > 0.9
+
+
+def test_blocks_do_not_show(cloud: tuple[torch.Tensor, torch.Tensor], monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = pair_histogram(*cloud)
+    monkeypatch.setattr("igps.nn._kernels.hard_pairs._BLOCK", 7)
+    np.testing.assert_allclose(pair_histogram(*cloud), whole, atol=1e-14)
+
+
+def test_does_not_depend_on_order_or_on_the_basis(cloud: tuple[torch.Tensor, torch.Tensor]) -> None:
+    embedding, potential = cloud
+    order = torch.randperm(len(embedding), generator=torch.Generator().manual_seed(0))
+    rotation = torch.linalg.qr(torch.randn(6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))).Q
+    turned = pair_histogram(embedding[order] @ rotation, potential[order])
+    np.testing.assert_allclose(turned, pair_histogram(embedding, potential), atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("embedding", "potential", "message"),
+    [
+        (torch.zeros(1, 3), torch.zeros(1), "two points"),
+        (torch.zeros(5, 3), torch.zeros(4), r"potential: expected shape \(5,\), one of each point, got \(4,\)"),
+        (torch.zeros(1, 5, 3), torch.zeros(1), r"points: expected shape \(P, D\), got \(1, 5, 3\)"),
+        (torch.full((5, 3), torch.nan), torch.zeros(5), "finite"),
+        (torch.zeros(5, 3), -torch.ones(5), "non-negative"),
+    ],
+)
+def test_bad_input_is_refused(embedding: torch.Tensor, potential: torch.Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        pair_histogram(embedding, potential)
+
+
+def test_half_precision_is_counted_in_single(cloud: tuple[torch.Tensor, torch.Tensor]) -> None:
+    embedding, potential = cloud[0].bfloat16(), cloud[0].bfloat16().float().norm(dim=1)
+    with torch.autocast("cpu", torch.bfloat16):
+        result = pair_histogram(embedding, potential)
+    assert result.dtype == torch.float32
+    torch.testing.assert_close(result, pair_histogram(embedding.float(), potential))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("n_bins", 1), ("n_classes", 0), ("distance_range", 0.0), ("potential_range", -1.0)]
+)
+def test_bad_layout_is_refused(cloud: tuple[torch.Tensor, torch.Tensor], name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name}={value}"):
+        pair_histogram(*cloud, **{name: value})
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_cuda_equals_cpu(cloud: tuple[torch.Tensor, torch.Tensor]) -> None:
+    embedding, potential = (values.float() for values in cloud)
+    on_device = pair_histogram(embedding.cuda(), potential.cuda()).cpu()
+    np.testing.assert_allclose(on_device, pair_histogram(embedding, potential), atol=1e-6)

@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from batches import N_POINTS, alone, embedded, scaled, two_bodies
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from igps.nn.batch_features import View, Views, check_kind, nearest_directions
+from igps.nn.embedding import SpectralEmbedding
+
+
+class Counting(nn.Module):
+    """An embedding that counts its calls."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls = 0
+
+    def forward(self, eigenfunctions: Tensor, eigenvalues: Tensor, area: Tensor) -> Tensor:
+        self.calls += 1
+        return eigenfunctions
+
+
+def test_nearest_directions_are_those_of_a_loop() -> None:
+    generator = torch.Generator().manual_seed(1)
+    points = torch.randn(9, 3, generator=generator, dtype=torch.float64)
+    targets = torch.randn(20, 3, generator=generator, dtype=torch.float64)
+    found = nearest_directions(points, targets, n_nearest=3)
+    for point, direction in zip(points, found, strict=True):
+        nearest = sorted(targets, key=lambda target, point=point: float((target - point).norm()))[:3]  # type: ignore[misc]
+        torch.testing.assert_close(direction, normalize(torch.stack(nearest).mean(dim=0) - point, dim=0))
+    whole = nearest_directions(points, targets, n_nearest=50)
+    torch.testing.assert_close(whole, normalize(targets.mean(dim=0) - points, dim=1))
+
+
+def test_an_embedding_is_computed_once() -> None:
+    batch = two_bodies()
+    views, embedding, other = Views(batch, training=False), Counting(), Counting()
+    for _ in range(3):
+        view = views.of("interior", None, None)
+        assert view.embedded(embedding) is view.embedded(embedding)
+        view.embedded(other)
+    assert embedding.calls == other.calls == 1
+    views.of("surface", None, None).embedded(embedding)
+    views.of("interior", 20, None).embedded(embedding)
+    views.of("interior", 20, 10).embedded(embedding)
+    assert embedding.calls == 3
+
+
+def test_positions_do_not_change_with_scale() -> None:
+    batch, large = two_bodies(), scaled(two_bodies(), 8.0)
+    expected = View(batch, "interior", batch.interior).positions()
+    torch.testing.assert_close(View(large, "interior", large.interior).positions(), expected)
+    by_hand = batch.interior.points.numpy() / np.sqrt([2.0, 3.0])[:, None, None]
+    np.testing.assert_allclose(expected, by_hand, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["interior", "surface"])
+def test_directions_in_the_embedding_lead_outwards_whatever_the_padding(kind: str) -> None:
+    batch, embedding = two_bodies(), SpectralEmbedding(n_eigenpairs=4)
+    directions = View(batch, kind, getattr(batch, kind)).embedded_directions(embedding)  # type: ignore[arg-type]
+    for i, n in enumerate(N_POINTS):
+        inside, surface = (embedded(batch, i, where, 4) for where in ("interior", "surface"))
+        own, other, sign = (inside, surface, 1) if kind == "interior" else (surface, inside, -1)
+        nearest = (own[:, None] - other).norm(dim=2).argsort(dim=1)[:, :8]
+        expected = sign * normalize(other[nearest].mean(dim=1) - own, dim=1)
+        np.testing.assert_allclose(directions[i, :n], expected, atol=1e-4)
+        single = alone(batch, i)
+        unpadded = View(single, kind, getattr(single, kind)).embedded_directions(embedding)  # type: ignore[arg-type]
+        torch.testing.assert_close(unpadded[0], directions[i, :n])
+
+
+def test_neighbours_in_the_embedding_are_found_once_whatever_the_padding() -> None:
+    batch, embedding = two_bodies(), SpectralEmbedding(n_eigenpairs=4)
+    view = View(batch, "surface", batch.surface)
+    found = view.neighbours(embedding)
+    assert view.neighbours(embedding) is found
+    for i, n in enumerate(N_POINTS):
+        points = embedded(batch, i, "surface", 4)
+        apart = (points[:, None] - points).norm(dim=2).fill_diagonal_(torch.inf)
+        assert found[i].shape == (n, 16)
+        assert torch.equal(found[i], apart.argsort(dim=1)[:, :16])
+
+
+def test_subsets() -> None:
+    batch = two_bodies()
+    assert Views(batch, training=False).of("interior", None, 5).samples is batch.interior
+    fixed, again, drawn, other = (
+        Views(batch, training).of("interior", 9, 5).samples for training in (False, False, True, True)
+    )
+    assert fixed.mask.sum(dim=1).tolist() == [9, 9]
+    assert torch.equal(fixed.points, again.points)
+    assert drawn.mask.sum(dim=1).tolist() == [5, 5]
+    assert not torch.equal(drawn.points, other.points)
+    views = Views(batch, training=True)
+    assert views.of("interior", 9, 5) is views.of("interior", None, 5)
+    assert views.of("interior", 5, None) is not views.of("interior", 5, 5)
+
+
+def test_a_wrong_kind_says_which_there_are() -> None:
+    check_kind("surface")
+    with pytest.raises(ValueError, match="samples: expected 'interior' or 'surface', got 'volume'"):
+        check_kind("volume")

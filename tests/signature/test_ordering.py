@@ -1,0 +1,182 @@
+"""The order of a body's points, and what is chosen along it: the same body, the same choice."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from conftest import as_mesh
+from igps.data.batch import SampleBatch, collate
+from igps.mesh.mesh import Mesh
+from igps.nn.axes import EuclideanDistance, InteriorDistance, Potential
+from igps.nn.histograms.pairs import PairHistogram
+from igps.retrieval import chi_square
+from igps.signature.ordering import crowding, in_order_of_form, one_in_each_share, places, shares_around
+from igps.signature.signature import SignatureConfig, compute_signature
+
+CONFIG = SignatureConfig(n_eigenpairs=40, resolution=16, min_samples=0, n_surface_samples=400)
+
+
+def renumbered(mesh: Mesh, seed: int = 5) -> Mesh:
+    generator = np.random.default_rng(seed)
+    order = generator.permutation(len(mesh.vertices))
+    faces = np.argsort(order)[mesh.faces][generator.permutation(len(mesh.faces))]
+    shifts = generator.integers(0, 3, len(faces))
+    return Mesh(mesh.vertices[order], np.stack([np.roll(f, s) for f, s in zip(faces, shifts, strict=True)]))
+
+
+def spectrum_of(n_points: int) -> tuple[np.ndarray, np.ndarray]:
+    generator = np.random.default_rng(2)
+    return generator.normal(size=(n_points, 30)), np.sort(generator.uniform(5, 300, 30))
+
+
+def test_places_go_with_the_points_and_leave_signs_and_bases_alone() -> None:
+    functions, eigenvalues = spectrum_of(500)
+    eigenvalues[7:10] = eigenvalues[7]  # a multiplet, of which any basis may come
+    expected = places(functions, eigenvalues, 1.0)
+    order = np.random.default_rng(0).permutation(500)
+    np.testing.assert_allclose(places(functions[order], eigenvalues, 1.0), expected[order], rtol=1e-12)
+    np.testing.assert_allclose(places(functions * np.where(np.arange(30) % 2, -1, 1), eigenvalues, 1.0), expected)
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    turned = functions.copy()
+    turned[:, 7:10] = functions[:, 7:10] @ turn
+    np.testing.assert_allclose(places(turned, eigenvalues, 1.0), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        places(functions / 3, eigenvalues / 9, 9.0), expected, rtol=1e-12
+    )  # three times as large
+
+
+def test_points_of_one_potential_have_different_places() -> None:
+    """The mirror images in a symmetric body, told apart the same way whichever of them comes first."""
+    functions, eigenvalues = spectrum_of(300)
+    mirror = np.where(np.arange(30) % 3 == 0, -1.0, 1.0)
+    both = np.concatenate([functions, functions * mirror])
+    found = places(both, eigenvalues, 1.0)
+    assert np.diff(np.sort(found)).min() > 1e-9
+    exchanged = places(np.concatenate([functions * mirror, functions]), eigenvalues, 1.0)
+    np.testing.assert_allclose(np.sort(exchanged), np.sort(found), rtol=1e-9)
+
+
+def test_marks_are_counts_of_what_is_around() -> None:
+    line = np.zeros((9, 3))
+    line[:, 0] = np.arange(9)
+    expected = np.abs(line[:, 0] - line[:, :1]).mean(axis=1)  # all are nearest
+    np.testing.assert_allclose(crowding(line), expected / expected.mean())
+    areas = np.array([1.0, 2.0, 4.0])
+    np.testing.assert_allclose(shares_around(np.array([[0, 1, 2], [0, 2, 3], [1, 2, 3]]), areas) * 21 / 4, [3, 5, 7, 6])
+
+
+def test_each_share_gets_one() -> None:
+    sizes = np.random.default_rng(0).random(50) ** 3
+    sizes[[0, 20, 49]] = 0
+    ends = np.cumsum(sizes)
+    drawn = one_in_each_share(sizes, 400, np.random.default_rng(1))
+    assert (np.diff(drawn) >= 0).all()
+    assert not set(drawn) & {0, 20, 49}
+    counts = np.bincount(drawn, minlength=50)
+    assert (np.abs(counts - 400 * sizes / ends[-1]) < 2).all()  # a plain draw would be off by up to twenty
+    many = sum(np.bincount(one_in_each_share(sizes, 7, np.random.default_rng(i)), minlength=50) for i in range(3000))
+    np.testing.assert_allclose(many / 21000, sizes / ends[-1], atol=0.004)
+
+
+def bodies() -> dict[str, Mesh]:
+    """One without symmetry, and one that is its own mirror image, with all its samples."""
+    made = {}
+    for name, lean in (("blob", 0.2), ("mirrored", 0.0)):
+        body = trimesh.creation.icosphere(subdivisions=3)
+        x, y, z = body.vertices.T
+        body.vertices *= (1 + lean * x + 0.2 * np.sin(2.3 * y + 0.4) + 0.3 * z * x**2)[:, None] * [1.0, 0.8, 1.3]
+        made[name] = as_mesh(body)
+    mirrored = made["mirrored"].vertices
+    assert cKDTree(mirrored).query(mirrored * [-1, 1, 1])[0].max() < 1e-12
+    return made
+
+
+MOVES = {
+    "axes": lambda mesh: Mesh(mesh.vertices[:, [1, 2, 0]], mesh.faces),
+    "quarter turn": lambda mesh: Mesh(mesh.vertices @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]), mesh.faces),
+    "mirror image": lambda mesh: Mesh(mesh.vertices * [1, -1, 1], mesh.faces[:, ::-1]),
+    "numbering": renumbered,
+}
+
+
+@pytest.fixture(scope="module")
+def histograms() -> list[PairHistogram]:
+    """Of half of the samples, inside and on the surface; with Euclidean distances, which no symmetry of U explains."""
+    axes = [Potential(3), InteriorDistance(16), EuclideanDistance(12)]
+    return [PairHistogram(axes, samples=kind, n_samples=200).eval() for kind in ("interior", "surface")]
+
+
+@pytest.mark.parametrize("move", MOVES)
+def test_histograms_of_subsets_do_not_move(move: str, histograms: list[PairHistogram]) -> None:
+    still = {name: collate([compute_signature(mesh, CONFIG)]) for name, mesh in bodies().items()}
+    for histogram in histograms:
+        assert all(len(batch.interior.mask[0]) > 300 for batch in still.values())  # the subsets are some
+        before = torch.cat([histogram(batch) for batch in still.values()])
+        between = chi_square(before, before)[0, 1]
+        for (name, mesh), one in zip(bodies().items(), before, strict=True):
+            moved = histogram(collate([compute_signature(MOVES[move](mesh), CONFIG)]))
+            assert chi_square(one[None], moved) < 1e-4 * between, name
+
+
+def test_numbering_leaves_the_surface_samples_in_place(blob: Mesh) -> None:
+    points, others = (compute_signature(mesh, CONFIG).surface.points for mesh in (blob, renumbered(blob)))
+    distance, _ = cKDTree(others).query(points)
+    assert np.quantile(distance, 0.99) < 1e-5
+    other_seed = compute_signature(blob, SignatureConfig(**{**CONFIG.__dict__, "seed": 1})).surface.points
+    assert np.quantile(cKDTree(other_seed).query(points)[0], 0.5) > 1e-3
+
+
+def test_subsets_take_equal_steps() -> None:
+    lengths = (10, 7, 3)
+    mask = torch.arange(10) < torch.tensor(lengths)[:, None]
+    places = torch.arange(10.0).expand(3, -1)
+    batch = SampleBatch(places[..., None].expand(-1, -1, 3), places[..., None], mask, {"depth": places})
+    part = batch.subset(4, seed=0)
+    assert part.mask.sum(dim=1).tolist() == [4, 4, 3]
+    for row, length in enumerate(lengths):
+        chosen = part.attributes["depth"][row, part.mask[row]]
+        if length <= 4:
+            assert chosen.tolist() == list(range(length))
+        else:
+            assert ((chosen.diff() - length / 4).abs() < 1).all()
+            assert chosen[0] < length / 4
+            alone = SampleBatch(*(v[row : row + 1, :length] for v in (batch.points, batch.eigenfunctions, mask)), {})
+            assert alone.subset(4, seed=0).points[0, :, 0].tolist() == chosen.tolist()
+    starts = {tuple(batch.subset(4, seed=seed).attributes["depth"][0].tolist()) for seed in range(20)}
+    assert len(starts) > 1
+    assert set().union(*starts) == set(range(10))  # none is left out by every start
+
+
+def test_the_order_of_form_takes_out_every_numbering(blob: Mesh) -> None:
+    expected = in_order_of_form(blob)
+    for seed in range(3):
+        found = in_order_of_form(renumbered(blob, seed))
+        np.testing.assert_array_equal(found.vertices, expected.vertices)
+        np.testing.assert_array_equal(found.faces, expected.faces)
+
+
+def test_the_order_of_form_keeps_the_surface(blob: Mesh) -> None:
+    found = in_order_of_form(blob)
+
+    def corners(mesh: Mesh) -> set[bytes]:
+        """Every face by its corners' places, from each of the three on, so that orientation counts."""
+        places = mesh.vertices[mesh.faces]
+        return {np.roll(face, k, axis=0).tobytes() for face in places for k in range(3)}
+
+    assert corners(found) == corners(blob)
+    assert len(found.faces) == len(blob.faces)
+
+
+def test_the_order_of_form_does_not_depend_on_place_and_scale(blob: Mesh) -> None:
+    turn = Rotation.from_rotvec([0.3, 1.1, -0.7]).as_matrix()
+    moved = replace(blob, vertices=2.5 * blob.vertices @ turn.T + [3, -1, 2])
+    expected, found = in_order_of_form(blob), in_order_of_form(moved)
+    np.testing.assert_array_equal(found.faces, expected.faces)
+    np.testing.assert_allclose(found.vertices, 2.5 * expected.vertices @ turn.T + [3, -1, 2], atol=1e-12)

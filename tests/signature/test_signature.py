@@ -1,0 +1,269 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from conftest import as_mesh
+from igps.data.batch import collate
+from igps.mesh.mesh import Mesh, MeshError
+from igps.nn.axes import InteriorDistance, Potential
+from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding
+from igps.nn.histograms.pairs import PairHistogram
+from igps.signature.laplacian import laplacian
+from igps.signature.mean_value import mean_value_coordinates
+from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
+from igps.spectra import ConvergenceError, eigenpairs
+
+CONFIG = SignatureConfig(n_eigenpairs=40, resolution=12, min_samples=0, n_surface_samples=300, accuracy=None)
+
+
+def histogram(signature: Signature, samples: str = "interior") -> np.ndarray:
+    return PairHistogram([Potential(4), InteriorDistance(64)], samples=samples)(collate([signature]))[0].numpy()  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def signature(blob: Mesh) -> Signature:
+    return compute_signature(blob, CONFIG)
+
+
+def test_shapes_types_and_measures(blob: Mesh, signature: Signature) -> None:
+    n_samples = len(signature.interior)
+    assert signature.eigenvalues.shape == (40,)
+    assert signature.interior.points.shape == (n_samples, 3)
+    assert signature.interior.eigenfunctions.shape == (n_samples, 40)
+    assert signature.interior.eigenfunctions.dtype == np.float32
+    assert signature.surface.eigenfunctions.shape == (300, 40)
+    assert signature.area == pytest.approx(trimesh.Trimesh(blob.vertices, blob.faces).area)
+    assert signature.volume == pytest.approx(trimesh.Trimesh(blob.vertices, blob.faces).volume)
+
+
+def test_distance_and_potential_equal_the_papers_gram_form(blob: Mesh, signature: Signature) -> None:
+    # Rustamov 2010: d²(p,q) = (w(p) − w(q))ᵀ A (w(p) − w(q)) and U²(p) = w(p)ᵀ A w(p), A the Gram matrix of the GPS.
+    spectrum = eigenpairs(*laplacian(blob), 40, positions=blob.vertices)
+    gps = spectrum.eigenfunctions / np.sqrt(spectrum.eigenvalues)
+    gram = gps @ gps.T
+    points = signature.interior.points[::9]
+    weights = np.asarray(mean_value_coordinates(blob.vertices, blob.faces, points))
+    difference = weights[:, None] - weights[None]
+    distance = np.sqrt(np.maximum(np.einsum("pqi,ij,pqj->pq", difference, gram, difference), 0))
+    potential = np.sqrt(np.einsum("pi,ij,pj->p", weights, gram, weights))
+
+    eigenfunctions = torch.from_numpy(signature.interior.eigenfunctions[::9]).double()
+    embedding = spectral_embedding(
+        eigenfunctions, torch.from_numpy(signature.eigenvalues), torch.tensor(signature.area)
+    )
+    np.testing.assert_allclose(interior_distance(embedding, embedding), distance, atol=1e-6)
+    np.testing.assert_allclose(barycentroid_potential(embedding), potential, rtol=1e-5)
+
+
+def test_distance_to_itself_is_zero(signature: Signature) -> None:
+    embedding = torch.from_numpy(signature.interior.eigenfunctions)
+    assert interior_distance(embedding, embedding).diagonal().abs().max() == 0
+
+
+def test_barycentroid_of_a_ball_is_its_centre_and_of_a_body_its_least_potential(
+    sphere: Mesh, signature: Signature
+) -> None:
+    ball = compute_signature(sphere, replace(CONFIG, resolution=11))
+    np.testing.assert_allclose(ball.barycentroid, 0, atol=1e-9)
+    embedding = spectral_embedding(
+        torch.from_numpy(signature.interior.eigenfunctions),
+        torch.from_numpy(signature.eigenvalues),
+        torch.tensor(signature.area),
+    )
+    least = int(barycentroid_potential(embedding).argmin())
+    np.testing.assert_array_equal(signature.barycentroid, signature.interior.points[least])
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_scale_does_not_matter(blob: Mesh, signature: Signature, scale: float) -> None:
+    scaled = compute_signature(Mesh(blob.vertices * scale, blob.faces), CONFIG)
+    np.testing.assert_allclose(scaled.eigenvalues * scale**2, signature.eigenvalues, rtol=1e-7)
+    for samples in ("interior", "surface"):
+        np.testing.assert_allclose(histogram(scaled, samples), histogram(signature, samples), atol=1e-5)
+
+
+def test_grid_symmetries_and_shifts_do_not_matter(blob: Mesh, signature: Signature) -> None:
+    turn = np.array([[0, -1, 0], [0, 0, 1], [-1, 0, 0]], dtype=float)
+    moved = compute_signature(Mesh(blob.vertices @ turn.T + [10, -200, 3], blob.faces), CONFIG)
+    for samples in ("interior", "surface"):
+        np.testing.assert_allclose(histogram(moved, samples), histogram(signature, samples), atol=1e-5)
+
+
+def test_numbering_of_vertices_and_faces_does_not_matter(blob: Mesh, signature: Signature) -> None:
+    generator = np.random.default_rng(5)
+    order = generator.permutation(len(blob.vertices))
+    faces = np.argsort(order)[blob.faces][generator.permutation(len(blob.faces))]
+    shifts = generator.integers(0, 3, len(faces))
+    faces = np.array([np.roll(face, shift) for face, shift in zip(faces, shifts, strict=True)])
+    renumbered = compute_signature(Mesh(blob.vertices[order], faces), CONFIG)
+    np.testing.assert_allclose(histogram(renumbered), histogram(signature), atol=1e-5)
+
+
+def test_signs_of_eigenfunctions_do_not_matter(signature: Signature) -> None:
+    signs = np.where(np.arange(40) % 3 == 0, -1, 1).astype(np.float32)
+    flipped = replace(
+        signature,
+        interior=Samples(signature.interior.points, signature.interior.eigenfunctions * signs),
+        surface=Samples(signature.surface.points, signature.surface.eigenfunctions * signs),
+    )
+    for samples in ("interior", "surface"):
+        np.testing.assert_allclose(histogram(flipped, samples), histogram(signature, samples), atol=1e-6)
+
+
+def test_surface_samples_lie_on_the_surface_and_follow_its_area() -> None:
+    box = trimesh.creation.box((1, 2, 3))
+    for _ in range(3):
+        box = box.subdivide()
+    config = SignatureConfig(n_eigenpairs=10, resolution=8, min_samples=0, n_surface_samples=20_000)
+    points = compute_signature(as_mesh(box), config).surface.points
+    on_face = np.isclose(np.abs(points), [0.5, 1.0, 1.5], atol=1e-12)
+    assert on_face.any(axis=1).all()
+    share = on_face[on_face.sum(axis=1) == 1].mean(axis=0)
+    np.testing.assert_allclose(share, np.array([6, 3, 2]) / 11, atol=0.012)
+
+
+def test_surface_values_are_interpolated_linearly(blob: Mesh, signature: Signature) -> None:
+    spectrum = eigenpairs(*laplacian(blob), 40, positions=blob.vertices)
+    surface = trimesh.Trimesh(blob.vertices, blob.faces, process=False)
+    closest, _, face = trimesh.proximity.closest_point_naive(surface, signature.surface.points[:20])
+    weights = trimesh.triangles.points_to_barycentric(surface.triangles[face], closest)
+    expected = np.einsum("pi,pik->pk", weights, spectrum.eigenfunctions[surface.faces[face]])
+    np.testing.assert_allclose(signature.surface.eigenfunctions[:20], expected, atol=1e-4)
+
+
+def test_simplified_mesh_gives_a_near_descriptor(sphere: Mesh) -> None:
+    config = replace(CONFIG, max_vertices=700)
+    small, full = compute_signature(sphere, config), compute_signature(sphere, CONFIG)
+    assert any("simplified" in note for note in small.notes)
+    assert small.eigenvalues[0] == pytest.approx(full.eigenvalues[0], rel=0.02)
+
+
+def test_robust_backend_and_seed_are_honoured(blob: Mesh, signature: Signature) -> None:
+    robust = compute_signature(blob, replace(CONFIG, backend="robust"))
+    assert not np.array_equal(robust.eigenvalues, signature.eigenvalues)
+    np.testing.assert_allclose(robust.eigenvalues, signature.eigenvalues, rtol=0.05)
+    other = compute_signature(blob, replace(CONFIG, seed=1))
+    assert not np.array_equal(other.surface.points, signature.surface.points)
+    np.testing.assert_array_equal(compute_signature(blob, CONFIG).surface.points, signature.surface.points)
+
+
+@pytest.fixture(scope="module")
+def needles(blob: Mesh) -> Mesh:
+    """The blob with two vertices a billionth of its size apart."""
+    vertices = blob.vertices.copy()
+    a, b = blob.faces[100, :2]
+    vertices[a] = vertices[b] + (vertices[a] - vertices[b]) * 2e-8
+    return Mesh(vertices, blob.faces, name="needles")
+
+
+def test_other_matrices_serve_where_the_cotangent_ones_fail(needles: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = compute_signature(needles, CONFIG)
+    assert 1e-12 < plain.residual < 1e-6
+    assert plain.notes == ()
+    # What rounding leaves of the cotangent matrices' eigenpairs, by any solver, is far from that of the others'.
+    limit = plain.residual / 10
+    monkeypatch.setattr("igps.signature.signature._RESIDUAL", limit)
+    monkeypatch.setattr("igps.spectra.eigensolver.RESIDUAL_LIMIT", limit)
+    signature = compute_signature(needles, CONFIG)
+    (note,) = signature.notes
+    assert note.startswith("intrinsic-Delaunay matrices were used: ")
+    assert f"relative residual above {limit:.1e}" in note
+    assert signature.residual < limit
+    robust = compute_signature(needles, replace(CONFIG, backend="robust"))
+    np.testing.assert_array_equal(signature.eigenvalues, robust.eigenvalues)
+    np.testing.assert_array_equal(signature.interior.eigenfunctions, robust.interior.eigenfunctions)
+
+
+def test_a_mesh_that_no_matrices_serve_is_refused(needles: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("igps.signature.signature._RESIDUAL", 1e-18)
+    monkeypatch.setattr("igps.spectra.eigensolver.RESIDUAL_LIMIT", 1e-18)
+    with pytest.raises(ConvergenceError, match=r"needles: .* cotangent matrices .* intrinsic-Delaunay ones .*remesh"):
+        compute_signature(needles, CONFIG)
+
+
+def test_too_few_vertices_say_so(blob: Mesh) -> None:
+    with pytest.raises(MeshError, match=r"blob: 642 vertices are too few for 641 eigenpairs.*lower n_eigenpairs"):
+        compute_signature(blob, replace(CONFIG, n_eigenpairs=641))
+
+
+@pytest.mark.parametrize(
+    "field",
+    [{"n_eigenpairs": 0}, {"resolution": 0}, {"min_samples": -1}, {"n_surface_samples": 0}, {"backend": "x"},
+     {"max_vertices": 100}, {"accuracy": 2.0}, {"attributes": ("x",)}],
+)  # fmt: skip
+def test_bad_configuration_is_named(field: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=next(iter(field))):
+        SignatureConfig(**field)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("n_eigenpairs", [64, 100])
+def test_a_signature_is_the_beginning_of_one_with_more(blob: Mesh, n_eigenpairs: int) -> None:
+    """Samples, their order and the eigenvalues; the eigenfunctions but for the sign, which a single one has free."""
+    exact = replace(CONFIG, n_eigenpairs=n_eigenpairs)
+    more = replace(exact, n_eigenpairs=250, attributes=("electrostatic_potential", "surface_direction"))
+    alone, whole = compute_signature(blob, exact), compute_signature(blob, more)
+    found = whole.beginning(exact)
+    assert (found.config, found.interior.attributes, found.surface.attributes) == (exact, {}, {})
+    assert (found.area, found.volume, found.notes) == (alone.area, alone.volume, alone.notes)
+    np.testing.assert_allclose(found.eigenvalues, alone.eigenvalues, rtol=1e-9)
+    for one, other in ((found.interior, alone.interior), (found.surface, alone.surface)):
+        np.testing.assert_allclose(one.points, other.points, atol=1e-12)
+        assert one.eigenfunctions.shape == other.eigenfunctions.shape
+        assert one.eigenfunctions.flags.c_contiguous
+        signs = np.sign((one.eigenfunctions * other.eigenfunctions).sum(axis=0))
+        np.testing.assert_allclose(one.eigenfunctions * signs, other.eigenfunctions, atol=1e-4)
+    attributed = whole.beginning(replace(exact, attributes=("surface_direction",)))
+    assert set(attributed.interior.attributes) == set(attributed.surface.attributes) == {"surface_direction"}
+    np.testing.assert_allclose(histogram(found), histogram(alone), atol=1e-6)
+    with pytest.raises(AssertionError):  # the number does matter
+        np.testing.assert_allclose(histogram(whole), histogram(alone), atol=1e-4)
+
+
+def test_no_number_of_eigenpairs_is_the_usual_one(blob: Mesh) -> None:
+    config = SignatureConfig(resolution=6, min_samples=0, n_surface_samples=20)
+    assert config.as_dict() == replace(config, n_eigenpairs=250).as_dict() == config.resolved().as_dict()
+    assert config.as_dict()["n_eigenpairs"] == 250
+    assert "least_vertices" not in config.as_dict()
+    assert config.needing(50).as_dict() == {**config.as_dict(), "n_eigenpairs": 64, "least_vertices": 252}
+    signature = compute_signature(blob, config)
+    assert len(signature.eigenvalues) == signature.config.n_eigenpairs == 250
+
+
+def test_larger_configurations_have_all_and_more() -> None:
+    small = SignatureConfig(resolution=17, attributes=("depth",)).needing(50)
+    larger = list(small.larger())
+    assert {one.n_eigenpairs for one in larger} == {64, 100, 250}
+    assert [one.n_kept for one in larger] == sorted(one.n_kept for one in larger)
+    for one in larger:
+        assert set(one.attributes) >= {"depth"}
+        same = replace(one, n_eigenpairs=64, attributes=("depth",))
+        assert same == small
+    # What a plain dataset, and what one for `rich`, has in its cache.
+    plain = SignatureConfig(resolution=17).as_dict()
+    assert plain in [one.as_dict() for one in SignatureConfig(resolution=17).needing(0).larger()]
+    rich = ("depth", "electrostatic_potential", "surface_direction")
+    assert {**plain, "attributes": rich} in [one.as_dict() for one in SignatureConfig(resolution=17).larger()]
+    assert {one.n_kept for one in SignatureConfig(n_eigenpairs=40).larger()} == {40}  # other samples
+    assert {one.n_kept for one in SignatureConfig(n_eigenpairs=64, max_vertices=120).larger()} == {64, 100}
+
+
+def test_paper_is_the_paper() -> None:
+    paper = SignatureConfig.paper()
+    assert (paper.n_eigenpairs, paper.resolution, paper.min_samples, paper.backend) == (250, 32, 0, "cotangent")
+    assert paper.max_vertices is None
+
+
+def test_real_model(homer: Mesh) -> None:
+    signature = compute_signature(homer, SignatureConfig.paper())
+    assert histogram(signature).sum() == pytest.approx(1)
+    exact = compute_signature(homer, replace(SignatureConfig.paper(), accuracy=None))
+    np.testing.assert_allclose(histogram(signature), histogram(exact), atol=2e-4)
+    # The barycentroid of a standing figure lies in its trunk: between a third and two thirds of its height.
+    low, high = homer.vertices.min(axis=0), homer.vertices.max(axis=0)
+    height = int(np.argmax(high - low))
+    assert 1 / 3 < (signature.barycentroid[height] - low[height]) / (high - low)[height] < 2 / 3

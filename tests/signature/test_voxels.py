@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import igl
+import numpy as np
+import pytest
+import trimesh
+from scipy.stats import kstest
+
+import igps.signature.voxels as voxels
+from conftest import as_mesh
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.winding import winding_number
+from igps.signature.voxels import grid_axes, inside_grid, interior_samples
+
+
+def grid_points(axes: tuple[np.ndarray, ...]) -> np.ndarray:
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def test_box_is_filled_exactly() -> None:
+    points = interior_samples(as_mesh(trimesh.creation.box((1, 2, 4))), resolution=32)
+    assert len(points) == 8 * 16 * 32
+    np.testing.assert_allclose(np.sort(np.unique(points[:, 0].round(9))), (np.arange(8) - 3.5) / 8)
+
+
+def test_volume_of_samples_tends_to_volume(blob: Mesh) -> None:
+    resolution = 64
+    cell = np.ptp(blob.vertices, axis=0).max() / resolution
+    assert len(interior_samples(blob, resolution)) * cell**3 == pytest.approx(blob.volume, rel=0.01)
+
+
+def test_radial_law_of_a_ball(sphere: Mesh) -> None:
+    radius = np.linalg.norm(interior_samples(sphere, 32), axis=1)
+    assert kstest(radius, lambda r: np.clip(r, 0, 1) ** 3).statistic < 0.02
+
+
+@pytest.mark.parametrize("make", [lambda: trimesh.creation.torus(1, 0.3), lambda: trimesh.creation.capsule(2, 0.5)])
+def test_inside_equals_libigl_winding_number(make) -> None:  # type: ignore[no-untyped-def]
+    mesh = as_mesh(make())
+    axes = grid_axes(mesh, 19)
+    winding = igl.winding_number(np.array(mesh.vertices), np.array(mesh.faces), grid_points(axes))
+    np.testing.assert_array_equal(inside_grid(mesh, axes).ravel(), winding > 0.5)
+
+
+def test_grid_lines_through_vertices_and_edges() -> None:
+    # A grid whose lines run through every vertex and along every edge of an octahedron, and through none when shifted.
+    mesh = as_mesh(trimesh.Trimesh(*_octahedron(), process=False))
+    exact = tuple(np.arange(-2, 3) / 2.0 for _ in range(3))
+    points = grid_points(exact)
+    expected = np.abs(points).sum(axis=1) < 1 - 1e-9
+    np.testing.assert_array_equal(inside_grid(mesh, exact).ravel(), expected)
+
+
+def _octahedron() -> tuple[np.ndarray, np.ndarray]:
+    vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)
+    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    return vertices, faces
+
+
+def test_overlapping_parts_count_as_inside_once_or_twice() -> None:
+    # Two boxes that overlap, bridged to one component by sharing no vertex is not allowed: use a self-crossing tube.
+    surface = trimesh.creation.torus(1, 0.6, major_sections=48, minor_sections=24)
+    surface.vertices[:, 0] *= 0.5  # the tube now crosses itself near the axis
+    mesh = as_mesh(surface)
+    axes = grid_axes(mesh, 24)
+    winding = igl.winding_number(np.array(mesh.vertices), np.array(mesh.faces), grid_points(axes))
+    np.testing.assert_array_equal(inside_grid(mesh, axes).ravel(), winding > 0.5)
+
+
+def test_small_holes_do_not_matter_and_large_ones_go_by_the_winding_number(sphere: Mesh) -> None:
+    axes = grid_axes(sphere, 24)
+    whole = inside_grid(sphere, axes)
+    few = np.delete(sphere.faces, [3, 700, 2222], axis=0)
+    np.testing.assert_array_equal(inside_grid(Mesh(sphere.vertices, few, allow_open=True), axes), whole)
+    cap = sphere.faces[sphere.vertices[sphere.faces, 2].mean(axis=1) < 0.75]
+    used, faces = np.unique(cap, return_inverse=True)
+    bowl = Mesh(sphere.vertices[used], faces.reshape(-1, 3), allow_open=True)
+    winding = igl.winding_number(np.array(bowl.vertices), np.array(bowl.faces), grid_points(axes))
+    clear = np.abs(winding - 0.5) > 1e-6
+    np.testing.assert_array_equal(inside_grid(bowl, axes).ravel()[clear], (winding > 0.5)[clear])
+
+
+def test_solid_angles_are_needed_near_a_hole_only(sphere: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[np.ndarray] = []
+
+    def recording(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+        asked.append(points)
+        return winding_number(vertices, faces, points)
+
+    monkeypatch.setattr(voxels, "winding_number", recording)
+    mesh = Mesh(sphere.vertices, np.delete(sphere.faces, 100, axis=0), allow_open=True)
+    axes = grid_axes(sphere, 48)
+    np.testing.assert_array_equal(inside_grid(mesh, axes), inside_grid(sphere, axes))
+    hole = sphere.vertices[sphere.faces[100]].mean(axis=0)
+    assert all(np.linalg.norm(points - hole, axis=1).max() < 0.2 for points in asked)
+
+
+def test_grid_moves_and_turns_with_the_mesh(blob: Mesh) -> None:
+    turn = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=float)
+    shift = np.array([3.0, -40.0, 0.7])
+    moved = interior_samples(Mesh(blob.vertices @ turn.T + shift, blob.faces), 20)
+    expected = interior_samples(blob, 20) @ turn.T + shift
+    key = lambda points: points[np.lexsort(points.round(6).T)]  # noqa: E731
+    np.testing.assert_allclose(key(moved), key(expected), atol=1e-9)
+
+
+def test_min_samples_refines_the_grid(blob: Mesh) -> None:
+    coarse = interior_samples(blob, 8)
+    refined = interior_samples(blob, 8, min_samples=1000)
+    assert len(coarse) < 1000 <= len(refined) < 2500
+    np.testing.assert_array_equal(interior_samples(blob, 8, min_samples=len(coarse)), coarse)
+
+
+def test_body_too_thin_for_the_grid() -> None:
+    sheet = trimesh.creation.box((1, 1, 1e-3))
+    sheet.vertices = sheet.vertices @ trimesh.transformations.rotation_matrix(0.4, [1, 2, 0])[:3, :3].T
+    with pytest.raises(MeshError, match="min_samples"):
+        interior_samples(as_mesh(sheet, "sheet"), resolution=2)
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(("depth", "n_inside"), [(5e-6, 16 * 16), (5e-7, 0)])
+def test_surface_is_as_thick_where_the_grid_has_one_layer(axis: int, depth: float, n_inside: int) -> None:
+    # The cell centres of a plate lie so many cells below its two faces; closer than 1e-6 cells is on the surface.
+    extents = np.roll([2 * depth / 16, 1.0, 1.0], axis)
+    axes = grid_axes(plate := as_mesh(trimesh.creation.box(extents)), 16)
+    assert len(axes[axis]) == 1
+    assert inside_grid(plate, axes).sum() == n_inside
+
+
+@pytest.mark.parametrize(("resolution", "min_samples", "name"), [(0, 0, "resolution"), (4, -1, "min_samples")])
+def test_bad_arguments(blob: Mesh, resolution: int, min_samples: int, name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        interior_samples(blob, resolution, min_samples)

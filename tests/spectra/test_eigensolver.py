@@ -1,0 +1,464 @@
+"""The eigensolver against dense solvers, closed forms and invariances."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any, Literal
+
+import igl
+import lapy
+import numpy as np
+import pytest
+import torch
+import trimesh
+from problems import Problem, cotangent_problem, torus
+from scipy import sparse
+from scipy.linalg import eigh
+
+from conftest import torch_threads
+from igps import _threads as threads
+from igps.mesh.mesh import Mesh
+from igps.signature.laplacian import laplacian
+from igps.spectra import ConvergenceError, Spectrum, eigenpairs, eigensolver
+from igps.spectra import _krylov as krylov
+from igps.spectra import _lanczos as lanczos
+from igps.spectra._direct import analyse
+
+pytestmark = pytest.mark.usefixtures("both_ways")
+
+
+@pytest.fixture(scope="module")
+def torus_problem() -> Problem:
+    return cotangent_problem(torus())
+
+
+@pytest.fixture(scope="module")
+def torus_oracle(torus_problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    stiffness, mass, _ = torus_problem
+    return eigh(stiffness.toarray(), np.diag(mass))
+
+
+def assert_pairs(spectrum: Spectrum, problem: Problem, tolerance: float = 1e-7) -> None:
+    stiffness, mass, _ = problem
+    values, functions = spectrum.eigenvalues, spectrum.eigenfunctions
+    assert np.all(np.diff(values) >= 0)
+    residual = stiffness @ functions - mass[:, None] * functions * values
+    assert np.max(np.linalg.norm(residual / np.sqrt(mass)[:, None], axis=0) / values) <= 2 * tolerance
+    np.testing.assert_allclose(functions.T @ (mass[:, None] * functions), np.eye(len(values)), atol=1e-10)
+    assert np.abs(mass @ functions).max() < 1e-9 * np.sqrt(mass.sum())
+
+
+@pytest.mark.parametrize("n_eigenpairs", [1, 7, 100, 280])
+def test_agrees_with_a_dense_solver(
+    n_eigenpairs: int, torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray]
+) -> None:
+    stiffness, mass, positions = torus_problem
+    spectrum = eigenpairs(stiffness, mass, n_eigenpairs, positions=positions)
+    np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1 : n_eigenpairs + 1], rtol=1e-10)
+    assert_pairs(spectrum, torus_problem)
+
+
+def test_spans_the_space_of_the_dense_solver(
+    torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray]
+) -> None:
+    stiffness, mass, positions = torus_problem
+    values, functions = torus_oracle
+    cut = 60 + int(np.argmax(np.diff(values[60:90])))
+    spectrum = eigenpairs(stiffness, mass, cut, positions=positions)
+    overlap = functions[:, 1 : cut + 1].T @ (mass[:, None] * spectrum.eigenfunctions)
+    np.testing.assert_allclose(np.linalg.svd(overlap, compute_uv=False), 1, atol=1e-9)
+
+
+def test_sphere_has_multiplets_of_odd_size() -> None:
+    """l(l + 1) with multiplicity 2l + 1 on the unit sphere; the last multiplet is cut."""
+    mesh = trimesh.creation.icosphere(subdivisions=4)
+    problem = cotangent_problem(mesh)
+    spectrum = eigenpairs(problem[0], problem[1], 110, positions=problem[2])
+    degree = np.repeat(np.arange(1, 11), 2 * np.arange(1, 11) + 1)[:110]
+    np.testing.assert_allclose(spectrum.eigenvalues, degree * (degree + 1), rtol=0.045)
+    assert_pairs(spectrum, problem)
+
+
+def copies_of_a_patch(n_copies: int, side: int) -> Problem:
+    """Identical square grids tied to one vertex: almost every eigenvalue has multiplicity n_copies − 1."""
+    path = sparse.diags_array([np.ones(side - 1), np.ones(side - 1)], offsets=[-1, 1])
+    grid = sparse.kron(path, sparse.eye_array(side)) + sparse.kron(sparse.eye_array(side), path)
+    copies = sparse.coo_array(sparse.kron(sparse.eye_array(n_copies), grid))
+    tips = 1 + side**2 * np.arange(n_copies)
+    hub = np.zeros_like(tips)
+    rows, columns = np.r_[copies.coords[0] + 1, hub, tips], np.r_[copies.coords[1] + 1, tips, hub]
+    n_vertices = 1 + n_copies * side**2
+    adjacency = sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(n_vertices, n_vertices))
+    stiffness = sparse.csr_array(sparse.diags_array(adjacency.sum(axis=1)) - adjacency)
+    return stiffness, np.linspace(1, 1, n_vertices), np.zeros((n_vertices, 3))
+
+
+def test_multiplets_larger_than_the_block() -> None:
+    problem = copies_of_a_patch(n_copies=40, side=5)
+    values = np.linalg.eigvalsh(problem[0].toarray())
+    assert np.ptp(values[1:40]) < 1e-12 < 1e-3 < values[40] - values[39]
+    for n_eigenpairs in (38, 39, 60, 100):
+        spectrum = eigenpairs(problem[0], problem[1], n_eigenpairs)
+        np.testing.assert_allclose(spectrum.eigenvalues, values[1 : n_eigenpairs + 1], rtol=1e-10)
+        assert_pairs(spectrum, problem)
+
+
+def test_more_copies_than_distinct_eigenvalues() -> None:
+    """Four distinct eigenvalues fill most of the space: the Krylov space of the start block is soon exhausted."""
+    problem = copies_of_a_patch(n_copies=300, side=2)
+    values = np.linalg.eigvalsh(problem[0].toarray())
+    spectrum = eigenpairs(problem[0], problem[1], 299)
+    np.testing.assert_allclose(spectrum.eigenvalues, values[1:300], rtol=1e-10)
+    assert_pairs(spectrum, problem)
+
+
+def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """10,242 vertices: two pieces of the basis, two subtrees; and a team, though the result is small."""
+    sphere = trimesh.creation.icosphere(subdivisions=5)
+    sphere.vertices *= 1, 0.8, 0.6
+    stiffness, mass, positions = cotangent_problem(sphere)
+    monkeypatch.setattr(threads, "n_cores", lambda: 8)
+    monkeypatch.setattr(lanczos, "TEAM_RESULT", 0)
+    monkeypatch.setattr(krylov, "COLUMNS_AT_ONCE", 100)
+    teams: list[int] = []
+
+    class Watched(threads.Team):
+        def __enter__(self) -> threads.Team:
+            teams.append(self.n_threads)
+            return super().__enter__()
+
+    monkeypatch.setattr(lanczos, "Team", Watched)
+    spectra = []
+    for n_threads in (1, 2, 5):
+        with torch_threads(n_threads):
+            spectra.append(eigenpairs(stiffness, mass, 20, positions=positions))
+    assert teams == [1, 2, 5]
+    assert_pairs(spectra[0], (stiffness, mass, positions))
+    for other in spectra[1:]:
+        np.testing.assert_array_equal(other.eigenvalues, spectra[0].eigenvalues)
+        np.testing.assert_array_equal(other.eigenfunctions, spectra[0].eigenfunctions)
+
+
+def filled(vectors: np.ndarray, steps: list[Callable[[], None]]) -> np.ndarray:
+    """By the steps, the last first: they come in any order."""
+    for step in reversed(steps):
+        step()
+    return vectors
+
+
+def test_krylov_basis_keeps_its_promises(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Orthonormal rows, a projection that is the operator's, residuals that are the vectors'; also when widened."""
+    monkeypatch.setattr(krylov, "COLUMNS_AT_ONCE", 100)  # the eigenvectors take many steps
+    stiffness, mass, positions = torus_problem
+    matrix = sparse.csr_array(stiffness * mass.sum() / np.sqrt(mass)[:, None] / np.sqrt(mass))
+    factors = analyse(matrix, positions).factorize(matrix, 300.0)
+    space = krylov.Krylov(factors, np.sqrt(mass / mass.sum()), 16, 40, np.random.default_rng(0))
+    for widen in (False, False, True, False, False):
+        space.expand()
+        if widen:
+            space.widen()
+    basis = space._basis[: space._stop]
+    torch.testing.assert_close(basis @ basis.T, torch.eye(len(basis), dtype=torch.float64), atol=1e-12, rtol=0)
+    inside = basis[1 : space.size + 1]
+    assert len(inside) == 3 * 16 + 2 * 2 * 16
+    projected = inside @ factors.solve(inside.T.contiguous())
+    torch.testing.assert_close(space._projected[1 : space.size + 1, 1 : space.size + 1], projected, atol=1e-12, rtol=0)
+    ritz = space.ritz_pairs(300.0)
+    largest = torch.argsort((ritz.eigenvalues - 300).abs())[:40]
+    values = ritz.eigenvalues[largest].numpy()
+    vectors = filled(*space.eigenvectors(ritz, largest, np.arange(len(mass))))
+    actual = np.linalg.norm(matrix @ vectors - vectors * values, axis=0)
+    actual *= torch.linalg.norm(ritz.coefficients[:, largest], dim=0).numpy()
+    estimated = ritz.residuals[largest].numpy()
+    assert estimated.max() > 1e-3
+    np.testing.assert_allclose(estimated, actual, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("distance", [1e-3, 1e-6, 1e-9])
+def test_a_shift_beside_an_eigenvalue_costs_no_orthogonality(
+    distance: float, torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """There the operator magnifies most what rounding leaves of older vectors, from block to block."""
+    stiffness, mass, positions = torus_problem
+    area = mass.sum()
+    matrix = sparse.csr_array(stiffness * area / np.sqrt(mass)[:, None] / np.sqrt(mass))
+    shift = torus_oracle[0][30] * area * (1 + distance)
+    factors = analyse(matrix, positions).factorize(matrix, shift)
+    space = krylov.Krylov(factors, np.sqrt(mass / area), 8, 300, np.random.default_rng(0))
+    for _ in range(30):
+        space.expand()
+    ritz = space.ritz_pairs(shift)
+    basis = space._basis[: space._stop]
+    torch.testing.assert_close(basis @ basis.T, torch.eye(len(basis), dtype=torch.float64), atol=1e-10, rtol=0)
+    exact = torus_oracle[0] * area
+    exact = np.sort(exact[np.abs(exact - shift).argsort()[:20]])
+    nearest = torch.argsort((ritz.eigenvalues - shift).abs())[:20]
+    vectors = filled(*space.eigenvectors(ritz, nearest, np.arange(len(mass))))
+    quotients = np.sort(np.einsum("vk,vk->k", vectors, matrix @ vectors))
+    np.testing.assert_allclose(quotients, exact, rtol=1e-10)
+
+
+def test_eigenvalues_are_the_quotients_of_their_vectors(torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    spectrum = eigenpairs(stiffness, mass, 100, positions=positions, tolerance=1e-3)
+    functions = spectrum.eigenfunctions
+    quotients = np.einsum("vk,vk->k", functions, stiffness @ functions)
+    np.testing.assert_allclose(spectrum.eigenvalues, quotients, rtol=1e-13)
+
+
+def test_a_large_basis_gives_its_place_to_the_eigenvectors(
+    torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stiffness, mass, positions = torus_problem
+    monkeypatch.setattr(krylov, "MOST_SINGLE_ENTRIES", 1000)
+    monkeypatch.setattr(krylov, "COLUMNS_AT_ONCE", 100)
+    monkeypatch.delattr(krylov.Krylov, "eigenvectors")  # which would need memory beside the basis
+    spectrum = eigenpairs(stiffness, mass, 130, positions=positions)
+    np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1:131], rtol=1e-10)
+    assert_pairs(spectrum, torus_problem)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_scale_of_the_coordinates(scale: float, torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    one = eigenpairs(stiffness, mass, 50, positions=positions)
+    other = eigenpairs(stiffness, mass * scale**2, 50, positions=positions * scale)
+    np.testing.assert_allclose(other.eigenvalues * scale**2, one.eigenvalues, rtol=1e-10)
+    assert_pairs(other, (stiffness, mass * scale**2, positions))
+
+
+def test_same_seed_same_bits_other_seed_same_space(torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    one, again, other = (eigenpairs(stiffness, mass, 40, positions=positions, seed=seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(one.eigenfunctions, again.eigenfunctions)
+    assert not np.array_equal(one.eigenfunctions, other.eigenfunctions)
+    np.testing.assert_allclose(one.eigenvalues, other.eigenvalues, rtol=1e-10)
+
+
+def test_positions_change_only_the_work(torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    with_positions = eigenpairs(stiffness, mass, 60, positions=positions)
+    np.testing.assert_allclose(eigenpairs(stiffness, mass, 60).eigenvalues, with_positions.eigenvalues, rtol=1e-10)
+
+
+@pytest.mark.parametrize("n_vertices", [4, 12])
+def test_tiny_meshes(n_vertices: int) -> None:
+    tetrahedron = trimesh.Trimesh(np.eye(4)[:, :3], [[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
+    problem = cotangent_problem(tetrahedron if n_vertices == 4 else trimesh.creation.icosahedron())
+    spectrum = eigenpairs(*problem[:2], n_vertices - 2)
+    values = eigh(problem[0].toarray(), np.diag(problem[1]), eigvals_only=True)
+    np.testing.assert_allclose(spectrum.eigenvalues, values[1:-1], rtol=1e-10)
+    assert_pairs(spectrum, problem)
+
+
+def test_flat_triangles_with_huge_cotangents() -> None:
+    mesh = torus(jitter=0.0)
+    squashed = np.random.default_rng(3).choice(len(mesh.faces), 40, replace=False)
+    for a, b, c in mesh.faces[squashed]:
+        mesh.vertices[a] = (mesh.vertices[b] + mesh.vertices[c]) / 2 + 1e-5 * (mesh.vertices[a] - mesh.vertices[b])
+    problem = cotangent_problem(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
+    assert abs(problem[0]).max() > 1e3
+    spectrum = eigenpairs(problem[0], problem[1], 80, positions=problem[2])
+    values = eigh(problem[0].toarray(), np.diag(problem[1]), eigvals_only=True)
+    np.testing.assert_allclose(spectrum.eigenvalues, values[1:81], rtol=1e-7)
+
+
+def test_arpack_agrees(torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    one = eigenpairs(stiffness, mass, 80, positions=positions)
+    arpack = eigenpairs(stiffness, mass, 80, method="eigsh")
+    np.testing.assert_allclose(one.eigenvalues, arpack.eigenvalues, rtol=1e-9)
+    assert_pairs(arpack, torus_problem)
+
+
+def test_a_missed_pair_is_noticed_by_inertia(
+    torus_problem: Problem,
+    torus_oracle: tuple[np.ndarray, np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Hide the tenth pair twice: the solver must not return before it is back."""
+    leading = krylov.RitzPairs.leading
+    calls = []
+
+    def forgetful(self: krylov.RitzPairs, n_below: int, tolerance: float) -> object:
+        found = leading(self, n_below, tolerance)
+        calls.append(len(found))
+        return found[np.arange(len(found)) != 9] if len(calls) <= 2 else found
+
+    monkeypatch.setattr(krylov.RitzPairs, "leading", forgetful)
+    stiffness, mass, positions = torus_problem
+    with caplog.at_level(logging.DEBUG):
+        spectrum = eigenpairs(stiffness, mass, 80, positions=positions)
+    np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1:81], rtol=1e-10)
+    assert len(calls) >= 3
+    assert "eigenvalues found below" in caplog.text
+
+
+def fail(*arguments: object) -> None:
+    raise ConvergenceError("on purpose")
+
+
+def test_falls_back_to_arpack_with_a_warning(
+    torus_problem: Problem, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    stiffness, mass, positions = torus_problem
+    expected = eigenpairs(stiffness, mass, 30, positions=positions)
+    monkeypatch.setattr(eigensolver, "lanczos", fail)
+    spectrum = eigenpairs(stiffness, mass, 30, positions=positions)
+    np.testing.assert_allclose(spectrum.eigenvalues, expected.eigenvalues, rtol=1e-10)
+    assert_pairs(spectrum, torus_problem)
+    assert "falling back to ARPACK: on purpose" in caplog.text
+
+
+def test_a_shift_below_the_spectrum_takes_over(
+    torus_problem: Problem,
+    torus_oracle: tuple[np.ndarray, np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    stiffness, mass, positions = torus_problem
+    monkeypatch.setattr(lanczos, "_factorize_inside", fail)
+    with caplog.at_level(logging.INFO):
+        spectrum = eigenpairs(stiffness, mass, 80, positions=positions)
+    np.testing.assert_allclose(spectrum.eigenvalues, torus_oracle[0][1:81], rtol=1e-10)
+    assert_pairs(spectrum, torus_problem)
+    assert "falling back to a shift below 0: on purpose" in caplog.text
+    assert "ARPACK" not in caplog.text
+
+
+def test_the_fallback_too_is_proved_complete(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    arpack = eigensolver._arpack
+
+    def lossy(*arguments: object) -> tuple[np.ndarray, np.ndarray]:
+        values, functions = arpack(*arguments)  # type: ignore[arg-type]
+        return np.delete(values, 4), np.delete(functions, 4, axis=1)
+
+    monkeypatch.setattr(eigensolver, "lanczos", fail)
+    monkeypatch.setattr(eigensolver, "_arpack", lossy)
+    with pytest.raises(ConvergenceError, match="found 30 of 31"):
+        eigenpairs(*torus_problem[:2], 30)
+
+
+def test_wrong_pairs_are_not_returned(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    stiffness, mass, _ = torus_problem
+    values, vectors = np.arange(1.0, 11), np.linalg.qr(np.random.default_rng(0).normal(size=(len(mass), 10)))[0]
+    monkeypatch.setattr(eigensolver, "lanczos", lambda *arguments: (values, vectors))
+    monkeypatch.setattr(eigensolver, "_arpack", lambda *arguments: (values, vectors))
+    monkeypatch.setattr(eigensolver, "_prove_complete", lambda *arguments: None)
+    with pytest.raises(ConvergenceError, match="10 of eigenpairs 1 to 10 have a relative residual above"):
+        eigenpairs(stiffness, mass, 10)
+
+
+@pytest.mark.parametrize("method", ["lanczos", "eigsh"])
+@pytest.mark.parametrize("n_eigenpairs", [60, 300])  # Lanczos, and the dense solver
+def test_the_residual_is_that_of_the_worst_pair(
+    n_eigenpairs: int, method: Literal["lanczos", "eigsh"], torus_problem: Problem
+) -> None:
+    stiffness, mass, positions = torus_problem
+    spectrum = eigenpairs(stiffness, mass, n_eigenpairs, positions=positions, method=method, tolerance=1e-4)
+    values, functions = spectrum.eigenvalues, spectrum.eigenfunctions
+    defect = stiffness @ functions - mass[:, None] * functions * values
+    expected = np.linalg.norm(defect / np.sqrt(mass)[:, None], axis=0) / values
+    assert spectrum.residual == pytest.approx(expected.max(), rel=1e-2, abs=1e-12)
+    assert 0 < spectrum.residual < 1e-4
+
+
+@pytest.mark.parametrize("pack", [sparse.diags_array, sparse.diags, lambda mass: sparse.csc_matrix(np.diag(mass))])
+def test_mass_may_be_a_diagonal_matrix(pack: Callable[[np.ndarray], Any], torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    of_vector = eigenpairs(stiffness, mass, 20, positions=positions)
+    of_matrix = eigenpairs(stiffness, pack(mass), 20, positions=positions)
+    np.testing.assert_array_equal(of_matrix.eigenfunctions, of_vector.eigenfunctions)
+    np.testing.assert_array_equal(of_matrix.mass, mass)
+
+
+def test_takes_the_matrices_of_other_libraries() -> None:
+    """LaPy's and libigl's, as they give them; LaPy solves with them as the oracle."""
+    mesh = torus(32, 16)
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    solver = lapy.Solver(lapy.TriaMesh(vertices, faces), lump=True, use_cholmod=False)
+    values = solver.eigs(25)[0][1:]
+    of_lapy = eigenpairs(solver.stiffness, solver.mass, 24)
+    np.testing.assert_allclose(of_lapy.eigenvalues, values, rtol=1e-5)  # LaPy computes in single precision
+    of_igl = eigenpairs(-igl.cotmatrix(vertices, faces), igl.massmatrix(vertices, faces, 0), 24)
+    np.testing.assert_allclose(of_igl.eigenvalues, values, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("length", "usable"), [(400, True), (8000, False)])
+def test_rounding_excuses_only_a_small_residual(length: float, usable: bool) -> None:
+    """A needle's cotangents: what rounding allows grows with the square of its length, what is accepted does not."""
+    needle = trimesh.creation.cylinder(0.2, length, sections=300)
+    stiffness, mass = laplacian(Mesh(needle.vertices, needle.faces))
+    if usable:
+        assert 1e-6 < eigenpairs(stiffness, mass, 50, tolerance=1e-6).residual < 1e-4
+    else:
+        with pytest.raises(ConvergenceError, match=r"relative residual above 1.0e-04"):
+            eigenpairs(stiffness, mass, 50, tolerance=1e-6)
+
+
+def test_arguments_are_left_alone(torus_problem: Problem) -> None:
+    stiffness, mass, positions = (array.copy() for array in torus_problem)
+    spectrum = eigenpairs(stiffness, mass, 20, positions=positions)
+    assert (stiffness != torus_problem[0]).nnz == 0
+    np.testing.assert_array_equal(mass, torus_problem[1])
+    np.testing.assert_array_equal(positions, torus_problem[2])
+    assert not np.shares_memory(spectrum.mass, mass)
+
+
+def test_two_components_are_counted_at_any_scale() -> None:
+    one = trimesh.creation.icosphere(subdivisions=2)
+    two = trimesh.util.concatenate([one, one.copy().apply_translation([3, 0, 0])])
+    for scale in (1e-6, 1, 1e6):
+        stiffness, mass, _ = cotangent_problem(two)
+        with pytest.raises(ValueError, match="2 connected components"):
+            eigenpairs(stiffness, mass * scale**2, 10)
+
+
+def test_components_tied_by_rounding_alone_are_counted() -> None:
+    stiffness, mass, _ = cotangent_problem(trimesh.creation.icosphere(subdivisions=1))
+    both = sparse.lil_array(sparse.block_diag([stiffness, stiffness]))
+    both[0, len(mass)] = both[len(mass), 0] = -1e-17
+    with pytest.raises(ValueError, match="2 connected components"):
+        eigenpairs(sparse.csr_array(both), np.r_[mass, mass], 10)
+
+
+def test_what_is_refused(torus_problem: Problem) -> None:
+    stiffness, mass, positions = torus_problem
+    n_vertices = len(mass)
+
+    def changed(value: float) -> np.ndarray:
+        return np.where(np.arange(n_vertices) == 3, value, mass)
+
+    broken = stiffness.copy()
+    broken.data[5] = np.nan
+    lopsided = stiffness.copy()
+    lopsided[0, lopsided.indices[1]] += 0.1
+    with pytest.raises(ValueError, match="n_eigenpairs must be at least 1"):
+        eigenpairs(stiffness, mass, 0)
+    with pytest.raises(ValueError, match="ask for fewer eigenpairs"):
+        eigenpairs(stiffness, mass, n_vertices - 1)
+    with pytest.raises(ValueError, match="stiffness has entries that are not finite"):
+        eigenpairs(broken, mass, 5)
+    for bad in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="mass must be finite and positive"):
+            eigenpairs(stiffness, changed(bad), 5)
+    with pytest.raises(ValueError, match="symmetric"):
+        eigenpairs(lopsided, mass, 5)
+    with pytest.raises(ValueError, match="sum to zero"):
+        eigenpairs(stiffness + sparse.diags_array(mass), mass, 5)
+    with pytest.raises(ValueError, match="scipy sparse"):
+        eigenpairs(stiffness.toarray(), mass, 5)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"mass \(V,\)"):
+        eigenpairs(stiffness, mass[1:], 5)
+    with pytest.raises(ValueError, match="positions"):
+        eigenpairs(stiffness, mass, 5, positions=positions[1:])
+    with pytest.raises(ValueError, match="method"):
+        eigenpairs(stiffness, mass, 5, method="lobpcg")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="pass -stiffness"):
+        eigenpairs(-stiffness, mass, 5)
+    with pytest.raises(ValueError, match="not diagonal: lump it"):
+        eigenpairs(stiffness, abs(stiffness), 5)
+    with pytest.raises(ValueError, match="not diagonal"):
+        eigenpairs(stiffness, sparse.diags_array(mass).tocsr()[:, :-1], 5)

@@ -1,0 +1,235 @@
+"""The sparse factorization against dense linear algebra."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from problems import cotangent_problem, torus
+from scipy import sparse
+
+from conftest import with_slivers
+from igps._threads import Team
+from igps.spectra import _multifrontal as multifrontal
+from igps.spectra._direct import Factors, analyse
+from igps.spectra._factorization import Factorization, SingularMatrixError
+from igps.spectra._multifrontal import Factors as CompiledFactors
+from igps.spectra._symbolic import dissect
+
+pytestmark = pytest.mark.usefixtures("both_ways")
+
+EPSILON = float(np.finfo(float).eps)
+
+
+def grid_matrix(n: int, seed: int = 0) -> tuple[sparse.csr_array, np.ndarray]:
+    """A symmetric indefinite matrix on a jittered, triangulated n × n grid, and the places of its vertices."""
+    rng = np.random.default_rng(seed)
+    index = np.arange(n * n).reshape(n, n)
+    pairs = [(index[1:], index[:-1]), (index[:, 1:], index[:, :-1]), (index[1:, 1:], index[:-1, :-1])]
+    rows, columns = (np.concatenate([pair[side].ravel() for pair in pairs]) for side in (0, 1))
+    weights = rng.uniform(0.5, 2, len(rows))
+    off_diagonal = sparse.coo_array((weights, (rows, columns)), shape=(n * n, n * n))
+    matrix = off_diagonal + off_diagonal.T + sparse.diags_array(rng.normal(size=n * n))
+    places = np.stack(np.meshgrid(range(n), range(n)), axis=-1).reshape(-1, 2) + rng.uniform(0, 0.3, (n * n, 2))
+    return sparse.csr_array(matrix), places
+
+
+def random_graph_matrix(n: int, seed: int) -> sparse.csr_array:
+    """A symmetric matrix on a random graph, not connected and without any geometry."""
+    pattern = sparse.random_array((n, n), density=min(1, 1.5 / n), rng=np.random.default_rng(seed))
+    diagonal = np.random.default_rng(seed).normal(size=n)
+    return sparse.csr_array(pattern + pattern.T + sparse.diags_array(diagonal))
+
+
+@functools.cache
+def sliver_matrix() -> tuple[sparse.csr_array, np.ndarray]:
+    """M^-½ L M^-½ of a torus some faces of which are slivers, in units of 1/area, and the places of its vertices."""
+    mesh = torus(jitter=0)
+    vertices, faces = with_slivers(np.array(mesh.vertices), np.array(mesh.faces), 30)
+    stiffness, mass, places = cotangent_problem(trimesh.Trimesh(vertices, faces, process=False))
+    assert abs(stiffness).max() > 1000
+    scale = sparse.diags_array(np.sqrt(mass.sum() / mass))
+    return sparse.csr_array(scale @ stiffness @ scale), places
+
+
+@functools.cache
+def sliver_eigenvalues() -> np.ndarray:
+    return np.linalg.eigvalsh(sliver_matrix()[0].toarray())
+
+
+def backward_error(matrix: np.ndarray, solution: np.ndarray, right: np.ndarray, norm: float | None = None) -> float:
+    """The relative change of the matrix for which the solution would be exact (Rigal and Gaches 1967)."""
+    residual = np.linalg.norm(matrix @ solution - right)
+    return float(residual / ((norm or np.linalg.norm(matrix, 2)) * np.linalg.norm(solution)))
+
+
+def eliminations(factors: Factors) -> list[np.ndarray]:
+    """E of every node that has one."""
+    found = []
+    if isinstance(factors, CompiledFactors):
+        tree = factors.tree
+        for node, n_own in enumerate(np.diff(tree.first)):
+            block = factors.blocks[tree.block_start[node] : tree.block_start[node + 1]]
+            found.append(block.reshape(n_own, -1)[:, n_own:] if n_own else block)
+    else:
+        assert isinstance(factors, Factorization)
+        for level, blocks in zip(factors.dissection.levels, factors.blocks, strict=True):
+            for batch, of_batch in zip(level.batches, blocks, strict=True):
+                found += list(of_batch[:, :, batch.shape[1] :].numpy())
+    return [elimination for elimination in found if elimination.size]
+
+
+def elimination_growth(factors: Factors) -> float:
+    """The largest norm of what one elimination adds to the rest in terms of what it takes away, at least 1."""
+    return max([1.0, *(float(np.linalg.norm(elimination)) for elimination in eliminations(factors))])
+
+
+@pytest.mark.parametrize("shift", [-20.0, 0.37, 3.0])
+@pytest.mark.parametrize("leaf_size", [4, 32, 10_000])
+@pytest.mark.parametrize("with_places", [True, False])
+def test_solve_and_inertia_on_a_grid(shift: float, leaf_size: int, with_places: bool) -> None:
+    matrix, places = grid_matrix(23)
+    dense = matrix.toarray() - shift * np.eye(matrix.shape[0])
+    right = np.random.default_rng(1).normal(size=(len(dense), 5))
+    factors = analyse(matrix, places if with_places else None, leaf_size=leaf_size).factorize(matrix, shift)
+    solution = factors.solve(torch.from_numpy(right)).numpy()
+    # Pivoting only within blocks, only the growth of what is eliminated costs digits: none where the matrix is definite
+    # or a single block. The square is the bound for any matrix, and far too large for most.
+    growth = elimination_growth(factors)
+    assert growth == 1 or (shift != -20 and leaf_size < 10_000)
+    assert backward_error(dense, solution, right) < EPSILON * min(10 * growth**2, 1000 * growth)
+    assert factors.n_negative == (np.linalg.eigvalsh(dense) < 0).sum()
+
+
+@pytest.mark.parametrize("shift", [-1.0, 300.0, 700.0, 1e4])
+@pytest.mark.parametrize("leaf_size", [4, 32, 10_000])
+@pytest.mark.parametrize("with_places", [True, False])
+def test_slivers_and_shifts_among_the_eigenvalues_cost_no_digits(
+    shift: float, leaf_size: int, with_places: bool
+) -> None:
+    """As the eigensolver uses it: eigenvalues from 0 to 10⁷, of which the shift has none to some hundred below it.
+
+    One shift in about a hundred lies so close to an eigenvalue of a leading block that it does cost digits.
+    """
+    matrix, places = sliver_matrix()
+    structure = analyse(matrix, places if with_places else None, leaf_size=leaf_size)
+    right = np.random.default_rng(1).normal(size=(matrix.shape[0], 5))
+    errors = []
+    for other in (0.8 * shift, shift, 1.25 * shift):
+        shifted = matrix.toarray() - other * np.eye(matrix.shape[0])
+        factors = structure.factorize(matrix, other)
+        eigenvalues = sliver_eigenvalues() - other
+        solution = factors.solve(torch.from_numpy(right)).numpy()
+        errors.append(backward_error(shifted, solution, right, np.abs(eigenvalues).max()))
+        n_negative = (eigenvalues < 0).sum()
+        assert factors.n_negative == structure.inertia(matrix, other) == n_negative
+    assert np.median(errors) < 100 * EPSILON
+    assert max(errors) < 1e4 * EPSILON
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 7, 60, 400])
+def test_solve_and_inertia_on_random_graphs(n: int) -> None:
+    matrix = random_graph_matrix(n, seed=n)
+    dense = matrix.toarray()
+    factors = analyse(matrix, leaf_size=8).factorize(matrix)
+    right = np.random.default_rng(n).normal(size=(n, 2))
+    assert backward_error(dense, factors.solve(torch.from_numpy(right)).numpy(), right) < 10 * EPSILON
+    assert factors.n_negative == (np.linalg.eigvalsh(dense) < 0).sum()
+
+
+def test_subtrees_solved_side_by_side() -> None:
+    """20,449 unknowns, four subtrees: the residual is as of one, and a team changes no bit."""
+    matrix, places = grid_matrix(143)
+    factors = analyse(matrix, places).factorize(matrix, -20.0)
+    right = torch.from_numpy(np.random.default_rng(1).normal(size=(143**2, 5)))
+    solution = factors.solve(right)
+    residual = matrix @ solution.numpy() + 20 * solution.numpy() - right.numpy()
+    assert np.abs(residual).max() < 100 * EPSILON * abs(matrix).max() * float(solution.abs().max())
+    with Team(3) as team:
+        for _ in range(3):
+            assert torch.equal(factors.solve(right, team), solution)
+
+
+@pytest.mark.parametrize("at_once", [50, 256])
+def test_subtrees_eliminated_side_by_side(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The five-point Laplacian of as large a grid, its inertia from its eigenvalues: a team changes no bit."""
+    monkeypatch.setattr(multifrontal, "AT_ONCE", at_once)
+    line = sparse.diags_array([[-1.0] * 142, [2.0] * 143, [-1.0] * 142], offsets=[-1, 0, 1])
+    one = sparse.eye_array(143)
+    matrix = sparse.csr_array(sparse.kron(line, one) + sparse.kron(one, line))
+    places = np.stack(np.meshgrid(range(143), range(143)), axis=-1).reshape(-1, 2)
+    of_line = 2 - 2 * np.cos(np.arange(1, 144) * np.pi / 144)
+    eigenvalues = np.sort((of_line[:, None] + of_line).ravel())
+    behind = 500 + int(np.diff(eigenvalues[500:600]).argmax())
+    shift = float(eigenvalues[behind : behind + 2].mean())
+    structure = analyse(matrix, places)
+    factors = structure.factorize(matrix, shift)
+    assert factors.n_negative == structure.inertia(matrix, shift) == behind + 1
+    right = torch.from_numpy(np.random.default_rng(1).normal(size=(143**2, 2)))
+    solution = factors.solve(right)
+    residual = matrix @ solution.numpy() - shift * solution.numpy() - right.numpy()
+    assert np.abs(residual).max() < 1e4 * EPSILON * 8 * float(solution.abs().max())
+    with Team(3) as team:
+        for _ in range(3):
+            again = structure.factorize(matrix, shift, team)
+            assert torch.equal(again.solve(right), solution)
+            assert again.n_negative == structure.inertia(matrix, shift, team) == behind + 1
+
+
+def test_coinciding_places_are_allowed() -> None:
+    matrix, _ = grid_matrix(12)
+    factors = analyse(matrix, np.zeros((144, 3)), leaf_size=8).factorize(matrix, -20.0)
+    right = np.random.default_rng(0).normal(size=(144, 1))
+    dense = matrix.toarray() + 20 * np.eye(144)
+    np.testing.assert_allclose(
+        factors.solve(torch.from_numpy(right)).numpy(), np.linalg.solve(dense, right), atol=1e-10
+    )
+
+
+def test_a_separator_keeps_blocks_small() -> None:
+    """On an n × n grid the root needs about n unknowns; a cut through the wrong place would need many more."""
+    matrix, places = grid_matrix(40)
+    root = dissect(matrix, places).levels[-1]
+    assert len(root.own) <= 1.5 * 40
+
+
+def test_one_dissection_serves_other_values() -> None:
+    matrix, places = grid_matrix(15)
+    structure = analyse(matrix, places)
+    other = matrix.copy()
+    other.data *= 3
+    right = torch.ones(225, 1, dtype=torch.float64)
+    thrice = structure.factorize(other, 0.3).solve(right)
+    torch.testing.assert_close(thrice, structure.factorize(matrix, 0.1).solve(right) / 3, rtol=1e-9, atol=1e-12)
+    with pytest.raises(ValueError, match="dissect it anew"):
+        structure.factorize(grid_matrix(16)[0])
+
+
+def test_arguments_are_left_alone() -> None:
+    matrix, places = grid_matrix(10)
+    unsorted = sparse.csr_array((matrix.data.copy(), matrix.indices.copy(), matrix.indptr.copy()), shape=matrix.shape)
+    row = slice(matrix.indptr[5], matrix.indptr[6])
+    unsorted.indices[row], unsorted.data[row] = unsorted.indices[row][::-1], unsorted.data[row][::-1]
+    before = unsorted.indices.copy(), unsorted.data.copy(), places.copy()
+    right = torch.ones(100, 2, dtype=torch.float64)
+    solution = analyse(unsorted, places).factorize(unsorted, 0.1).solve(right)
+    for now, then in zip((unsorted.indices, unsorted.data, places), before, strict=True):
+        np.testing.assert_array_equal(now, then)
+    assert torch.equal(right, torch.ones(100, 2, dtype=torch.float64))
+    torch.testing.assert_close(solution, analyse(matrix, places).factorize(matrix, 0.1).solve(right))
+
+
+def test_what_is_refused() -> None:
+    matrix, places = grid_matrix(6)
+    with pytest.raises(ValueError, match="must store entry"):
+        analyse(sparse.csr_array(sparse.triu(matrix)), places)
+    with pytest.raises(ValueError, match="diagonal"):
+        analyse(sparse.csr_array(matrix - sparse.diags_array(matrix.diagonal())), places)
+    with pytest.raises(ValueError, match="coordinates"):
+        analyse(matrix, places[:-1])
+    zero = sparse.csr_array((np.zeros(4), np.arange(4), np.arange(5)), shape=(4, 4))
+    with pytest.raises(SingularMatrixError):
+        analyse(zero).factorize(zero)

@@ -1,0 +1,108 @@
+"""Products in tiles, and inverses by them, against NumPy's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from igps._compiled import is_available
+
+pytestmark = pytest.mark.skipif(not is_available(), reason="needs numba, the extra [fast]")
+
+SHAPES = [(1, 1, 1), (6, 8, 5), (7, 9, 3), (13, 7, 20), (5, 1, 40), (30, 31, 30), (12, 12, 0), (0, 8, 4), (2, 16, 1)]
+
+
+def invert(matrix: np.ndarray) -> tuple[int, np.ndarray]:
+    """What `loops` says of a pivot block: its negative eigenvalues, and its inverse."""
+    from igps.spectra._loops import AT_ONCE, invert_front
+
+    n = len(matrix)
+    width = -(-n // AT_ONCE) * AT_ONCE
+    front = np.full((n, n + 3), np.nan)
+    front[:, :n] = np.triu(matrix)
+    inverse, copy, room = (np.full(n * width, np.nan) for _ in range(3))
+    strips = [np.full(AT_ONCE * (width + AT_ONCE), np.nan) for _ in range(2)]
+    n_negative = invert_front(inverse, front.ravel(), n, n + 3, width, copy, room, *strips)
+    return n_negative, inverse.reshape(n, width)[:, :n]
+
+
+@pytest.mark.parametrize("keep", [True, False])
+@pytest.mark.parametrize("transposed", [True, False])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_product_in_tiles(shape: tuple[int, int, int], transposed: bool, keep: bool) -> None:
+    """Between other numbers, which stay as they are."""
+    from igps.spectra._tiles import product
+
+    m, n, k = shape
+    rng = np.random.default_rng(0)
+    a, x, source = rng.normal(size=(k, m)), rng.normal(size=(k, n + 2)), rng.normal(size=(m, n + 1))
+    before = rng.normal(size=(m + 2, n + 5))
+    out = before.copy()
+    laid_out = np.ascontiguousarray(a.T) if transposed else a
+    strides = (1, k) if transposed else (m, 1)
+    product(
+        shape, -0.5, (laid_out.ravel(), 0, *strides), (x.ravel(), 1, n + 2), keep, (source.ravel(), 0, n + 1),
+        (out.ravel(), n + 5 + 3, n + 5),
+    )  # fmt: skip
+    expected = before.copy()
+    expected[1 : m + 1, 3 : n + 3] = keep * source[:, :n] - 0.5 * a.T @ x[:, 1 : n + 1]
+    np.testing.assert_allclose(out, expected, rtol=0, atol=1e-13)
+
+
+def test_a_product_of_whole_tiles_may_be_added_in_place() -> None:
+    from igps.spectra._tiles import product
+
+    rng = np.random.default_rng(0)
+    a, x, out = rng.normal(size=(5, 9)), rng.normal(size=(5, 24)), rng.normal(size=(9, 24))
+    expected = out + a.T @ x
+    whole = out.ravel(), 0, 24
+    product((9, 24, 5), 1.0, (a.ravel(), 0, 9, 1), (x.ravel(), 0, 24), True, whole, whole)
+    np.testing.assert_allclose(out, expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 8, 9, 26, 63, 120])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_a_block_is_inverted_and_its_negative_eigenvalues_counted(n: int, share: float) -> None:
+    rng = np.random.default_rng(n)
+    vectors = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    eigenvalues = rng.uniform(1, 3, n) * np.where(np.arange(n) < share * n, -1, 1)
+    n_negative, inverse = invert(vectors * eigenvalues @ vectors.T)
+    if n_negative < 0:  # neither order of the pivots will do
+        assert 0 < share < 1
+        assert n > 2
+    else:
+        assert n_negative == (eigenvalues < 0).sum()
+        np.testing.assert_allclose(inverse, vectors / eigenvalues @ vectors.T, rtol=0, atol=1e-12)
+
+
+def test_most_indefinite_blocks_need_no_other_way() -> None:
+    """Of Laplacians on a line, shifted among their eigenvalues, all but a few; of these, none is wrong."""
+    refused = 0
+    for n in range(5, 61):
+        matrix = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1) - 0.37 * np.eye(n)
+        n_negative, inverse = invert(matrix)
+        if n_negative < 0:
+            refused += 1
+            continue
+        assert n_negative == (np.linalg.eigvalsh(matrix) < 0).sum()
+        np.testing.assert_allclose(matrix @ inverse, np.eye(n), rtol=0, atol=1e-11)
+    assert refused <= 3
+
+
+@pytest.mark.parametrize("n", [2, 3, 10, 19])
+@pytest.mark.parametrize("tiny", [0.0, 1e-9])
+def test_pivots_that_are_too_small_are_taken_last(n: int, tiny: float) -> None:
+    """An arrow's: its tip, nearly 0, is the first of the pivots; backwards, it is the last."""
+    matrix = np.diag(np.arange(1.0, n + 1))
+    matrix[0, 1:] = matrix[1:, 0] = 1.0
+    matrix[0, 0] = tiny
+    n_negative, inverse = invert(matrix)
+    assert n_negative == 1
+    np.testing.assert_allclose(inverse, np.linalg.inv(matrix), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("tiny", [0.0, 1e-9, np.nan])
+def test_where_both_ends_are_too_small_it_says_so(tiny: float) -> None:
+    matrix = np.eye(6)
+    matrix[:2, :2] = matrix[4:, 4:] = [[tiny, 1], [1, tiny]]
+    assert invert(matrix)[0] == -1

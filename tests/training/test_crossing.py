@@ -1,0 +1,51 @@
+"""Crossings of a surface with itself, against every pair of triangles tried one by one."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import trimesh
+from training.graded.crossing import crossing_faces
+
+
+def passes(p: np.ndarray, q: np.ndarray, triangle: np.ndarray) -> bool:
+    """Whether a segment passes through a triangle: the common point, from three equations."""
+    a, b, c = triangle
+    matrix = np.column_stack([b - a, c - a, p - q])
+    if abs(np.linalg.det(matrix)) < 1e-14:
+        return False
+    u, v, t = np.linalg.solve(matrix, p - a)
+    return bool(u > 0 and v > 0 and u + v < 1 and 0 < t < 1)
+
+
+def tried_one_by_one(vertices: np.ndarray, faces: np.ndarray) -> set[tuple[int, int]]:
+    found = set()
+    for i, j in itertools.combinations(range(len(faces)), 2):
+        if set(faces[i]) & set(faces[j]):
+            continue
+        a, b = vertices[faces[i]], vertices[faces[j]]
+        sides = [(x[k], x[(k + 1) % 3], y) for x, y in ((a, b), (b, a)) for k in range(3)]
+        if any(passes(*side) for side in sides):
+            found.add((i, j))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_all_crossings_are_found(seed: int) -> None:
+    g = np.random.default_rng(seed)
+    vertices = g.normal(size=(90, 3))
+    # Long and short triangles, some with common vertices.
+    faces = np.array([g.choice(90, 3, replace=False) for _ in range(60)])
+    vertices[:40] *= 0.3
+    found = {(int(min(pair)), int(max(pair))) for pair in crossing_faces(vertices, faces)}
+    assert found == tried_one_by_one(vertices, faces)
+    assert found
+
+
+def test_two_balls() -> None:
+    ball = trimesh.creation.icosphere(2)
+    for gap, crossed in ((2.1, False), (1.5, True)):
+        both = trimesh.util.concatenate([ball, ball.copy().apply_translation([gap, 0.013, 0.007])])
+        assert bool(len(crossing_faces(np.asarray(both.vertices), np.asarray(both.faces)))) == crossed

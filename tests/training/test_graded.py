@@ -1,0 +1,270 @@
+"""Graded shapes: two levels of labels, one surface a body, and meshes that need no mending."""
+
+from __future__ import annotations
+
+import csv
+import pickle
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+import pytest
+import trimesh
+from training.graded import GradedShape, GradedShapes, body_of
+from training.graded.bodies import Pose, draw_body, draw_pose
+from training.graded.kinds import KINDS, LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, body_classes
+from training.graded.plates import MACHINES, SHEETS, Helix, Plate, machine, sheet
+
+from igps.data.sources import find_meshes
+from igps.mesh.loading import LoadOptions, load_mesh
+from igps.shapes import ArticulatedShapes
+from igps.shapes.files import off_text
+from igps.shapes.templates import TEMPLATES
+
+pytest.importorskip("skimage", reason="the extra 'shapes' is not installed")
+pytest.importorskip("igl", reason="the extra 'igl' is not installed")
+
+CLASSES = body_classes(0)
+# The named classes that bend, and one class of each kind.
+FIRST = {one.name.split("-")[0]: i for i, one in reversed(list(enumerate(CLASSES)))}
+COUNTS, SUM = [(3614, 7224), (2924, 5844), (2770, 5540), (3202, 6404)], 6960.694254095106
+BENDING = ["biped", "octopus", "snake", "hand", "star", "beast", "chain", "serpent", "sheet", "coil"]
+
+
+def drawn(kind: str, number: int = 0) -> Pose:
+    body = draw_body(CLASSES[FIRST[kind]], [2, number], [0, number])
+    return draw_pose(body, np.random.default_rng([1, number]), 3000)
+
+
+@pytest.fixture(scope="module")
+def poses() -> dict[str, Pose]:
+    return {kind: drawn(kind) for kind in FIRST}
+
+
+@pytest.fixture(scope="module")
+def shapes() -> GradedShapes:
+    return GradedShapes(3, 2, 3, seed=2)
+
+
+@pytest.fixture(scope="module")
+def made(shapes: GradedShapes) -> list[GradedShape]:
+    return list(shapes)
+
+
+def test_every_family_gives_bodies_and_poses(poses: dict[str, Pose]) -> None:
+    assert set(poses) == set(TEMPLATES) | set(KINDS)
+    for kind, pose in poses.items():
+        surface = trimesh.Trimesh(pose.bent, pose.faces, process=False)
+        assert surface.is_watertight, kind
+        assert surface.is_winding_consistent, kind
+        assert surface.volume > 0.01, kind
+        assert surface.body_count == 1, kind
+
+
+def test_a_pose_is_nearly_isometric_to_the_surface_at_rest(poses: dict[str, Pose]) -> None:
+    area, volume = [], []
+    for pose in poses.values():
+        rest, bent = (trimesh.Trimesh(v, pose.faces, process=False) for v in (pose.rest, pose.bent))
+        area.append(abs(bent.area / rest.area - 1))
+        volume.append(abs(bent.volume / rest.volume - 1))
+    assert np.median(area) < 0.01
+    assert np.median(volume) < 0.01
+    assert max(area) < 0.05
+    assert max(volume) < 0.06
+
+
+def test_animals_bend_and_things_do_not(poses: dict[str, Pose]) -> None:
+    """The greatest change of a distance between two vertices, over the body's extent."""
+
+    def change(pose: Pose) -> float:
+        some = np.random.default_rng(0).choice(len(pose.rest), 300, replace=False)
+        rest, bent = (np.linalg.norm(v[some, None] - v[None, some], axis=2) for v in (pose.rest, pose.bent))
+        return float(np.abs(rest - bent).max() / rest.max())
+
+    for kind in ("mug", "chair", "vessel", "table", "stack", "machine"):
+        np.testing.assert_array_equal(poses[kind].bent, poses[kind].rest)
+    assert min(change(poses[kind]) for kind in BENDING) > 0.005  # some poses are nearly at rest
+    assert np.median([change(poses[kind]) for kind in BENDING]) > 0.15
+
+
+def test_every_sheet_has_the_holes_that_its_name_tells() -> None:
+    """Of every outline, also of those whose middle is a disc; each hole is a handle."""
+    for outline in SHEETS:
+        without, *others = (sheet(np.random.default_rng(3), outline, n).genus for n in (0, 1, 2, 4))
+        assert others == [without + 1, without + 2, without + 4]
+    stars = [i for i, one in enumerate(CLASSES) if one.name.startswith("sheet-star-") and "-0-" not in one.name]
+    assert len(stars) == 3
+    for i in stars:
+        draw_body(CLASSES[i], [0, i], [1, i])  # its surface has that genus, or there is none
+
+
+def test_a_body_that_cannot_be_made_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = []
+
+    def impossible(*arguments: object) -> NoReturn:
+        tried.append(arguments)
+        raise ValueError("no sound body")
+
+    monkeypatch.setattr("training.graded.shapes.draw_body", impossible)
+    shapes = GradedShapes(1, 2, 3)
+    for pose in range(3):
+        with pytest.raises(ValueError, match=rf"biped/00/0{pose} could not be made: no sound body"):
+            shapes[pose]
+    assert len(tried) == 1
+    with pytest.raises(ValueError, match="biped/01"):
+        shapes[4]
+    assert len(tried) == 2
+
+
+def test_shapes_are_read_without_mending(made: list[GradedShape], tmp_path: Path) -> None:
+    for shape in made:
+        path = tmp_path / "shape.off"
+        path.write_text(off_text(shape.vertices, shape.faces))
+        mesh = load_mesh(path, LoadOptions(mend="never"))
+        assert mesh.notes == ()  # not turned inside out either
+        assert mesh.genus == shape.genus
+        assert 0.66 * 2400 <= len(shape.vertices) <= 1.34 * 5000
+
+
+def test_poses_have_triangles_of_their_own_and_bodies_are_one(made: list[GradedShape]) -> None:
+    """Area^1.5 over volume does not change with motion, scale or bending, and does with the body."""
+    assert len({len(shape.vertices) for shape in made}) > 12
+    compactness: dict[str, list[float]] = {}
+    for shape in made:
+        surface = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+        compactness.setdefault(shape.body, []).append(float(np.log(surface.area**1.5 / surface.volume)))
+    within = max(np.ptp(values) for values in compactness.values())
+    bodies = {body: np.mean(values) for body, values in compactness.items()}
+    between = [abs(bodies[f"{name}/00"] - bodies[f"{name}/01"]) for name in {body_of(body) for body in bodies}]
+    assert within < 0.1, (within, between)
+    assert max(between) > 0.1
+
+
+def test_same_seed_same_arrays_other_seed_others(made: list[GradedShape]) -> None:
+    """A shape depends neither on those made before nor on how many classes, bodies and poses there are."""
+    for index, shape in ((17, made[17]), (4, made[4])):
+        body_class, rest = divmod(index, 6)
+        body, pose = divmod(rest, 3)
+        more = GradedShapes(5, 4, 7, seed=2)
+        again = more[(body_class * 4 + body) * 7 + pose]
+        assert again.name == shape.name
+        np.testing.assert_array_equal(again.vertices, shape.vertices)
+        np.testing.assert_array_equal(again.faces, shape.faces)
+    other = GradedShapes(3, 2, 3, seed=3)[4]
+    assert other.vertices.shape != made[4].vertices.shape or not np.allclose(other.vertices, made[4].vertices)
+
+
+def test_both_levels_are_labels(shapes: GradedShapes, made: list[GradedShape]) -> None:
+    assert len(shapes) == len(made) == 18
+    assert shapes.names[:4] == ["biped/00/00", "biped/00/01", "biped/00/02", "biped/01/00"]
+    assert shapes.labels == [shape.label for shape in made] == [name.split("/")[0] for name in shapes.names]
+    assert shapes.bodies == [shape.body for shape in made] == [body_of(name) for name in shapes.names]
+    assert shapes[-1].name == "octopus/01/02"
+    with pytest.raises(IndexError, match="18"):
+        shapes[18]
+
+
+def test_the_look_alikes_can_be_left_out() -> None:
+    assert set(LOOK_ALIKE_TEMPLATES) == set(TEMPLATES)
+    assert set(LOOK_ALIKE_FAMILIES) < set(KINDS)
+    with_them, without = GradedShapes(200), GradedShapes(200, look_alikes=False)
+    assert with_them.class_names[:12] == list(TEMPLATES)
+    assert len(set(with_them.class_names)) == len(set(without.class_names)) == 200
+    left = {name.split("-")[0] for name in without.class_names}
+    assert left == set(KINDS) - set(LOOK_ALIKE_FAMILIES)
+    # What a name tells besides its number is not repeated.
+    assert len({name.rsplit("-", 1)[0] for name in without.class_names}) == 200
+    assert GradedShapes(30).class_names == with_them.class_names[:30]
+
+
+def test_the_other_generator_is_as_it_was() -> None:
+    """Tests and figures rest on its shapes: sums of coordinates as they were at first."""
+    shapes = ArticulatedShapes(n_classes=24, n_per_class=2)
+    found = [(len(shapes[i].vertices), len(shapes[i].faces)) for i in (0, 13, 24, 47)]
+    assert found == COUNTS
+    assert np.abs(shapes[0].vertices).sum() == pytest.approx(SUM, rel=1e-9)
+
+
+def test_write_makes_folders_of_classes_and_bodies(tmp_path: Path) -> None:
+    shapes = GradedShapes(1, 2, 2, seed=4, n_vertices=(1600, 2000))
+    shapes.write(tmp_path)
+    files = find_meshes(tmp_path)
+    assert files.names == tuple(f"{name}.off" for name in shapes.names)
+    assert files.labels == tuple(shapes.labels)
+    with (tmp_path / "bodies.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["file"] for row in rows] == list(files.names)
+    assert [row["label"] for row in rows] == shapes.bodies
+    read = trimesh.load(files.paths[3], process=False)
+    np.testing.assert_array_equal(read.vertices, shapes[3].vertices)
+
+    GradedShapes(1, 1, 1, seed=4, n_vertices=(1600, 2000)).write(tmp_path)  # fewer of the same forget nothing
+    assert len((tmp_path / "bodies.csv").read_text().splitlines()) == 5
+
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files.paths}
+    files.paths[1].write_bytes(before[files.paths[1]][0][:4000])  # as a full disk would leave it
+    shapes.write(tmp_path)
+    assert all(path.read_bytes() == before[path][0] for path in files.paths)
+    assert [path.stat().st_mtime_ns == before[path][1] for path in files.paths] == [True, False, True, True]
+    with pytest.raises(ValueError, match="root="):
+        GradedShapes(1, 2, 2, seed=5, n_vertices=(1600, 2000)).write(tmp_path)
+
+
+def test_it_travels_to_other_processes(shapes: GradedShapes, made: list[GradedShape]) -> None:
+    again = pickle.loads(pickle.dumps(shapes))
+    assert repr(again) == repr(shapes)
+    np.testing.assert_array_equal(again[7].vertices, made[7].vertices)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"n_classes": 0},
+        {"n_bodies": 0},
+        {"n_poses": 0},
+        {"seed": -1},
+        {"n_vertices": (100, 200)},
+        {"n_vertices": (4000, 3000)},
+        {"n_classes": 100_000},
+    ],
+)
+def test_arguments_out_of_range_are_named(arguments: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        GradedShapes(**arguments)  # type: ignore[arg-type]
+
+
+def counted_volume(solid: Plate | Helix) -> float:
+    """By counting random points of the solid's box, made somewhat larger."""
+    low, high = solid.box()
+    low, high = low - 0.05, high + 0.05
+    points = np.random.default_rng(0).uniform(low, high, (300_000, 3))
+    inside = solid.distance(*points.T) < 0.0
+    assert (points[inside] >= solid.box()[0] - 1e-6).all()
+    assert (points[inside] <= solid.box()[1] + 1e-6).all()
+    return float(np.prod(high - low) * inside.mean())
+
+
+def test_a_plate_has_its_volume() -> None:
+    """A stadium with a round hole; the rounded rim takes off little."""
+    plate = Plate(((-0.5, 0.0, 0.5, 0.0, 0.4, 0.4),), ((0.2, 0.0, 0.2),), 0.2)
+    area = 0.8 + np.pi * 0.4**2 - np.pi * 0.2**2
+    assert plate.genus == 1
+    assert 0.94 * area * 0.2 < counted_volume(plate) < area * 0.2
+
+
+def test_a_helix_has_its_volume() -> None:
+    """By Pappus: the cross-section times the length of the wire, and half a ball at either end."""
+    helix = Helix(0.5, 0.4, 2.5, 0.12)
+    length = 2.5 * np.hypot(2 * np.pi * 0.5, 0.4)
+    expected = np.pi * 0.12**2 * length + 4 / 3 * np.pi * 0.12**3
+    assert counted_volume(helix) == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_every_outline_and_every_part_of_a_machine_is_sound(seed: int) -> None:
+    for position, outline in enumerate(SHEETS):
+        skeleton = sheet(np.random.default_rng([seed, position]), outline, position % 3)
+        assert skeleton.genus >= position % 3
+    for kind in MACHINES:
+        for extra in ("plain", "collar", "shaft", "ear", "pins"):
+            assert machine(np.random.default_rng(seed), kind, extra, 3).genus >= (extra == "ear")

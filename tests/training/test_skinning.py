@@ -1,0 +1,176 @@
+"""Dual quaternions against rotation matrices, and what bending leaves as it was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from training.graded.rods import Binding, Rig, Rod, at_rest, bend, bind, carry, limbs
+from training.graded.skinning import Motions, after, motion, moved, normalized, product, same_side, turn_about
+
+from igps.shapes.grammar import FAMILIES
+from igps.shapes.skeleton import Part, Skeleton, limb
+from igps.shapes.solids import Blob, Solid
+from igps.shapes.templates import TEMPLATES
+
+Array = NDArray[np.float64]
+g = np.random.default_rng(0)
+POINTS = g.normal(size=(50, 3))
+
+
+def scalar_first(rotation: Rotation) -> Array:
+    return rotation.as_quat()[..., [3, 0, 1, 2]]
+
+
+def test_products_are_those_of_rotations() -> None:
+    a, b = Rotation.random(20, rng=1), Rotation.random(20, rng=2)
+    found = product(scalar_first(a), scalar_first(b))
+    expected = scalar_first(a * b)
+    expected *= np.sign((found * expected).sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
+def test_a_motion_turns_and_then_moves() -> None:
+    turns, steps = Rotation.random(50, rng=3), g.normal(size=(50, 3))
+    found = moved(motion(scalar_first(turns), steps), POINTS)
+    np.testing.assert_allclose(found, turns.apply(POINTS) + steps, atol=1e-13)
+
+
+def test_a_turn_about_a_point_leaves_it_where_it_is() -> None:
+    vectors, centres = g.normal(size=(50, 3)), g.normal(size=(50, 3))
+    turns = turn_about(centres, vectors)
+    np.testing.assert_allclose(moved(turns, centres), centres, atol=1e-13)
+    expected = Rotation.from_rotvec(vectors).apply(POINTS - centres) + centres
+    np.testing.assert_allclose(moved(turns, POINTS), expected, atol=1e-13)
+    still = turn_about(centres, np.zeros((50, 3)))
+    np.testing.assert_allclose(moved(still, POINTS), POINTS, atol=1e-15)
+
+
+def test_one_motion_after_another() -> None:
+    first, second = (turn_about(g.normal(size=(50, 3)), g.normal(size=(50, 3))) for _ in range(2))
+    np.testing.assert_allclose(moved(after(first, second), POINTS), moved(first, moved(second, POINTS)), atol=1e-13)
+
+
+def test_a_blend_is_rigid_and_half_way_between() -> None:
+    """Of a rotation and no motion about the same point: half the angle, whatever sign the quaternions come with."""
+    axis = np.array([0.0, 0.0, 1.0])
+    centre = np.array([1.0, 2.0, 3.0])
+    a, b = turn_about(centre, 0.0 * axis), turn_about(centre, 1.6 * axis)
+    b = same_side(Motions(-b.real, -b.dual), a.real)
+    half = normalized(Motions(0.5 * (a.real + b.real), 0.5 * (a.dual + b.dual)))
+    expected = Rotation.from_rotvec(0.8 * axis).apply(POINTS - centre) + centre
+    np.testing.assert_allclose(moved(half, POINTS), expected, atol=1e-13)
+
+
+def cylinder(length: float, radius: float) -> trimesh.Trimesh:
+    """A round bar along z from 0, of triangles much smaller than it is thick."""
+    angle, z = np.meshgrid(np.linspace(0, 2 * np.pi, 48, endpoint=False), np.linspace(0, length, 121), indexing="ij")
+    side = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(48), np.arange(120), indexing="ij")
+    a, b = (i * 121 + j).ravel(), ((i + 1) % 48 * 121 + j).ravel()
+    walls = np.concatenate([np.stack([a, b, b + 1], axis=1), np.stack([a, b + 1, a + 1], axis=1)])
+    ring = np.arange(48) * 121
+    low, high = len(side), len(side) + 1
+    caps = [[low, b, a] for a, b in zip(ring, np.roll(ring, -1), strict=True)]
+    caps += [[high, a + 120, b + 120] for a, b in zip(ring, np.roll(ring, -1), strict=True)]
+    return trimesh.Trimesh(np.vstack([side, [[0, 0, 0], [0, 0, length]]]), np.vstack([walls, caps]), process=False)
+
+
+def straight_rod(length: float, radius: float, n: int = 61) -> Rod:
+    along = np.linspace(0.0, length, n)
+    points = np.stack([0 * along, 0 * along, along], axis=1)
+    sides = np.tile(np.eye(3)[:, :2], (n, 1, 1))
+    return Rod(-1, 0.0, points, along, np.full(n, radius), np.full(n, radius), sides)
+
+
+def bent_bar(turns: Array) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
+    bar, rod = cylinder(3.0, 0.2), straight_rod(3.0, 0.2, len(turns))
+    rig = Rig((rod,), np.zeros(1, dtype=np.int64))
+    binding = Binding(np.ones((len(bar.vertices), 1)), bar.vertices[:, 2:3])
+    vertices = bend(bar.vertices, rig, binding, carry(rig, [turns]))
+    return bar, trimesh.Trimesh(vertices, bar.faces, process=False)
+
+
+def test_one_element_that_turns_carries_everything_rigidly() -> None:
+    turns = np.zeros((61, 3))
+    turns[0] = (0.3, -1.1, 0.4)
+    bar, moved_bar = bent_bar(turns)
+    np.testing.assert_allclose(moved_bar.vertices, Rotation.from_rotvec(turns[0]).apply(bar.vertices), atol=1e-12)
+
+
+@pytest.mark.parametrize("degrees", [60.0, 130.0])
+def test_a_bent_bar_is_a_piece_of_a_torus(degrees: float) -> None:
+    """Bent evenly by an angle: area and volume stay (Pappus), and the far end is turned by that angle."""
+    turns = np.zeros((61, 3))
+    turns[1:60, 0] = np.radians(degrees) / 59
+    bar, bent = bent_bar(turns)
+    assert abs(bent.area / bar.area - 1) < 2e-3
+    assert abs(bent.volume / bar.volume - 1) < 2e-3
+    cap = bar.vertices[:, 2] == 3.0
+    end = bent.vertices[cap] - bent.vertices[cap].mean(axis=0)
+    flat = bar.vertices[cap] - bar.vertices[cap].mean(axis=0)
+    turned = Rotation.from_rotvec([np.radians(degrees), 0, 0])
+    np.testing.assert_allclose(end, turned.apply(flat), atol=1e-9)
+
+
+def test_a_hinge_keeps_lengths_near_both_bones() -> None:
+    """Two bones and weights that go over between them: away from the joint every edge keeps its length."""
+    bar = cylinder(3.0, 0.2)
+    z = bar.vertices[:, 2]
+    first = Rod(-1, 0.0, np.zeros((1, 3)), np.zeros(1), np.ones(1), np.ones(1), np.zeros((1, 3, 2)))
+    second = Rod(0, 0.0, np.array([[0, 0, 1.5]]), np.zeros(1), np.ones(1), np.ones(1), np.zeros((1, 3, 2)))
+    rig = Rig((first, second), np.arange(2))
+    share = np.clip((z - 1.2) / 0.6, 0.0, 1.0)
+    binding = Binding(np.stack([1 - share, share], axis=1), np.zeros((len(z), 2)))
+    carried = carry(rig, [np.zeros((1, 3)), np.array([[1.2, 0.0, 0.0]])])
+    bent = bend(bar.vertices, rig, binding, carried)
+    edges = bar.edges_unique
+    outside = (np.abs(z[edges] - 1.5) > 0.31).all(axis=1)
+    lengths = [np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1)[outside] for v in (bar.vertices, bent)]
+    assert outside.sum() > 1000
+    np.testing.assert_allclose(lengths[1], lengths[0], rtol=1e-9)
+    top = z > 1.85
+    joint = np.array([0, 0, 1.5])
+    expected = Rotation.from_rotvec([1.2, 0, 0]).apply(bar.vertices[top] - joint) + joint
+    np.testing.assert_allclose(bent[top], expected, atol=1e-12)
+
+
+def test_weights_are_shares_and_follow_the_nearest_rod() -> None:
+    arm = limb("arm", [0.6, 0.6], [0.15, 0.13, 0.12], [(20, 10), (25, 0)])
+    hub: Solid = Blob((0.4, 0.4, 0.4))
+    skeleton = Skeleton(Part(hub, children=tuple(arm.joined((0, 0, 0.3 * s), (0, 0, s)) for s in (-1, 1))))
+    bones = at_rest(skeleton, {})
+    rig = limbs(bones)
+    assert [rod.parent for rod in rig.rods] == [-1, 0, 0]  # the hub, and two arms of two bones each
+    assert rig.owner.tolist() == [0, 1, 1, 2, 2]
+    bar = cylinder(1.6, 0.13)
+    both = trimesh.util.concatenate([bar, trimesh.creation.icosphere(4, 0.4).apply_translation([2, 0, 0])])
+    binding = bind(np.asarray(both.vertices), np.asarray(both.faces), rig, [bone.placed for bone in bones])
+    np.testing.assert_allclose(binding.weights.sum(axis=1), 1.0)
+    assert (binding.weights >= 0.0).all()
+    z = bar.vertices[:, 2]
+    weights = binding.weights[: len(z)]
+    assert (weights[z > 0.75, 2] > 0.99).all()
+    assert (weights[z < 0.1, 0] > 0.9).all()
+    assert (weights[:, 1] == 0.0).all()  # the other arm is nowhere near
+    # Along the arm its arc length, which begins at its root 0.3 from the middle.
+    middle = (z > 0.8) & (z < 1.3)
+    np.testing.assert_allclose(binding.along[: len(z)][middle, 2], z[middle] - 0.3, atol=0.02)
+    # From the hub to the arm the weights go over without a step.
+    levels = np.unique(z)
+    mean = np.array([weights[z == level, 2].mean() for level in levels])
+    assert np.abs(np.diff(mean)).max() < 0.15
+
+
+def test_trunks_bend_and_frames_do_not() -> None:
+    """A wheel without limbs has no joint at all; the trunk of a four-legged animal is a rod, its legs too."""
+    wheel = FAMILIES["wheel"].build(np.random.default_rng(0), 4, 3, "none", "plain")
+    assert all(len(rod.along) == 1 for rod in limbs(at_rest(wheel, {})).rods)
+    rods = limbs(at_rest(TEMPLATES["quadruped"](), {})).rods
+    assert len(rods[0].joints) == 1  # the spine
+    knees = [rod for rod in rods if len(rod.joints) == 2 and not rod.joints[1].is_root]
+    assert len(knees) >= 4
+    for rod in knees:
+        assert np.degrees(rod.joints[1].high - rod.joints[1].low).max() > 90.0

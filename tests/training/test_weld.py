@@ -1,0 +1,168 @@
+"""Welds: the tube adds one handle, and the gap it bridges is the best of all pairs of vertices."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import shortest_path
+from training.studies import weld as weld_module
+from training.studies.weld import TUBE_FACES, facing_vertices, weld, weld_gap
+
+from conftest import as_trimesh, horseshoe, surface_genus
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.surface import vertex_normals
+
+
+def grooved_ball() -> Mesh:
+    """A wide ball with a narrow groove: places face each other, but none is far away along the surface."""
+    body = trimesh.creation.icosphere(subdivisions=3)
+    z = body.vertices[:, 2:]
+    body.vertices *= np.concatenate([2 - 0.5 * np.exp(-((z / 0.12) ** 2))] * 2 + [np.ones_like(z)], axis=1)
+    body.vertices *= np.random.default_rng(0).uniform(0.99, 1.01, (len(body.vertices), 1))
+    return Mesh(body.vertices, body.faces, name="grooved_ball")
+
+
+def paths(mesh: Mesh) -> NDArray[np.float64]:
+    """(V, V) shortest paths along edges."""
+    surface = as_trimesh(mesh)
+    i, j = surface.edges_unique.T
+    graph = sparse.coo_matrix((surface.edges_unique_length, (i, j)), shape=(len(mesh.vertices),) * 2)
+    return shortest_path(graph.tocsr(), directed=False)
+
+
+def test_weld_adds_a_handle_and_nothing_else() -> None:
+    mesh = horseshoe()
+    a, b = len(mesh.vertices) - 2, len(mesh.vertices) - 1  # the middles of the two ends
+    welded = weld(mesh, a, b)
+    assert surface_genus(mesh) == 0
+    assert surface_genus(welded) == 1
+    np.testing.assert_array_equal(welded.vertices, mesh.vertices)
+    assert len(welded.faces) == len(mesh.faces) - 2 + TUBE_FACES
+    old = {tuple(face) for face in mesh.faces.tolist()}
+    kept, tube = welded.faces[:-TUBE_FACES].tolist(), welded.faces[-TUBE_FACES:]
+    removed = old - {tuple(face) for face in kept}
+    assert {tuple(face) for face in kept} < old
+    assert len(removed) == 2
+    assert all(a in face or b in face for face in removed)
+    assert set(tube.ravel().tolist()) == {vertex for face in removed for vertex in face}
+    # The tube is a solid bridge over the gap: about half of the two triangles' area times the gap.
+    assert 0 < welded.volume - mesh.volume < 0.05 * mesh.volume
+    assert f"vertices {a} and {b}" in welded.notes[-1]
+    # The way from one end to the other is now as long as the gap, no more once around the ring.
+    assert paths(mesh)[a, b] > 5
+    assert paths(welded)[a, b] < 5 * np.linalg.norm(mesh.vertices[a] - mesh.vertices[b])
+
+
+def test_weld_takes_the_shortest_tube() -> None:
+    mesh = horseshoe(0.15)
+    a, b = 3, len(mesh.vertices) - 10
+    at = [[face for face in mesh.faces.tolist() if vertex in face] for vertex in (a, b)]
+    lengths = [
+        sum(float(np.linalg.norm(mesh.vertices[p] - mesh.vertices[q])) for p, q in zip(one, turned, strict=True))
+        for one, other in itertools.product(*at)
+        for turned in (other[::-1], other[1::-1] + other[:1:-1], [other[0], other[2], other[1]])
+    ]
+    tube = weld(mesh, a, b).faces[-TUBE_FACES:]
+    ends = mesh.vertices[tube[1::2][:, [0, 2]]]
+    assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum() == pytest.approx(min(lengths))
+
+
+def test_weld_refuses_what_cannot_be_welded(sphere: Mesh) -> None:
+    for pair in ((0, len(sphere.vertices)), (-1, 5)):
+        with pytest.raises(ValueError, match="expected a vertex index from 0 to 2561"):
+            weld(sphere, *pair)
+    neighbour = int(sphere.faces[(sphere.faces == 0).any(axis=1)][0].max())
+    for other in (0, neighbour):
+        with pytest.raises(ValueError, match="more than three edges apart"):
+            weld(sphere, 0, other)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "largest_gap", "least_path"),
+    [(horseshoe(0.008), 1 / 64, 1 / 4), (horseshoe(0.03), 1 / 32, 1 / 4), (grooved_ball(), 1 / 16, None)],
+    ids=["narrow", "wide", "crease"],
+)
+def test_facing_vertices_are_the_best_of_all_pairs(mesh: Mesh, largest_gap: float, least_path: float | None) -> None:
+    a, b = facing_vertices(mesh)
+    normals = as_trimesh(mesh)
+    areas = normals.face_normals * normals.area_faces[:, None]
+    sums = np.stack([areas[(mesh.faces == i).any(axis=1)].sum(axis=0) for i in range(len(mesh.vertices))])
+    unit = sums / np.linalg.norm(sums, axis=1, keepdims=True)
+    np.testing.assert_allclose(vertex_normals(mesh.vertices, mesh.faces), unit, atol=1e-12)
+    way = mesh.vertices[None, :] - mesh.vertices[:, None]
+    gap = np.linalg.norm(way, axis=2) + np.eye(len(way))
+    along = paths(mesh)
+    facing = np.einsum("ik,ijk->ij", unit, way / gap[..., None]) > 0.5
+    allowed = facing & facing.T & (gap <= largest_gap * mesh.diagonal)
+    assert allowed.any()
+    if least_path is None:
+        assert not (allowed & (along >= mesh.diagonal / 4)).any()
+        value = along
+    else:
+        allowed &= along >= least_path * mesh.diagonal
+        value = along / gap
+    assert allowed[a, b]
+    assert value[a, b] == pytest.approx(value[allowed].max())
+
+
+def test_search_lists_every_facing_pair_once_and_best_first() -> None:
+    mesh = horseshoe(0.2, n_sections=30, n_around=8)
+    largest_gap = 0.3 * mesh.diagonal
+    unit = vertex_normals(mesh.vertices, mesh.faces)
+    way = mesh.vertices[None, :] - mesh.vertices[:, None]
+    gap = np.linalg.norm(way, axis=2) + np.eye(len(way))
+    facing = np.einsum("ik,ijk->ij", unit, way / gap[..., None]) > 0.5
+    allowed = np.triu(facing & facing.T & (gap <= largest_gap))
+    assert np.triu(facing & (gap <= largest_gap)).sum() > 2 * allowed.sum()  # many look at what does not look at them
+    along = paths(mesh)
+    far = np.median(along[allowed])
+    for least_path, value in ((None, along), (far, along / gap)):
+        found = list(weld_module._GapSearch(mesh).pairs(largest_gap, least_path))
+        wanted = allowed & (along >= (least_path or 0))
+        assert len(found) == len(set(found)) == wanted.sum()
+        assert all(wanted[min(pair), max(pair)] for pair in found)
+        values = np.array([value[pair] for pair in found])
+        assert (np.diff(values) <= 1e-12).all()
+
+
+def test_narrow_gaps_come_before_wide_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = horseshoe()
+    asked = []
+
+    def none(self: object, largest_gap: float, least_path: float | None = None) -> list[tuple[int, int]]:
+        asked.append((largest_gap / mesh.diagonal, least_path and least_path / mesh.diagonal))
+        return []
+
+    monkeypatch.setattr(weld_module._GapSearch, "pairs", none)
+    with pytest.raises(MeshError, match="no two places face each other"):
+        facing_vertices(mesh)
+    assert asked == [(1 / 64, 1 / 4), (1 / 32, 1 / 4), (1 / 16, 1 / 4), (1 / 16, None)]
+
+
+def test_gap_must_be_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = horseshoe()
+    search = weld_module._GapSearch(mesh)
+    ends = len(mesh.vertices) - 2, len(mesh.vertices) - 1
+    across_the_tube = 20 * 14, 20 * 14 + 7
+    assert search.is_clear(*ends)
+    assert not search.is_clear(*across_the_tube)
+    monkeypatch.setattr(weld_module._GapSearch, "is_clear", lambda self, a, b: False)
+    with pytest.raises(MeshError, match="no two places face each other"):
+        facing_vertices(mesh)
+
+
+def test_convex_body_has_no_gap(sphere: Mesh) -> None:
+    with pytest.raises(MeshError, match="no two places face each other"):
+        weld_gap(sphere)
+
+
+def test_homer_is_welded_at_the_feet(homer: Mesh) -> None:
+    pair = homer.vertices[list(facing_vertices(homer))]
+    height = (pair[:, 1] - homer.vertices[:, 1].min()) / np.ptp(homer.vertices[:, 1])
+    assert (height < 0.1).all()
+    assert np.linalg.norm(pair[0] - pair[1]) == pytest.approx(0.0096, abs=5e-4)

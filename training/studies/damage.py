@@ -1,0 +1,137 @@
+"""What damaged files cost: damaged meshes as queries against the gallery of their clean twins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from igps._parallel import one_thread
+from igps.data.dataset import SignatureDataset
+from igps.mesh.mending import Mending, mend
+from igps.mesh.mesh import Mesh
+from igps.nn.descriptor import Descriptor
+from igps.retrieval.scores import retrieval_scores
+from training.studies.altered import Answer, Way, describe_altered
+from training.studies.damages import DAMAGES
+
+_CLEAN = "clean"
+
+
+@dataclass(frozen=True)
+class DamageResult:
+    """What one damage costs one descriptor.
+
+    Args:
+        n_given: meshes that were damaged.
+        scores: means over the damaged meshes that could be described, each as a query of the clean others; fractions.
+            None where no two of them are of one class.
+        clean: the same of their clean twins.
+        notes: why others could not be described, by name.
+    """
+
+    n_given: int
+    scores: Mapping[str, float]
+    clean: Mapping[str, float]
+    notes: Mapping[str, str]
+
+    @property
+    def usable(self) -> float:
+        """Share of the damaged meshes that could be described."""
+        return 1 - len(self.notes) / self.n_given
+
+    def loss(self, score: str) -> float:
+        """By how much a mean score is lower than that of the clean twins; NaN without scores."""
+        return self.clean.get(score, np.nan) - self.scores.get(score, np.nan)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For a JSON file."""
+        return {
+            "n_given": self.n_given,
+            "usable": self.usable,
+            "scores": dict(self.scores),
+            "clean": dict(self.clean),
+            "notes": dict(self.notes),
+        }
+
+
+def damage(
+    dataset: SignatureDataset,
+    descriptors: Sequence[Descriptor],
+    *,
+    damages: Sequence[str] | None = None,
+    mending: Mending = "auto",
+    seed: int = 0,
+    n_workers: int | None = None,
+) -> dict[str, dict[str, DamageResult]]:
+    """Damage every mesh in every way of `DAMAGES`, mend it as a file would be, and query the clean others with it.
+
+    Args:
+        dataset: labelled clean meshes, their signatures with all that the descriptors need.
+        descriptors: to be measured.
+        damages: names; all if None.
+        mending: see `LoadOptions`.
+        seed: of the damages.
+        n_workers: processes; all cores if None.
+
+    Returns:
+        By descriptor, by damage.
+
+    Raises:
+        ValueError: no classes, or an unknown damage.
+    """
+    if dataset.files.labels is None:
+        raise ValueError("dataset: expected meshes with classes, got none. Give labels, or a folder per class.")
+    names = list(damages or DAMAGES)
+    if unknown := [name for name in names if name not in DAMAGES]:
+        raise ValueError(f"damages: expected some of {', '.join(DAMAGES)}, got {unknown[0]!r}.")
+    least = dataset.config.n_vertices_read
+    ways: dict[str, Way | None] = {name: partial(damaged, name, seed, mending, least) for name in names}
+    found = describe_altered(dataset, {_CLEAN: None, **ways}, descriptors, n_workers=n_workers)
+    clean = [of[_CLEAN] for of in found]
+    spoiled = {name: [of[name] for of in found] for name in names}
+    return {
+        one.name: {name: _result(one, dataset, clean, answers) for name, answers in spoiled.items()}
+        for one in descriptors
+    }
+
+
+def damaged(name: str, seed: int, mending: Mending, least_vertices: int, mesh: Mesh) -> Mesh:
+    """The mesh damaged and mended again.
+
+    Raises:
+        MeshError: it could not be mended.
+    """
+    vertices, faces = DAMAGES[name].apply(mesh, seed)
+    return mend(vertices, faces, how=mending, least_vertices=least_vertices, name=f"{mesh.name} ({name})")
+
+
+def _result(
+    descriptor: Descriptor,
+    dataset: SignatureDataset,
+    clean: Sequence[Mapping[str, Answer]],
+    spoiled: Sequence[Mapping[str, Answer]],
+) -> DamageResult:
+    labels = dataset.files.labels or ()
+    before, after = ([of[descriptor.name] for of in answers] for answers in (clean, spoiled))
+    notes = {
+        name: one if isinstance(one, str) else str(other)
+        for name, one, other in zip(dataset.files.names, before, after, strict=True)
+        if isinstance(one, str) or isinstance(other, str)
+    }
+    kept = [i for i, name in enumerate(dataset.files.names) if name not in notes]
+    if len({labels[i] for i in kept}) == len(kept):
+        # Nothing is left, or nothing that could be found.
+        return DamageResult(len(dataset), {}, {}, notes)
+    gallery, queries = (torch.from_numpy(np.stack([answers[i] for i in kept])) for answers in (before, after))
+    scores = []
+    for one in (queries, gallery):
+        with torch.inference_mode(), one_thread():
+            distances = torch.cat([descriptor.distances(row[None], gallery) for row in one])
+        # Square: each query leaves out its own twin.
+        scores.append(retrieval_scores(distances, [labels[i] for i in kept]).mean())
+    return DamageResult(len(dataset), scores[0], scores[1], notes)

@@ -1,0 +1,209 @@
+"""What may happen to a mesh on its way to a descriptor: noise, resampling, welds, holes, lost limbs, scale and motion.
+
+Each function returns a new, checked `Mesh` and says in its notes what was done. `DISTURBANCES` lists those that
+descriptors are tried against, with the strength that is usual here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial.transform import Rotation
+
+from igps.descriptors._geodesics import edge_graph
+from igps.mesh._extras import libigl
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.simplification import simplify
+from igps.mesh.surface import components, face_areas, vertex_normals
+from training.studies.weld import weld_gap
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """A change of the mesh that should change a description little.
+
+    Args:
+        description: what is done, and how much of it.
+        apply: does it.
+    """
+
+    description: str
+    apply: Callable[[Mesh], Mesh]
+
+
+def noise(mesh: Mesh, amplitude: float = 0.005, seed: int = 0) -> Mesh:
+    """Move every vertex along its normal by a normal random length.
+
+    Args:
+        mesh: the body.
+        amplitude: standard deviation of that length over the diagonal of the bounding box.
+        seed: of the lengths.
+
+    Raises:
+        ValueError: `amplitude` is not positive.
+    """
+    if not amplitude > 0:
+        raise ValueError(f"amplitude: expected a positive share of the diagonal, got {amplitude}.")
+    lengths = np.random.default_rng(seed).normal(0, amplitude * mesh.diagonal, len(mesh.vertices))
+    note = f"every vertex moved along its normal, standard deviation {amplitude:g} of the bounding box diagonal"
+    steps = lengths[:, None] * vertex_normals(mesh.vertices, mesh.faces)
+    return _changed(mesh, mesh.vertices + steps, mesh.faces, note)
+
+
+def simplified(mesh: Mesh, share: float) -> Mesh:
+    """`simplify` to a share of the vertices.
+
+    Raises:
+        ImportError: libigl is not installed.
+        MeshError: the share cannot be reached.
+    """
+    _check_share(share)
+    return simplify(mesh, max(round(share * len(mesh.vertices)), 4))
+
+
+def remesh(mesh: Mesh) -> Mesh:
+    """The surface with other triangles, as many as before and of more even size.
+
+    Every triangle is cut into four at the middles of its sides; then the shortest edge is replaced by its middle until
+    the number of faces is the old one; then the vertices are put back onto the old surface, each to the nearest point.
+    No step changes the topology.
+
+    Raises:
+        ImportError: libigl is not installed.
+        MeshError: the old number of faces is out of reach.
+    """
+    igl = libigl("remesh")
+    vertices, faces = igl.upsample(np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces.astype(np.int32)))
+    vertices, faces, *_ = igl.decimate(
+        np.asfortranarray(vertices), np.asfortranarray(faces.astype(np.int32)), len(mesh.faces)
+    )
+    if len(faces) > len(mesh.faces):
+        raise MeshError(
+            f"{mesh.name}: could not be remeshed with {len(mesh.faces)} faces without changing its topology "
+            f"({len(faces)} were reached)."
+        )
+    _, _, vertices = igl.point_mesh_squared_distance(
+        np.asfortranarray(vertices), np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces)
+    )
+    return _changed(mesh, vertices, faces, "remeshed: every face cut into four, then the shortest edges collapsed")
+
+
+def hole(mesh: Mesh, share: float = 0.01, seed: int = 0) -> Mesh:
+    """Take a patch out of the surface: the faces nearest along the surface to a random one.
+
+    Args:
+        mesh: the body.
+        share: of the area, at most; halved until the patch does not cut the surface in two.
+        seed: of the middle of the patch.
+
+    Returns:
+        An open mesh.
+
+    Raises:
+        ValueError: `share` out of range.
+    """
+    _check_share(share)
+    area = face_areas(mesh.vertices, mesh.faces)
+    middle = np.random.default_rng(seed).choice(len(area), p=area / area.sum())
+    from_corners = dijkstra(edge_graph(mesh), indices=mesh.faces[middle])
+    order = np.argsort(from_corners.mean(axis=0)[mesh.faces].mean(axis=1), kind="stable")
+    n_removed = max(int((np.cumsum(area[order]) <= share * area.sum()).sum()), 1)
+    while True:
+        kept = np.delete(mesh.faces, order[:n_removed], axis=0)
+        used, faces = np.unique(kept, return_inverse=True)
+        faces = faces.reshape(-1, 3)
+        if n_removed == 1 or components(faces, len(used))[0] == 1:
+            break
+        n_removed //= 2
+    lost = 1 - face_areas(mesh.vertices, kept).sum() / area.sum()
+    note = f"a hole of {len(mesh.faces) - len(kept)} faces, {lost:.2%} of the area"
+    return replace(mesh, vertices=mesh.vertices[used], faces=faces, allow_open=True, notes=(*mesh.notes, note))
+
+
+def clip(mesh: Mesh, share: float = 0.1) -> Mesh:
+    """Cut off the end that is farthest from the middle, and close the cut with a flat cap.
+
+    The plane is perpendicular to the direction from the centroid of the surface to the vertex farthest from it. Of
+    several pieces that remain, the one of the largest volume is kept. Cut and cap by manifold3d.
+
+    Args:
+        mesh: a closed body.
+        share: of the body's extent in that direction.
+
+    Raises:
+        ValueError: `share` out of range.
+        ImportError: manifold3d is not installed.
+        MeshError: manifold3d does not take the mesh, or leaves nothing.
+    """
+    _check_share(share)
+    try:
+        import manifold3d
+    except ImportError as error:
+        raise ImportError('clip needs manifold3d: pip install "interior-gps[manifold]".') from error
+    area = face_areas(mesh.vertices, mesh.faces)
+    centre = np.average(mesh.vertices[mesh.faces].mean(axis=1), axis=0, weights=area)
+    points = mesh.vertices - centre
+    distance = np.linalg.norm(points, axis=1)
+    direction = points[np.argmax(distance)] / distance.max()
+    along = points @ direction
+    cut = along.max() - share * np.ptp(along)
+    body = manifold3d.Manifold(manifold3d.Mesh64(np.ascontiguousarray(points), mesh.faces.astype(np.uint64)))
+    if body.status() != manifold3d.Error.NoError:
+        raise MeshError(f"{mesh.name}: manifold3d does not accept the surface ({body.status()}), so it was not cut.")
+    pieces = body.trim_by_plane(-direction, -float(cut)).decompose()
+    if not pieces:
+        raise MeshError(f"{mesh.name}: nothing remains when the farthest {share:.0%} are cut off.")
+    piece = max(pieces, key=lambda one: one.volume()).to_mesh64()
+    faces = np.asarray(piece.tri_verts, dtype=np.int64)
+    result = _changed(mesh, np.asarray(piece.vert_properties)[:, :3] + centre, faces, "clipped")
+    lost = 1 - result.volume / mesh.volume
+    note = f"the farthest {share:.0%} of its extent cut off and capped, {lost:.2%} of the volume"
+    return replace(result, notes=(*mesh.notes, note))
+
+
+def scale(mesh: Mesh, factor: float) -> Mesh:
+    """All lengths times a positive factor."""
+    if not 0 < factor < np.inf:
+        raise ValueError(f"factor: expected a positive number, got {factor}.")
+    return _changed(mesh, mesh.vertices * factor, mesh.faces, f"scaled by {factor:g}")
+
+
+def move(mesh: Mesh, seed: int = 0) -> Mesh:
+    """Turn the mesh about its centre by a uniformly random rotation, and move it by twice its diagonal.
+
+    Rotations are uniform by normalised normal quaternions (Shoemake 1992).
+    """
+    generator = np.random.default_rng(seed)
+    rotation = Rotation.from_quat(generator.standard_normal(4))
+    way = generator.standard_normal(3)
+    centre = mesh.vertices.mean(axis=0)
+    offset = 2 * mesh.diagonal * way / np.linalg.norm(way)
+    return _changed(mesh, rotation.apply(mesh.vertices - centre) + centre + offset, mesh.faces, "turned and moved")
+
+
+DISTURBANCES: Mapping[str, Disturbance] = {
+    "noise": Disturbance("vertices moved along their normals, standard deviation 0.5 % of the diagonal", noise),
+    "half": Disturbance("simplified to 50 % of the vertices", partial(simplified, share=0.5)),
+    "tenth": Disturbance("simplified to 10 % of the vertices", partial(simplified, share=0.1)),
+    "remesh": Disturbance("each face cut into four, then the shortest edges collapsed to the old number", remesh),
+    "weld": Disturbance("two places that face each other joined by a triangular tube", weld_gap),
+    "hole": Disturbance("a patch of 1 % of the area removed", hole),
+    "limb": Disturbance("the farthest 10 % of the extent cut off and capped, by manifold3d", clip),
+    "scale": Disturbance("scaled by 7", partial(scale, factor=7.0)),
+    "motion": Disturbance("a random rotation, and a move by twice the diagonal", move),
+}
+"""The disturbances by name."""
+
+
+def _check_share(share: float) -> None:
+    if not 0 < share < 1:
+        raise ValueError(f"share: expected a number between 0 and 1, got {share}.")
+
+
+def _changed(mesh: Mesh, vertices: NDArray[np.float64], faces: NDArray[np.int64], note: str) -> Mesh:
+    return replace(mesh, vertices=vertices, faces=faces, notes=(*mesh.notes, note))

@@ -1,0 +1,17 @@
+"""Studies of the library: `python -m training.study {robustness,damage,figure} …`, `--help` for each."""
+
+from __future__ import annotations
+
+from igps.cli import main
+from training.studies.damage_command import damage
+from training.studies.figure_command import pose, potential, topology
+from training.studies.robustness_command import robustness
+
+COMMANDS = {
+    "robustness": robustness,
+    "damage": damage,
+    "figure": {"pose": pose, "topology": topology, "potential": potential},
+}
+
+if __name__ == "__main__":
+    main(COMMANDS, "python -m training.study")
