@@ -14,9 +14,9 @@ from torch import Tensor
 
 import igps
 from igps.data.batch import Body
+from igps.data.requirements import Requirements
 from igps.descriptors.gps import gps
 from igps.descriptors.interior import interior
-from igps.nn.requirements import Requirements
 
 SMALL = ["--signature.n_eigenpairs", "20", "--signature.resolution", "10", "--signature.min_samples", "0"]
 SMALL += ["--signature.n_surface_samples", "60", "--n_workers", "1"]

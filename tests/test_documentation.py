@@ -108,11 +108,11 @@ def test_the_ten_lines_print_scores_and_the_nearest(tmp_path: Path) -> None:
     dataset = SignatureDataset(tmp_path / "shapes", cache_dir=tmp_path / "cache")
     cells = histograms_by_loops(dataset)
     distances = np.array([[np.sum((a - b) ** 2 / np.maximum(a + b, 1e-300)) / 2 for b in cells] for a in cells])
-    labels = list(dataset.files.labels or ())
+    labels = list(dataset.bodies.labels or ())
     assert (found["nn"], found["ft"]) == pytest.approx(first_tier(distances, labels))
-    expected = [dataset.files.names[i] for i in np.argsort(distances[0], kind="stable")[:3]]
+    expected = [dataset.bodies.names[i] for i in np.argsort(distances[0], kind="stable")[:3]]
     assert ast.literal_eval(nearest) == expected
-    assert expected[0] == dataset.files.names[0]
+    assert expected[0] == dataset.bodies.names[0]
 
 
 def test_the_classifier_of_the_readme_tells_classes_apart(tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_shows(page: str, tmp_p
 
 def check_retrieval(printed: str, folder: Path) -> None:
     dataset = SignatureDataset(folder / "shapes", cache_dir=folder / "cache")
-    cells, labels = histograms_by_loops(dataset), list(dataset.files.labels or ())
+    cells, labels = histograms_by_loops(dataset), list(dataset.bodies.labels or ())
     distances = np.array([[np.sum((a - b) ** 2 / np.maximum(a + b, 1e-300)) / 2 for b in cells] for a in cells])
     bipeds = [i for i, label in enumerate(labels) if label == "biped"]
     rankings = [[labels[j] for j in np.argsort(distances[i], kind="stable") if j != i] for i in bipeds]

@@ -51,7 +51,7 @@ def test_result_is_what_heights_give(dataset: SignatureDataset) -> None:
     heights = torch.tensor([1.0, 1.1, 2.3, 2.2, 2.4, 2.6]) * 2
     assert result.distances is not None
     torch.testing.assert_close(result.distances, (heights[:, None] - heights).abs(), atol=1e-5, rtol=0)
-    assert result.names == dataset.files.names
+    assert result.names == dataset.bodies.names
     assert result.labels == ("ball", "ball", "ball", "egg", "egg", "egg")
     row = result.row()
     assert list(row) == KEYS

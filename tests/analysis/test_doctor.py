@@ -20,7 +20,7 @@ from damaged_files import (
 )
 from igps._parallel import Limits
 from igps.analysis.doctor import Finding, examine, expected_cost, usable
-from igps.data.sources import find_meshes
+from igps.data.sources import find_bodies
 from igps.mesh.loading import LoadOptions
 from igps.signature.signature import SignatureConfig
 
@@ -28,7 +28,7 @@ CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surfac
 
 
 def findings(root: Path, **options) -> dict[str, Finding]:  # type: ignore[no-untyped-def]
-    files = find_meshes(root)
+    files = find_bodies(root)
     found = examine(files, config=CONFIG, n_workers=1, progress=False, **options)
     assert tuple(finding.id for finding in found) == files.names
     return {finding.id: finding for finding in found}
@@ -116,7 +116,7 @@ def test_the_cost_grows_with_vertices_and_eigenpairs() -> None:
 
 def test_the_cost_is_that_of_the_mesh_that_is_simplified(tmp_path: Path) -> None:
     write_clean(tmp_path / "clean.off")
-    files = find_meshes(tmp_path)
+    files = find_bodies(tmp_path)
     (full,) = examine(files, config=CONFIG, n_workers=1, progress=False)
     fewer = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60, max_vertices=60)
     (simplified,) = examine(files, config=fewer, n_workers=1, progress=False)

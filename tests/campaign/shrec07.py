@@ -14,10 +14,10 @@ from pathlib import Path
 
 from igps import LoadOptions, SignatureConfig, SignatureDataset, descriptor, retrieval_scores
 from igps.analysis.comparison import pair_distances
-from igps.data.sources import labelled_meshes
+from igps.data.requirements import Requirements
+from igps.data.sources import labelled_bodies
 from igps.descriptors import NAMES
 from igps.nn.description import describe_usable
-from igps.nn.requirements import Requirements
 
 EXPECTED = Path(__file__).with_name("shrec07.json")
 SCORES = ("nn", "ft", "st", "dcg")
@@ -34,13 +34,13 @@ def measure(folder: Path, names: list[str], cache_dir: Path | None, n_workers: i
     for one in descriptors.values():
         requirements = requirements | one.requirements
     config = requirements.apply_to(SignatureConfig.paper())
-    dataset = SignatureDataset(labelled_meshes(folder), config, cache_dir, reading=LoadOptions())
+    dataset = SignatureDataset(labelled_bodies(folder), config, cache_dir, reading=LoadOptions())
     dataset.precompute(n_workers=n_workers, strict=True)
     found = {}
     for name, one in descriptors.items():
         descriptions, failures = describe_usable(dataset, one, n_workers=n_workers, strict=False, progress=True)
         distances = pair_distances(one, descriptions)
-        means = retrieval_scores(distances, dataset.usable(failures).files.labels or ()).mean()
+        means = retrieval_scores(distances, dataset.usable(failures).bodies.labels or ()).mean()
         found[name] = {score: round(100 * _POINT * float(means[score])) / _POINT for score in SCORES}
         found[name]["n_described"] = len(descriptions)
     return found

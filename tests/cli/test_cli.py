@@ -61,7 +61,7 @@ def test_retrieve_prints_and_writes_what_python_computes(
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     histograms = describe(dataset, small_interior())
     distances = chi_square(histograms, histograms)
-    expected = retrieval_scores(distances, dataset.files.labels or ())
+    expected = retrieval_scores(distances, dataset.bodies.labels or ())
 
     scores = json.loads((out / "scores.json").read_text())
     assert {"nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map", "n_queries", "per_class", "config"} | {
@@ -78,14 +78,14 @@ def test_retrieve_prints_and_writes_what_python_computes(
 
     with np.load(out / "distances.npz") as archive:
         np.testing.assert_allclose(archive["distances"], distances, atol=1e-7)
-        assert archive["names"].tolist() == list(dataset.files.names)
+        assert archive["names"].tolist() == list(dataset.bodies.names)
         assert archive["labels"].tolist() == ["ball"] * 3 + ["egg"] * 3
     rows = list(csv.DictReader((out / "ranking.csv").open(newline="")))
     assert len(rows) == 6 * 5
-    for i, name in enumerate(dataset.files.names):
+    for i, name in enumerate(dataset.bodies.names):
         ranked = [row for row in rows if row["query"] == name]
         others = [j for j in torch.argsort(distances[i], stable=True).tolist() if j != i]
-        assert [row["model"] for row in ranked] == [dataset.files.names[j] for j in others]
+        assert [row["model"] for row in ranked] == [dataset.bodies.names[j] for j in others]
         assert [row["relevant"] for row in ranked] == [str(int(i // 3 == j // 3)) for j in others]
     assert not (out / "failures.csv").exists()
 
@@ -419,13 +419,13 @@ def test_json_is_what_the_table_tells(
     histograms = describe(dataset, small_interior())
     distances = chi_square(histograms[1:2], histograms)[0]
     order = distances.argsort()[:3]
-    assert [row["mesh"] for row in rows] == [dataset.files.names[i] for i in order]
+    assert [row["mesh"] for row in rows] == [dataset.bodies.names[i] for i in order]
     assert [row["distance"] for row in rows] == pytest.approx(distances[order].tolist(), abs=1e-6)
     assert (rows[0]["rank"], rows[0]["class"]) == (1, "ball")
 
     igps(monkeypatch, "compare", root, "--descriptors", INTERIOR, "--json", *options)
     (row,) = json.loads(capsys.readouterr().out)
-    expected = retrieval_scores(chi_square(histograms, histograms), dataset.files.labels or ()).mean()
+    expected = retrieval_scores(chi_square(histograms, histograms), dataset.bodies.labels or ()).mean()
     assert {name: row[name] for name in expected} == pytest.approx(expected)
 
 

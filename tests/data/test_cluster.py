@@ -21,7 +21,7 @@ from igps.cli import main
 from igps.cli.precompute import dask_executor, part_of
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import fill_elsewhere
-from igps.data.sources import mesh_files
+from igps.data.sources import given_bodies
 from igps.signature.signature import SignatureConfig
 
 distributed = pytest.importorskip("distributed")
@@ -142,7 +142,7 @@ def test_the_command_and_what_it_says_of_no_scheduler(
 def test_shards_have_all_files_once(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    files = mesh_files([f"{i}.off" for i in range(100)])
+    files = given_bodies([f"{i}.off" for i in range(100)])
     for n in (1, 7, 64, 300):
         names = [name for k in range(1, n + 1) for name in part_of(files, f"{k}/{n}").names]
         assert sorted(names) == sorted(files.names)
@@ -195,5 +195,5 @@ def test_a_cluster_that_fails_is_told(
 def test_a_worker_of_another_version_is_refused(root: Path, tmp_path: Path) -> None:
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     with pytest.raises(MachineError, match=r"has igps .*, signatures \d+, where 9\.9, signatures 9 is asked for"):
-        fill_elsewhere(dataset._recipe, "9.9, signatures 9", root / "00.off")
+        fill_elsewhere(dataset._pipeline, "9.9, signatures 9", root / "00.off")
     assert stored(tmp_path / "cache") == {}

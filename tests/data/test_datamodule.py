@@ -31,7 +31,7 @@ def test_loaders_give_the_parts_and_balanced_batches(root: Path, tmp_path: Path)
         cache_dir=tmp_path / "cache", n_workers=1,
     )  # fmt: skip
     module.prepare_data()
-    names = module.dataset.files.names
+    names = module.dataset.bodies.names
     (batch,) = module.train_dataloader()
     assert sorted(batch.labels.tolist()) == [0, 0, 1, 1, 2, 2]
     assert set(batch.ids) <= {names[i] for i in module.split.train}

@@ -11,7 +11,7 @@ import torch
 from bodies_on_disk import write_body
 from torch.utils.data import DataLoader
 
-import igps.data.pipeline as recipe_module
+import igps.data.pipeline as pipeline_module
 from igps._parallel import Failed, Limits
 from igps.data.batch import LabelledSignature, SignatureBatch, collate
 from igps.data.dataset import Failure, SignatureDataset
@@ -40,13 +40,13 @@ def dataset(root: Path, tmp_path: Path) -> SignatureDataset:
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the meshes whose signature is computed, not read."""
     names: list[str] = []
-    compute = recipe_module.compute_signature
+    compute = pipeline_module.compute_signature
 
     def counting(mesh, config):  # type: ignore[no-untyped-def]
         names.append(mesh.name)
         return compute(mesh, config)
 
-    monkeypatch.setattr(recipe_module, "compute_signature", counting)
+    monkeypatch.setattr(pipeline_module, "compute_signature", counting)
     return names
 
 
@@ -150,7 +150,7 @@ def test_precompute_fills_the_cache_and_lists_bad_meshes(root: Path, tmp_path: P
     assert "a single triangle" in failure.error
     assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 4
     usable = dataset.usable(failures)
-    assert usable.files.names == ("ball/1.off", "ball/2.off", "egg/1.off", "egg/2.off")
+    assert usable.bodies.names == ("ball/1.off", "ball/2.off", "egg/1.off", "egg/2.off")
     assert usable.labels.tolist() == [0, 0, 1, 1]
 
 
@@ -214,6 +214,6 @@ def test_slow_meshes_are_listed(dataset: SignatureDataset, tmp_path: Path) -> No
 
 
 def test_a_failure_names_its_file_once(dataset: SignatureDataset) -> None:
-    path = dataset.files.paths[2]
+    path = dataset.bodies.paths[2]
     expected = Failure("egg/1.off", path, f"{path}: bad")
     assert dataset.failure(2, Failed("bad")) == dataset.failure(2, Failed(f"{path}: bad")) == expected

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from bodies_on_disk import write_body
 
-import igps.data.pipeline as recipe_module
+import igps.data.pipeline as pipeline_module
 from igps.data.cache import SignatureCache
 from igps.data.pipeline import SignaturePipeline
 from igps.mesh.loading import LoadOptions
@@ -29,53 +29,53 @@ def path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def recipe(tmp_path: Path) -> SignaturePipeline:
+def pipeline(tmp_path: Path) -> SignaturePipeline:
     return SignaturePipeline(CONFIG, LoadOptions(), tmp_path / "cache")
 
 
 def test_a_signature_is_computed_once_and_is_that_of_the_mesh(
-    recipe: SignaturePipeline, path: Path, monkeypatch: pytest.MonkeyPatch
+    pipeline: SignaturePipeline, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert not recipe.is_cached(path)
-    first = recipe.signature(path)
-    assert recipe.is_cached(path)
-    expected = compute_signature(recipe.mesh(path), CONFIG)
+    assert not pipeline.is_cached(path)
+    first = pipeline.signature(path)
+    assert pipeline.is_cached(path)
+    expected = compute_signature(pipeline.mesh(path), CONFIG)
 
     def no_more(*_: object) -> None:
         pytest.fail("computed again")
 
-    monkeypatch.setattr(recipe_module, "compute_signature", no_more)
-    for found in (first, recipe.signature(path)):
+    monkeypatch.setattr(pipeline_module, "compute_signature", no_more)
+    for found in (first, pipeline.signature(path)):
         np.testing.assert_array_equal(found.interior.eigenfunctions, expected.interior.eigenfunctions)
         np.testing.assert_array_equal(found.eigenvalues, expected.eigenvalues)
 
 
-def test_fill_caches_and_returns_only_what_serves(recipe: SignaturePipeline, path: Path) -> None:
-    filled = recipe.fill(path)
+def test_fill_caches_and_returns_only_what_serves(pipeline: SignaturePipeline, path: Path) -> None:
+    filled = pipeline.fill(path)
     assert len(pickle.dumps(filled)) < 1000
-    assert recipe.is_cached(path)
-    assert recipe.served(path) == filled == recipe.fill(path)
+    assert pipeline.is_cached(path)
+    assert pipeline.served(path) == filled == pipeline.fill(path)
 
 
-def test_a_worker_gets_a_small_copy(recipe: SignaturePipeline, path: Path) -> None:
-    sent = pickle.dumps(recipe)
+def test_a_worker_gets_a_small_copy(pipeline: SignaturePipeline, path: Path) -> None:
+    sent = pickle.dumps(pipeline)
     assert len(sent) < 2000
-    assert pickle.loads(sent) == recipe
-    assert pickle.loads(sent).key(path) == recipe.key(path)
+    assert pickle.loads(sent) == pipeline
+    assert pickle.loads(sent).key(path) == pipeline.key(path)
 
 
 def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
-    recipe: SignaturePipeline, path: Path, tmp_path: Path
+    pipeline: SignaturePipeline, path: Path, tmp_path: Path
 ) -> None:
     copy, renamed, other = tmp_path / "copy.off", tmp_path / "egg.obj", tmp_path / "other.off"
     shutil.copy(path, copy)
     shutil.copy(path, renamed)
     write_body(other, 1.1, 1.6)
-    assert recipe.key(copy) == recipe.key(path)
-    assert replace(recipe, cache_dir=tmp_path).key(path) == recipe.key(path)
-    recipes = [recipe, replace(recipe, config=replace(CONFIG, seed=1))]
-    recipes += [
-        replace(recipe, reading=reading)
+    assert pipeline.key(copy) == pipeline.key(path)
+    assert replace(pipeline, cache_dir=tmp_path).key(path) == pipeline.key(path)
+    pipelines = [pipeline, replace(pipeline, config=replace(CONFIG, seed=1))]
+    pipelines += [
+        replace(pipeline, reading=reading)
         for reading in (
             LoadOptions("never"),
             LoadOptions("always"),
@@ -83,15 +83,15 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
             LoadOptions(allow_open=True),
         )
     ]
-    keys = [one.key(path) for one in recipes] + [recipe.key(renamed), recipe.key(other)]
+    keys = [one.key(path) for one in pipelines] + [pipeline.key(renamed), pipeline.key(other)]
     assert len(set(keys)) == len(keys)
 
 
-def test_keys_are_those_of_the_caches_that_exist(recipe: SignaturePipeline, tmp_path: Path) -> None:
+def test_keys_are_those_of_the_caches_that_exist(pipeline: SignaturePipeline, tmp_path: Path) -> None:
     """Frozen: another key leaves all caches useless. It changes with ALGORITHM_VERSION alone."""
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
     assert SignatureConfig.ALGORITHM_VERSION == 4
-    assert recipe.key(tmp_path / "frozen.off") == "a75ab4e79d95e15f56ca4e5e68e03c5b743a43fc7a5f05b9f19fbd1a5e9140c7"
+    assert pipeline.key(tmp_path / "frozen.off") == "a75ab4e79d95e15f56ca4e5e68e03c5b743a43fc7a5f05b9f19fbd1a5e9140c7"
 
 
 def test_a_new_version_of_the_mending_leaves_bodies_that_are_read_as_they_are(
@@ -101,20 +101,20 @@ def test_a_new_version_of_the_mending_leaves_bodies_that_are_read_as_they_are(
     body.export(tmp_path / "body.off")
     open_body = trimesh.Trimesh(body.vertices, body.faces[1:], process=False)
     open_body.export(tmp_path / "open.off")
-    recipe = SignaturePipeline(CONFIG, LoadOptions(), tmp_path / "cache")
+    pipeline = SignaturePipeline(CONFIG, LoadOptions(), tmp_path / "cache")
 
     def fill() -> int:
         """How many had to be computed."""
         before = len(computed)
         for name in ("body.off", "open.off"):
-            recipe.fill(tmp_path / name)
-            assert recipe.is_cached(tmp_path / name)
+            pipeline.fill(tmp_path / name)
+            assert pipeline.is_cached(tmp_path / name)
         return len(computed) - before
 
     assert [fill(), fill()] == [2, 0]
-    assert recipe.notes(tmp_path / "open.off")
-    monkeypatch.setattr(recipe_module, "MENDING_VERSION", recipe_module.MENDING_VERSION + 1)
-    assert not recipe.is_cached(tmp_path / "open.off")
+    assert pipeline.notes(tmp_path / "open.off")
+    monkeypatch.setattr(pipeline_module, "MENDING_VERSION", pipeline_module.MENDING_VERSION + 1)
+    assert not pipeline.is_cached(tmp_path / "open.off")
     assert [fill(), fill()] == [1, 0]
 
 
@@ -123,12 +123,12 @@ def test_a_mended_body_of_before_versions_of_the_mending_is_made_again(tmp_path:
     body = trimesh.creation.icosphere(subdivisions=2)
     path = tmp_path / "open.off"
     trimesh.Trimesh(body.vertices, body.faces[1:], process=False).export(path)
-    recipe = SignaturePipeline(CONFIG, LoadOptions(), tmp_path / "cache")
-    SignatureCache(tmp_path / "cache").put(recipe.key(path), compute_signature(recipe.mesh(path), CONFIG))
-    assert not recipe.is_cached(path)
-    recipe.fill(path)
+    pipeline = SignaturePipeline(CONFIG, LoadOptions(), tmp_path / "cache")
+    SignatureCache(tmp_path / "cache").put(pipeline.key(path), compute_signature(pipeline.mesh(path), CONFIG))
+    assert not pipeline.is_cached(path)
+    pipeline.fill(path)
     assert computed == [CONFIG.n_kept]
-    assert recipe.is_cached(path)
+    assert pipeline.is_cached(path)
 
 
 USUAL = replace(CONFIG, n_eigenpairs=None)
@@ -144,7 +144,7 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         numbers.append(config.n_kept)
         return compute_signature(mesh, config)
 
-    monkeypatch.setattr(recipe_module, "compute_signature", counting)
+    monkeypatch.setattr(pipeline_module, "compute_signature", counting)
     return numbers
 
 
@@ -180,35 +180,35 @@ def test_a_larger_signature_serves(tmp_path: Path, computed: list[int], subdivis
 
 
 def test_a_signature_of_another_mesh_or_with_other_samples_does_not_serve(
-    recipe: SignaturePipeline, path: Path, computed: list[int]
+    pipeline: SignaturePipeline, path: Path, computed: list[int]
 ) -> None:
     """The file has 162 vertices: enough for 64 eigenpairs, and subdivided for 250."""
-    replace(recipe, config=USUAL).signature(path)
-    replace(recipe, config=NEEDED).signature(path)
+    replace(pipeline, config=USUAL).signature(path)
+    replace(pipeline, config=NEEDED).signature(path)
     assert computed == [250]
-    replace(recipe, config=replace(CONFIG, n_eigenpairs=64)).signature(path)
-    replace(recipe, config=replace(CONFIG, n_eigenpairs=20)).signature(path)
-    replace(recipe, config=replace(NEEDED, seed=1)).signature(path)
+    replace(pipeline, config=replace(CONFIG, n_eigenpairs=64)).signature(path)
+    replace(pipeline, config=replace(CONFIG, n_eigenpairs=20)).signature(path)
+    replace(pipeline, config=replace(NEEDED, seed=1)).signature(path)
     assert computed == [250, 64, 20, 64]
 
 
 def test_a_damaged_larger_signature_is_passed_over(path: Path, tmp_path: Path, computed: list[int]) -> None:
-    recipe = SignaturePipeline(USUAL, LoadOptions(), tmp_path / "cache")
-    recipe.signature(path)
+    pipeline = SignaturePipeline(USUAL, LoadOptions(), tmp_path / "cache")
+    pipeline.signature(path)
     (file,) = (tmp_path / "cache").rglob("*.safetensors")
     content = bytearray(file.read_bytes())
     content[-1] ^= 1  # of an eigenfunction: the header does not tell
     file.write_bytes(content)
-    needed = replace(recipe, config=NEEDED)
+    needed = replace(pipeline, config=NEEDED)
     assert len(needed.signature(path).eigenvalues) == 64
     assert computed == [250, 64]
     assert len(needed.signature(path).eigenvalues) == 64
     assert computed == [250, 64]
 
 
-def test_a_missing_file_is_named(recipe: SignaturePipeline, tmp_path: Path) -> None:
+def test_a_missing_file_is_named(pipeline: SignaturePipeline, tmp_path: Path) -> None:
     gone = tmp_path / "gone.off"
-    assert not recipe.is_cached(gone)
-    for function in (recipe.key, recipe.signature, recipe.mesh):
+    assert not pipeline.is_cached(gone)
+    for function in (pipeline.key, pipeline.signature, pipeline.mesh):
         with pytest.raises(MeshError, match=r"gone\.off"):
             function(gone)

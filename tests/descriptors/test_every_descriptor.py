@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 import igps
 from igps.data.batch import Body, SignatureBatch, collate
+from igps.data.requirements import Requirements
 from igps.descriptors import NAMES, descriptor
 from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import EmbeddedDescriptor
-from igps.nn.requirements import Requirements
 from igps.retrieval import cosine
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 import igps
+from igps.data.requirements import Requirements
 from igps.descriptors import NAMES
 from igps.descriptors.d2 import D2
-from igps.nn.requirements import Requirements
 from igps.signature.signature import SignatureConfig
 
 THIRTEEN = (

@@ -128,7 +128,7 @@ def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path: Path) -> No
         body.export(tmp_path / f"{name}.off")
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
     assert grouped(duplicates(dataset, n_workers=1).groups) == {frozenset({"one.off", "copy.off"})}
-    names = dataset.files.names
+    names = dataset.bodies.names
     apart = compared(dataset.subset([names.index("one.off"), names.index("longer.off")]))
     assert apart.limit < apart.surfaces < Calibration.load().same.distance
 
@@ -201,7 +201,7 @@ def test_poses_are_grouped_by_the_descriptor_alone(dataset: SignatureDataset) ->
     shipped = Calibration.load()
     calibration = replace(shipped, descriptor="same", model=fingerprint(Same()), signatures=calibration_params(CONFIG))
     all_of_them = duplicates(dataset, Same(), poses=True, calibration=calibration, n_workers=1)
-    assert grouped(all_of_them.groups) == {frozenset(dataset.files.names)}
+    assert grouped(all_of_them.groups) == {frozenset(dataset.bodies.names)}
     assert set(all_of_them.pairs.values()) == {0.0}
     assert grouped(duplicates(dataset, Same(), calibration=calibration, n_workers=1).groups) == SAME
 
@@ -227,7 +227,7 @@ def test_an_index_gives_the_same_groups_and_tells_of_files_that_are_gone(
 
 
 def test_a_distance_and_what_it_means(dataset: SignatureDataset) -> None:
-    number = {name: i for i, name in enumerate(dataset.files.names)}
+    number = {name: i for i, name in enumerate(dataset.bodies.names)}
 
     def between(one: str, other: str) -> tuple[float, bool]:
         found = compared(dataset.subset([number[one], number[other]]))

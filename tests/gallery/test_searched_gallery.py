@@ -71,9 +71,9 @@ def test_it_ranks_as_the_descriptor_does(dataset: SignatureDataset, root: Path, 
     distances = igps.chi_square(histograms[4:5], histograms)[0]
     found = gallery.query(root / "egg" / "1.off", top=4, cache_dir=tmp_path / "cache")
     nearest = torch.argsort(distances, stable=True)[:4].tolist()
-    assert [match.name for match in found] == [dataset.files.names[i] for i in nearest]
-    assert [match.label for match in found] == [(dataset.files.labels or ())[i] for i in nearest]
-    assert [match.path for match in found] == [dataset.files.paths[i].resolve() for i in nearest]
+    assert [match.name for match in found] == [dataset.bodies.names[i] for i in nearest]
+    assert [match.label for match in found] == [(dataset.bodies.labels or ())[i] for i in nearest]
+    assert [match.path for match in found] == [dataset.bodies.paths[i].resolve() for i in nearest]
     np.testing.assert_allclose([match.distance for match in found], distances[nearest], rtol=2e-3, atol=1e-6)
 
 

@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from batches import N_POINTS, alone, embedded, scaled, two_bodies
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from batches import N_POINTS, alone, embedded, scaled, two_bodies
 from igps.nn.batch_features import View, Views, check_kind, nearest_directions
 from igps.nn.embedding import SpectralEmbedding
 

@@ -16,6 +16,7 @@ import jobs
 from conftest import torch_threads
 from igps.data.batch import Body, SignatureBatch
 from igps.data.dataset import SignatureDataset
+from igps.data.requirements import Requirements
 from igps.mesh.mesh import MeshError
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.description import (
@@ -29,7 +30,6 @@ from igps.nn.description import (
 from igps.nn.descriptor import BodyDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
-from igps.nn.requirements import Requirements
 from igps.signature.attributes import AttributeName
 from igps.signature.signature import SignatureConfig
 
@@ -149,7 +149,7 @@ def test_what_cannot_be_described_is_listed(dataset: SignatureDataset) -> None:
     values, failures = describe_usable(dataset, area, n_workers=1)
     np.testing.assert_allclose(values[:, 1], [dataset[i].signature.area for i in (0, 1, 3)], rtol=1e-6)
     (failure,) = failures
-    assert failure.path == dataset.files.paths[2]
+    assert failure.path == dataset.bodies.paths[2]
     assert failure.error == f"{failure.path}: it is not to my liking"
     with pytest.raises(MeshError, match=re.escape(failure.error)):
         describe_usable(dataset, area, n_workers=1, strict=True)
@@ -161,7 +161,7 @@ def test_what_cannot_be_described_is_listed(dataset: SignatureDataset) -> None:
 
 def test_a_mesh_that_cannot_be_read_is_listed(dataset: SignatureDataset, tmp_path: Path) -> None:
     (tmp_path / "bad.off").write_text("nothing")
-    paths = [dataset.files.paths[0], tmp_path / "bad.off"]
+    paths = [dataset.bodies.paths[0], tmp_path / "bad.off"]
     both = SignatureDataset(paths, CONFIG, tmp_path / "cache")
     values, failures = describe_usable(both, histogram(), n_workers=1)
     assert values.shape == (1, 3, 8)
@@ -173,7 +173,7 @@ def test_a_mesh_that_cannot_be_read_is_listed(dataset: SignatureDataset, tmp_pat
 def test_a_body_that_kills_its_process_costs_no_other_its_description(dataset: SignatureDataset) -> None:
     values, failures = describe_usable(dataset, Area(refused="1.off", dies=True), n_workers=2)
     np.testing.assert_allclose(values[:, 1], [dataset[i].signature.area for i in (0, 2, 3)], rtol=1e-6)
-    assert [failure.path for failure in failures] == [dataset.files.paths[1]]
+    assert [failure.path for failure in failures] == [dataset.bodies.paths[1]]
     assert "was killed, twice" in failures[0].error
 
 
@@ -242,19 +242,19 @@ def test_what_has_been_described_is_not_described_again(fresh: SignatureDataset)
 
 
 def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDataset) -> None:
-    paths = fresh.files.paths
+    paths = fresh.bodies.paths
     _, values = asked(fresh)
     assert asked(fresh, cache_tag="other words")[0] == ["0", "1", "2"]
     assert asked(fresh, cache_tag=None)[0] == ["0", "1", "2"]
     # CacheHit by the same Signatures: another descriptor under the same words would get the histograms otherwise.
-    cache = fresh.recipe.cache_dir.with_name("other")
+    cache = fresh.pipeline.cache_dir.with_name("other")
     more = SignatureDataset(paths, replace(CONFIG, attributes=get_args(AttributeName)), cache)
     more.precompute(n_workers=1, progress=False)
     plain = SignatureDataset(paths, CONFIG, cache)
     asked(more)
     assert plain.cached_keys() == more.cached_keys()
     assert describe_usable(plain, Area(), cache_tag="one", n_workers=1)[0].shape == (3, 2)
-    with_own = SignatureDataset(paths, CONFIG, fresh.recipe.cache_dir, point_functions={"height": lambda x: x[:, 2]})
+    with_own = SignatureDataset(paths, CONFIG, fresh.pipeline.cache_dir, point_functions={"height": lambda x: x[:, 2]})
     assert asked(with_own)[0] == asked(with_own)[0] == ["0", "1", "2"]
     body = trimesh.creation.icosphere(subdivisions=2)
     body.vertices *= [2.0, 0.7, 0.5]
@@ -267,7 +267,7 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDatase
 
 def test_a_file_that_changes_meanwhile_is_not_mistaken_for_what_it_was(fresh: SignatureDataset) -> None:
     """Two files change places while they are described: neither description is kept as that of the other."""
-    first, second = fresh.files.paths[:2]
+    first, second = fresh.bodies.paths[:2]
     _, values = asked(fresh, cache_tag=None)
 
     class Meddling(Counting):
@@ -285,7 +285,7 @@ def test_a_file_that_changes_meanwhile_is_not_mistaken_for_what_it_was(fresh: Si
 
 def test_damaged_descriptions_are_made_again(fresh: SignatureDataset, caplog: pytest.LogCaptureFixture) -> None:
     _, values = asked(fresh)
-    first, second, _ = sorted((fresh.recipe.cache_dir / "descriptions").rglob("*.safetensors"))
+    first, second, _ = sorted((fresh.pipeline.cache_dir / "descriptions").rglob("*.safetensors"))
     content = bytearray(first.read_bytes())
     content[-1] ^= 1
     first.write_bytes(content)
@@ -300,7 +300,7 @@ def test_damaged_descriptions_are_made_again(fresh: SignatureDataset, caplog: py
 def test_where_descriptions_cannot_be_kept_they_are_made(
     fresh: SignatureDataset, caplog: pytest.LogCaptureFixture
 ) -> None:
-    (fresh.recipe.cache_dir / "descriptions").write_text("in the way")
+    (fresh.pipeline.cache_dir / "descriptions").write_text("in the way")
     for _ in range(2):
         assert asked(fresh)[0] == ["0", "1", "2"]
     assert caplog.text.count("descriptions are not kept") == 2

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from batches import alone, scaled, two_bodies
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from batches import alone, scaled, two_bodies
 from igps.data.batch import Body, SignatureBatch
+from igps.data.requirements import Requirements
 from igps.nn.axes import (
     Attribute,
     EmbeddedPairCosines,
@@ -23,7 +24,6 @@ from igps.nn.descriptor import BodyDescriptor, Descriptor, EmbeddedDescriptor, H
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.heads.closed_form import WhitenedHead
 from igps.nn.histograms.pairs import PairHistogram
-from igps.nn.requirements import Requirements
 from igps.retrieval import chi_square, cosine
 
 

@@ -58,11 +58,11 @@ def test_scores_are_those_of_damaged_queries_in_the_clean_gallery(dataset: Signa
     names = ["soup", "holes", "noise"]
     found = study(dataset, Root(), damages=names, seed=3)["root"]
     assert list(found) == names
-    labels = dataset.files.labels or ()
-    clean = [float(np.sqrt(as_trimesh(load_mesh(path)).area)) for path in dataset.files.paths]
+    labels = dataset.bodies.labels or ()
+    clean = [float(np.sqrt(as_trimesh(load_mesh(path)).area)) for path in dataset.bodies.paths]
     for name in names:
         spoiled = []
-        for path in dataset.files.paths:
+        for path in dataset.bodies.paths:
             vertices, faces = DAMAGES[name].apply(load_mesh(path), 3)
             spoiled.append(float(np.sqrt(as_trimesh(mend(vertices, faces)).area)))
         result = found[name]
@@ -76,13 +76,13 @@ def test_scores_are_those_of_damaged_queries_in_the_clean_gallery(dataset: Signa
 
 
 def test_what_cannot_be_described_is_left_out_of_both_sides(dataset: SignatureDataset) -> None:
-    bad = dataset.files.names[0]
+    bad = dataset.bodies.names[0]
     found = study(dataset, Height("height", bad=bad), damages=["turned"])["height"]["turned"]
     assert found.usable == pytest.approx(5 / 6)
     assert list(found.notes) == [bad]
     assert "is too much" in found.notes[bad]
-    labels = (dataset.files.labels or ())[1:]
-    heights = [float(np.ptp(load_mesh(path).vertices[:, 2])) for path in dataset.files.paths[1:]]
+    labels = (dataset.bodies.labels or ())[1:]
+    heights = [float(np.ptp(load_mesh(path).vertices[:, 2])) for path in dataset.bodies.paths[1:]]
     expected = nearest_neighbours(heights, heights, labels)
     assert found.scores["nn"] == pytest.approx(expected)
     assert found.loss("nn") == pytest.approx(0)
@@ -130,7 +130,7 @@ def test_all_damages_are_the_default(dataset: SignatureDataset) -> None:
 def test_wrong_arguments_are_named(dataset: SignatureDataset) -> None:
     with pytest.raises(ValueError, match=r"damages: expected some of holes, .*got 'rust'"):
         study(dataset, Root(), damages=["soup", "rust"])
-    unlabelled = SignatureDataset(list(dataset.files.paths), CONFIG)
+    unlabelled = SignatureDataset(list(dataset.bodies.paths), CONFIG)
     with pytest.raises(ValueError, match="dataset: expected meshes with classes"):
         study(unlabelled, Root())
 

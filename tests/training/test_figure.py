@@ -104,7 +104,7 @@ def test_pose_draws_the_histogram_of_every_mesh(
 
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     expected = {}
-    for i, name in enumerate(dataset.files.names):
+    for i, name in enumerate(dataset.bodies.names):
         signature = dataset[i].signature
         distance = pdist(signature.interior.eigenfunctions / np.sqrt(signature.eigenvalues))
         # Each pair is shared by the two bins whose centres surround it; bins of 1/16 up to 4.

@@ -15,7 +15,7 @@ from training.graded.bodies import Pose, draw_body, draw_pose
 from training.graded.kinds import KINDS, LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, body_classes
 from training.graded.plates import MACHINES, SHEETS, Helix, Plate, machine, sheet
 
-from igps.data.sources import find_meshes
+from igps.data.sources import find_bodies
 from igps.mesh.loading import LoadOptions, load_mesh
 from igps.shapes import ArticulatedShapes
 from igps.shapes.files import off_text
@@ -188,7 +188,7 @@ def test_the_other_generator_is_as_it_was() -> None:
 def test_write_makes_folders_of_classes_and_bodies(tmp_path: Path) -> None:
     shapes = GradedShapes(1, 2, 2, seed=4, n_vertices=(1600, 2000))
     shapes.write(tmp_path)
-    files = find_meshes(tmp_path)
+    files = find_bodies(tmp_path)
     assert files.names == tuple(f"{name}.off" for name in shapes.names)
     assert files.labels == tuple(shapes.labels)
     with (tmp_path / "bodies.csv").open(newline="") as stream:

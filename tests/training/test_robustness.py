@@ -14,7 +14,7 @@ from training.studies.robustness import POSE, Robustness, robustness
 from conftest import horseshoe
 from igps.data.batch import collate
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import MeshFiles, find_meshes
+from igps.data.sources import Bodies, find_bodies
 from igps.descriptors import descriptor
 from igps.descriptors.d2 import D2
 from igps.descriptors.interior import interior
@@ -26,7 +26,7 @@ from own_descriptors import Root, Same, root_area, write_egg
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
 
 
-def of(source: Path | list[Path] | MeshFiles, tmp_path: Path) -> SignatureDataset:
+def of(source: Path | list[Path] | Bodies, tmp_path: Path) -> SignatureDataset:
     return SignatureDataset(source, CONFIG, tmp_path / "cache")
 
 
@@ -78,8 +78,8 @@ def test_poses_are_compared_within_each_body(tmp_path: Path) -> None:
     unit = root_area(meshes[1]) - root_area(meshes[0])
     poses = [write_egg(tmp_path / "poses" / f"{x}.off", x, 2) for x in (1.0, 1.1, 1.3)]
     size = [root_area(path) for path in poses]
-    files = find_meshes(tmp_path / "poses")
-    one_body = MeshFiles(files.paths, files.names, ("body",) * 3)
+    files = find_bodies(tmp_path / "poses")
+    one_body = Bodies(files.paths, files.names, ("body",) * 3)
     movement = run(tmp_path, meshes, Root(), poses=of(one_body, tmp_path)).movements["root"][POSE]
     expected = {
         "1.0.off - 1.1.off": (size[1] - size[0]) / unit,

@@ -84,7 +84,7 @@ def damage(
     Raises:
         ValueError: no classes, or an unknown damage.
     """
-    if dataset.files.labels is None:
+    if dataset.bodies.labels is None:
         raise ValueError("dataset: expected meshes with classes, got none. Give labels, or a folder per class.")
     names = list(damages or DAMAGES)
     if unknown := [name for name in names if name not in DAMAGES]:
@@ -116,14 +116,14 @@ def _result(
     clean: Sequence[Mapping[str, Answer]],
     spoiled: Sequence[Mapping[str, Answer]],
 ) -> DamageResult:
-    labels = dataset.files.labels or ()
+    labels = dataset.bodies.labels or ()
     before, after = ([of[descriptor.name] for of in answers] for answers in (clean, spoiled))
     notes = {
         name: one if isinstance(one, str) else str(other)
-        for name, one, other in zip(dataset.files.names, before, after, strict=True)
+        for name, one, other in zip(dataset.bodies.names, before, after, strict=True)
         if isinstance(one, str) or isinstance(other, str)
     }
-    kept = [i for i, name in enumerate(dataset.files.names) if name not in notes]
+    kept = [i for i, name in enumerate(dataset.bodies.names) if name not in notes]
     if len({labels[i] for i in kept}) == len(kept):
         # Nothing is left, or nothing that could be found.
         return DamageResult(len(dataset), {}, {}, notes)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps.cli.reading import signatures
-from igps.data.sources import labelled_meshes
+from igps.data.sources import labelled_bodies
 from igps.mesh.loading import LoadOptions, load_mesh
 from igps.mesh.mending import Mending
 from igps.mesh.mesh import Mesh
@@ -28,7 +28,7 @@ def pose(root: Path, classes: list[str] | None = None, out: Path = Path("pose.pn
         classes: which to draw; all if not given.
         out: the picture, a PNG file.
     """
-    files = labelled_meshes(root)
+    files = labelled_bodies(root)
     labels = files.labels or ()
     known = sorted(set(labels))
     classes = classes or known

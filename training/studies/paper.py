@@ -62,7 +62,7 @@ def pose_curves(dataset: SignatureDataset, classes: Sequence[str], n_bins: int =
     axis = InteriorDistance(n_bins)
     histogram = PairHistogram([axis], SpectralEmbedding(n_eigenpairs=dataset.config.n_eigenpairs))
     histograms = describe(dataset, HistogramDescriptor(histogram), progress=True)[:, 0]
-    labels = np.array(dataset.files.labels)
+    labels = np.array(dataset.bodies.labels)
     distances = chi_square(histograms, histograms).numpy()
     members = {name: labels == name for name in classes if name in labels}
     return PoseCurves(

@@ -101,7 +101,7 @@ def robustness(
         units = {one.name: _between_meshes(one, [of[_AS_IT_IS][one.name] for of in found]) for one in descriptors}
     else:
         units = _between_classes(gallery, descriptors, n_workers)
-    table = {one.name: _movements(one, dataset.files.names, found, units[one.name]) for one in descriptors}
+    table = {one.name: _movements(one, dataset.bodies.names, found, units[one.name]) for one in descriptors}
     if poses is not None:
         for name, movement in _between_poses(poses, descriptors, units, n_workers).items():
             table[name][POSE] = movement

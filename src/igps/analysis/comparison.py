@@ -87,7 +87,7 @@ def compare(
         ValueError: the meshes have no classes, two descriptors one name, or the signatures lack what one needs.
         MeshError: a mesh that cannot be described, if `strict`.
     """
-    if dataset.files.labels is None:
+    if dataset.bodies.labels is None:
         raise ValueError("dataset: expected meshes with classes, got none. Give labels, or a folder per class.")
     check_descriptors(descriptors, dataset)
     n = len(dataset)
@@ -129,7 +129,7 @@ def _result(
 ) -> Result:
     described = [i for i, outcome in enumerate(outcomes) if isinstance(outcome, Description)]
     descriptions = [outcome for outcome in outcomes if isinstance(outcome, Description)]
-    labels = [dataset.files.labels[i] for i in described] if dataset.files.labels else []
+    labels = [dataset.bodies.labels[i] for i in described] if dataset.bodies.labels else []
     distances, scores, error = None, None, None
     try:
         if not descriptions:
@@ -142,7 +142,7 @@ def _result(
         logger.warning("%s: no scores: %s", descriptor.name, error)
     return Result(
         descriptor=descriptor,
-        names=tuple(dataset.files.names[i] for i in described),
+        names=tuple(dataset.bodies.names[i] for i in described),
         labels=tuple(labels),
         distances=distances,
         scores=scores,

@@ -12,7 +12,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from igps._parallel import Failed, Limits, run
-from igps.data.sources import MeshFiles
+from igps.data.sources import Bodies
 from igps.mesh.loading import LoadOptions, load_mesh, read_surface
 from igps.mesh.mending import Step, mended_by
 from igps.mesh.mesh import MeshError
@@ -55,7 +55,7 @@ class Finding:
 
 
 def examine(
-    files: MeshFiles,
+    files: Bodies,
     reading: LoadOptions | None = None,
     config: SignatureConfig | None = None,
     *,

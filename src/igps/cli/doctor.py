@@ -8,7 +8,7 @@ from pathlib import Path
 from igps._parallel import Limits
 from igps.analysis.doctor import Finding, examine, usable
 from igps.cli.reading import Verdict, write_rows
-from igps.data.sources import find_meshes
+from igps.data.sources import find_bodies
 from igps.mesh.loading import Component, LoadOptions
 from igps.mesh.mending import Mending
 from igps.report.tables import findings_table
@@ -48,7 +48,7 @@ def doctor(
     """
     reading = LoadOptions(mend, component, allow_open)
     limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
-    found = examine(find_meshes(root), reading, signature, n_workers=n_workers, limits=limits)
+    found = examine(find_bodies(root), reading, signature, n_workers=n_workers, limits=limits)
     print(findings_table(found))
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 from igps.cli.reading import signatures
 from igps.data.dataset import Failure
-from igps.data.sources import find_meshes
+from igps.data.sources import find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.gallery.gallery import Gallery, about_of
 from igps.mesh.loading import LoadOptions
@@ -36,7 +36,7 @@ def index_build(
         strict: stop at the first mesh that cannot be used instead of skipping it
     """
     chosen = descriptor_of(descriptor)
-    dataset, unread = signatures(find_meshes(root), [chosen], n_workers=n_workers, strict=strict, **reading)
+    dataset, unread = signatures(find_bodies(root), [chosen], n_workers=n_workers, strict=strict, **reading)
     gallery, undescribed = Gallery.build(out, dataset, descriptor, n_workers=n_workers, strict=strict, progress=True)
     _print_state(gallery, [*unread, *undescribed])
 
@@ -58,7 +58,7 @@ def index_add(
     """
     gallery = Gallery(index)
     reading = as_indexed(gallery, reading)
-    dataset, unread = signatures(find_meshes(root), [gallery.descriptor], n_workers=n_workers, strict=strict, **reading)
+    dataset, unread = signatures(find_bodies(root), [gallery.descriptor], n_workers=n_workers, strict=strict, **reading)
     name = gallery.index.about["descriptor"]
     gallery, undescribed = Gallery.add(index, dataset, name, n_workers=n_workers, strict=strict, progress=True)
     _print_state(gallery, [*unread, *undescribed])

@@ -15,9 +15,9 @@ from typing import Any
 from igps._parallel import Limits, MachineError
 from igps.cli.reading import chosen_dataset, write_rows
 from igps.data.pipeline import version
-from igps.data.sources import MeshFiles, find_meshes
+from igps.data.requirements import Requirements
+from igps.data.sources import Bodies, find_bodies
 from igps.descriptors import descriptor as descriptor_of
-from igps.nn.requirements import Requirements
 
 # Seconds until a scheduler that does not answer is taken for missing.
 _ANSWERS_WITHIN = 15
@@ -51,7 +51,7 @@ def precompute(
         time_limit: seconds that the signature of one mesh may take; no limit if not given.
         memory_limit: gigabytes of memory that the signature of one mesh may take; no limit if not given.
     """
-    files = part_of(find_meshes(root), shard)
+    files = part_of(find_bodies(root), shard)
     if not len(files):
         print(f"{root}: no mesh in shard {shard}")
         return
@@ -69,7 +69,7 @@ def precompute(
     print(f"{len(dataset) - len(failed)} of {len(dataset)} signatures{part} are in the cache; {len(failed)} failed")
 
 
-def part_of(files: MeshFiles, shard: str | None) -> MeshFiles:
+def part_of(files: Bodies, shard: str | None) -> Bodies:
     """Every n-th of the files, so that the shards 1/n to n/n have all, each once; all of them if None.
 
     Raises:

@@ -13,11 +13,11 @@ from typing import Any
 
 from igps._parallel import Limits
 from igps.data.dataset import Failure, SignatureDataset
-from igps.data.sources import MeshFiles
+from igps.data.requirements import Requirements
+from igps.data.sources import Bodies
 from igps.mesh.loading import Component, LoadOptions
 from igps.mesh.mending import Mending, mended_by
 from igps.nn.descriptor import Descriptor
-from igps.nn.requirements import Requirements
 from igps.signature.signature import SignatureConfig
 
 FLAGS = {
@@ -37,7 +37,7 @@ class Verdict:
 
 
 def signatures(
-    source: Path | Sequence[Path] | MeshFiles,
+    source: Path | Sequence[Path] | Bodies,
     descriptors: Sequence[Descriptor] = (),
     cache_dir: Path | None = None,
     signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
@@ -83,7 +83,7 @@ def signatures(
 
 
 def chosen_dataset(
-    source: Path | Sequence[Path] | MeshFiles,
+    source: Path | Sequence[Path] | Bodies,
     needs: Requirements | None,
     cache_dir: Path | None = None,
     signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
@@ -129,7 +129,7 @@ def mending_summary(dataset: SignatureDataset, n_given: int) -> str:
 
 def write_notes(path: Path, dataset: SignatureDataset) -> None:
     """Write a table of what was done to which mesh; or remove that of an earlier run where nothing was done."""
-    notes = zip(dataset.files.names, dataset.all_notes(), strict=True)
+    notes = zip(dataset.bodies.names, dataset.all_notes(), strict=True)
     write_rows(path, ("file", "note"), [(name, note) for name, told in notes for note in told])
 
 

@@ -18,7 +18,7 @@ from igps.cli.reading import signatures, write_notes, write_rows
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure, SignatureDataset
-from igps.data.sources import MeshFiles, find_meshes, labelled_meshes
+from igps.data.sources import Bodies, find_bodies, labelled_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.gallery.gallery import Gallery, cache_tag
 from igps.nn.description import describe_usable
@@ -57,13 +57,13 @@ def retrieve(
     check_report(report, out)
     chosen = descriptor_of(descriptor)
     dataset, descriptions, failures = _described(
-        labelled_meshes(root), descriptor, n_workers=n_workers, strict=strict, **reading
+        labelled_bodies(root), descriptor, n_workers=n_workers, strict=strict, **reading
     )
     distances = pair_distances(chosen, descriptions, progress=True)
-    scores = retrieval_scores(distances, dataset.files.labels or ())
+    scores = retrieval_scores(distances, dataset.bodies.labels or ())
     print(scores_table(scores))
     reranked = reranked_distances(distances, progress=True) if rerank else None
-    scores_reranked = None if reranked is None else retrieval_scores(reranked, dataset.files.labels or ())
+    scores_reranked = None if reranked is None else retrieval_scores(reranked, dataset.bodies.labels or ())
     if scores_reranked is not None:
         print(f"\nre-ranked by the whole collection, without its labels\n{scores_table(scores_reranked)}")
     if failures:
@@ -105,9 +105,9 @@ def extract(
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}.")
     dataset, descriptions, failures = _described(source, descriptor, **reading)
     features = (descriptions if shortening is None else shortening.short(descriptions)).numpy()
-    arrays: dict[str, Any] = {"features": features, "names": np.array(dataset.files.names)}
-    if dataset.files.labels is not None:
-        arrays["labels"] = np.array(dataset.files.labels)
+    arrays: dict[str, Any] = {"features": features, "names": np.array(dataset.bodies.names)}
+    if dataset.bodies.labels is not None:
+        arrays["labels"] = np.array(dataset.bodies.labels)
     out.parent.mkdir(parents=True, exist_ok=True)
     with out.open("wb") as file:  # given a name, NumPy would append .npz to it
         np.savez_compressed(file, **arrays)
@@ -156,13 +156,13 @@ def query(
     descriptor = descriptor or "pretrained"
     chosen = descriptor_of(descriptor)
     _, wanted, _ = _described([mesh], descriptor, **reading)
-    dataset, descriptions, _ = _described(find_meshes(gallery), descriptor, **reading)  # type: ignore[arg-type]
+    dataset, descriptions, _ = _described(find_bodies(gallery), descriptor, **reading)  # type: ignore[arg-type]
     n_found = min(top, len(dataset))
     n_near = min(max(top, N_RERANKED), len(dataset)) if rerank else n_found
     found = search(wanted, descriptions, top=n_near, distance=chosen.distances)
     if rerank:
         found = rerank_found(wanted, found, lambda indices: descriptions[indices], chosen.distances, top=n_found)
-    names, labels = dataset.files.names, dataset.files.labels
+    names, labels = dataset.bodies.names, dataset.bodies.labels
     places = zip(found.indices[0].tolist(), found.distances[0].tolist(), strict=True)
     rows = [(names[i], None if labels is None else labels[i], distance) for i, distance in places]
     _print_found(rows)
@@ -184,7 +184,7 @@ def _as_rows(rows: Sequence[tuple[str, str | None, float]]) -> list[dict[str, An
 
 
 def _described(
-    source: Path | Sequence[Path] | MeshFiles,
+    source: Path | Sequence[Path] | Bodies,
     descriptor: str | Descriptor,
     n_workers: int | None = None,
     strict: bool = False,
@@ -222,7 +222,7 @@ def _write_retrieval(
     reranked: Tensor | None,
 ) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    names, labels = dataset.files.names, dataset.files.labels or ()
+    names, labels = dataset.bodies.names, dataset.bodies.labels or ()
     (out / "scores.json").write_text(json.dumps(summary, indent=2) + "\n")
     arrays: dict[str, Any] = {"distances": distances.numpy(), "names": np.array(names), "labels": np.array(labels)}
     if reranked is not None:

@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 
 from igps.data.batch import LabelledSignature, SignatureBatch, collate
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import labelled_meshes
+from igps.data.sources import labelled_bodies
 from igps.data.splits import SplitProtocol, split_seen, split_unseen
 from igps.mesh.loading import LoadOptions
 from igps.signature.signature import Samples, SignatureConfig
@@ -46,7 +46,7 @@ class SignatureDataModule(LightningDataModule):
         (6, 3, 6)
 
     Args:
-        root: a folder that tells classes, see `find_meshes`.
+        root: a folder that tells classes, see `find_bodies`.
         protocol: "seen" splits each class, "unseen" splits the classes.
         n_train: shapes of each class ("seen") or classes ("unseen") in training and validation together.
         n_validation: how many of those validate.
@@ -86,7 +86,7 @@ class SignatureDataModule(LightningDataModule):
             raise ValueError(f"n_samples_in_memory: expected None or at least 2, got {n_samples_in_memory}.")
         if has_configuration():
             self.save_hyperparameters()
-        self.dataset = SignatureDataset(labelled_meshes(root), config, cache_dir, reading=reading)
+        self.dataset = SignatureDataset(labelled_bodies(root), config, cache_dir, reading=reading)
         self.classes_per_batch = classes_per_batch
         self.shapes_per_class = shapes_per_class
         self.n_samples_in_memory = n_samples_in_memory

@@ -23,7 +23,7 @@ from igps.data.batch import LabelledSignature, SignatureBatch, collate
 from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.file_stat_cache import FileStatCache
 from igps.data.pipeline import CacheHit, SignaturePipeline, fill_elsewhere, version
-from igps.data.sources import MeshFiles, find_meshes, mesh_files
+from igps.data.sources import Bodies, find_bodies, given_bodies
 from igps.mesh.loading import LoadOptions
 from igps.mesh.mesh import Mesh, MeshError
 from igps.signature.signature import Samples, SignatureConfig
@@ -60,7 +60,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         (1, 'ball.off', (20,))
 
     Args:
-        root_or_paths: a folder (see `find_meshes`), mesh files, or a `MeshFiles`.
+        root_or_paths: a folder (see `find_bodies`), mesh files, or a `Bodies`.
         config: parameters of the Signatures; `SignatureConfig()` if None, with 250 eigenpairs. For one descriptor
             alone, `descriptor.requirements.apply_to(SignatureConfig())` has as many as it needs.
         cache_dir: where Signatures are kept; the user's cache directory if None. The key of a file covers the mesh
@@ -77,7 +77,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def __init__(
         self,
-        root_or_paths: str | Path | Sequence[str | Path] | MeshFiles,
+        root_or_paths: str | Path | Sequence[str | Path] | Bodies,
         config: SignatureConfig | None = None,
         cache_dir: str | Path | None = None,
         *,
@@ -85,49 +85,49 @@ class SignatureDataset(Dataset[LabelledSignature]):
         reading: LoadOptions | None = None,
         point_functions: Mapping[str, PointFunction] | None = None,
     ) -> None:
-        if isinstance(root_or_paths, MeshFiles):
-            self.files = root_or_paths
+        if isinstance(root_or_paths, Bodies):
+            self.bodies = root_or_paths
         elif isinstance(root_or_paths, str | Path) and Path(root_or_paths).is_dir():
-            self.files = find_meshes(root_or_paths)
+            self.bodies = find_bodies(root_or_paths)
         elif isinstance(root_or_paths, str | Path):
-            self.files = mesh_files([root_or_paths], labels)
+            self.bodies = given_bodies([root_or_paths], labels)
         else:
-            self.files = mesh_files(root_or_paths, labels)
-        self._recipe = SignaturePipeline(
+            self.bodies = given_bodies(root_or_paths, labels)
+        self._pipeline = SignaturePipeline(
             (config or SignatureConfig()).resolved(), reading or LoadOptions(), Path(cache_dir or default_cache_dir())
         )
         self._point_functions = dict(point_functions or {})
-        self.classes: tuple[str, ...] = tuple(sorted(set(self.files.labels or ())))
+        self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
 
     @property
     def config(self) -> SignatureConfig:
         """Parameters of the Signatures."""
-        return self._recipe.config
+        return self._pipeline.config
 
     @property
-    def recipe(self) -> SignaturePipeline:
+    def pipeline(self) -> SignaturePipeline:
         """How a file becomes a Signature."""
-        return self._recipe
+        return self._pipeline
 
     @property
     def reading(self) -> LoadOptions:
         """How the mesh files are read."""
-        return self._recipe.reading
+        return self._pipeline.reading
 
     @property
     def labels(self) -> Tensor:
         """(N,) int64 index of each mesh's class in `classes`, −1 where unknown."""
         index = {name: i for i, name in enumerate(self.classes)}
-        names: Sequence[str | None] = self.files.labels or [None] * len(self.files)
+        names: Sequence[str | None] = self.bodies.labels or [None] * len(self.bodies)
         return torch.tensor([-1 if name is None else index[name] for name in names], dtype=torch.int64)
 
     def __len__(self) -> int:
-        return len(self.files)
+        return len(self.bodies)
 
     def __getitem__(self, index: int) -> LabelledSignature:
-        path, name = self.files.paths[index], self.files.names[index]
-        label = -1 if self.files.labels is None else self.classes.index(self.files.labels[index])
-        signature = replace(self._recipe.signature(path), name=name)
+        path, name = self.bodies.paths[index], self.bodies.names[index]
+        label = -1 if self.bodies.labels is None else self.classes.index(self.bodies.labels[index])
+        signature = replace(self._pipeline.signature(path), name=name)
         if self._point_functions:
             signature = replace(signature, interior=_with_attributes(signature.interior, self._point_functions, name))
         return LabelledSignature(signature, label, name)
@@ -138,7 +138,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         Raises:
             MeshError: it cannot be used.
         """
-        return self._recipe.mesh(self.files.paths[index])
+        return self._pipeline.mesh(self.bodies.paths[index])
 
     def key(self, index: int) -> str:
         """The name of a Signature in the cache, by the content of its file and everything that it depends on.
@@ -146,7 +146,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         Raises:
             MeshError: the file cannot be read.
         """
-        return self._recipe.key(self.files.paths[index])
+        return self._pipeline.key(self.bodies.paths[index])
 
     def cached_keys(self) -> list[str | None]:
         """What in the cache serves each mesh, None where nothing does; of files that are known, without reading them.
@@ -155,18 +155,18 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """
         if self._point_functions:
             return [None] * len(self)
-        ready = FileStatCache(self._recipe).ready(self.files.paths)
-        served = (self._served(i) if path not in ready else ready[path] for i, path in enumerate(self.files.paths))
+        ready = FileStatCache(self._pipeline).ready(self.bodies.paths)
+        served = (self._served(i) if path not in ready else ready[path] for i, path in enumerate(self.bodies.paths))
         return [None if one is None else one.key for one in served]
 
     def notes(self, index: int) -> tuple[str, ...]:
         """What was done to a mesh on its way to its cached Signature, in words."""
-        return self._recipe.notes(self.files.paths[index])
+        return self._pipeline.notes(self.bodies.paths[index])
 
     def all_notes(self) -> list[tuple[str, ...]]:
         """The notes of all meshes; of files that are known from `precompute` without reading them again."""
-        ready = FileStatCache(self._recipe).ready(self.files.paths)
-        return [ready[path].notes if path in ready else self.notes(i) for i, path in enumerate(self.files.paths)]
+        ready = FileStatCache(self._pipeline).ready(self.bodies.paths)
+        return [ready[path].notes if path in ready else self.notes(i) for i, path in enumerate(self.bodies.paths)]
 
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
         """Some of the items as a batch, with or without their meshes."""
@@ -175,8 +175,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
     def subset(self, indices: Sequence[int]) -> SignatureDataset:
         """The dataset of some of the meshes; `classes` keeps all names, so that labels keep their numbers."""
         chosen = object.__new__(SignatureDataset)
-        chosen.files = self.files.subset(indices)
-        chosen._recipe = self._recipe
+        chosen.bodies = self.bodies.subset(indices)
+        chosen._pipeline = self._pipeline
         chosen._point_functions = self._point_functions
         chosen.classes = self.classes
         return chosen
@@ -204,21 +204,21 @@ class SignatureDataset(Dataset[LabelledSignature]):
             MeshError: a bad mesh, if `strict`.
             MachineError: the disk is full, or the like; what is done is kept.
         """
-        SignatureCache(self._recipe.cache_dir).remove_abandoned()
-        known = FileStatCache(self._recipe)
-        ready = known.ready(self.files.paths)
-        missing = [i for i, path in enumerate(self.files.paths) if path not in ready]
-        fill: Callable[[Path], CacheHit] = self._recipe.fill
+        SignatureCache(self._pipeline.cache_dir).remove_abandoned()
+        known = FileStatCache(self._pipeline)
+        ready = known.ready(self.bodies.paths)
+        missing = [i for i, path in enumerate(self.bodies.paths) if path not in ready]
+        fill: Callable[[Path], CacheHit] = self._pipeline.fill
         if executor is None:
             served = {i: self._served(i) for i in missing}
-            known.remember({self.files.paths[i]: one for i, one in served.items() if one is not None})
+            known.remember({self.bodies.paths[i]: one for i, one in served.items() if one is not None})
             missing = [i for i, one in served.items() if one is None]
-            paths = [self.files.paths[i] for i in missing]
+            paths = [self.bodies.paths[i] for i in missing]
         else:
             # Elsewhere, and from another folder: the workers look for themselves what there is.
-            recipe = replace(self._recipe, cache_dir=self._recipe.cache_dir.absolute())
-            fill = partial(fill_elsewhere, recipe, version())
-            paths = [self.files.paths[i].absolute() for i in missing]
+            pipeline = replace(self._pipeline, cache_dir=self._pipeline.cache_dir.absolute())
+            fill = partial(fill_elsewhere, pipeline, version())
+            paths = [self.bodies.paths[i].absolute() for i in missing]
         failures: dict[int, Failure] = {}
         new: dict[Path, CacheHit] = {}
         results = run(fill, paths, n_workers=n_workers, executor=executor, limits=limits)
@@ -232,7 +232,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
                 bar.update()
                 if not isinstance(outcome, Failed):
                     self._check_visible(outcome, first=not new)
-                    new[self.files.paths[missing[number]]] = outcome
+                    new[self.bodies.paths[missing[number]]] = outcome
                     if len(new) >= _REMEMBERED_AT_ONCE:
                         known.remember(new)
                         new.clear()
@@ -246,32 +246,32 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def _served(self, index: int) -> CacheHit | None:
         try:
-            return self._recipe.served(self.files.paths[index])
+            return self._pipeline.served(self.bodies.paths[index])
         except MeshError:  # computing it will say why
             return None
 
     def _check_visible(self, served: CacheHit, first: bool) -> None:
         """Raise a MachineError if what a worker put into its cache does not come to this one, asked at the first."""
-        path = SignatureCache(self._recipe.cache_dir).path(served.key)
+        path = SignatureCache(self._pipeline.cache_dir).path(served.key)
         deadline = time.monotonic() + _SHARED_WITHIN
         while first and not path.exists():
             if time.monotonic() > deadline:
                 raise MachineError(
-                    f"{self._recipe.cache_dir}: the workers' signatures do not appear there. Choose a cache_dir that "
+                    f"{self._pipeline.cache_dir}: the workers' signatures do not appear there. Choose a cache_dir that "
                     "this machine and all workers share, by the same path."
                 )
             time.sleep(0.1)
 
     def failure(self, index: int, failed: Failed) -> Failure:
         """What failed of a mesh, in a sentence that names its file."""
-        path, reason = self.files.paths[index], failed.reason
+        path, reason = self.bodies.paths[index], failed.reason
         named = reason if reason.startswith(str(path)) else f"{path}: {reason}"
-        return Failure(self.files.names[index], path, named)
+        return Failure(self.bodies.names[index], path, named)
 
     def usable(self, failures: Sequence[Failure]) -> SignatureDataset:
         """The dataset without the meshes that failed."""
         failed = {failure.id for failure in failures}
-        return self.subset([i for i, name in enumerate(self.files.names) if name not in failed])
+        return self.subset([i for i, name in enumerate(self.bodies.names) if name not in failed])
 
 
 def _with_attributes(samples: Samples, functions: Mapping[str, PointFunction], name: str) -> Samples:

@@ -25,8 +25,8 @@ _PATIENCE = 30.0
 # A file may change again within the grain of its clock: what is so young is not remembered.
 _YOUNG = 2 * 10**9
 _TABLE = (
-    "CREATE TABLE IF NOT EXISTS file (recipe TEXT, path TEXT, size INTEGER, mtime INTEGER, ctime INTEGER, key TEXT, "
-    "bytes INTEGER, notes TEXT, PRIMARY KEY (recipe, path)) WITHOUT ROWID"
+    "CREATE TABLE IF NOT EXISTS file (pipeline TEXT, path TEXT, size INTEGER, mtime INTEGER, ctime INTEGER, key TEXT, "
+    "bytes INTEGER, notes TEXT, PRIMARY KEY (pipeline, path)) WITHOUT ROWID"
 )
 
 
@@ -44,15 +44,15 @@ class Known:
 
 
 class FileStatCache:
-    """The files of one recipe, by path, size and times of change, in a small database beside its cache.
+    """The files of one pipeline, by path, size and times of change, in a small database beside its cache.
 
     It may be removed at any time, and where it cannot be read or written, it is done without.
     """
 
-    def __init__(self, recipe: SignaturePipeline) -> None:
-        self._recipe = recipe
-        self._path = recipe.cache_dir / _FILE
-        told = json.dumps([asdict(recipe.reading), recipe.config.as_dict(), MENDING_VERSION], sort_keys=True)
+    def __init__(self, pipeline: SignaturePipeline) -> None:
+        self._pipeline = pipeline
+        self._path = pipeline.cache_dir / _FILE
+        told = json.dumps([asdict(pipeline.reading), pipeline.config.as_dict(), MENDING_VERSION], sort_keys=True)
         self._name = hashlib.sha256(told.encode()).hexdigest()[:32]
 
     def ready(self, paths: Sequence[Path]) -> dict[Path, Known]:
@@ -60,11 +60,11 @@ class FileStatCache:
         found: dict[Path, Known] = {}
         if not self._path.exists():
             return found
-        cache = SignatureCache(self._recipe.cache_dir)
+        cache = SignatureCache(self._pipeline.cache_dir)
         with self._dispensable(), contextlib.closing(self._database()) as database:
             for path in paths:
                 row = database.execute(
-                    "SELECT size, mtime, ctime, key, bytes, notes FROM file WHERE recipe = ? AND path = ?",
+                    "SELECT size, mtime, ctime, key, bytes, notes FROM file WHERE pipeline = ? AND path = ?",
                     (self._name, os.path.abspath(path)),
                 ).fetchone()
                 if row is None:

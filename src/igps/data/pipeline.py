@@ -168,7 +168,7 @@ def version() -> str:
     return f"{importlib.metadata.version('interior-gps')}, signatures {SignatureConfig.ALGORITHM_VERSION}"
 
 
-def fill_elsewhere(recipe: SignaturePipeline, expected: str, path: Path) -> CacheHit:
+def fill_elsewhere(pipeline: SignaturePipeline, expected: str, path: Path) -> CacheHit:
     """`SignaturePipeline.fill` by a worker of a cluster.
 
     Raises:
@@ -180,7 +180,7 @@ def fill_elsewhere(recipe: SignaturePipeline, expected: str, path: Path) -> Cach
             f"the worker on {socket.gethostname()} has igps {here}, where {expected} is asked for. Install one version "
             "everywhere and run again: what is done is kept."
         )
-    return recipe.fill(path)
+    return pipeline.fill(path)
 
 
 def _stamp(path: Path) -> tuple[int, int, int]:

@@ -16,7 +16,7 @@ LABELS_FILE = "labels.csv"
 
 
 @dataclass(frozen=True)
-class MeshFiles:
+class Bodies:
     """Mesh files and what is known of them.
 
     Args:
@@ -32,16 +32,16 @@ class MeshFiles:
     def __len__(self) -> int:
         return len(self.paths)
 
-    def subset(self, indices: Sequence[int]) -> MeshFiles:
+    def subset(self, indices: Sequence[int]) -> Bodies:
         """Some of the files, in the given order."""
-        return MeshFiles(
+        return Bodies(
             tuple(self.paths[i] for i in indices),
             tuple(self.names[i] for i in indices),
             None if self.labels is None else tuple(self.labels[i] for i in indices),
         )
 
 
-def find_meshes(root: str | Path) -> MeshFiles:
+def find_bodies(root: str | Path) -> Bodies:
     """The meshes below a folder, with their classes if it tells them.
 
     Three layouts are known: meshes and a `labels.csv` with the columns `file,label` (paths relative to the folder); one
@@ -60,29 +60,29 @@ def find_meshes(root: str | Path) -> MeshFiles:
     in_classes = [(path, folder.name) for folder in folders for path in _meshes_in(folder)]
     if in_classes:
         paths, labels = zip(*in_classes, strict=True)
-        return MeshFiles(paths, _names(paths, root), labels)
+        return Bodies(paths, _names(paths, root), labels)
     paths = tuple(_meshes_in(root))
     if not paths:
         raise FileNotFoundError(
             f"{root}: no mesh found. Expected a folder per class, or mesh files with a {LABELS_FILE} (file,label), "
             f"in one of the formats {', '.join(sorted(_suffixes()))}."
         )
-    return MeshFiles(paths, _names(paths, root), None)
+    return Bodies(paths, _names(paths, root), None)
 
 
-def labelled_meshes(root: str | Path) -> MeshFiles:
-    """`find_meshes` of a folder that tells classes.
+def labelled_bodies(root: str | Path) -> Bodies:
+    """`find_bodies` of a folder that tells classes.
 
     Raises:
         ValueError: it tells none.
     """
-    files = find_meshes(root)
+    files = find_bodies(root)
     if files.labels is None:
         raise ValueError(f"{root}: no classes found. Expected one folder per class, or a {LABELS_FILE} (file,label).")
     return files
 
 
-def mesh_files(paths: Sequence[str | Path], labels: Sequence[str] | None = None) -> MeshFiles:
+def given_bodies(paths: Sequence[str | Path], labels: Sequence[str] | None = None) -> Bodies:
     """The given files, in the given order, with the given classes.
 
     Raises:
@@ -93,10 +93,10 @@ def mesh_files(paths: Sequence[str | Path], labels: Sequence[str] | None = None)
         raise ValueError("paths: expected at least one mesh file, got none.")
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
-    return MeshFiles(files, tuple(str(path) for path in files), None if labels is None else tuple(labels))
+    return Bodies(files, tuple(str(path) for path in files), None if labels is None else tuple(labels))
 
 
-def _from_labels_file(root: Path) -> MeshFiles:
+def _from_labels_file(root: Path) -> Bodies:
     file = root / LABELS_FILE
     with file.open(newline="", encoding="utf-8-sig") as stream:
         reader = csv.DictReader(stream)
@@ -111,7 +111,7 @@ def _from_labels_file(root: Path) -> MeshFiles:
     twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
         raise ValueError(f"{file}: {twice[0]} is listed twice. List each mesh once.")
-    return MeshFiles(tuple(root / name for name in names), tuple(names), tuple(label for _, label in rows))
+    return Bodies(tuple(root / name for name in names), tuple(names), tuple(label for _, label in rows))
 
 
 def _meshes_in(folder: Path) -> list[Path]:

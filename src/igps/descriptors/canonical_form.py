@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from igps.data.batch import Body
+from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import farthest_points
 from igps.mesh.simplification import simplify
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.requirements import Requirements
 from igps.retrieval.distances import euclidean
 from igps.signature.ordering import in_order_of_form
 

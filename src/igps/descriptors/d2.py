@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from igps.data.batch import Body
+from igps.data.requirements import Requirements
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.requirements import Requirements
 
 ShapeFunction = Literal["d2", "a3", "d1"]
 

@@ -18,8 +18,8 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
 from igps.data.batch import Body
+from igps.data.requirements import Requirements
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.requirements import Requirements
 
 METRICATION = 1.0495
 """Largest ratio of the length of a path of links to the Euclidean distance of its ends, in free space."""

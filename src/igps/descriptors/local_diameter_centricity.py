@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps.data.batch import Body
+from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import farthest_points
 from igps.mesh._extras import libigl
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors, longest_side, unit, vertex_areas
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.requirements import Requirements
 from igps.signature.ordering import in_order_of_form
 from igps.signature.sampling import surface_points
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from igps.data.batch import Body
+from igps.data.requirements import Requirements
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.requirements import Requirements
 from igps.retrieval.distances import euclidean
 
 Normalisation = Literal["area", "slope"]

@@ -23,8 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from igps.data.batch import Body
+from igps.data.requirements import Requirements
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.requirements import Requirements
 from igps.retrieval.distances import euclidean
 from igps.signature.signature import Signature
 

@@ -26,10 +26,10 @@ from scipy.sparse.linalg import LinearOperator, eigsh, splu
 from torch import Tensor
 
 from igps.data.batch import Body
+from igps.data.requirements import Requirements
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import longest_side
 from igps.nn.descriptor import BodyDescriptor
-from igps.nn.requirements import Requirements
 from igps.retrieval.distances import euclidean
 from igps.signature.voxels import grid_axes, inside_grid
 

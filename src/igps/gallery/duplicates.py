@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from igps._parallel import Failed, on_threads
 from igps.data.dataset import Failure, SignatureDataset
-from igps.data.sources import MeshFiles
+from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
 from igps.gallery.calibration import Calibration
@@ -145,11 +145,11 @@ def duplicates(
     if surfaces is not None:
         joined = _around_the_finest(joined, surfaces, calibration, n_workers, progress)
         failures = [*failures, *surfaces.failures.values()]
-    names = dataset.files.names
+    names = dataset.bodies.names
     groups = _groups(joined)
     return Duplicates(
         tuple(tuple(names[i] for i in one) for one in groups),
-        {names[i]: dataset.files.paths[i] for one in groups for i in one},
+        {names[i]: dataset.bodies.paths[i] for one in groups for i in one},
         {(names[i], names[j]): distance for (i, j), distance in joined.items()},
         len(dataset),
         tuple(failures),
@@ -449,5 +449,5 @@ def _files_of(gallery: Gallery, cache_dir: str | Path | None) -> SignatureDatase
     names = tuple(one.name for one in entries)
     if len(set(names)) < len(names):  # of several folders
         names = tuple(one.id for one in entries)
-    files = MeshFiles(tuple(Path(one.id) for one in entries), names, None)
+    files = Bodies(tuple(Path(one.id) for one in entries), names, None)
     return SignatureDataset(files, gallery.config, cache_dir, reading=gallery.reading)

@@ -203,7 +203,7 @@ class Gallery:
         failures: list[Failure] = []
         index = VectorIndex(path)
         check_alike(index, about)
-        known = index.marks([_id(one) for one in dataset.files.paths])
+        known = index.marks([_id(one) for one in dataset.bodies.paths])
         batches = _batches(dataset, chosen, known, failures, n_workers, strict, progress)
         extend_index(path, about, batches, progress=progress)
         return cls(path, descriptor), failures
@@ -310,16 +310,16 @@ def _batches(
         for start in range(0, len(dataset), _AT_ONCE):
             part = dataset.subset(range(start, min(start + _AT_ONCE, len(dataset))))
             keys = [_key(part, i) for i in range(len(part))]
-            new = [i for i, path in enumerate(part.files.paths) if keys[i] is None or known.get(_id(path)) != keys[i]]
+            new = [i for i, path in enumerate(part.bodies.paths) if keys[i] is None or known.get(_id(path)) != keys[i]]
             if new:
                 descriptions, failed = _described(part.subset(new), descriptor, n_workers, strict)
                 failures += failed
                 lost = {failure.id for failure in failed}
-                labels = part.files.labels or (None,) * len(part)
+                labels = part.bodies.labels or (None,) * len(part)
                 entries = [
-                    Entry(_id(part.files.paths[i]), part.files.names[i], labels[i], keys[i] or "")
+                    Entry(_id(part.bodies.paths[i]), part.bodies.names[i], labels[i], keys[i] or "")
                     for i in new
-                    if part.files.names[i] not in lost
+                    if part.bodies.names[i] not in lost
                 ]
                 yield descriptions, entries
             bar.update(len(part))
@@ -334,9 +334,9 @@ def _described(
         if strict:
             raise
         if len(dataset) == 1:
-            path = dataset.files.paths[0]
+            path = dataset.bodies.paths[0]
             words = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
-            return torch.zeros(0), [Failure(dataset.files.names[0], path, words)]
+            return torch.zeros(0), [Failure(dataset.bodies.names[0], path, words)]
     # None of them: each tells why, where all at once tell of one alone.
     each = [_described(dataset.subset([i]), descriptor, 1, strict) for i in range(len(dataset))]
     return torch.zeros(0), [failure for _, failed in each for failure in failed]

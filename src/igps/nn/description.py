@@ -140,7 +140,7 @@ class _Kept:
     def __init__(self, dataset: SignatureDataset, cache_tag: str) -> None:
         self._dataset, self._kept_as = dataset, cache_tag
         self._served = dataset.cached_keys()
-        self._cache = DescriptionCache(dataset.recipe.cache_dir)
+        self._cache = DescriptionCache(dataset.pipeline.cache_dir)
         self._cache.remove_abandoned()
         self._is_writable = True
 
@@ -222,7 +222,7 @@ def _describe_one(job: tuple[Descriptor, SignatureDataset]) -> Description:
         values = descriptor(batch)[0].cpu().numpy()
         seconds = time.process_time() - start
     if not np.isfinite(values).all():
-        raise MeshError(f"{dataset.files.paths[0]}: the description has entries that are not finite.")
+        raise MeshError(f"{dataset.bodies.paths[0]}: the description has entries that are not finite.")
     return Description(values, seconds)
 
 

@@ -15,10 +15,10 @@ from torch import Tensor, nn
 
 from igps._threads import one_thread
 from igps.data.batch import Body, SignatureBatch
+from igps.data.requirements import Requirements
 from igps.nn.batch_features import Views
 from igps.nn.heads.base import distances_of
 from igps.nn.histograms.base import SampleHistogram
-from igps.nn.requirements import Requirements
 from igps.retrieval import chi_square
 from igps.retrieval.vectors import MOST_NUMBERS, Comparison
 

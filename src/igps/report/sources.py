@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import MeshFiles
+from igps.data.sources import Bodies
 from igps.mesh.loading import LoadOptions
 from igps.signature.signature import SignatureConfig
 
@@ -18,15 +18,15 @@ _FORMAT = "igps-meshes-1"
 
 def write_sources(folder: Path, dataset: SignatureDataset) -> None:
     """Write meshes.json: for each mesh its name in the results and its path; reading, signature, and cache folder."""
-    recipe, files = dataset.recipe, dataset.files
+    pipeline, files = dataset.pipeline, dataset.bodies
     summary = {
         "format": _FORMAT,
         "meshes": [
             {"file": name, "path": str(path.resolve())} for name, path in zip(files.names, files.paths, strict=True)
         ],
-        "reading": asdict(recipe.reading),
-        "signature": asdict(recipe.config),
-        "cache_dir": str(recipe.cache_dir.resolve()),
+        "reading": asdict(pipeline.reading),
+        "signature": asdict(pipeline.config),
+        "cache_dir": str(pipeline.cache_dir.resolve()),
     }
     (folder / MESHES_FILE).write_text(json.dumps(summary, indent=1) + "\n")
 
@@ -52,7 +52,7 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
         paths = tuple(Path(one["path"]) if meshes is None else meshes / one["file"] for one in summary["meshes"])
         signature = {**summary["signature"], "attributes": tuple(summary["signature"]["attributes"])}
         return SignatureDataset(
-            MeshFiles(paths, names, None),
+            Bodies(paths, names, None),
             SignatureConfig(**signature),
             Path(summary["cache_dir"]),
             reading=LoadOptions(**summary["reading"]),

@@ -82,10 +82,10 @@ def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | Non
         By name; a mesh that cannot be read, and was not kept, is left out and logged.
     """
     kept = read_surfaces(path)
-    names, files = dataset.files.names, dataset.files.paths
-    missing = [i for i, name in enumerate(names) if not _is_current(dataset.recipe, files[i], kept.get(name))]
+    names, files = dataset.bodies.names, dataset.bodies.paths
+    missing = [i for i, name in enumerate(names) if not _is_current(dataset.pipeline, files[i], kept.get(name))]
     if missing:
-        make = partial(surface_of_file, dataset.recipe, n_vertices=fitting_vertices(len(names)))
+        make = partial(surface_of_file, dataset.pipeline, n_vertices=fitting_vertices(len(names)))
         outcomes = run(make, [files[i] for i in missing], n_workers=n_workers)
         for number, outcome in tqdm(outcomes, total=len(missing), desc="pictures"):
             if isinstance(outcome, Failed):
@@ -98,13 +98,13 @@ def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | Non
     return found
 
 
-def surface_of_file(recipe: SignaturePipeline, path: Path, n_vertices: int) -> Surface:
+def surface_of_file(pipeline: SignaturePipeline, path: Path, n_vertices: int) -> Surface:
     """The surface of a mesh file.
 
     Raises:
         MeshError: it cannot be used.
     """
-    return surface_of(recipe.mesh(path), recipe.signature(path), n_vertices, recipe.key(path))
+    return surface_of(pipeline.mesh(path), pipeline.signature(path), n_vertices, pipeline.key(path))
 
 
 def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "") -> Surface:
@@ -198,12 +198,12 @@ def _read(path: Path) -> Iterator[tuple[str, Surface]]:
         start_v, start_f = start_v + n_vertices, start_f + n_faces
 
 
-def _is_current(recipe: SignaturePipeline, path: Path, kept: Surface | None) -> bool:
+def _is_current(pipeline: SignaturePipeline, path: Path, kept: Surface | None) -> bool:
     """Whether the file is gone, or the one that the surface was made from."""
     if kept is None:
         return False
     try:
-        return recipe.key(path) == kept.key
+        return pipeline.key(path) == kept.key
     except MeshError:
         return True
 

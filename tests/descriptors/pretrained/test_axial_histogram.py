@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from batches import alone, embedded, scaled, two_bodies
-from loops import hat
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from batches import alone, embedded, scaled, two_bodies
 from igps.data.batch import SignatureBatch
+from igps.data.requirements import Requirements
 from igps.descriptors.pretrained.axial_histogram import AxialHistogram, principal_axes
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.requirements import Requirements
+from loops import hat
 
 EMBEDDING = SpectralEmbedding(n_eigenpairs=6)
 

@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from batches import alone, batch_of, embedded, scaled, two_bodies
-from loops import hat
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from batches import alone, batch_of, embedded, scaled, two_bodies
 from igps.data.batch import SignatureBatch
+from igps.data.requirements import Requirements
 from igps.descriptors.pretrained.branch_histogram import BranchHistogram
 from igps.descriptors.pretrained.piece_histogram import PieceHistogram
 from igps.nn._kernels.merge_tree import N_NEIGHBOURS
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram
-from igps.nn.requirements import Requirements
+from loops import hat
 
 EMBEDDING = SpectralEmbedding(n_eigenpairs=5)
 LEVELS = (0.1, 0.3, 0.6)

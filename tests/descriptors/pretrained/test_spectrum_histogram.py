@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from batches import N_EIGENPAIRS, alone, scaled, two_bodies
 
+from batches import N_EIGENPAIRS, alone, scaled, two_bodies
+from igps.data.requirements import Requirements
 from igps.descriptors.pretrained.spectrum_histogram import SpectrumHistogram
 from igps.nn.descriptor import HistogramDescriptor
-from igps.nn.requirements import Requirements
 
 
 def test_shares_are_those_of_a_loop() -> None:

@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from batches import batch_of, embedded, two_bodies
-from loops import hat, soft_classes
 from torch import nn
 
+from batches import batch_of, embedded, two_bodies
+from igps.data.requirements import Requirements
 from igps.nn.axes import (
     AXES,
     Attribute,
@@ -23,7 +23,7 @@ from igps.nn.axes import (
 from igps.nn.axes.points import soft_memberships
 from igps.nn.batch_features import View
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.requirements import Requirements
+from loops import hat, soft_classes
 
 
 def view(kind: str = "interior") -> View:

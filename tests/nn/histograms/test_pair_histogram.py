@@ -7,22 +7,13 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from batches import N_POINTS, batch_of, embedded, two_bodies
-from loops import (
-    Axis,
-    cosines,
-    distances,
-    equal_bins,
-    hard_classes,
-    pair_histogram_by_loops,
-    product,
-    soft_classes,
-)
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 import igps.nn.histograms.pairs as histogram_module
+from batches import N_POINTS, batch_of, embedded, two_bodies
 from igps.data.batch import SignatureBatch
+from igps.data.requirements import Requirements
 from igps.nn._kernels.hard_pairs import pair_histogram
 from igps.nn.axes import (
     Attribute,
@@ -37,7 +28,16 @@ from igps.nn.axes import (
 from igps.nn.axes.pairs import Distances, OrientedPoints
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram, joint_histogram
-from igps.nn.requirements import Requirements
+from loops import (
+    Axis,
+    cosines,
+    distances,
+    equal_bins,
+    hard_classes,
+    pair_histogram_by_loops,
+    product,
+    soft_classes,
+)
 
 DEVICES = [
     "cpu",

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from batches import alone, embedded, scaled, two_bodies
-from loops import product, soft_classes
 
+from batches import alone, embedded, scaled, two_bodies
+from igps.data.requirements import Requirements
 from igps.nn._kernels.balls import ball_radii
 from igps.nn.axes import BallRadius, EuclideanDistance, Potential
 from igps.nn.batch_features import View
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.points import PointHistogram
-from igps.nn.requirements import Requirements
+from loops import product, soft_classes
 
 
 def layout(**options: int) -> PointHistogram:

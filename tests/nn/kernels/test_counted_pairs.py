@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from loops import Axis, cosines, distances, pair_histogram_by_loops
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -14,6 +13,7 @@ from igps import _threads as threads
 from igps._compiled import is_available
 from igps.nn._kernels import counted_pairs
 from igps.nn._kernels.counted_pairs import can_count, count_pairs
+from loops import Axis, cosines, distances, pair_histogram_by_loops
 
 pytestmark = pytest.mark.skipif(not is_available(), reason="needs numba, the extra [fast]")
 

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from loops import cosines, distances, pair_histogram_by_loops
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from igps.nn._kernels.oriented_pairs import oriented_pair_histogram, point_pair_features
 from igps.nn.axes.centres import middles
+from loops import cosines, distances, pair_histogram_by_loops
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 

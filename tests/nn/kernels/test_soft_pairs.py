@@ -7,12 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from loops import distances, pair_histogram_by_loops
 from torch import Tensor
 
 from conftest import torch_threads
 from igps.nn._kernels.hard_pairs import class_pairs
 from igps.nn._kernels.soft_pairs import soft_pair_histogram
+from loops import distances, pair_histogram_by_loops
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn.axes.points import soft_memberships
 from igps.nn.batch_features import SampleKind, View
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential
 from igps.nn.histograms.base import SampleHistogram, counted, joint, present
-from igps.nn.requirements import Requirements, embedding_requirements
 
 # The weight of a sample is so great a power of its potential: the trunk decides where the axes lie, limbs hardly
 _POWER = -4

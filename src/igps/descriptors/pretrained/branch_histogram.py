@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn._kernels.merge_tree import merge_tree
 from igps.nn.batch_features import SampleKind, View
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram, present
-from igps.nn.requirements import Requirements, embedding_requirements
 
 
 class BranchHistogram(SampleHistogram):

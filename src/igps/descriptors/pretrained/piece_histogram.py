@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn._kernels.merge_tree import merge_tree
 from igps.nn.axes.points import soft_memberships
 from igps.nn.batch_features import SampleKind, View
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram, present
-from igps.nn.requirements import Requirements, embedding_requirements
 
 # Centres are logarithms to base 2. Of sizes, from one sample in 64 on
 _SMALLEST, _LARGEST = -6.0, -0.5

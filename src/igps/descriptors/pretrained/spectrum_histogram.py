@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from igps.data.requirements import Requirements
 from igps.nn.batch_features import View
 from igps.nn.histograms.base import SampleHistogram
-from igps.nn.requirements import Requirements
 
 
 class SpectrumHistogram(SampleHistogram):

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
+from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn.axes.centres import OrderedCentres, middles
 from igps.nn.batch_features import View
-from igps.nn.requirements import Requirements, embedding_requirements
 
 
 @dataclass(frozen=True)

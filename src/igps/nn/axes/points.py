@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
+from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn.axes.centres import OrderedCentres, middles
 from igps.nn.batch_features import View
 from igps.nn.embedding import barycentroid_potential
-from igps.nn.requirements import Requirements, embedding_requirements
 from igps.signature.attributes import AttributeName
 
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from igps.data.batch import SignatureBatch
+from igps.data.requirements import Requirements
 from igps.nn.batch_features import SampleKind, View, Views, check_kind
-from igps.nn.requirements import Requirements
 
 
 class SampleHistogram(nn.Module, ABC):

@@ -10,6 +10,7 @@ from operator import or_
 import torch
 from torch import Tensor, nn
 
+from igps.data.requirements import Requirements
 from igps.nn._kernels.hard_pairs import class_pairs, hard_pair_histogram
 from igps.nn._kernels.oriented_pairs import oriented_pair_histogram
 from igps.nn._kernels.soft_pairs import soft_pair_histogram
@@ -18,7 +19,6 @@ from igps.nn.axes.pairs import DistanceAxis, Distances, OrientedPoints
 from igps.nn.batch_features import SampleKind, View
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram, joint, present
-from igps.nn.requirements import Requirements
 
 
 class PairHistogram(SampleHistogram):

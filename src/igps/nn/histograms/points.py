@@ -9,11 +9,11 @@ from operator import or_
 import torch
 from torch import Tensor, nn
 
+from igps.data.requirements import Requirements
 from igps.nn.axes.points import PointAxis
 from igps.nn.batch_features import SampleKind, View
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram, counted, joint, present
-from igps.nn.requirements import Requirements
 
 
 class PointHistogram(SampleHistogram):

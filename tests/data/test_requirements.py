@@ -10,10 +10,10 @@ from torch import nn
 
 from batches import batch_of, two_bodies
 from igps.data.batch import Body
+from igps.data.requirements import Requirements, embedding_requirements
 from igps.descriptors import NAMES, descriptor
 from igps.nn.descriptor import BodyDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.requirements import Requirements, embedding_requirements
 from igps.signature.signature import SignatureConfig
 
 
