@@ -1,0 +1,1 @@
+"""File formats that are no triangle meshes, a module each: a file becomes bodies."""

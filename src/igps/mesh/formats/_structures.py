@@ -1,0 +1,138 @@
+"""The text of a structure file, as gemmi's models, chains, residues and atoms."""
+
+from __future__ import annotations
+
+import gzip
+import re
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from igps.mesh.mesh import MeshError
+
+if TYPE_CHECKING:
+    import gemmi
+
+SUFFIXES = frozenset({".pdb", ".ent", ".cif", ".mmcif", ".pqr"})
+"""Of structure files; a further ".gz" may follow."""
+
+# Twice the largest structures of the Protein Data Bank.
+_MOST_BYTES = 2**31
+_ATOM_LINE = re.compile(rb"^(?:ATOM  |HETATM)[^\r\n]*", re.MULTILINE)
+_NUMBER_OF_RESIDUE = re.compile(r"(-?\d+)([A-Za-z]?)")
+
+
+def suffix(path: Path) -> str:
+    """The suffix in lower case, of a gzipped file that before ".gz"."""
+    return Path(path.name.lower().removesuffix(".gz")).suffix
+
+
+def read_structure(path: Path) -> gemmi.Structure:
+    """Of a PQR file the charges of atoms are their occupancies, and the radii their B-factors.
+
+    Raises:
+        MeshError: the file is missing, cut short, unreadable, or larger than any structure.
+        ImportError: gemmi is not installed.
+    """
+    text = _text(path)
+    if suffix(path) == ".pqr":
+        return _pqr(text, path)
+    gemmi = gemmi_module()
+    try:
+        if suffix(path) in (".pdb", ".ent"):
+            return gemmi.read_pdb_string(_ATOM_LINE.sub(_with_numbers, text))
+        blocks = gemmi.cif.read_string(text.decode("utf-8", "replace"))
+        return gemmi.make_structure_from_block(next((b for b in blocks if b.find_values("_atom_site.id")), blocks[0]))
+    except (RuntimeError, ValueError, IndexError) as error:
+        reason = " ".join(str(error).split())
+        raise MeshError(
+            f"{path}: not readable as a structure, or cut short ({reason}). Download or export it again."
+        ) from error
+
+
+def gemmi_module() -> Any:
+    """Gemmi, or an ImportError that says how to install it."""
+    try:
+        import gemmi
+    except ImportError as error:
+        raise ImportError('Structures of molecules need gemmi: pip install "interior-gps[molecules]".') from error
+    return gemmi
+
+
+def _text(path: Path) -> bytes:
+    if suffix(path) not in SUFFIXES:
+        raise MeshError(f"{path}: expected a structure in {', '.join(sorted(SUFFIXES))}, gzipped or not.")
+    if not path.is_file():
+        raise MeshError(f"{path}: no such file. Check the path.")
+    try:
+        with gzip.open(path) if path.name.lower().endswith(".gz") else path.open("rb") as file:
+            text = file.read(_MOST_BYTES + 1)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise MeshError(f"{path}: the gzipped file is cut short or damaged ({error}). Download it again.") from error
+    if len(text) > _MOST_BYTES:
+        raise MeshError(f"{path}: more than {_MOST_BYTES:,} bytes of text, which no structure has. Check the file.")
+    if not text.strip():
+        raise MeshError(f"{path}: the file is empty. Export it again.")
+    return text
+
+
+def _with_numbers(line: re.Match[bytes]) -> bytes:
+    """A line of a PDB file, with NaN where a coordinate is no number: gemmi would read a zero there."""
+    whole = line.group()
+    for start in (30, 38, 46):
+        number = whole[start : start + 8]
+        try:
+            float(number)
+        except ValueError:
+            if len(number) == 8:
+                whole = whole[:start] + b"     nan" + whole[start + 8 :]
+    return whole
+
+
+def _pqr(text: bytes, path: Path) -> gemmi.Structure:
+    """Fields are parted by blanks: type, serial number, atom, residue, [chain,] number, x, y, z, charge, radius."""
+    gemmi = gemmi_module()
+    structure = gemmi.Structure()
+    chains: dict[str, list[Any]] = {}
+    for number, line in enumerate(text.decode("latin-1").splitlines(), start=1):
+        if line.startswith(("MODEL", "ENDMDL")):
+            _add_model(structure, chains)
+        if not line.startswith(("ATOM", "HETATM")):
+            continue
+        fields = line.split()
+        try:
+            x, y, z, charge, radius = map(float, fields[-5:])
+            name, residue, *chain, place = fields[2:-5]
+            found = _NUMBER_OF_RESIDUE.fullmatch(place)
+            if len(chain) > 1 or found is None or not radius >= 0:
+                raise ValueError("10 or 11 fields, the last a radius of at least 0, were expected")
+        except ValueError as error:
+            raise MeshError(
+                f"{path}: line {number} is no atom of a PQR file ({error}). It may be cut short; write it again."
+            ) from error
+        residues = chains.setdefault(chain[0] if chain else "", [])
+        key = gemmi.SeqId(int(found[1]), found[2] or " ")
+        if not residues or residues[-1].seqid != key or residues[-1].name != residue:
+            new = gemmi.Residue()
+            new.name, new.seqid, new.het_flag = residue, key, line[0]
+            residues.append(new)
+        atom = gemmi.Atom()
+        atom.name, atom.pos, atom.occ, atom.b_iso = name, gemmi.Position(x, y, z), charge, radius
+        residues[-1].add_atom(atom)
+    _add_model(structure, chains)
+    return structure
+
+
+def _add_model(structure: gemmi.Structure, chains: dict[str, list[Any]]) -> None:
+    """The chains as a model, if there are any; none are left in `chains`."""
+    gemmi = gemmi_module()
+    if not chains:
+        return
+    model = gemmi.Model(len(structure) + 1)
+    for name, residues in chains.items():
+        chain = gemmi.Chain(name)
+        for residue in residues:
+            chain.add_residue(residue)
+        model.add_chain(chain)
+    structure.add_model(model)
+    chains.clear()

@@ -1,0 +1,308 @@
+"""Molecules: the balls of atoms that a structure file holds, by chain, by model or by assembly."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.mesh.formats._structures import SUFFIXES, gemmi_module, read_structure, suffix
+from igps.mesh.mesh import MeshError
+from igps.mesh.residues import (
+    BACKBONE,
+    CHARGED_ATOMS,
+    PHOSPHATE_OXYGENS,
+    STANDARD,
+    residue_ball,
+    side_chain_ball,
+)
+
+if TYPE_CHECKING:
+    import gemmi
+
+logger = logging.getLogger(__name__)
+
+MoleculeBodies = Literal["chains", "models", "assembly"]
+
+# Radius of an atom whose element is not known, carbon's.
+_UNKNOWN_RADIUS = 1.7
+
+_NOTES = {
+    "alternative": "{} alternative locations: that of the highest occupancy was taken",
+    "nowhere": "{} atoms without a position were left out",
+    "element": f"{{}} atoms of an unknown element: a radius of {_UNKNOWN_RADIUS} Å was taken",
+    "residue": "{} residues of an unknown name",
+    "side chain": "{} residues without side chain: balls of the side chain's volume stand for them",
+    "alpha": "{} residues of Cα alone: balls of the residue's volume stand for them",
+    "repeated": "{} residues repeat a number: all were kept",
+    "ligand": "{} ligands were left out",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Molecule:
+    """The balls of a body, and what is known of its residues.
+
+    Args:
+        name: of the file, with the model, chain or assembly.
+        positions: (A, 3) of the balls, Å.
+        radii: (A,) van der Waals radii, Å.
+        charges: (A,) elementary charges.
+        residue_of: (A,) the residue of each ball, from 0.
+        residue_names: of the R residues, three letters; a modified amino acid has the name of the one that it was.
+        residue_positions: (R, 3) of the Cα atoms, or else the mean of a residue's atoms, Å.
+        b_factors: (R,) means of the residue's atoms: B-factors, Å², or a model's confidence (pLDDT); NaN of a PQR file.
+        notes: what was done to the structure, in words.
+    """
+
+    name: str
+    positions: NDArray[np.float64]
+    radii: NDArray[np.float64]
+    charges: NDArray[np.float64]
+    residue_of: NDArray[np.int64]
+    residue_names: tuple[str, ...]
+    residue_positions: NDArray[np.float64]
+    b_factors: NDArray[np.float64]
+    notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return f"Molecule({self.name!r}, {len(self.residue_names)} residues, {len(self.radii)} balls)"
+
+
+def is_structure(path: str | Path) -> bool:
+    """Whether a file has a suffix of PDB, mmCIF or PQR, with ".gz" behind it or without."""
+    return suffix(Path(path)) in SUFFIXES
+
+
+def read_molecule(
+    path: str | Path, bodies: MoleculeBodies = "chains", *, ligands: bool = False, hydrogens: bool = False
+) -> list[Molecule]:
+    """Read the bodies of a structure file: PDB, mmCIF or PQR, gzipped or not.
+
+    Each model of an ensemble gives bodies of its own. Water is left out. Of alternative locations that of the highest
+    occupancy is taken, the first of equals. Radii are van der Waals radii of the elements (Bondi 1964), and charges
+    those of residues at pH 7, without the ends of chains. A PQR file has its own of both, and keeps its hydrogens.
+
+    An amino acid with no atom of its side chain gets a ball of the side chain's volume, which touches Cα on the side of
+    Cβ; one of Cα alone is a ball of its whole volume (Zamyatnin 1972). So backbones and traces are bodies, too.
+
+    Example:
+        >>> import tempfile
+        >>> line = "HETATM    1 ZN    ZN A   1      11.104   6.134  -6.504  1.00 20.00          ZN\\n"
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(f"{folder}/zinc.pdb").write_text(line)
+        ...     (zinc,) = read_molecule(f"{folder}/zinc.pdb", ligands=True)
+        >>> zinc.residue_names, zinc.radii.round(2).tolist()
+        (('ZN',), [1.39])
+
+    Args:
+        path: the file.
+        bodies: "chains": every chain of every model; "models": every model as a whole; "assembly": of every model the
+            first biological assembly that the file names.
+        ligands: whether what belongs to no polymer belongs to the bodies. In a file without polymers it does.
+        hydrogens: whether hydrogens are kept, which most structures lack.
+
+    Returns:
+        At least one. Chains without usable atoms are left out, which is logged.
+
+    Raises:
+        ValueError: unknown `bodies`.
+        MeshError: the file is missing, cut short, unreadable, or holds no molecule.
+        ImportError: gemmi is not installed.
+    """
+    path = Path(path)
+    if bodies not in get_args(MoleculeBodies):
+        raise ValueError(f"bodies: expected one of {', '.join(get_args(MoleculeBodies))}, got {bodies!r}.")
+    structure = read_structure(path)
+    parts = list(_parts(structure, bodies, path))
+    found, left_out = _molecules(parts, ligands, hydrogens, suffix(path) == ".pqr")
+    if not found and not ligands:
+        found, left_out = _molecules(parts, True, hydrogens, suffix(path) == ".pqr")
+    if not found:
+        raise MeshError(
+            f"{path}: no atoms of a molecule that have positions, in {len(parts)} {bodies}. Check that the file is "
+            "complete, and not of water alone."
+        )
+    for name in left_out:
+        logger.warning("%s: no atoms of a polymer, left out; read its ligands, or check the file.", name)
+    return found
+
+
+def _molecules(
+    parts: list[tuple[str, list[gemmi.Chain], list[str]]], ligands: bool, hydrogens: bool, is_pqr: bool
+) -> tuple[list[Molecule], list[str]]:
+    """Those of the parts, and the names of parts that hold none."""
+    found, left_out = [], []
+    for name, chains, notes in parts:
+        one = _Builder(ligands, hydrogens or is_pqr, is_pqr)
+        for chain in chains:
+            one.add_chain(chain)
+        if any(radius > 0 for radius in one.radii):
+            found.append(one.molecule(name, notes))
+        else:
+            left_out.append(name)
+    return found, left_out
+
+
+def _parts(
+    structure: gemmi.Structure, bodies: MoleculeBodies, path: Path
+) -> Iterator[tuple[str, list[gemmi.Chain], list[str]]]:
+    """The name of each body, its chains, and notes."""
+    gemmi = gemmi_module()
+    for model in structure:
+        name = f"{path} model {model.num}" if len(structure) > 1 else str(path)
+        if bodies == "chains":
+            # A chain may come in several pieces.
+            for label in dict.fromkeys(chain.name for chain in model):
+                yield f"{name} chain {label or 'without name'}", [c for c in model if c.name == label], []
+        elif bodies == "assembly" and len(structure.assemblies):
+            first = structure.assemblies[0]
+            made = gemmi.make_assembly(first, model, gemmi.HowToNameCopiedChain.AddNumber)
+            yield f"{name} assembly {first.name}", list(made), []
+        else:
+            notes = ["the file names no assembly: the model was taken as it is"] if bodies == "assembly" else []
+            yield name, list(model), notes
+
+
+class _Builder:
+    """Collects the balls and residues of one molecule."""
+
+    def __init__(self, ligands: bool, hydrogens: bool, is_pqr: bool) -> None:
+        self.ligands, self.hydrogens, self.is_pqr = ligands, hydrogens, is_pqr
+        self.radii: list[float] = []
+        self._positions: list[NDArray[np.float64]] = []
+        self._charges: list[float] = []
+        self._residue_of: list[int] = []
+        self._names: list[str] = []
+        self._places: list[NDArray[np.float64]] = []
+        self._b_factors: list[float] = []
+        self._count: Counter[str] = Counter()
+
+    def molecule(self, name: str, notes: list[str]) -> Molecule:
+        own = ["radii and charges are those of the PQR file"] if self.is_pqr else []
+        counted = [text.format(self._count[what]) for what, text in _NOTES.items() if self._count[what]]
+        return Molecule(
+            name,
+            np.array(self._positions),
+            np.array(self.radii),
+            np.array(self._charges),
+            np.array(self._residue_of, dtype=np.int64),
+            tuple(self._names),
+            np.array(self._places),
+            np.array(self._b_factors),
+            (*notes, *own, *counted),
+        )
+
+    def add_chain(self, chain: gemmi.Chain) -> None:
+        seen: set[str] = set()
+        for residue in self._conformers(chain):
+            if residue.is_water():
+                continue
+            atoms = self._atoms(residue)
+            if self._add_residue(residue, atoms):
+                place = str(residue.seqid)
+                self._count["repeated"] += place in seen
+                seen.add(place)
+
+    def _add_residue(self, residue: gemmi.Residue, atoms: list[gemmi.Atom]) -> bool:
+        """Whether the residue belongs to the molecule."""
+        kind = gemmi_module().find_tabulated_residue(residue.name)
+        name = _standard(residue.name, kind)
+        named = {atom.name for atom in atoms}
+        is_known = name != residue.name or (kind.is_amino_acid() or kind.is_nucleic_acid())
+        in_polymer = residue.het_flag == "A" or is_known or {"N", "CA", "C"} <= named
+        if not atoms or not (in_polymer or self.ligands):
+            self._count["ligand"] += bool(atoms)
+            return False
+        self._count["residue"] += in_polymer and not is_known
+        at = np.array([atom.pos.tolist() for atom in atoms])
+        alpha = next((i for i, atom in enumerate(atoms) if atom.name == "CA"), None) if in_polymer else None
+        self._names.append(name)
+        self._places.append(at.mean(axis=0) if alpha is None else at[alpha])
+        self._b_factors.append(np.nan if self.is_pqr else float(np.mean([atom.b_iso for atom in atoms])))
+        charged = (PHOSPHATE_OXYGENS if kind.is_nucleic_acid() else CHARGED_ATOMS.get(name, {})) if in_polymer else {}
+        if alpha is not None and not self.is_pqr and (named == {"CA"} or (named <= BACKBONE and name != "GLY")):
+            self._add_coarse_ball(name, atoms, at, sum(charged.values()))
+            if named == {"CA"}:
+                return True
+        for atom, position in zip(atoms, at, strict=True):
+            if self.is_pqr:
+                self._add_ball(position, atom.b_iso, atom.occ)
+                continue
+            has_element = atom.element.atomic_number > 0
+            self._count["element"] += not has_element
+            radius = atom.element.vdw_r if has_element else _UNKNOWN_RADIUS
+            self._add_ball(position, radius, charged.get(atom.name, 0.0))
+        return True
+
+    def _add_ball(self, position: NDArray[np.float64], radius: float, charge: float) -> None:
+        self._positions.append(position)
+        self.radii.append(radius)
+        self._charges.append(charge)
+        self._residue_of.append(len(self._names) - 1)
+
+    def _add_coarse_ball(self, name: str, atoms: list[gemmi.Atom], at: NDArray[np.float64], charge: float) -> None:
+        """That which stands for a missing side chain, or for a residue of Cα alone."""
+        place = {atom.name: position for atom, position in zip(atoms, at, strict=True)}
+        if len(place) == 1:
+            self._count["alpha"] += 1
+            self._add_ball(place["CA"], residue_ball(name), charge)
+            return
+        self._count["side chain"] += 1
+        radius, centre = side_chain_ball(name), place["CA"]
+        if {"N", "C"} <= place.keys():
+            # Tetrahedral geometry has Cβ in this direction.
+            b, c = centre - place["N"], place["C"] - centre
+            direction = -0.58273431 * np.cross(b, c) + 0.56802827 * b - 0.54067466 * c
+            centre = centre + radius * direction / max(float(np.linalg.norm(direction)), 1e-9)
+        self._add_ball(centre, radius, charge)
+
+    def _conformers(self, chain: gemmi.Chain) -> Iterator[gemmi.Residue]:
+        """The residues; of several that are alternatives to each other, that of the highest occupancy."""
+        group: list[Any] = []
+        for residue in chain:
+            is_alternative = len(residue) > 0 and all(atom.has_altloc() for atom in residue)
+            if group and not (is_alternative and residue.seqid == group[0].seqid):
+                yield self._best(group)
+                group = []
+            if is_alternative:
+                group.append(residue)
+            else:
+                yield residue
+        if group:
+            yield self._best(group)
+
+    def _best(self, group: list[gemmi.Residue]) -> gemmi.Residue:
+        self._count["alternative"] += len(group) - 1
+        return max(group, key=lambda residue: max(atom.occ for atom in residue))
+
+    def _atoms(self, residue: gemmi.Residue) -> list[gemmi.Atom]:
+        """Those that have a position, one of each that has alternatives."""
+        chosen: dict[Any, Any] = {}
+        for number, atom in enumerate(residue):
+            if not self.hydrogens and atom.is_hydrogen():
+                continue
+            if not np.isfinite(atom.pos.tolist()).all():
+                self._count["nowhere"] += 1
+                continue
+            key = atom.name if atom.has_altloc() else number
+            self._count["alternative"] += key in chosen
+            if key not in chosen or atom.occ > chosen[key].occ:
+                chosen[key] = atom
+        return list(chosen.values())
+
+
+def _standard(name: str, kind: gemmi.ResidueInfo) -> str:
+    """The name of the amino acid that a modified one was; any other name as it is."""
+    if name in STANDARD:
+        return STANDARD[name]
+    if kind.is_standard() or not kind.is_amino_acid():
+        return name
+    gemmi = gemmi_module()
+    return gemmi.expand_one_letter(kind.one_letter_code.upper(), gemmi.ResidueKind.AA) or name

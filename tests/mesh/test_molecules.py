@@ -1,0 +1,283 @@
+"""Structure files become molecules: small files written here, and what strangers' files hold."""
+
+from __future__ import annotations
+
+import gzip
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from igps.mesh.formats.molecules import is_structure, read_molecule
+from igps.mesh.mesh import MeshError
+from igps.mesh.molecular_surface import molecular_surface
+from igps.mesh.residues import VOLUMES
+
+pytest.importorskip("gemmi")
+
+ALANINE = [("N", 0.0, 0.0), ("CA", 1.46, 0.0), ("C", 2.0, 1.4), ("O", 1.3, 2.4), ("CB", 2.0, -0.8)]
+
+
+def line(
+    number: int,
+    name: str,
+    x: float,
+    y: float,
+    z: float,
+    *,
+    residue: str = "ALA",
+    chain: str = "A",
+    place: str = "   1 ",
+    record: str = "ATOM",
+    alternative: str = " ",
+    occupancy: float = 1.0,
+    b: float = 20.0,
+    element: str | None = None,
+) -> str:
+    element = name[0] if element is None else element
+    return (
+        f"{record:<6}{number:>5} {name:^4}{alternative}{residue:>3} {chain}{place:>5}   {x:8.3f}{y:8.3f}{z:8.3f}"
+        f"{occupancy:6.2f}{b:6.2f}          {element:>2}\n"
+    )
+
+
+def residue(number: int, name: str = "ALA", atoms: list[tuple[str, float, float]] = ALANINE, **said: object) -> str:
+    place = said.pop("place", f"{number:>4} ")
+    return "".join(
+        line(i, atom, x, y, 3.8 * number, residue=name, place=place, **said)  # type: ignore[arg-type]
+        for i, (atom, x, y) in enumerate(atoms, start=1)
+    )
+
+
+def written(folder: Path, text: str, name: str = "made.pdb") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def backbone(atoms: int = 4) -> list[tuple[str, float, float]]:
+    return ALANINE[:atoms]
+
+
+def test_atoms_have_the_radii_of_their_elements(tmp_path: Path) -> None:
+    (molecule,) = read_molecule(written(tmp_path, residue(1) + residue(2, "MET", [*ALANINE, ("SD", 3.0, -2.0)])))
+    np.testing.assert_allclose(molecule.radii[:5], [1.55, 1.70, 1.70, 1.52, 1.70], atol=1e-6)  # Bondi 1964
+    assert molecule.radii[-1] == pytest.approx(1.80)
+    assert molecule.residue_names == ("ALA", "MET")
+    assert molecule.residue_of.tolist() == [0] * 5 + [1] * 6
+    np.testing.assert_allclose(molecule.residue_positions, [[1.46, 0, 3.8], [1.46, 0, 7.6]])
+    assert molecule.notes == ()
+
+
+def test_pdb_and_mmcif_and_their_gzipped_files_are_one_molecule(tmp_path: Path) -> None:
+    import gemmi
+
+    text = residue(1) + residue(2, "LYS") + "END\n"
+    plain = written(tmp_path, text)
+    structure = gemmi.read_structure(str(plain))
+    structure.setup_entities()
+    cif = written(tmp_path, structure.make_mmcif_document().as_string(), "made.cif")
+    paths = [plain, cif]
+    for path in (plain, cif):
+        paths.append(path.with_name(path.name + ".gz"))
+        paths[-1].write_bytes(gzip.compress(path.read_bytes()))
+    one, *others = (read_molecule(path)[0] for path in paths)
+    assert all(is_structure(path) for path in paths)
+    for other in others:
+        np.testing.assert_allclose(other.positions, one.positions)
+        np.testing.assert_array_equal(other.radii, one.radii)
+        np.testing.assert_array_equal(other.charges, one.charges)
+        assert other.residue_names == one.residue_names
+
+
+def test_a_pqr_file_has_its_own_charges_and_radii(tmp_path: Path) -> None:
+    rows = "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 1.85\nATOM 2 HN ALA A 1 0.5 0.5 0.0 0.30 0.0\n"
+    rows += "ATOM 3 CA HIE 2A 1.5 0.0 0.0 0.10 2.00\nHETATM 4 O WAT 3 9 9 9 -0.8 1.6\nTER\nEND\n"
+    molecules = read_molecule(written(tmp_path, rows, "made.pqr"), "models")
+    (molecule,) = molecules
+    np.testing.assert_allclose(molecule.charges, [-0.3, 0.3, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(molecule.radii, [1.85, 0, 2], atol=1e-6)
+    assert molecule.residue_names == ("ALA", "HIS")
+    assert np.isnan(molecule.b_factors).all()
+    assert molecule.notes == ("radii and charges are those of the PQR file",)
+
+
+def test_charges_are_those_of_residues_at_ph_7(tmp_path: Path) -> None:
+    names = {
+        "ASP": "OD1 OD2",
+        "GLU": "OE1 OE2",
+        "LYS": "NZ",
+        "ARG": "NH1 NH2",
+        "HIS": "ND1 NE2",
+        "SER": "OG",
+        "DA": "OP1",
+    }
+    side = {name: [(atom, 3.0 + i, -2.0) for i, atom in enumerate(atoms.split())] for name, atoms in names.items()}
+    text = "".join(residue(i, name, [*ALANINE, *side[name]]) for i, name in enumerate(names, start=1))
+    (molecule,) = read_molecule(written(tmp_path, text))
+    sums = np.bincount(molecule.residue_of, molecule.charges)
+    np.testing.assert_allclose(sums, [-1, -1, 1, 1, 0.1, 0, -0.5])
+
+
+def test_models_and_chains_are_bodies_of_their_own(tmp_path: Path) -> None:
+    models = "".join(
+        f"MODEL     {i:>4}\n{residue(1)}{residue(2)}TER\n{residue(1, chain='B')}ENDMDL\n" for i in range(1, 21)
+    )
+    path = written(tmp_path, models)
+    of_models = read_molecule(path, "models")
+    assert [len(molecule.radii) for molecule in of_models] == [15] * 20
+    assert of_models[19].name == f"{path} model 20"
+    of_chains = read_molecule(path)
+    assert [len(molecule.radii) for molecule in of_chains] == [10, 5] * 20
+    assert of_chains[1].name == f"{path} model 1 chain B"
+
+
+def test_an_assembly_is_built_by_its_operators(tmp_path: Path) -> None:
+    remark = (
+        "REMARK 350 BIOMOLECULE: 1\n"
+        "REMARK 350 APPLY THE FOLLOWING TO CHAINS: A\n"
+        "REMARK 350   BIOMT1   1  1.000000  0.000000  0.000000        0.00000\n"
+        "REMARK 350   BIOMT2   1  0.000000  1.000000  0.000000        0.00000\n"
+        "REMARK 350   BIOMT3   1  0.000000  0.000000  1.000000        0.00000\n"
+        "REMARK 350   BIOMT1   2 -1.000000  0.000000  0.000000        0.00000\n"
+        "REMARK 350   BIOMT2   2  0.000000 -1.000000  0.000000        0.00000\n"
+        "REMARK 350   BIOMT3   2  0.000000  0.000000  1.000000       50.00000\n"
+    )
+    (molecule,) = read_molecule(written(tmp_path, remark + residue(1)), "assembly")
+    one = molecule.positions[:5]
+    np.testing.assert_allclose(molecule.positions[5:], one * [-1, -1, 1] + [0, 0, 50], atol=1e-4)
+    (alone,) = read_molecule(written(tmp_path, residue(1)), "assembly")
+    assert alone.notes == ("the file names no assembly: the model was taken as it is",)
+
+
+def test_water_is_left_out_and_ligands_as_said(tmp_path: Path) -> None:
+    water = line(9, "O", 9, 9, 9, residue="HOH", place=" 101 ", record="HETATM")
+    ligand = line(10, "C1", 5, 5, 5, residue="XYZ", place=" 102 ", record="HETATM")
+    changed = residue(2, "MSE", [*ALANINE, ("SE", 3.0, -2.0)], record="HETATM")
+    path = written(tmp_path, residue(1) + changed + water + ligand)
+    (molecule,) = read_molecule(path)
+    assert molecule.residue_names == ("ALA", "MET")
+    assert molecule.notes == ("1 ligands were left out",)
+    (more,) = read_molecule(path, ligands=True)
+    assert more.residue_names == ("ALA", "MET", "XYZ")
+    with pytest.raises(MeshError, match=r"water\.pdb: no atoms .* not of water alone"):
+        read_molecule(written(tmp_path, water, "water.pdb"))
+
+
+def test_hydrogens_are_left_out_unless_asked_for(tmp_path: Path) -> None:
+    path = written(tmp_path, residue(1, atoms=[*ALANINE, ("H", 0.0, -1.0)]))
+    assert len(read_molecule(path)[0].radii) == 5
+    assert len(read_molecule(path, hydrogens=True)[0].radii) == 6
+
+
+def test_a_backbone_gets_balls_of_its_side_chains(tmp_path: Path) -> None:
+    text = residue(1, "LEU", backbone()) + residue(2, "GLY", backbone()) + residue(3, "LYS", backbone())
+    (molecule,) = read_molecule(written(tmp_path, text))
+    assert molecule.notes == ("2 residues without side chain: balls of the side chain's volume stand for them",)
+    assert np.bincount(molecule.residue_of).tolist() == [5, 4, 5]
+    leucine = molecule.positions[0], molecule.radii[0]
+    assert 4 / 3 * np.pi * leucine[1] ** 3 == pytest.approx(VOLUMES["LEU"] - VOLUMES["GLY"])
+    # It touches Cα, on the side of Cβ, which tetrahedral geometry has away from N and C.
+    away = leucine[0] - [1.46, 0, 3.8]
+    assert np.linalg.norm(away) == pytest.approx(leucine[1])
+    for bonded in ([0.0, 0.0, 3.8], [2.0, 1.4, 3.8]):
+        bond = np.array(bonded) - [1.46, 0, 3.8]
+        cosine = away @ bond / np.linalg.norm(away) / np.linalg.norm(bond)
+        assert np.degrees(np.arccos(cosine)) == pytest.approx(109.5, abs=4)
+    assert np.bincount(molecule.residue_of, molecule.charges).tolist() == [0, 0, 1]
+
+
+def test_a_trace_has_balls_of_its_residues(tmp_path: Path) -> None:
+    text = "".join(residue(i, "ASP", ALANINE[1:2]) for i in range(1, 9))
+    (molecule,) = read_molecule(written(tmp_path, text))
+    assert molecule.notes == ("8 residues of Cα alone: balls of the residue's volume stand for them",)
+    np.testing.assert_allclose(4 / 3 * np.pi * molecule.radii**3, VOLUMES["ASP"])
+    assert molecule.charges.tolist() == [-1.0] * 8
+    assert molecular_surface(molecule).volume > 6 * VOLUMES["ASP"]
+
+
+def test_of_alternatives_the_most_occupied_is_taken(tmp_path: Path) -> None:
+    atoms = [
+        line(5, "CB", 2, -0.8, 3.8, alternative="A", occupancy=0.4),
+        line(6, "CB", 2, -0.9, 3.8, alternative="B", occupancy=0.6),
+    ]
+    kinds = residue(2, "SER", alternative="A", occupancy=0.3) + residue(2, "THR", alternative="B", occupancy=0.7)
+    (molecule,) = read_molecule(written(tmp_path, residue(1, atoms=backbone()) + "".join(atoms) + kinds))
+    assert molecule.positions[4, 1] == pytest.approx(-0.9)
+    assert molecule.residue_names == ("ALA", "THR")
+    assert molecule.notes == ("2 alternative locations: that of the highest occupancy was taken",)
+
+
+def test_negative_inserted_and_repeated_numbers_lose_nothing(tmp_path: Path) -> None:
+    text = residue(1, place="  -5 ") + residue(2, place="  -5A") + residue(3, "GLY") + residue(4, "SER", place="   3 ")
+    (molecule,) = read_molecule(written(tmp_path, text))
+    assert molecule.residue_names == ("ALA", "ALA", "GLY", "SER")
+    assert len(molecule.radii) == 20
+    assert molecule.notes == ("1 residues repeat a number: all were kept",)
+
+
+def test_unknown_elements_and_residues_are_kept_with_a_note(tmp_path: Path) -> None:
+    (molecule,) = read_molecule(written(tmp_path, residue(1, "QQQ") + residue(2, element="Xx")))
+    assert len(molecule.radii) == 10
+    assert molecule.residue_names == ("QQQ", "ALA")
+    assert molecule.notes == (
+        "5 atoms of an unknown element: a radius of 1.7 Å was taken",
+        "1 residues of an unknown name",
+    )
+
+
+def test_atoms_without_a_position_are_left_out_not_put_at_the_origin(tmp_path: Path) -> None:
+    text = residue(1).replace("   1.300   2.400", "********   2.400")
+    (molecule,) = read_molecule(written(tmp_path, text))
+    assert len(molecule.radii) == 4
+    assert "1 atoms without a position were left out" in molecule.notes
+
+
+def test_a_chain_without_atoms_costs_no_other_chain(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    lost = line(1, "N", 0, 0, 0, chain="B").replace("   0.000   0.000   0.000", "     nan     nan     nan")
+    path = written(tmp_path, residue(1) + lost)
+    with caplog.at_level(logging.WARNING):
+        (molecule,) = read_molecule(path)
+    assert molecule.name == f"{path} chain A"
+    assert f"{path} chain B: no atoms of a polymer, left out" in caplog.text
+
+
+def test_b_factors_are_means_over_residues(tmp_path: Path) -> None:
+    text = line(1, "N", 0, 0, 0, b=10) + line(2, "CA", 1, 0, 0, b=30) + residue(2, b=70.0)
+    assert read_molecule(written(tmp_path, text))[0].b_factors.tolist() == [20.0, 70.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("cut.pdb", residue(1) + "ATOM      6  N   ALA A   2      11.1", "cut short"),
+        ("cut.cif", "data_x\nloop_\n_atom_site.id\n_atom_site.Cartn_x\n1 2\n3\n", "cut short"),
+        ("cut.pqr", "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 1.85\nATOM 2 CA ALA A 1 0.0", "line 2 .*cut short"),
+        ("negative.pqr", "ATOM 1 N ALA A 1 0.0 0.0 0.0 -0.30 -1.85\n", "radius of at least 0"),
+        ("empty.pdb", "  \n", "the file is empty"),
+        ("words.pdb", "no structure at all\n", "no atoms of a molecule"),
+        ("words.cif", "no structure at all\n", "not readable as a structure"),
+        ("other.xyz", "1\n", "expected a structure"),
+    ],
+)
+def test_bad_files_are_named_with_the_remedy(tmp_path: Path, name: str, text: str, said: str) -> None:
+    with pytest.raises(MeshError, match=rf"{name}: .*{said}"):
+        read_molecule(written(tmp_path, text, name))
+
+
+def test_a_gzipped_file_that_is_cut_short_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "cut.pdb.gz"
+    path.write_bytes(gzip.compress((residue(1) * 50).encode())[:-20])
+    with pytest.raises(MeshError, match=r"cut\.pdb\.gz: .*cut short.* Download it again"):
+        read_molecule(path)
+    path.write_bytes(b"no gzip")
+    with pytest.raises(MeshError, match=r"cut\.pdb\.gz: .*damaged"):
+        read_molecule(path)
+    with pytest.raises(MeshError, match="no such file"):
+        read_molecule(tmp_path / "absent.pdb")
+
+
+def test_unknown_bodies_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="bodies: expected one of chains, models, assembly"):
+        read_molecule(written(tmp_path, residue(1)), "residues")  # type: ignore[arg-type]
