@@ -10,8 +10,8 @@ from pathlib import Path
 
 import yaml
 from PIL import Image
-from training.contact_sheet import contact_sheet
 from training.graded import GradedShapes
+from training.studies.contact_sheet import contact_sheet
 
 WIDTH = 1400  # pixels
 

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from igps.cli import main
+from igps.cli import Commands
+from igps.cli import main as run
 from training.studies.damage_command import damage
 from training.studies.figure_command import pose, potential, topology
 from training.studies.robustness_command import robustness
 
-COMMANDS = {
+COMMANDS: Commands = {
     "robustness": robustness,
     "damage": damage,
     "figure": {"pose": pose, "topology": topology, "potential": potential},
 }
 
+
+def main() -> None:
+    """Run the study that the words of the command line name."""
+    run(COMMANDS, "python -m training.study")
+
+
 if __name__ == "__main__":
-    main(COMMANDS, "python -m training.study")
+    main()

@@ -89,7 +89,7 @@ def test_a_page_afterwards_wherever_the_meshes_are(
     assert len(data_of(page)["shapes"]) == 4
 
 
-def test_compare_and_robustness_have_pages(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compare_has_a_page(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     descriptors = ["--descriptors", INTERIOR, "own_descriptors:small_gps"]
     igps(monkeypatch, "compare", root, *descriptors, *options(tmp_path / "compare", "--report"))
     data = data_of(tmp_path / "compare" / "report.html")
@@ -98,29 +98,15 @@ def test_compare_and_robustness_have_pages(root: Path, tmp_path: Path, monkeypat
     assert [system["scores"]["ft"] for system in data["systems"]] == pytest.approx([row["ft"] for row in rows])
     assert sum("surface" in shape for shape in data["shapes"]) == 4
 
-    meshes = [root / "ball" / "0.off", root / "egg" / "0.off"]
-    descriptors = ["--descriptors", "own_descriptors:Root"]
-    igps(monkeypatch, "robustness", *meshes, *descriptors, *options(tmp_path / "robustness", "--report"))
-    data = data_of(tmp_path / "robustness" / "report.html")
-    written = json.loads((tmp_path / "robustness" / "robustness.json").read_text())
-    assert data["movements"] == written["movements"]
-    assert [shape["name"] for shape in data["shapes"]] == list(map(str, meshes))
-    assert sum("surface" in shape for shape in data["shapes"]) == 2
-
 
 def test_what_is_missing_is_told_before_anything_is_computed(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cache = ["--cache_dir", tmp_path / "cache"]
-    for command in ("retrieve", "compare", "robustness"):
+    for command in ("retrieve", "compare"):
         with pytest.raises(SystemExit, match="1"):
             igps(monkeypatch, command, root, "--report", *cache)
         assert "expected --out" in capsys.readouterr().err
-    with monkeypatch.context() as patch:
-        patch.setitem(sys.modules, "jinja2", None)
-        with pytest.raises(SystemExit, match="1"):
-            igps(monkeypatch, "retrieve", root, "--report", *options(tmp_path / "out"))
-    assert "interior-gps[page]" in capsys.readouterr().err
     assert not (tmp_path / "cache").exists()
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, "report", tmp_path)

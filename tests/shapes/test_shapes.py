@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
-from training.contact_sheet import contact_sheet
 from training.graded import GradedShapes
+from training.studies.contact_sheet import contact_sheet
 
 from igps.shapes import ArticulatedShapes, GeneratedShape
 from igps.shapes.solids import Arc, Box, Cone, Prism, Ring, Solid
@@ -232,7 +232,7 @@ def test_contact_sheet_shows_mirrored_shapes_right_side_out(tmp_path: Path, monk
     assert {np.linalg.det(shapes[i].motion) > 0 for i in range(len(shapes))} == {True, False}  # some are mirrored
     drawn: list[trimesh.Trimesh] = []
     monkeypatch.setattr(
-        "training.contact_sheet.paint",
+        "training.studies.contact_sheet.paint",
         lambda axis, vertices, faces, colour: drawn.append(trimesh.Trimesh(vertices, faces, process=False)),
     )
     contact_sheet(shapes, tmp_path / "sheet.png", n_shown=2)

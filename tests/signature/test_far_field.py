@@ -9,10 +9,10 @@ import logging
 import numpy as np
 import pytest
 import torch
-from bodies import Mesh, bumpy_sphere, interior_points, smooth_functions, torus
 from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import Rotation
 
+from bodies import Mesh, bumpy_sphere, interior_points, smooth_functions, torus
 from conftest import with_slivers
 from igps.mesh import mesh as geometry
 from igps.signature import _closed_forms as closed_forms

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from training.studies.damage import damage as study
 from training.studies.damages import DAMAGES
+from training.study import main
 
-from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, Root, write_egg

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 from training.studies import paper_figures as paper
 from training.studies.weld import TUBE_FACES, facing_vertices, weld
+from training.study import main
 
 from conftest import horseshoe
-from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh

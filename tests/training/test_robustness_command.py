@@ -1,7 +1,8 @@
-"""`igps robustness`: what it prints and writes is what the study finds."""
+"""`python -m training.study robustness`: what it prints and writes is what the study finds."""
 
 from __future__ import annotations
 
+import html
 import json
 import re
 import sys
@@ -11,8 +12,8 @@ import numpy as np
 import pytest
 from training.studies import robustness as study
 from training.studies.disturbances import DISTURBANCES
+from training.study import main
 
-from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.shapes import ArticulatedShapes
 from igps.signature.signature import SignatureConfig
@@ -106,3 +107,29 @@ def test_errors_are_said_in_one_line(
     with pytest.raises(SystemExit, match="1"):
         run(monkeypatch, tmp_path, write_egg(tmp_path / "egg.off", 1.5, 2), *arguments, *SMALL)
     assert re.search(f"igps: .*{message}", capsys.readouterr().err)
+
+
+def test_robustness_has_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    meshes = [write_egg(tmp_path / f"{height}.off", height) for height in (1.0, 2.0)]
+    words = ["--descriptors", "own_descriptors:Root", "--report", "--n_workers", "1", *SMALL]
+    written = run(monkeypatch, tmp_path, *meshes, *words)
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page)
+    assert found is not None
+    data = json.loads(found[1])
+    assert data["movements"] == written["movements"]
+    assert [shape["name"] for shape in data["shapes"]] == list(map(str, meshes))
+    assert sum("surface" in shape for shape in data["shapes"]) == 2
+    assert all(one.description in html.unescape(page) for one in DISTURBANCES.values())
+
+
+def test_robustness_without_a_folder_has_no_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cache = tmp_path / "cache"
+    words = ["robustness", write_egg(tmp_path / "1.off", 1.0), "--report", "--cache_dir", cache]
+    monkeypatch.setattr(sys, "argv", ["study", *map(str, words)])
+    with pytest.raises(SystemExit, match="1"):
+        main()
+    assert "expected --out" in capsys.readouterr().err
+    assert not cache.exists()

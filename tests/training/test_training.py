@@ -36,8 +36,8 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(script: str, *arguments: object) -> str:
-    command = [sys.executable, str(PROJECT / "training" / script), *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": str(PROJECT / "src")}
+    command = [sys.executable, "-m", f"training.{script}", *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": f"{PROJECT / 'src'}{os.pathsep}{PROJECT}"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -79,7 +79,7 @@ def rows(table: str) -> dict[str, list[float]]:
 def test_splits_are_scored_as_by_the_librarys_parts(root: Path, name: str, protocol: str) -> None:
     n_train = 3 if protocol == "seen" else 2
     table = run(
-        "evaluate.py", "splits", root / "meshes", "--descriptor", name, "--protocol", protocol, "--n_train", n_train,
+        "evaluate", "splits", root / "meshes", "--descriptor", name, "--protocol", protocol, "--n_train", n_train,
         "--n_splits", 2, "--cache_dir", root / "cache",
     )  # fmt: skip
     assert f"{name}, {protocol}, n_train={n_train}, 2 splits from seed 100" in table
@@ -101,7 +101,7 @@ def test_splits_are_scored_as_by_the_librarys_parts(root: Path, name: str, proto
 
 def test_a_metric_is_the_prior_of_the_heads(root: Path) -> None:
     table = run(
-        "evaluate.py", "splits", root / "meshes", "--descriptor", "pretrained", "--protocol", "unseen", "--n_train", 2,
+        "evaluate", "splits", root / "meshes", "--descriptor", "pretrained", "--protocol", "unseen", "--n_train", 2,
         "--n_splits", 1, "--cache_dir", root / "cache",
     )  # fmt: skip
     module = igps.descriptor("pretrained")
@@ -124,7 +124,7 @@ def test_a_metric_is_the_prior_of_the_heads(root: Path) -> None:
 
 
 def test_classification_counts_what_the_kernel_head_finds(root: Path) -> None:
-    printed = run("classify.py", root / "meshes", "--n_train", 3, "--n_splits", 2, "--cache_dir", root / "cache")
+    printed = run("classify", root / "meshes", "--n_train", 3, "--n_splits", 2, "--cache_dir", root / "cache")
     histograms, labels, part_cells = described(root, "rich")
     shares = []
     for seed in (100, 101):
@@ -141,12 +141,12 @@ def test_classification_counts_what_the_kernel_head_finds(root: Path) -> None:
 def test_checkpoint_to_table_figure_and_classifier(root: Path) -> None:
     out = root / "out"
     run(
-        "train.py", "fit", "--config", PROJECT / "configs/default.yaml", "--config", PROJECT / "configs/smoke.yaml",
+        "train", "fit", "--config", PROJECT / "configs/default.yaml", "--config", PROJECT / "configs/smoke.yaml",
         "--data.root", root / "meshes", "--data.cache_dir", root / "cache_plain", "--data.n_train", 4,
         "--data.n_validation", 2, "--data.shapes_per_class", 2, "--trainer.default_root_dir", out,
     )  # fmt: skip
     (checkpoint,) = out.rglob("*.ckpt")
-    table = run("evaluate.py", "checkpoint", checkpoint, "--out", out / "evaluation")
+    table = run("evaluate", "checkpoint", checkpoint, "--out", out / "evaluation")
     printed = rows(table)
     assert list(printed) == ["plain", "learned", "whitened", "kernel"]
 
@@ -173,7 +173,7 @@ def test_checkpoint_to_table_figure_and_classifier(root: Path) -> None:
         assert numbers == pytest.approx(wanted, abs=0.06), name
     assert (out / "evaluation/layout.png").stat().st_size > 10_000
 
-    accuracy = run("classify.py", root / "meshes", "--checkpoint", checkpoint)
+    accuracy = run("classify", root / "meshes", "--checkpoint", checkpoint)
     train = torch.tensor(split.train)
     head = KernelHead().fit(histograms[train].flatten(1), labels[train], learner.part_cells)
     share = 100 * float((head.predict(part.flatten(1)) == labels[test]).double().mean())
@@ -182,7 +182,7 @@ def test_checkpoint_to_table_figure_and_classifier(root: Path) -> None:
 
 def test_ablation_prints_every_head_of_every_layout(root: Path) -> None:
     table = run(
-        "ablate.py", root / "meshes", "--n_train", 3, "--n_splits", 1, "--n_epochs", 1, "--n_training_samples", 50,
+        "ablate", root / "meshes", "--n_train", 3, "--n_splits", 1, "--n_epochs", 1, "--n_training_samples", 50,
         "--cache_dir", root / "cache",
     )  # fmt: skip
     pattern = r"^(interior|euclidean|oriented) +(nothing|bins|spectrum|bins \+ spectrum)  +(.*)$"
@@ -204,7 +204,7 @@ def test_ablation_prints_every_head_of_every_layout(root: Path) -> None:
 
 def test_pretraining_saves_a_metric_and_measures_it(root: Path, tmp_path: Path) -> None:
     out = run(
-        "pretrain.py", "--root", tmp_path / "generated", "--n_classes", 27, "--n_bodies", 2, "--n_poses", 2,
+        "pretrain", "--root", tmp_path / "generated", "--n_classes", 27, "--n_bodies", 2, "--n_poses", 2,
         "--n_parts", 2, "--n_scored", 4, "--cache_dir", root / "cache", "--data", root / "meshes",
         "--plain", '["interior"]',
         "--out", tmp_path / "metric.safetensors", "--figures", tmp_path / "figures",

@@ -51,7 +51,7 @@ A command that prints a table returns what it tells, for `--json`.
 """
 
 
-def main(commands: Commands = COMMANDS, program: str = "igps") -> None:
+def main(commands: Commands | None = None, program: str = "igps") -> None:
     """Run the command that the words of the command line name: status 1 if the input is at fault, 2 if the machine is.
 
     Args:
@@ -59,6 +59,7 @@ def main(commands: Commands = COMMANDS, program: str = "igps") -> None:
         program: what the commands follow on the command line.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    commands = COMMANDS if commands is None else commands
     parser = command_parser(commands, program)
     command, options = _chosen(parser.instantiate(parser.parse_args()), commands)
     as_json = options.pop(JSON, False)
@@ -85,10 +86,10 @@ def main(commands: Commands = COMMANDS, program: str = "igps") -> None:
         sys.exit(status)
 
 
-def command_parser(commands: Commands = COMMANDS, program: str = "igps") -> ArgumentParser:
+def command_parser(commands: Commands | None = None, program: str = "igps") -> ArgumentParser:
     """The parser of all commands; for the arguments see `main`."""
     parser = ArgumentParser(prog=program, description="Volumetric shape retrieval by interior Global Point Signatures.")
-    _add_commands(parser, commands)
+    _add_commands(parser, COMMANDS if commands is None else commands)
     return parser
 
 

@@ -1,0 +1,10 @@
+"""Write a table of the documentation from results: `python -m training.record NAME KIND RESULTS "COMMAND"`."""
+
+from __future__ import annotations
+
+from jsonargparse import auto_cli
+
+from training.studies.pages import record
+
+if __name__ == "__main__":
+    auto_cli(record)

@@ -1,0 +1,242 @@
+"""Measure what the distances of `pretrained` mean, on generated bodies that it was not fitted to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+import igps
+from igps._parallel import on_threads
+from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained
+from igps.gallery.calibration import (
+    CALIBRATION,
+    FINEST,
+    KINDS,
+    Calibration,
+    calibration_params,
+    quantiles,
+    threshold_at,
+    threshold_between,
+)
+from igps.gallery.duplicates import Surfaces, distance_if_alike
+from igps.gallery.gallery import fingerprint
+from igps.mesh.mesh import Mesh
+from igps.nn.description import describe
+from igps.nn.descriptor import Descriptor
+from training.graded import GradedShapes, body_of
+from training.studies.disturbances import move, remesh, scale, simplified
+
+SUFFIXES = {"triangles": ".off", "half": ".off", "motion": ".ply", "format": ".stl", "all": ".obj", "longer": ".off"}
+"""Of the files: what was done to the body, and the format. What was made longer is no copy."""
+
+LENGTHENED = 0.02
+"""By how much of √area."""
+
+
+def calibrate(
+    root: Path = Path("build/calibration"),
+    copies: Path = Path("build/copies"),
+    n_classes: int = 40,
+    seed: int = 1,
+    n_copied: int = 2,
+    rate: float = 0.001,
+    pose_rate: float = 0.01,
+    model: Path = PRETRAINED,
+    out: Path = CALIBRATION,
+    cache_dir: Path | None = None,
+    n_workers: int | None = None,
+) -> None:
+    """Make copies, measure all pairs, save the calibration, and print it.
+
+    Args:
+        root: folder of the generated meshes.
+        copies: folder of the copies that are made of them; those that are there stay.
+        n_classes, seed: of `GradedShapes`, four bodies of a class and four poses of a body.
+        n_copied: bodies of each class to copy.
+        rate: of false pairs among poses of bending bodies and bodies of one class, at most.
+        pose_rate: of false pairs among bodies of one class where poses are the same, at most.
+        model: the parameters of `pretrained`.
+        out: the calibration.
+        cache_dir: folder of cached signatures; the user's cache directory if not given.
+        n_workers: processes; all cores if not given.
+    """
+    descriptor = pretrained(model)
+    shapes = _generated(root, descriptor, n_classes, seed, cache_dir, n_workers)
+    bodies = np.array([body_of(name) for name in shapes.files.names])
+    classes = np.array(shapes.files.labels)
+    is_rigid = np.isin(classes, _still(GradedShapes(n_classes, 4, 4, seed)))
+
+    made = _copies(shapes, copies, n_copied, seed)
+    copied = igps.SignatureDataset([path for _, _, path in made], shapes.config, cache_dir)
+    failures = copied.precompute(n_workers=n_workers)
+    for failure in failures:
+        print(failure.error)
+    failed = {failure.path for failure in failures}
+    made = [one for one in made if one[2] not in failed]
+    copied, originals = copied.usable(failures), [i for i, _, _ in made]
+    is_copy = np.array([way != "longer" for _, way, _ in made])
+
+    described, of_copies = (describe(one, descriptor, n_workers=n_workers) for one in (shapes, copied))
+    with torch.inference_mode():
+        distances = descriptor.distances(described, described).numpy()
+        to_copies = descriptor.distances(described[originals], of_copies).diagonal().numpy()[is_copy]
+    i, j = np.triu_indices(len(shapes), 1)
+    distances = distances[i, j]
+    of_body, of_class = bodies[i] == bodies[j], classes[i] == classes[j]
+    rigid_poses = of_body & is_rigid[i]
+    of_kind = {"poses": of_body & ~is_rigid[i], "bodies": of_class & ~of_body, "classes": ~of_class}
+    by_kind = {"copies": np.concatenate([to_copies, distances[rigid_poses]])}
+    by_kind |= {kind: distances[pairs] for kind, pairs in of_kind.items()}
+    near = 2 * float(by_kind["copies"].max())
+
+    surfaces, surfaces_of_copies = (_Measured(one, n_workers) for one in (shapes, copied))
+
+    def among(chosen: NDArray[np.bool_]) -> list[_Pair]:
+        return [(surfaces, i[k], surfaces, j[k]) for k in np.flatnonzero(chosen)]
+
+    def of_made(chosen: NDArray[np.bool_]) -> list[_Pair]:
+        return [(surfaces, originals[n], surfaces_of_copies, n) for n in np.flatnonzero(chosen)]
+
+    # The hard ones tell the rate: other poses of bodies that bend, and other bodies of the class.
+    others = among(of_kind["poses"] | of_kind["bodies"])
+    pairs = of_made(is_copy) + among(rigid_poses), others, of_made(~is_copy)
+    of_same, of_others, of_longer = (_apart(some, n_workers) for some in pairs)
+    of_different = np.concatenate([of_others, of_longer])
+
+    calibration = Calibration(
+        "pretrained",
+        fingerprint(descriptor),
+        calibration_params(shapes.config),
+        f"{len(set(classes))} classes of GradedShapes({n_classes}, seed={seed}), {len(set(bodies))} bodies, "
+        f"{len(shapes)} poses, {is_copy.sum()} copies, {len(of_longer)} that are longer",
+        {kind: quantiles(by_kind[kind]) for kind in KINDS},
+        {kind: len(by_kind[kind]) for kind in KINDS},
+        near,
+        threshold_between(of_same[:, 0], of_different[:, 0], rate),
+        threshold_at(of_same[:, 1], of_different[:, 1], rate),
+        threshold_between(np.concatenate([by_kind["copies"], by_kind["poses"]]), by_kind["bodies"], pose_rate),
+    )
+    calibration.save(out)
+    _print(calibration, of_same, of_others, of_longer, [way for _, way, _ in made if way != "longer"], to_copies)
+
+
+def _still(shapes: GradedShapes) -> list[str]:
+    """The classes whose bodies do not bend: in the first pose of the first nothing has moved."""
+    found = []
+    for number, name in enumerate(shapes.class_names):
+        pose = shapes.pose(number * shapes.n_bodies * shapes.n_poses)
+        if np.abs(pose.bent - pose.rest).max() < 1e-6 * np.ptp(pose.rest, axis=0).max():
+            found.append(name)
+    return found
+
+
+def _generated(
+    root: Path, descriptor: Descriptor, n_classes: int, seed: int, cache_dir: Path | None, n_workers: int | None
+) -> igps.SignatureDataset:
+    """The shapes, those that are not there yet written first."""
+    try:
+        GradedShapes(n_classes, 4, 4, seed).write(root, progress=True, n_workers=n_workers)
+    except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
+        print(error)
+    shapes = igps.SignatureDataset(root, descriptor.requirements.apply_to(igps.SignatureConfig()), cache_dir)
+    return shapes.usable(shapes.precompute(n_workers=n_workers))
+
+
+def _copies(shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: int) -> list[tuple[int, str, Path]]:
+    """Of the first pose of bodies, one copy by all ways at once, one by one of them, and what is longer.
+
+    Which shape, way and file.
+    """
+    first: dict[str, int] = {}
+    for i, name in enumerate(shapes.files.names):
+        first.setdefault(body_of(name), i)
+    chosen = [(body, i) for body, i in sorted(first.items()) if int(body.rsplit("/", 1)[1]) < n_bodies]
+    made = []
+    for number, (body, i) in enumerate(chosen):
+        for way in ("all", tuple(SUFFIXES)[number % 4], "longer"):
+            path = folder / way / f"{body.replace('/', '-')}{SUFFIXES[way]}"
+            if not path.exists():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                copy = _copy(shapes.mesh(i), way, seed + number)
+                trimesh.Trimesh(copy.vertices, copy.faces, process=False).export(path)
+            made.append((i, way, path))
+    return made
+
+
+def _copy(mesh: Mesh, way: str, seed: int) -> Mesh:
+    if way == "longer":
+        mesh = _lengthened(mesh, seed)
+    if way in ("triangles", "all", "longer"):
+        mesh = remesh(mesh)
+    if way in ("half", "all"):
+        mesh = simplified(mesh, 0.5)
+    if way in ("motion", "all"):
+        mirrored = replace(mesh, vertices=mesh.vertices * [-1.0, 1.0, 1.0], faces=mesh.faces[:, ::-1])
+        mesh = move(scale(mirrored, math.exp(np.random.default_rng(seed).uniform(-3, 3))), seed)
+    return mesh
+
+
+def _lengthened(mesh: Mesh, seed: int) -> Mesh:
+    """What lies beyond a plane across it moves away from the plane; what the plane cuts is stretched."""
+    random = np.random.default_rng(seed)
+    normal = random.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    height = mesh.vertices @ normal
+    beyond = height > np.quantile(height, random.uniform(0.3, 0.7))
+    return replace(mesh, vertices=mesh.vertices + np.outer(beyond * LENGTHENED * math.sqrt(mesh.area), normal))
+
+
+class _Measured:
+    """Samples and coarseness of surfaces, each taken once."""
+
+    def __init__(self, dataset: igps.SignatureDataset, n_workers: int | None) -> None:
+        surfaces = Surfaces(dataset)
+        self.samples = [surfaces.samples(k) for k in range(len(dataset))]
+        self.coarseness = list(on_threads(surfaces.coarseness, range(len(dataset)), n_workers))
+
+
+_Pair = tuple[_Measured, int, _Measured, int]
+
+
+def _apart(pairs: list[_Pair], n_workers: int | None) -> NDArray[np.float64]:
+    """(N, 2) how far apart the surfaces of pairs are; and that over what their levels of detail leave open."""
+
+    def one(pair: _Pair) -> tuple[float, float]:
+        first, i, second, j = pair
+        apart = distance_if_alike(first.samples[i], second.samples[j])
+        return apart, apart / max(first.coarseness[i], second.coarseness[j], FINEST)
+
+    return np.array(list(on_threads(one, pairs, n_workers)))
+
+
+def _print(
+    calibration: Calibration,
+    same: NDArray[np.float64],
+    others: NDArray[np.float64],
+    longer: NDArray[np.float64],
+    ways: list[str],
+    to_copies: NDArray[np.float64],
+) -> None:
+    print(calibration.made_of)
+    for way in SUFFIXES:
+        rows = np.array([k for k, of in enumerate(ways) if of == way], dtype=np.int64)
+        if len(rows):
+            surfaces, detail = same[rows].max(axis=0)
+            largest = (
+                f"distance ≤ {to_copies[rows].max():.4f}, surfaces ≤ {surfaces:.2%}, {detail:.1f} times coarseness"
+            )
+            print(f"{way:>10}: {len(rows)} copies, {largest}")
+    for name, found in (("poses of rigid bodies", same[len(ways) :]), ("others", others), ("longer", longer)):
+        for column, unit in enumerate(("of √area", "times coarseness")):
+            levels = 0, 0.001, 0.01, 0.1, 0.5, 0.99, 1
+            few = ", ".join(f"{one:.4g}" for one in np.quantile(found[:, column], levels, method="higher"))
+            print(f"{name}: {len(found)}, {unit}: least, 0.1 %, 1 %, 10 %, 50 %, 99 %, largest: {few}")
+    for kind in KINDS:
+        print(f"{kind:>10}: {calibration.n_pairs[kind]} pairs, median {calibration.distances[kind][11]:.4f}")
+    print(f"near {calibration.near:.4f}\nsame {calibration.same}\ndetail {calibration.detail}\npose {calibration.pose}")

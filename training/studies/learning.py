@@ -1,0 +1,141 @@
+"""Retrieval scores over several seeded splits, and of a trained checkpoint."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import mean, stdev
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+import igps
+from igps.data.datamodule import SignatureDataModule
+from igps.data.splits import Split, SplitProtocol, split_seen, split_unseen
+from igps.nn.description import describe
+from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.heads.base import Head, distances_of
+from igps.nn.heads.closed_form import KernelHead, WhitenedHead
+from igps.nn.learner import RetrievalLearner
+from igps.report.learned import learned_layout
+from igps.retrieval import chi_square, retrieval_scores
+
+Row = Literal["none", "prior", "whitened", "kernel"]
+FITTED: dict[str, type[WhitenedHead | KernelHead]] = {"whitened": WhitenedHead, "kernel": KernelHead}
+COLUMNS = {"ft": "FT", "nn": "NN", "dcg": "DCG", "st": "ST", "adr": "ADR", "map": "mAP"}
+
+
+def splits(
+    root: Path,
+    descriptor: str = "interior",
+    protocol: SplitProtocol = "seen",
+    n_train: int = 10,
+    n_test: int | None = None,
+    n_splits: int = 5,
+    first_seed: int = 100,
+    cache_dir: Path | None = None,
+    out: Path | None = None,
+) -> None:
+    """Scores of the plain chi-square distance and of the heads: mean ± standard deviation over splits.
+
+    Args:
+        root: labelled collection.
+        descriptor: what is compared.
+        protocol: seen splits every class, unseen splits the classes.
+        n_train: shapes of each class (seen) or classes (unseen) to fit to.
+        n_test: classes to test (unseen); all others if not given.
+        n_splits: how many splits, with the seeds from `first_seed` on.
+        first_seed: see n_splits.
+        cache_dir: folder of cached signatures; the user's cache directory if not given.
+        out: a JSON file to which the rows are added.
+    """
+    module, prior = histograms_and_prior(descriptor)
+    dataset = igps.SignatureDataset(root, module.requirements.apply_to(igps.SignatureConfig()), cache_dir)
+    dataset.precompute(strict=True)
+    histograms, labels = describe(dataset, module, progress=True).flatten(1), dataset.labels
+    print(f"{descriptor}, {protocol}, n_train={n_train}, {n_splits} splits from seed {first_seed}, percent")
+    print(f"{'head':<10}" + "".join(f"{title:>14}" for title in COLUMNS.values()))
+    rows: list[dict[str, Any]] = []
+    for head in ("none", "prior", "whitened", "kernel"):
+        if head == "prior" and prior is None:
+            continue
+        results = []
+        for seed in range(first_seed, first_seed + n_splits):
+            if protocol == "seen":
+                split = split_seen(labels, n_train, seed=seed)
+            else:
+                split = split_unseen(labels, n_train, n_test=n_test, seed=seed)
+            results.append(score(histograms, labels, split, head, module.part_cells, prior))
+        values = {name: [one[name] for one in results] for name in COLUMNS}
+        found = {name: {"mean": mean(v), "stdev": stdev(v) if n_splits > 1 else 0.0} for name, v in values.items()}
+        print(f"{head:<10}" + "".join(f"{100 * v['mean']:>8.1f} ± {100 * v['stdev']:>3.1f}" for v in found.values()))
+        rows.append({"descriptor": descriptor, "protocol": protocol, "head": head, **found})
+    if out is not None:
+        earlier = json.loads(out.read_text()) if out.exists() else []
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(json.dumps([*earlier, *rows], indent=1) + "\n")
+
+
+def histograms_and_prior(name: str) -> tuple[HistogramDescriptor, Head | None]:
+    """The descriptor of a name, whose histograms heads are fitted to, and the metric that it has of them, if any.
+
+    Raises:
+        ValueError: it gives no histograms.
+    """
+    found = igps.descriptor(name)
+    if isinstance(found, EmbeddedDescriptor) and isinstance(found.descriptor, HistogramDescriptor):
+        return found.descriptor, found.head
+    if not isinstance(found, HistogramDescriptor):
+        raise ValueError(f"descriptor: expected one of histograms, such as interior or rich, got {name}.")
+    return found, None
+
+
+def score(
+    histograms: Tensor,
+    labels: Tensor,
+    split: Split,
+    head: Row,
+    part_cells: Sequence[int] | None,
+    prior: Head | None = None,
+) -> dict[str, float]:
+    """Scores of the test part, each shape against the others."""
+    train, test = torch.tensor(split.train), torch.tensor(split.test)
+    metric = prior if head == "prior" else None
+    if head in FITTED:
+        metric = FITTED[head](prior=prior).fit(histograms[train], labels[train], part_cells)
+    distance = chi_square if metric is None else distances_of(metric)
+    vectors = histograms[test] if metric is None else metric(histograms[test])
+    return retrieval_scores(distance(vectors, vectors), labels[test]).mean()
+
+
+def checkpoint(path: Path, out: Path = Path("build/evaluation")) -> None:
+    """Scores of a checkpoint on the test part of its own split; and what it has learned.
+
+    "plain" is the distance of its histograms without the head, "learned" the whole; "whitened" and "kernel" are heads
+    fitted to the same histograms of its training and validation parts.
+
+    Args:
+        path: the checkpoint.
+        out: folder for layout.png, the learned bins and filter against their start.
+    """
+    learner = RetrievalLearner.load_from_checkpoint(path).eval()
+    data = SignatureDataModule.load_from_checkpoint(path)
+    data.prepare_data()
+    histograms, labels = describe(data.dataset, learner.descriptor, progress=True), data.dataset.labels
+    test = torch.tensor(data.split.test)
+    part = histograms[test]
+    found = {"plain": retrieval_scores(learner.distance.plain(part, part), labels[test]).mean()}
+    with torch.inference_mode():
+        found["learned"] = retrieval_scores(learner.distances(part, part), labels[test]).mean()
+    # The validation part has chosen nothing that these heads depend on.
+    split = Split(data.split.train + data.split.validation, (), data.split.test)
+    for head in ("whitened", "kernel"):
+        found[head] = score(histograms.flatten(1), labels, split, head, learner.part_cells)
+    print(f"{'':<10}" + "".join(f"{title:>8}" for title in COLUMNS.values()))
+    for name, scores in found.items():
+        print(f"{name:<10}" + "".join(f"{100 * scores[column]:>8.1f}" for column in COLUMNS))
+    out.mkdir(parents=True, exist_ok=True)
+    learned_layout(learner.descriptor, out / "layout.png")
+    print(f"learned bins and filter: {out / 'layout.png'}")

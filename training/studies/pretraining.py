@@ -1,0 +1,159 @@
+"""Fit the metric of the descriptor `pretrained` to generated shapes, and measure it where it was not fitted."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import igps
+from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained_parts, save_pretrained, two_levels
+from igps.mesh.loading import LoadOptions
+from igps.nn.description import describe
+from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
+from igps.nn.heads.two_level import TwoLevelHead
+from training.graded import GradedShapes, body_of, family_of, looks_alike
+from training.studies.transfer import curve, few_labels, report, two_level_scores
+
+# Of two classes each part has a single direction, and its vectors are signs, which may cancel.
+_FEWEST = 3
+
+
+def pretrain(
+    root: Path = Path("build/pretrain"),
+    n_classes: int = 240,
+    n_bodies: int = 4,
+    n_poses: int = 4,
+    n_parts: int = 3,
+    n_scored: int = 12,
+    seed: int = 0,
+    out: Path = PRETRAINED,
+    cache_dir: Path | None = None,
+    plain: Sequence[str] = ("gps", "interior", "multiscale", "rich"),
+    data: Path | None = None,
+    figures: Path = Path("build"),
+    n_workers: int | None = None,
+) -> None:
+    """Generate shapes, check the metric on families that it was not fitted to, fit it to all, and save it.
+
+    Args:
+        root: folder of the generated meshes.
+        n_classes, n_bodies, n_poses, seed: of `GradedShapes`.
+        n_parts: into how many parts the families are dealt, by the seed. A class of a family that was fitted to is much
+            easier to tell than what a user has, so that whole families are held out.
+        n_scored: classes of each part to score, drawn by the seed.
+        out: the file of parameters.
+        cache_dir: folder of cached signatures; the user's cache directory if not given.
+        plain: descriptors to score on the same classes beside the metric.
+        data: a labelled collection to measure the transfer on.
+        figures: folder of pretrain.png, FT on `data` against the number of generated classes.
+        n_workers: processes; all cores if not given.
+    """
+    figures.mkdir(parents=True, exist_ok=True)
+    shapes = GradedShapes(n_classes, n_bodies, n_poses, seed)
+    try:
+        shapes.write(root, progress=True, n_workers=n_workers)
+    except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
+        print(error)
+    descriptor = pretrained_parts().eval()
+    generated = _usable(root, descriptor, cache_dir, n_workers)
+    histograms, labels = describe(generated, descriptor, progress=True, n_workers=n_workers), generated.labels
+    bodies = _numbers([body_of(name) for name in generated.files.names])
+    parts = _dealt([family_of(name) for name in generated.classes], n_parts, seed)
+
+    def fit(n: int, seed: int, among: Tensor) -> TwoLevelHead:
+        """The metric, of n classes drawn by the seed."""
+        chosen = torch.isin(labels, torch.tensor(_drawn(among.tolist(), n, seed)))
+        return two_levels().fit(histograms[chosen], labels[chosen], descriptor.part_cells, bodies=bodies[chosen])
+
+    scored = [torch.isin(labels, torch.tensor(_drawn(part.tolist(), n_scored, seed))) for part in parts]
+    others = [torch.cat([*parts[:i], *parts[i + 1 :]]) for i in range(n_parts)]
+
+    def score(name: str, distances: Sequence[Tensor]) -> None:
+        two_level_scores(
+            name, [(d, labels[chosen], bodies[chosen]) for d, chosen in zip(distances, scored, strict=True)]
+        )
+
+    print(f"{n_parts} parts of the families, each scored by a metric that was fitted to the others:")
+    alike = torch.tensor([looks_alike(name) for name in generated.classes])
+    strangers = [among[~alike[among]] for among in others]
+    ways = [("pretrained", others, others)]
+    if min(len(among) for among in strangers) >= _FEWEST:
+        ways += [("without look-alikes", strangers, strangers), ("as many, with them", others, strangers)]
+    for name, among, like in ways:
+        heads = [fit(len(other), seed, one) for one, other in zip(among, like, strict=True)]
+        score(name, [_distances(head, histograms[where]) for head, where in zip(heads, scored, strict=True)])
+    for name in plain:
+        other = igps.descriptor(name)
+        described = [
+            describe(
+                _usable(root, other, cache_dir, n_workers, torch.nonzero(where).flatten().tolist()),
+                other,
+                n_workers=n_workers,
+            )
+            for where in scored
+        ]
+        score(name, [other.distances(one, one) for one in described])
+
+    everything = torch.arange(len(generated.classes))
+    head = fit(len(everything), seed, everything)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_pretrained(EmbeddedDescriptor(descriptor, head), out)
+    print(f"fitted to all {len(everything)} classes: {out}")
+    if data is None:
+        return
+
+    real = _usable(data, descriptor, cache_dir, n_workers)
+    found, classes = describe(real, descriptor, progress=True, n_workers=n_workers), real.labels
+    report(str(data), found, classes, head)
+    unlike = everything[~alike]
+    both = (("without look-alikes", unlike), ("of all kinds", everything)) if len(unlike) >= _FEWEST else ()
+    for name, among in both:
+        title = f"{data}, fitted to {len(unlike)} classes {name}"
+        report(title, found, classes, fit(len(unlike), seed, among))
+    counts = [n for n in (10, 30, 100) if n < len(everything)] + [len(everything)]
+    curve(partial(fit, among=everything), counts, found, classes, figures / "pretrain.png")
+    # Two of each class are left to find each other.
+    for n in (n for n in (1, 3, 5) if n + 2 <= int(classes.bincount().min())):
+        few_labels(n, found, classes, head, descriptor.part_cells)
+
+
+def _usable(
+    root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None, some: list[int] | None = None
+) -> igps.SignatureDataset:
+    """The dataset of the meshes, or some of them, whose signatures could be computed; those that could not are told."""
+    config = descriptor.requirements.apply_to(igps.SignatureConfig())
+    data = igps.SignatureDataset(root, config, cache_dir, reading=LoadOptions())
+    if some is not None:
+        data = data.subset(some)
+    failures = data.precompute(n_workers=n_workers)
+    for failure in failures:
+        print(failure)
+    return data.usable(failures)
+
+
+def _dealt(families: Sequence[str], n_parts: int, seed: int) -> list[Tensor]:
+    """Numbers of the classes in each part, whole families at a time."""
+    names = sorted(set(families))
+    random.Random(seed).shuffle(names)
+    return [
+        torch.tensor([i for i, family in enumerate(families) if family in names[k::n_parts]]) for k in range(n_parts)
+    ]
+
+
+def _drawn(classes: Sequence[int], n: int, seed: int) -> list[int]:
+    return random.Random(seed).sample(sorted(classes), min(n, len(classes)))
+
+
+def _numbers(names: Sequence[str]) -> Tensor:
+    number = {name: i for i, name in enumerate(sorted(set(names)))}
+    return torch.tensor([number[name] for name in names])
+
+
+def _distances(head: TwoLevelHead, histograms: Tensor) -> Tensor:
+    vectors = head(histograms)
+    return head.distances(vectors, vectors)
