@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 from igps.report.tables import TITLES
@@ -16,6 +17,7 @@ from igps.signature.signature import SignatureConfig
 
 DOCS = Path(__file__).parents[2] / "docs"
 RESULTS = DOCS / "benchmarks" / "results"
+_WIDTH = 120  # of lines of prose
 _PLACE = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 
 Table = tuple[list[str], list[list[str]]]
@@ -130,10 +132,8 @@ def markdown(name: str) -> str:
     """The table of a name, and a line that says what measured it."""
     results = kept(name)
     lines = [_row(results["columns"]), _row(["---"] * len(results["columns"])), *map(_row, results["rows"])]
-    told = (
-        f"`{results['command']}`: version {results['version']}, signatures {results['signatures']}, {results['date']},"
-    )
-    return "\n".join([*lines, "", told, f"{results['processor']}."]) + "\n"
+    by = f"version {results['version']}, signatures {results['signatures']}, {results['date']}, {results['processor']}"
+    return "\n".join([*lines, "", *wrap(f"`{results['command']}`: {by}.", _WIDTH)]) + "\n"
 
 
 def _row(cells: Sequence[str]) -> str:
