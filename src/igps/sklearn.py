@@ -9,6 +9,8 @@ from typing import Any, Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.utils.validation import check_is_fitted
 
 from igps.data.batch import collate
 from igps.data.dataset import SignatureDataset
@@ -19,12 +21,6 @@ from igps.mesh.mesh import Mesh
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor, HistogramDescriptor
 from igps.signature.signature import SignatureConfig, compute_signature
-
-try:
-    from sklearn.base import BaseEstimator, TransformerMixin
-    from sklearn.utils.validation import check_is_fitted
-except ImportError as error:
-    raise ImportError('igps.sklearn needs scikit-learn: pip install "interior-gps[sklearn]".') from error
 
 
 class VolumetricFeatures(TransformerMixin, BaseEstimator):

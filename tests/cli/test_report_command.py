@@ -15,8 +15,6 @@ from igps.report.results import read_results
 from igps.report.surfaces import read_surfaces
 from own_descriptors import SMALL, write_egg
 
-pytest.importorskip("jinja2")
-
 INTERIOR = "own_descriptors:small_interior"
 
 

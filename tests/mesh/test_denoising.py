@@ -119,7 +119,8 @@ def test_edges_of_a_box_stay_sharp(amplitude: float) -> None:
 
 def plate_with_holes(seed: int, longest_edge: float | None = None) -> Mesh:
     """Long thin triangles between the rims; with shorter edges, slivers."""
-    manifold3d = pytest.importorskip("manifold3d")
+    import manifold3d
+
     random = np.random.default_rng(seed)
     plate = manifold3d.Manifold.cube((2, 1, 0.2), True)
     for x in (-0.6, 0, 0.6):
@@ -143,7 +144,8 @@ def test_plates_with_holes_keep_their_volume(seed: int, longest_edge: float | No
 
 def test_a_fan_of_thousands_of_slivers_does_not_fold_up() -> None:
     """Noise is wider than they are, and all meet in one vertex."""
-    manifold3d = pytest.importorskip("manifold3d")
+    import manifold3d
+
     ball = trimesh.creation.icosphere(subdivisions=5)
     whole = manifold3d.Manifold(manifold3d.Mesh64(np.array(ball.vertices), np.array(ball.faces, dtype=np.uint64)))
     drawn = (whole + manifold3d.Manifold.cylinder(1.2, 0.3, 0, 3000).translate((0, 0, 0.9))).to_mesh64()

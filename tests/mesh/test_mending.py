@@ -18,10 +18,6 @@ from igps.mesh.subdivision import subdivided
 from igps.mesh.surface import area_vectors
 from igps.mesh.watertight import watertight
 
-pytest.importorskip("igl")
-pytest.importorskip("skimage")
-pytest.importorskip("manifold3d")
-
 
 def box() -> Mesh:
     surface = trimesh.creation.box((1, 2, 3))

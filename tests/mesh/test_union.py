@@ -1,7 +1,4 @@
-import sys
-
 import numpy as np
-import pytest
 import trimesh
 
 from igps.mesh._union import united, without_walls
@@ -9,8 +6,6 @@ from igps.mesh.mending import mend, mended_by
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import face_patches
 from igps.shapes import ArticulatedShapes
-
-pytest.importorskip("igl")
 
 
 def box(low, high, subdivisions=2):
@@ -26,7 +21,6 @@ def together(*surfaces):
 
 
 def test_boxes_that_overlap_are_one_body_of_the_right_volume_and_area():
-    pytest.importorskip("manifold3d")
     surface = together(box([0, 0, 0], [2, 1, 1]), box([1.3, 0.2, 0.25], [3, 0.7, 0.75]))
     body = mend(*surface)
     assert mended_by(body.notes) == ("united",)
@@ -36,7 +30,6 @@ def test_boxes_that_overlap_are_one_body_of_the_right_volume_and_area():
 
 
 def test_parts_that_do_not_touch_or_are_open_are_left_to_the_grid():
-    pytest.importorskip("manifold3d")
     apart = together(box([0, 0, 0], [1, 1, 1]), box([2, 0, 0], [3, 1, 1]))
     vertices, faces = box([0.5, 0.5, 0.5], [2, 2, 2])
     opened = together(box([0, 0, 0], [1, 1, 1]), (vertices, faces[len(faces) // 2 :]))
@@ -44,14 +37,6 @@ def test_parts_that_do_not_touch_or_are_open_are_left_to_the_grid():
         notes = []
         assert united(*surface, notes)[1] is surface[1]
         assert notes == []
-
-
-def test_without_manifold3d_parts_that_overlap_are_left_to_the_grid(monkeypatch):
-    monkeypatch.setitem(sys.modules, "manifold3d", None)
-    surface = together(box([0, 0, 0], [2, 1, 1]), box([1.3, 0.2, 0.25], [3, 0.7, 0.75]))
-    body = mend(*surface)
-    assert "watertight" in mended_by(body.notes)
-    np.testing.assert_allclose(body.volume, 2.25, rtol=0.03)
 
 
 def with_wall():
@@ -69,7 +54,8 @@ def test_a_wall_between_two_halves_is_dropped_and_nothing_else():
 
 
 def test_two_halves_with_a_wall_each_that_overlap_are_the_body_that_they_were_cut_from():
-    manifold3d = pytest.importorskip("manifold3d")
+    import manifold3d
+
     shape = ArticulatedShapes(3, 1, seed=4)[2]
     shape = Mesh(shape.vertices, shape.faces)
     centred = shape.vertices - shape.vertices.mean(axis=0)

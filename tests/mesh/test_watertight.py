@@ -19,9 +19,6 @@ from igps.mesh.watertight import watertight
 from igps.mesh.winding import winding_number
 from igps.shapes import ArticulatedShapes
 
-pytest.importorskip("igl")
-pytest.importorskip("skimage")
-
 Surface = tuple[NDArray[np.float64], NDArray[np.int64]]
 BALL = 4 / 3 * np.pi
 
@@ -171,7 +168,6 @@ def test_faces_between_solids_are_left_out_of_the_winding_numbers() -> None:
 
 @pytest.mark.parametrize("number", [6, 11])
 def test_a_thin_body_of_overlapping_halves_with_holes_is_solid(number: int) -> None:
-    pytest.importorskip("manifold3d")
     shape = ArticulatedShapes(number + 1, 1, seed=11, n_vertices=3500)[number]
     body = Mesh(shape.vertices, shape.faces)
     mended = mend(*DAMAGES["everything"].apply(body, 0))

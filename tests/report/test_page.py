@@ -4,7 +4,6 @@ import base64
 import json
 import os
 import re
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -29,8 +28,6 @@ from igps.report.page import page_of
 from igps.report.page_data import data_of
 from igps.report.results import read_results
 from igps.retrieval import precision_recall_curve, retrieval_scores
-
-pytest.importorskip("jinja2")
 
 
 class Elements(HTMLParser):
@@ -197,10 +194,3 @@ def test_what_is_no_folder_of_results_is_told(tmp_path: Path) -> None:
     np.savez(tmp_path / "distances.npz", distances=np.zeros((2, 2)), names=np.array(["a", "b", "c"]))
     with pytest.raises(ValueError, match="between 3 meshes"):
         read_results(tmp_path)
-
-
-def test_without_jinja2_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    results = read_results(retrieval_folder(tmp_path))
-    monkeypatch.setitem(sys.modules, "jinja2", None)
-    with pytest.raises(ImportError, match=r"interior-gps\[page\]"):
-        page_of(results, {})

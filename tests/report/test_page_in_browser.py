@@ -34,7 +34,6 @@ from igps.report.page import write_page
 from igps.report.results import read_results
 from igps.shapes import ArticulatedShapes
 
-pytest.importorskip("jinja2")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: it drives the browser")
 
 # Software renders in place of a graphics card; in containers root must go without the sandbox.
@@ -507,8 +506,6 @@ def test_the_demo_ends_with_its_page(
     browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A smaller demo, the last line of which names a page that opens."""
-    pytest.importorskip("skimage")
-    pytest.importorskip("matplotlib")
     monkeypatch.setattr(
         sys.modules["igps.cli.demo"], "ArticulatedShapes", lambda **_: ArticulatedShapes(n_classes=2, n_per_class=2)
     )

@@ -26,7 +26,6 @@ from igps.retrieval.index import Entry, VectorIndex, extend_index, merge_indices
 from igps.retrieval.vectors import VectorMap
 
 pytest.importorskip("faiss")
-pytest.importorskip("sklearn")
 pytest.importorskip("filelock")
 
 ABOUT = {"descriptor": "test", "signature": {"resolution": 32}}

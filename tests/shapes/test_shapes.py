@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -15,8 +14,6 @@ from training.studies.contact_sheet import contact_sheet
 
 from igps.shapes import ArticulatedShapes, GeneratedShape
 from igps.shapes.solids import Arc, Box, Cone, Prism, Ring, Solid
-
-pytest.importorskip("skimage", reason="the extra 'shapes' is not installed")
 
 DEFAULTS = ["biped", "quadruped", "octopus", "spider", "hand", "snake", "plier", "mug"]
 # Of the grammar: one class of every family, with and without handles.
@@ -213,7 +210,6 @@ def test_write_refuses_a_folder_of_other_shapes(tmp_path: Path) -> None:
 
 
 def test_contact_sheet_shows_every_class(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib", reason="the extra 'plot' is not installed")
     from matplotlib.image import imread
 
     shapes = ArticulatedShapes(n_classes=4, n_per_class=2, n_vertices=1000)
@@ -227,7 +223,6 @@ def test_contact_sheet_shows_every_class(tmp_path: Path) -> None:
 
 
 def test_contact_sheet_shows_mirrored_shapes_right_side_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("matplotlib", reason="the extra 'plot' is not installed")
     shapes = GradedShapes(n_classes=3, n_bodies=1, n_poses=2, n_vertices=(1500, 1500))
     assert {np.linalg.det(shapes[i].motion) > 0 for i in range(len(shapes))} == {True, False}  # some are mirrored
     drawn: list[trimesh.Trimesh] = []
@@ -242,15 +237,6 @@ def test_contact_sheet_shows_mirrored_shapes_right_side_out(tmp_path: Path, monk
         volume = trimesh.Trimesh(shape.vertices, shape.faces, process=False).volume
         assert body.volume == pytest.approx(volume)
         assert volume > 0
-
-
-@pytest.mark.parametrize(("module", "extra"), [("skimage.measure", "shapes"), ("matplotlib.figure", "plot")])
-def test_a_missing_library_is_named_with_its_extra(
-    module: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ImportError, match=rf"interior-gps\[{extra}\]"):
-        contact_sheet(ArticulatedShapes(), tmp_path / "sheet.png")
 
 
 POINTS = np.random.default_rng(0).uniform(-1.5, 1.5, (400, 3))

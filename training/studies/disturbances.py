@@ -16,7 +16,6 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
 from igps.descriptors._geodesics import edge_graph
-from igps.mesh._extras import libigl
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import components, face_areas, vertex_normals
@@ -77,7 +76,8 @@ def remesh(mesh: Mesh) -> Mesh:
         ImportError: libigl is not installed.
         MeshError: the old number of faces is out of reach.
     """
-    igl = libigl("remesh")
+    import igl
+
     vertices, faces = igl.upsample(np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces.astype(np.int32)))
     vertices, faces, *_ = igl.decimate(
         np.asfortranarray(vertices), np.asfortranarray(faces.astype(np.int32)), len(mesh.faces)

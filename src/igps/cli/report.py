@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from igps.report.page import jinja, write_page
+from igps.report.page import write_page
 from igps.report.results import read_results
 from igps.report.sources import read_sources
 from igps.report.surfaces import keep_surfaces, read_surfaces
@@ -29,7 +29,6 @@ def report(
         n_workers: processes that make the pictures; all cores if not given.
     """
     found = read_results(results)
-    jinja()  # told before the pictures are made
     dataset = read_sources(results, meshes)
     if dataset is None:
         surfaces = read_surfaces(results / SURFACES)
@@ -44,5 +43,3 @@ def check_report(is_wanted: bool, out: Path | None) -> None:
     """Raise, before anything is computed, where a page is wanted that could not be made."""
     if is_wanted and out is None:
         raise ValueError("report: expected --out beside it, the folder that the page is written to. Give one.")
-    if is_wanted:
-        jinja()

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import farthest_points
-from igps.mesh._extras import libigl
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors, longest_side, unit, vertex_areas
 from igps.nn.descriptor import BodyDescriptor
@@ -78,7 +77,6 @@ class LocalDiameterCentricity(BodyDescriptor):
         """(n_diameter_bins, n_centricity_bins) histogram that sums to 1.
 
         Raises:
-            ImportError: libigl is not installed.
             MeshError: no ray meets the far side of the surface.
         """
         mesh = in_order_of_form(body.mesh)
@@ -115,11 +113,9 @@ def local_diameters(
 
     Returns:
         (P,) length, NaN where no ray counts.
-
-    Raises:
-        ImportError: libigl is not installed.
     """
-    igl = libigl("local_diameters")
+    import igl
+
     centre, size = mesh.vertices.mean(axis=0), longest_side(mesh.vertices)
     vertices = np.asfortranarray((mesh.vertices - centre) / size)
     faces = np.asfortranarray(mesh.faces)

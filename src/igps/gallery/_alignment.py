@@ -13,7 +13,6 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from igps.mesh._extras import libigl
 from igps.mesh.surface import area_vectors, unit
 
 Array = NDArray[np.float64]
@@ -109,17 +108,16 @@ class TriangleSurface:
     Args:
         vertices: (V, 3) without unit.
         faces: (F, 3).
-
-    Raises:
-        ImportError: libigl is not installed.
     """
 
     gap = 0.0
 
     def __init__(self, vertices: Array, faces: NDArray[np.int64]) -> None:
+        import igl
+
         self._triangles = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
         self._normals = unit(area_vectors(vertices, faces))
-        self._tree = libigl("alignment").AABB()
+        self._tree = igl.AABB()
         self._tree.init(*self._triangles)
 
     def nearest(self, samples: SurfaceSamples) -> tuple[Array, Array]:

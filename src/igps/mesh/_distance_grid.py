@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.mesh._extras import libigl
 from igps.mesh.surface import face_areas
 
 # How far from the surface exact distances are needed: marching cubes ask for both ends of the edges that cross it.
@@ -69,7 +68,8 @@ def distances(
     Returns:
         (X, Y, Z) distances and (X, Y, Z, 3) nearest points, cells.
     """
-    igl = libigl()
+    import igl
+
     vertices, faces = np.asfortranarray(vertices), np.asfortranarray(faces)
     size = 8
     blocks = np.stack(np.meshgrid(*(np.arange(0, n, size) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)

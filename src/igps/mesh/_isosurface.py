@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.mesh._extras import libigl
 from igps.mesh._level_set import LEAST, without_bubbles
 from igps.mesh.mesh import MeshError
 from igps.mesh.surface import (
@@ -25,10 +24,8 @@ _FLAT = 0.95
 
 def marched(field: NDArray[np.float32], name: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """The closed surface on which the field is zero; grid points are filled where it would touch itself."""
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError as error:
-        raise ImportError('watertight needs scikit-image: pip install "interior-gps[shapes]".') from error
+    from skimage.measure import marching_cubes
+
     for _ in range(20):
         if not (field.min() < 0 < field.max()):
             raise MeshError(
@@ -58,7 +55,8 @@ def simplified(
     surplus = len(vertices) - max_vertices
     if surplus <= 0:
         return vertices, faces
-    igl = libigl()
+    import igl
+
     scale = longest_side(vertices)
     points, triangles = vertices / scale, faces
     # The shortest edges first, which marching cubes leave in plenty and which need no quadrics: that is much faster.

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from igps.mesh._distance_grid import MARGIN
-from igps.mesh._extras import libigl
 from igps.mesh.surface import area_vectors, face_areas, signed_volume, unit
 
 # Grid points so close to a triangle are its wall, through which the flood does not pass: a grid line that crosses a
@@ -49,7 +48,8 @@ class OrientedSurface:
 
     @classmethod
     def of(cls, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> OrientedSurface:
-        igl = libigl()
+        import igl
+
         _, first, index = np.unique(np.round(vertices, 4), axis=0, return_index=True, return_inverse=True)
         vertices, faces = vertices[first], index.ravel()[faces]
         faces = faces[(np.diff(np.sort(faces, axis=1), axis=1) > 0).all(axis=1)]
@@ -86,7 +86,9 @@ class OrientedSurface:
     def winding(self, points: NDArray[Any]) -> NDArray[np.float64]:
         if not len(points) or not len(self.faces):
             return np.zeros(len(points))
-        return np.asarray(libigl().fast_winding_number(self.vertices, self.faces, points.astype(np.float64)))
+        import igl
+
+        return np.asarray(igl.fast_winding_number(self.vertices, self.faces, points.astype(np.float64)))
 
     def _without_hidden(self) -> OrientedSurface:
         """Without the faces that have the inside on both sides, such as walls between solids put together.

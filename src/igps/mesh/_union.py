@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.mesh._extras import libigl
 from igps.mesh._hole_filling import with_small_holes_filled
 from igps.mesh._tidying import SPECK, oriented, tidied, welded
 from igps.mesh.mesh import Mesh, MeshError
@@ -56,6 +55,8 @@ def _superfluous(
     sees: NDArray[np.bool_],
 ) -> int:
     """The patch that may go first, or −1; `places` lie on the faces `at`, −1 on one that is gone."""
+    import igl
+
     patch, ends_at_others = face_patches(faces, len(points))
     size = np.bincount(patch, areas)
     of_patch = np.where(at >= 0, patch[at], -1)
@@ -67,7 +68,7 @@ def _superfluous(
             continue
         shown = np.ascontiguousarray(places[(of_patch == number) & sees])
         rest = faces[patch != number]
-        squared = libigl().point_mesh_squared_distance(shown, points, rest)[0] if len(shown) else np.zeros(1)
+        squared = igl.point_mesh_squared_distance(shown, points, rest)[0] if len(shown) else np.zeros(1)
         if np.max(squared) <= _COINCIDENT**2:
             return number
     return -1
@@ -77,6 +78,8 @@ def _places(
     points: NDArray[np.float64], faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
     """Places (S, 3) on each patch, evenly by area and always the same; the faces (S,) they are on; who sees outside."""
+    import igl
+
     patch, _ = face_patches(faces, len(points))
     areas = face_areas(points, faces)
     generator = np.random.default_rng(0)
@@ -90,7 +93,7 @@ def _places(
     places = np.einsum("sc,scx->sx", weights, points[faces[at]])
     normals = unit(area_vectors(points, faces[at]))
     occluded = [
-        np.asarray(libigl().ambient_occlusion(points, faces, places, np.ascontiguousarray(side), _DIRECTIONS)).ravel()
+        np.asarray(igl.ambient_occlusion(points, faces, places, np.ascontiguousarray(side), _DIRECTIONS)).ravel()
         for side in (normals, -normals)
     ]
     return places, at, 1 - np.minimum(*occluded) > _OPEN
@@ -109,12 +112,10 @@ def united(
     """The outer surface of parts that are closed each by itself and overlap, by manifold3d.
 
     Each part is tidied on its own, and turned outward. The surface as it is, and no note, if a part is not closed, if
-    they do not overlap, are too many or only one, or without manifold3d, the extra ``[manifold]``.
+    they do not overlap or are too many or only one.
     """
-    try:
-        import manifold3d
-    except ImportError:
-        return vertices, faces
+    import manifold3d
+
     part, areas = face_parts(vertices, faces)
     speck = areas < SPECK * areas.sum()
     if not 1 < int((~speck).sum()) <= _MOST_PARTS:

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from igps.mesh._extras import libigl
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import longest_side
 
@@ -18,7 +17,6 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     so that a closed manifold stays one; the result is checked again like any mesh.
 
     Raises:
-        ImportError: libigl is not installed.
         MeshError: `max_vertices` cannot be reached, or the simplified surface is not a body any more.
     """
     if max_vertices < 4:
@@ -26,7 +24,8 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     surplus = len(mesh.vertices) - max_vertices
     if surplus <= 0:
         return mesh
-    igl = libigl("simplify")
+    import igl
+
     # In unit scale, because quadrics are sums of squares. A collapse on a closed surface takes a vertex and two faces.
     centre, scale = mesh.vertices.mean(axis=0), longest_side(mesh.vertices)
     points = np.asfortranarray((mesh.vertices - centre) / scale)

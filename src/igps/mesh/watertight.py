@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from igps.mesh._distance_grid import Grid, distances, rounded
-from igps.mesh._extras import libigl
 from igps.mesh._isosurface import marched, simplified
 from igps.mesh._level_set import joined, level_set
 from igps.mesh._outside import OrientedSurface, outside_of
@@ -63,7 +62,6 @@ def watertight(
         The body, with a note of what was done.
 
     Raises:
-        ImportError: libigl or scikit-image is not installed.
         MeshError: there is no surface (fewer than ten points, no triangle with an area).
     """
     if resolution < 8:
@@ -96,12 +94,7 @@ def watertight(
 
 
 def crosses_itself(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
-    """Whether any two faces have points in common beyond their common vertices and edge, by exact predicates.
-
-    Raises:
-        ImportError: libigl is not installed.
-    """
-    libigl()
+    """Whether any two faces have points in common beyond their common vertices and edge, by exact predicates."""
     from igl import predicates
 
     found, _, _ = predicates.find_self_intersections(

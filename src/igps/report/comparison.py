@@ -20,9 +20,6 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> N
     Args:
         curves: of each system by name, in the order of the legend.
         out: the PNG file.
-
-    Raises:
-        ImportError: matplotlib is missing.
     """
     figure = new_figure(8.5, 5.2)
     axes = figure.add_subplot()

@@ -38,11 +38,9 @@ def paint(axis: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int64], c
 
 
 def new_figure(width: float, height: float) -> Figure:
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError('figures need matplotlib: pip install "interior-gps[plot]".') from error
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)  # draws to a file without touching the user's pyplot state
     return figure

@@ -65,7 +65,7 @@ def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progre
 def draw_mesh(axis: Axes, path: Path) -> None:
     """Draw a mesh, shaded and seen along its thinnest principal axis."""
     mesh = load_mesh(path, LoadOptions(allow_open=True))
-    with contextlib.suppress(MeshError, ImportError):  # drawn in full, it only takes longer
+    with contextlib.suppress(MeshError):  # drawn in full, it only takes longer
         mesh = simplify(mesh, _THUMBNAIL_VERTICES)
     paint(axis, _seen_from_the_front(mesh.vertices), mesh.faces, GREY)
 

@@ -21,9 +21,6 @@ def learned_layout(descriptor: HistogramDescriptor, path: str | Path) -> None:
     Args:
         descriptor: its histograms of pairs are drawn one a row; others learn nothing.
         path: of the picture, such as layout.png.
-
-    Raises:
-        ImportError: matplotlib is not installed.
     """
     histograms = [one for part in descriptor.parts for one in part if isinstance(one, PairHistogram)]
     rows = [(histogram.embedding, _centres(histogram)) for histogram in histograms]
@@ -72,9 +69,6 @@ def transfer_curve(curve: Mapping[int, Sequence[float]], plain: float, path: str
         curve: FT, fractions, of several draws by the number of classes.
         plain: FT of the plain distance.
         path: of the picture.
-
-    Raises:
-        ImportError: matplotlib is not installed.
     """
     figure = new_figure(4.5, 3.2)
     axes = figure.subplots()

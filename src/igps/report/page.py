@@ -44,9 +44,6 @@ def write_page(path: Path, results: Results, surfaces: Mapping[str, Surface]) ->
         path: an HTML file.
         results: of a folder, see `read_results`.
         surfaces: pictures by the name of the mesh; those without have none.
-
-    Raises:
-        ImportError: jinja2 is missing.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page_of(results, surfaces), encoding="utf-8")
@@ -56,7 +53,7 @@ def page_of(results: Results, surfaces: Mapping[str, Surface]) -> str:
     """The page of results as text, for the arguments see `write_page`."""
     from markupsafe import Markup
 
-    environment = jinja()
+    environment = _templates()
     data = data_of(results, surfaces)
     # A policy that names the page's own scripts and style by content: no other can run, wherever it came from.
     scripts = [(_TEMPLATE / name).read_text(encoding="utf-8").strip() + "\n" for name in _SCRIPTS]
@@ -94,16 +91,10 @@ def page_of(results: Results, surfaces: Mapping[str, Surface]) -> str:
     )
 
 
-def jinja() -> Environment:
-    """The environment of the templates, which escapes all that it is given.
+def _templates() -> Environment:
+    """The environment of the templates, which escapes all that it is given."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    Raises:
-        ImportError: jinja2 is missing.
-    """
-    try:
-        from jinja2 import Environment, PackageLoader, StrictUndefined
-    except ImportError as error:
-        raise ImportError('the page of results needs jinja2: pip install "interior-gps[page]".') from error
     return Environment(
         loader=PackageLoader("igps.report", "template"),
         autoescape=True,

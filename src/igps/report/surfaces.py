@@ -211,7 +211,7 @@ def _is_current(pipeline: SignaturePipeline, path: Path, kept: Surface | None) -
 def _reduced(mesh: Mesh, n_vertices: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     try:
         small = simplify(mesh, n_vertices)
-    except (MeshError, ImportError):  # only to look at: what is between the handles may close
+    except MeshError:  # only to look at: what is between the handles may close
         return clustered(mesh.vertices, mesh.faces, n_vertices)
     return small.vertices, small.faces
 

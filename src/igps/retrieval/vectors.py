@@ -42,10 +42,7 @@ class VectorMap:
         """The map of descriptions (N, F) such as these; a few thousand are enough."""
         if comparison == "cosine" and descriptions.shape[1] <= MOST_NUMBERS:
             return cls(comparison)
-        try:
-            from sklearn.decomposition import PCA
-        except ImportError as error:
-            raise ImportError('an index needs scikit-learn: pip install "interior-gps[index]".') from error
+        from sklearn.decomposition import PCA
 
         features = _features(descriptions, comparison)
         n_kept = min(MOST_NUMBERS, *features.shape)

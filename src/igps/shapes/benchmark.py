@@ -64,7 +64,6 @@ class ArticulatedShapes:
 
     Raises:
         ValueError: an argument is out of range, or (on access) a shape cannot be made at this resolution.
-        ImportError: (on access) scikit-image is missing.
     """
 
     def __init__(self, n_classes: int = 8, n_per_class: int = 10, seed: int = 0, n_vertices: int = 3000) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,8 @@ _RELAXATION_STEPS = 10
 
 def mesh(body: Sequence[Placed], target: int) -> tuple[Array, Faces, float]:
     """Vertices (V,3), outward faces (F,3) and the grid spacing, with V within about a tenth of ``target``."""
-    marching_cubes = _marching_cubes()
+    from skimage.measure import marching_cubes
+
     # A vertex is a crossing of the surface with a grid line: 1.5 of them in an area of spacing², on average.
     spacing = float(np.sqrt(1.5 * _rough_area(body) / target))
     for _ in range(3):
@@ -73,14 +73,6 @@ def defect(vertices: Array, faces: Faces, genus: int, n_vertices: int, min_angle
     if angle < min_angle:
         return f"a triangle with an angle of {angle:.2g} degrees"
     return None
-
-
-def _marching_cubes() -> Callable[..., tuple[Any, ...]]:
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError as error:
-        raise ImportError('generated shapes need scikit-image: pip install "interior-gps[shapes]"') from error
-    return marching_cubes
 
 
 def _distance(body: Sequence[Placed], points: Array) -> Array:
