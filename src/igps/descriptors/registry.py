@@ -12,6 +12,7 @@ from igps.descriptors.gps import gps
 from igps.descriptors.inner_distance import InnerDistance
 from igps.descriptors.interior import interior
 from igps.descriptors.local_diameter_centricity import LocalDiameterCentricity
+from igps.descriptors.molecular import molecular
 from igps.descriptors.multiscale import multiscale
 from igps.descriptors.pretrained.descriptor import pretrained
 from igps.descriptors.rich import rich
@@ -37,7 +38,10 @@ _MAKERS: Mapping[str, Callable[[], Descriptor]] = {
 }
 
 NAMES: tuple[str, ...] = tuple(_MAKERS)
-"""The names of the library's descriptors."""
+"""The names of the library's descriptors of any body."""
+
+# Descriptors of bodies that bring attributes of their own.
+_OF_ATTRIBUTES: Mapping[str, Callable[[], Descriptor]] = {"molecular": molecular}
 
 
 def descriptor(which: str | Descriptor) -> Descriptor:
@@ -48,20 +52,21 @@ def descriptor(which: str | Descriptor) -> Descriptor:
         250
 
     Args:
-        which: one of `NAMES`; or "package.module:NAME", where NAME is a descriptor of your own or makes one when
-            called; or a descriptor.
+        which: one of `NAMES`, or "molecular"; or "package.module:NAME", where NAME is a descriptor of your own or
+            makes one when called; or a descriptor.
 
     Raises:
         ValueError: no descriptor has this name.
     """
     if isinstance(which, Descriptor):
         return which
-    if which in _MAKERS:
-        return _MAKERS[which]().eval()
+    if maker := _MAKERS.get(which) or _OF_ATTRIBUTES.get(which):
+        return maker().eval()
     module, colon, name = which.partition(":")
     if not colon:
         raise ValueError(
-            f"descriptor: expected one of {', '.join(NAMES)}, or package.module:NAME of one of your own, got {which!r}."
+            f"descriptor: expected one of {', '.join((*NAMES, *_OF_ATTRIBUTES))}, or package.module:NAME of one of "
+            f"your own, got {which!r}."
         )
     try:
         found = getattr(importlib.import_module(module), name)

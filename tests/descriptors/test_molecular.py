@@ -1,0 +1,121 @@
+"""`molecular`: what it counts, what it compares, and that it finds a bent molecule again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from igps.data.batch import collate
+from igps.descriptors import NAMES, descriptor
+from igps.descriptors.molecular import MOLECULAR_ATTRIBUTES, Shares, molecular
+from igps.mesh.formats.molecules import Molecule
+from igps.mesh.molecular_surface import molecular_surface
+from igps.mesh.residues import CHARGED_ATOMS, VOLUMES, residue_ball
+from igps.nn.axes import InteriorDistance
+from igps.nn.histograms.pairs import PairHistogram
+from igps.retrieval import chi_square
+from igps.signature.residue_attributes import with_residue_attributes
+from igps.signature.signature import Signature, SignatureConfig, compute_signature
+
+CONFIG = SignatureConfig(n_eigenpairs=64, n_surface_samples=100, min_samples=300, resolution=16)
+ROTATION = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
+
+
+def trace(seed: int, bend: float, n: int = 60) -> Molecule:
+    """Balls of residues of a random sequence along a bent coil."""
+    names = tuple(np.random.default_rng(seed).choice(sorted(VOLUMES), n).tolist())
+    t = np.arange(n)
+    coil = np.stack([1.5 * t, 5 * np.cos(1.3 * t), 5 * np.sin(1.3 * t)], axis=1)
+    if bend:
+        radius, angle = 1.5 * n / bend, coil[:, 0] * bend / (1.5 * n)
+        coil = np.stack([(radius + coil[:, 1]) * np.sin(angle), (radius + coil[:, 1]) * np.cos(angle), coil[:, 2]], 1)
+    charges = np.array([sum(CHARGED_ATOMS.get(name, {}).values()) for name in names])
+    radii = np.array([residue_ball(name) for name in names])
+    return Molecule(f"{seed} {bend}", coil, radii, charges, t, names, coil, np.zeros(n))
+
+
+def moved(molecule: Molecule) -> Molecule:
+    def move(at: NDArray[np.float64]) -> NDArray[np.float64]:
+        return at @ ROTATION.T + [10.0, -4.0, 3.0]
+
+    return replace(molecule, positions=move(molecule.positions), residue_positions=move(molecule.residue_positions))
+
+
+def signature_of(molecule: Molecule) -> Signature:
+    surface = molecular_surface(molecule, spacing=1.0, max_vertices=1200)
+    return with_residue_attributes(compute_signature(surface, CONFIG), molecule, MOLECULAR_ATTRIBUTES)
+
+
+@cache
+def signature(seed: int, bend: float) -> Signature:
+    return signature_of(trace(seed, bend))
+
+
+def described(*signatures: Signature, size: bool = True) -> torch.Tensor:
+    with torch.no_grad():
+        return molecular(size=size).eval()(collate(signatures))
+
+
+def test_pairs_are_counted_by_the_shares_of_both_samples() -> None:
+    one = signature(0, 0.0)
+    histogram = PairHistogram([Shares("residue_shares", 25), InteriorDistance(4)])
+    found = histogram(collate([one]))[0].double().numpy()
+    shares = one.interior.attributes["residue_shares"].astype(float)
+    embedded = one.interior.eigenfunctions / np.sqrt(one.eigenvalues)
+    distance = np.linalg.norm(embedded[:, None] - embedded, axis=2)
+    # Each pair in the two bins whose centres 0.5, 1.5, 2.5, 3.5 surround its distance.
+    place = np.clip(distance - 0.5, 0, 3)
+    bins = np.maximum(1 - np.abs(place[..., None] - np.arange(4)), 0)
+    bins[np.diag_indices(len(bins))] = 0
+    ordered = np.einsum("pa,qb,pqk->abk", shares, shares, bins, optimize=True)
+    ordered /= ordered.sum()
+    a, b = np.triu_indices(25)
+    wanted = np.where((a == b)[:, None], 1, 2) * ordered[a, b]
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
+
+
+def test_a_bent_molecule_is_nearest_to_itself() -> None:
+    signatures = [signature(seed, bend) for seed in range(4) for bend in (0.0, 2.0)]
+    for size in (True, False):
+        found = described(*signatures, size=size)
+        distances = molecular(size=size).distances(found, found).fill_diagonal_(np.inf)
+        assert distances.argmin(dim=1).tolist() == [1, 0, 3, 2, 5, 4, 7, 6]
+
+
+def test_motion_changes_little() -> None:
+    here, there, other = (
+        described(one) for one in (signature(0, 0.0), signature_of(moved(trace(0, 0.0))), signature(1, 0.0))
+    )
+    distances = molecular(size=False).distances
+    assert distances(here[:, :-2], there[:, :-2]) < 0.2 * distances(here[:, :-2], other[:, :-2])
+
+
+def test_size_is_a_factor_of_the_distance() -> None:
+    one, other = signature(0, 0.0), signature(1, 2.0)
+    larger = replace(other, area=1.5 * one.area, volume=one.volume / 2)
+    found, without = described(one, larger), described(one, larger, size=False)
+    np.testing.assert_allclose(found[:, :-2], without)
+    s = np.log(1.5) + np.log(2)
+    wanted = chi_square(without[:1], without[1:]) * s / (0.3 + s)
+    np.testing.assert_allclose(molecular().distances(found[:1], found[1:]), wanted, rtol=1e-4)
+    assert float(molecular().distances(found[:1], found[:1])) == 0
+
+
+def test_it_has_a_name_but_is_not_for_any_body() -> None:
+    assert descriptor("molecular").name == "molecular"
+    assert "molecular" not in NAMES
+    bare = replace(signature(0, 0.0), interior=replace(signature(0, 0.0).interior, attributes={}))
+    with pytest.raises(ValueError, match="attributes: expected 'residue_shares' among those"):
+        described(bare)
+
+
+def test_shares_of_another_kind_are_named() -> None:
+    with pytest.raises(ValueError, match="expected 7 shares of each sample as 'residue_shares'"):
+        PairHistogram([Shares("residue_shares", 7), InteriorDistance(4)])(collate([signature(0, 0.0)]))
+    with pytest.raises(ValueError, match="expected finite shares"):
+        Shares("residue_shares", 2).memberships(torch.tensor([[float("nan"), 1.0]]))
