@@ -1,17 +1,21 @@
 """What an installed package must do: python tests/smoke.py VERSION FOLDER, from outside of the tree.
 
-The body is a box, of which area, volume and distances are known; nothing but the dependencies is needed.
+The body is a box, of which area, volume and distances are known; nothing but the dependencies is needed. The Python of
+the README runs as it stands there.
 """
 
 from __future__ import annotations
 
 import importlib.metadata
 import itertools
+import re
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
+import torch
 import trimesh
 
 import igps
@@ -39,9 +43,28 @@ with tempfile.TemporaryDirectory() as name:
     assert 0.3 < signature.eigenvalues[0] < 1.1
     histograms = igps.describe(dataset, igps.descriptor("interior"))
     assert np.allclose(histograms.flatten(1).sum(1), 1, atol=1e-4)
-    igps.descriptor("pretrained")  # its parameters are in the package
-    sys.argv = ["igps", "retrieve", str(folder / "boxes"), "--cache_dir", str(folder / "cache"), "--n_workers", "1"]
-    main()
-    distances = igps.chi_square(histograms, histograms)
-    assert igps.retrieval_scores(distances, dataset.labels).mean()["nn"] == 1
+    torn = trimesh.load(folder / "boxes" / "long" / "0.off", process=False)
+    torn.update_faces(np.arange(len(torn.faces)) >= 12)
+    torn.export(folder / "torn.ply")
+    mended = igps.load_mesh(folder / "torn.ply")
+    assert mended.notes
+    assert np.isclose(mended.volume, 3.6, rtol=0.01)
+    options = ["--cache_dir", str(folder / "cache"), "--n_workers", "1"]
+    boxes, out = str(folder / "boxes"), folder / "out"
+    for words in (
+        ["retrieve", boxes, "--out", str(out), "--report"],
+        ["query", str(folder / "torn.ply"), "--gallery", boxes, "--top", "1"],
+    ):
+        sys.argv = ["igps", *words, *options]
+        main()
+    assert (out / "report.html").stat().st_size > 100_000
+    with np.load(out / "distances.npz") as archive:  # by pretrained
+        distances, labels = archive["distances"], archive["labels"]
+    assert igps.retrieval_scores(torch.from_numpy(distances), labels.tolist()).mean()["nn"] == 1
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    for number, example in enumerate(re.findall(r"^```python\n(.*?)^```", readme, re.DOTALL | re.MULTILINE)):
+        (folder / f"readme{number}").mkdir()
+        (folder / f"example{number}.py").write_text(example)
+        command = [sys.executable, str(folder / f"example{number}.py")]
+        subprocess.run(command, check=True, cwd=folder / f"readme{number}")
 print("works")

@@ -35,9 +35,6 @@ def findings(root: Path, **options) -> dict[str, Finding]:  # type: ignore[no-un
 
 
 def test_each_fault_and_what_will_be_done(tmp_path: Path) -> None:
-    pytest.importorskip("igl")
-    pytest.importorskip("skimage")
-    pytest.importorskip("manifold3d")
     write_clean(tmp_path / "clean.off")
     soup, holed = write_soup(tmp_path / "soup.off"), write_holed(tmp_path / "holed.off")
     write_box(tmp_path / "box.off")
@@ -87,8 +84,6 @@ def test_what_cannot_be_used_costs_the_others_nothing(tmp_path: Path, monkeypatc
 
 
 def test_the_reading_decides(tmp_path: Path) -> None:
-    pytest.importorskip("igl")
-    pytest.importorskip("skimage")
     holed = write_holed(tmp_path / "holed.off")
     never = findings(tmp_path, reading=LoadOptions("never"))["holed.off"]
     assert never.error == never.fault

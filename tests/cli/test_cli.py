@@ -286,7 +286,7 @@ def test_query_lists_the_nearest(
         (["retrieve", "nowhere"], "no such folder"),
         (["retrieve", "ROOT/egg"], "no classes found"),
         (["retrieve", "ROOT", "--descriptor", "best"], f"expected one of {', '.join(NAMES)}, or .*, got 'best'"),
-        (["retrieve", "ROOT"], "n_eigenpairs: this descriptor needs signatures of at least 250, got 20"),
+        (["retrieve", "ROOT"], "n_eigenpairs: this descriptor needs signatures of at least 64, got 20"),
         (["query", "ROOT/egg/1.off", "--gallery", "ROOT", "--top", "0"], "top"),
         (["query", "nowhere.off", "--gallery", "ROOT", "--descriptor", "d2"], "no such file|cannot be read"),
         (

@@ -90,8 +90,6 @@ def test_options_choose_the_mending(
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, "doctor", tmp_path, "--mend", "never", *FEW)
     assert "cannot be used" in capsys.readouterr().out
-    pytest.importorskip("igl")
-    pytest.importorskip("skimage")
     igps(monkeypatch, "doctor", tmp_path, "--mend", "always", *FEW)
     assert capsys.readouterr().out.splitlines()[1].split()[-1] == "watertight"
 

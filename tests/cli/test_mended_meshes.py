@@ -113,8 +113,6 @@ def test_never_and_always(
         assert all(error.startswith(str(root)) for error in refused.values())
     finally:
         logging.disable(logging.NOTSET)
-    pytest.importorskip("igl")
-    pytest.importorskip("skimage")
     igps(monkeypatch, "retrieve", root, "--mend", "always", *out, *ONE)
     # What bounds a body without crossing itself is watertight.
     summary = "5 of 8 meshes were mended: 2 welded, 2 subdivided, 1 made watertight"

@@ -117,9 +117,6 @@ def test_the_seed_chooses_the_damage(blob: Mesh) -> None:
 
 
 def test_all_damages_are_the_default(dataset: SignatureDataset) -> None:
-    pytest.importorskip("manifold3d")
-    pytest.importorskip("igl")
-    pytest.importorskip("skimage")
     found = study(dataset.subset([0, 5]), Root())["root"]
     assert list(found) == list(DAMAGES)
     # One mesh of each class: described, but there is nothing to find.

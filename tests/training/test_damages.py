@@ -27,8 +27,6 @@ def n_parts(vertices: np.ndarray, faces: np.ndarray) -> int:
 
 @pytest.mark.parametrize("name", sorted(DAMAGES))
 def test_same_seed_same_damage_and_no_body_is_left(blob: Mesh, name: str) -> None:
-    if name in ("halves", "everything"):
-        pytest.importorskip("manifold3d")
     before = blob.vertices.copy()
     vertices, faces = DAMAGES[name].apply(blob, 5)
     again = DAMAGES[name].apply(blob, 5)
@@ -84,7 +82,6 @@ def test_parts(blob: Mesh) -> None:
 
 
 def test_halves(blob: Mesh) -> None:
-    pytest.importorskip("manifold3d")
     vertices, faces = damage.halves(blob)
     assert n_parts(vertices, faces) == 2
     surface = trimesh.Trimesh(vertices, faces, process=False)

@@ -72,7 +72,6 @@ def test_hole_does_not_cut_the_body_in_two() -> None:
 
 
 def test_clip_takes_a_cap_off_a_ball(sphere: Mesh) -> None:
-    pytest.importorskip("manifold3d")
     turned = move(sphere)
     cut = clip(turned, 0.1)
     assert surface_genus(cut) == 0
@@ -85,7 +84,6 @@ def test_clip_takes_a_cap_off_a_ball(sphere: Mesh) -> None:
 
 
 def test_clip_keeps_the_largest_piece() -> None:
-    pytest.importorskip("manifold3d")
     ring = horseshoe(0.4)
     x, y, _ = ring.vertices.T
     # Its bend far away from its ends, of which one is thicker.
@@ -117,8 +115,6 @@ def test_scale_and_motion_keep_the_form(blob: Mesh) -> None:
 
 @pytest.mark.parametrize("name", DISTURBANCES)
 def test_every_disturbance_says_what_it_did(name: str) -> None:
-    if name == "limb":
-        pytest.importorskip("manifold3d")
     mesh = horseshoe()
     before = mesh.vertices.copy(), mesh.faces.copy()
     disturbed = DISTURBANCES[name].apply(mesh)

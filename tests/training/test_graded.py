@@ -21,9 +21,6 @@ from igps.shapes import ArticulatedShapes
 from igps.shapes.files import off_text
 from igps.shapes.templates import TEMPLATES
 
-pytest.importorskip("skimage", reason="the extra 'shapes' is not installed")
-pytest.importorskip("igl", reason="the extra 'igl' is not installed")
-
 CLASSES = body_classes(0)
 # The named classes that bend, and one class of each kind.
 FIRST = {one.name.split("-")[0]: i for i, one in reversed(list(enumerate(CLASSES)))}

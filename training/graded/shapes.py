@@ -77,7 +77,6 @@ class GradedShapes:
 
     Raises:
         ValueError: an argument is out of range, or (on access) a shape cannot be made at this resolution.
-        ImportError: (on access) scikit-image or libigl is missing.
     """
 
     def __init__(

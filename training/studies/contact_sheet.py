@@ -23,7 +23,6 @@ def contact_sheet(shapes: ArticulatedShapes | GradedShapes, path: str | Path, n_
 
     Raises:
         ValueError: `n_shown` is out of range.
-        ImportError: matplotlib or scikit-image is missing.
     """
     n_per_class = len(shapes) // shapes.n_classes
     if not 1 <= n_shown <= n_per_class:

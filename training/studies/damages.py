@@ -89,13 +89,10 @@ def halves(mesh: Mesh, seed: int = 0, overlap: float = 0.02) -> Triangles:
         overlap: over the diagonal of the bounding box.
 
     Raises:
-        ImportError: manifold3d is not installed.
         MeshError: manifold3d does not take the mesh.
     """
-    try:
-        import manifold3d
-    except ImportError as error:
-        raise ImportError('halves needs manifold3d: pip install "interior-gps[manifold]".') from error
+    import manifold3d
+
     centre = mesh.vertices.mean(axis=0)
     points = mesh.vertices - centre
     axis = np.linalg.eigh(points.T @ points)[1][:, -1]
@@ -119,7 +116,6 @@ def everything(mesh: Mesh, seed: int = 0) -> Triangles:
     """All of the above at once, at their usual strengths.
 
     Raises:
-        ImportError: manifold3d is not installed.
         MeshError: manifold3d does not take the mesh.
     """
     generator = np.random.default_rng(seed)

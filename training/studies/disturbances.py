@@ -58,7 +58,6 @@ def simplified(mesh: Mesh, share: float) -> Mesh:
     """`simplify` to a share of the vertices.
 
     Raises:
-        ImportError: libigl is not installed.
         MeshError: the share cannot be reached.
     """
     _check_share(share)
@@ -73,7 +72,6 @@ def remesh(mesh: Mesh) -> Mesh:
     No step changes the topology.
 
     Raises:
-        ImportError: libigl is not installed.
         MeshError: the old number of faces is out of reach.
     """
     import igl
@@ -137,14 +135,11 @@ def clip(mesh: Mesh, share: float = 0.1) -> Mesh:
 
     Raises:
         ValueError: `share` out of range.
-        ImportError: manifold3d is not installed.
         MeshError: manifold3d does not take the mesh, or leaves nothing.
     """
     _check_share(share)
-    try:
-        import manifold3d
-    except ImportError as error:
-        raise ImportError('clip needs manifold3d: pip install "interior-gps[manifold]".') from error
+    import manifold3d
+
     area = face_areas(mesh.vertices, mesh.faces)
     centre = np.average(mesh.vertices[mesh.faces].mean(axis=1), axis=0, weights=area)
     points = mesh.vertices - centre

@@ -32,9 +32,6 @@ def draw_pose_curves(histograms: Mapping[str, NDArray[np.floating]], centres: ND
         histograms: of each class, (N, B), each body's of sum 1.
         centres: (B,) ascending, of the bins; the last bin counts what lies beyond, too.
         out: the PNG file.
-
-    Raises:
-        ImportError: matplotlib is missing.
     """
     figure = new_figure(7.5, 4.2)
     axes = figure.add_subplot()
@@ -62,9 +59,6 @@ def draw_weld_change(mesh: Mesh, welded: Mesh, change: NDArray[np.floating], out
         welded: by `training.studies.disturbances.weld`, with the tube as its last faces.
         change: (pairs,) relative change of each distance.
         out: the PNG file.
-
-    Raises:
-        ImportError: matplotlib is missing.
     """
     figure = new_figure(9.4, 3.9)
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.7, 1, 1))
@@ -112,9 +106,6 @@ def draw_potential_slice(
         outline: (S, 2, 2) the ends of the segments in which the plane cuts the surface.
         barycentroid: (2,) where the potential is least.
         out: the PNG file.
-
-    Raises:
-        ImportError: matplotlib is missing.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.ticker import MaxNLocator

@@ -31,7 +31,7 @@ from igps.retrieval import rerank as reranked_distances
 
 def retrieve(
     root: Path,
-    descriptor: str = "interior",
+    descriptor: str = "pretrained",
     out: Path | None = None,
     report: bool = False,
     rerank: bool = False,
