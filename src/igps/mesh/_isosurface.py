@@ -23,6 +23,11 @@ _FLAT = 0.95
 
 
 def marched(field: NDArray[np.float32], name: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The closed surface on which the field is zero, its largest part."""
+    return largest(*level_surface(field, name))
+
+
+def level_surface(field: NDArray[np.float32], name: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """The closed surface on which the field is zero; grid points are filled where it would touch itself."""
     from skimage.measure import marching_cubes
 
@@ -46,7 +51,7 @@ def marched(field: NDArray[np.float32], name: str) -> tuple[NDArray[np.float64],
         field = without_bubbles(field)
     else:
         raise MeshError(f"{name}: no closed surface came of it. Raise the resolution.")
-    return _largest(vertices.astype(np.float64), faces)
+    return vertices.astype(np.float64), faces
 
 
 def simplified(
@@ -69,12 +74,12 @@ def simplified(
     triangles = np.asarray(triangles, dtype=np.int64)
     if len(triangles) == 0 or len(_bad_edges(triangles, len(points))) or not np.isfinite(points).all():
         return vertices, faces
-    points, triangles = _largest(points * scale, triangles)
+    points, triangles = largest(points * scale, triangles)
     triangles = _flipped(points, triangles)
-    return _with_volume(points, triangles, signed_volume(vertices, faces)), triangles
+    return with_volume(points, triangles, signed_volume(vertices, faces)), triangles
 
 
-def _with_volume(
+def with_volume(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], volume: float, most: float = 0.25
 ) -> NDArray[np.float64]:
     """The vertices moved along their normals, all by the same length of at most `most`, to give the volume.
@@ -101,7 +106,7 @@ def _bad_edges(faces: NDArray[np.int64], n_vertices: int) -> NDArray[np.int64]:
     return np.stack([bad // n_vertices, bad % n_vertices], axis=1)
 
 
-def _largest(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def largest(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """The connected component of the largest volume."""
     count, label = components(faces, len(vertices))
     if count > 1:

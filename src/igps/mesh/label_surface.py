@@ -1,0 +1,264 @@
+"""The surface of a label: from voxels to a closed triangle mesh without stairs, true to a fraction of a voxel.
+
+A label that has many more voxels than the mesh needs vertices is put on a coarser grid first, as shares of its voxels,
+where nothing of it is too thin for that. Then a smooth function that agrees with every voxel (`_label_field`) is
+interpolated by cubic splines along the long sides of the voxels, marching cubes take its zero level, quadrics (Garland
+and Heckbert 1997) leave as many vertices as are wanted, and the volume is made that of the voxels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from igps.mesh._isosurface import level_surface, simplified, with_volume
+from igps.mesh._label_field import PAD, filled_share, smooth_field
+from igps.mesh._level_set import LEAST, without_bubbles
+from igps.mesh.limits import check_grid
+from igps.mesh.mesh import MeshError
+from igps.mesh.surface import compact, components, signed_volume
+
+MAX_VERTICES = 5000
+"""As many vertices a label's surface has at most, where nothing else is said."""
+
+LEAST_VOXELS = 8
+"""A label of fewer voxels has no shape."""
+
+_ISLAND = 0.02  # share of the voxels below which a piece apart is dropped
+_SPECK = 0.005  # share of the volume below which a piece of the surface is none of the label's
+_SPARE = 4  # the grid may make so many times more vertices than are wanted, which are then simplified
+_FEWEST = 1500  # vertices that the grid makes at least, if need be by interpolation
+_MOST_REFINED = 4
+_N_LEVELS = 3
+# Share of a label that may lie where it is too thin for a coarser grid.
+_THIN = 0.005
+_TOUCHING = np.ones((3, 3, 3), dtype=bool)  # voxels that share a corner belong together
+
+
+def voxel_surface(
+    inside: ArrayLike, affine: ArrayLike | None = None, *, max_vertices: int = MAX_VERTICES, name: str = "volume"
+) -> tuple[NDArray[np.float64], NDArray[np.int64], tuple[str, ...]]:
+    """The closed, outward surface of the voxels of a body.
+
+    It encloses the volume of the voxels, has every centre of a voxel on its side (unless it was put on a coarser grid),
+    and is closed where the body ends at the border of the volume. Voxels that share only a corner are one piece. Holes
+    inside are filled.
+
+    Example:
+        >>> index = np.indices((24, 24, 24))
+        >>> ball = ((index - 11.3) ** 2).sum(axis=0) < 10**2
+        >>> vertices, faces, _ = voxel_surface(ball)
+        >>> radius = np.linalg.norm(vertices - 11.3, axis=1)
+        >>> bool(abs(radius - 10).max() < 0.3)
+        True
+
+    Args:
+        inside: (X, Y, Z), true at voxels whose centre lies in the body.
+        affine: (4, 4) from indices of voxels to the world; may shear and mirror. None for voxels of side 1.
+        max_vertices: about so many vertices at most.
+        name: what error messages call the body.
+
+    Returns:
+        Vertices (V, 3) in the world; faces (F, 3), counter-clockwise seen from outside, of one or several closed
+        pieces; and notes of what was done.
+
+    Raises:
+        MeshError: too few voxels, or an affine that is singular.
+    """
+    mask = np.asarray(inside, dtype=bool)
+    if mask.ndim != 3:
+        raise MeshError(f"{name}: expected an array of three axes, got shape {mask.shape}.")
+    matrix = np.eye(4) if affine is None else np.asarray(affine, dtype=np.float64)
+    spacing = checked_spacing(matrix, name)
+    box = ndimage.find_objects(mask.view(np.uint8))
+    n_voxels = int(np.count_nonzero(mask))
+    if n_voxels < LEAST_VOXELS:
+        raise MeshError(
+            f"{name}: {n_voxels} voxels, at least {LEAST_VOXELS} expected: they tell no shape. Leave it out, or label "
+            "it on a finer grid."
+        )
+    low = np.array([part.start for part in box[0]], dtype=np.float64)
+    notes: list[str] = []
+    mask = _whole(mask[box[0]], notes)
+    share, factor = _coarsened(mask, spacing, max_vertices)
+    mask = _joined(share >= 0.5)
+    share = np.pad(np.where(mask, np.maximum(share, 0.5), share), PAD)
+    check_grid(share.size, name)
+    sides = spacing * factor
+    field = smooth_field(share, sides, is_mask=bool((factor == 1).all()))
+    fineness = _fineness(sides, _n_vertices(mask, sides))
+    field = _refined(field, share, fineness, LEAST * float((sides / fineness).min()))
+    vertices, faces = _meshed(field, sides / fineness, share.sum() * sides.prod(), max_vertices, name)
+    # Index of the first voxel's centre: that of a block of `factor` voxels lies (factor - 1) / 2 further.
+    index = (vertices / sides - PAD) * factor + (factor - 1) / 2 + low
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        faces = np.ascontiguousarray(faces[:, ::-1])
+    return index @ matrix[:3, :3].T + matrix[:3, 3], faces, tuple(notes)
+
+
+def checked_spacing(affine: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    """(3,) sides of a voxel, length.
+
+    Raises:
+        MeshError: the affine is no invertible matrix (4, 4) of finite numbers.
+    """
+    if affine.shape != (4, 4) or not np.isfinite(affine).all():
+        raise MeshError(f"{name}: affine: expected a finite matrix of shape (4, 4), got {affine.tolist()}.")
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    if not spacing.all() or abs(np.linalg.det(affine[:3, :3] / np.where(spacing, spacing, 1))) < 1e-6:
+        raise MeshError(
+            f"{name}: the affine is singular, so the voxels have no volume. Write the file again with the spacing and "
+            "the directions of its axes."
+        )
+    return spacing
+
+
+def _whole(mask: NDArray[np.bool_], notes: list[str]) -> NDArray[np.bool_]:
+    """Without islands, and with holes filled."""
+    label, island, size = _islands(mask)
+    if len(island):
+        mask = mask & ~np.isin(label, island)
+        lost = int(size[island].sum())
+        notes.append(f"dropped {len(island)} small pieces apart, {lost} voxels, {lost / size.sum():.1%} of the label")
+    # What is outside shares faces.
+    hollow, n_hollow = ndimage.label(np.pad(~mask, 1, constant_values=True))
+    if n_hollow > 1:
+        filled = (hollow != hollow[0, 0, 0])[1:-1, 1:-1, 1:-1]
+        notes.append(f"filled holes of {np.count_nonzero(filled) - np.count_nonzero(mask)} voxels")
+        return np.asarray(filled)
+    return mask
+
+
+def _islands(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64]]:
+    """The piece of each voxel, from 1; the pieces that are too small to stay; and the voxels of each, of 0 none."""
+    label, _ = ndimage.label(mask, _TOUCHING)
+    size = np.bincount(label.reshape(-1))
+    size[0] = 0
+    return label, np.nonzero(size < _ISLAND * size.sum())[0][1:], size
+
+
+def _joined(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Where pieces share an edge or a corner only, voxels beside that are added."""
+    for _ in range(3):
+        label, n_pieces = ndimage.label(mask)
+        if n_pieces < 2:
+            break
+        padded = np.pad(label, 1)
+        extra = np.zeros_like(mask)
+        for step in np.ndindex(3, 3, 3):
+            offset = np.array(step) - 1
+            if np.abs(offset).sum() < 2 or tuple(offset) < (0, 0, 0):
+                continue
+            moved = padded[tuple(slice(1 + d, 1 + d + n) for d, n in zip(offset, mask.shape, strict=True))]
+            at = np.argwhere((label > 0) & (moved > 0) & (label != moved))
+            for axis in np.nonzero(offset)[0][:-1]:
+                at = at.copy()
+                at[:, axis] += offset[axis]
+                extra[tuple(at.T)] = True
+        if not extra.any():
+            break
+        mask = mask | extra
+    return mask
+
+
+def _n_vertices(mask: NDArray[np.bool_], sides: NDArray[np.float64]) -> float:
+    """About how many vertices marching cubes make on a grid as fine as the shortest side."""
+    area = 0.0
+    for axis in range(3):
+        crossings = np.count_nonzero(np.diff(mask.view(np.int8), axis=axis, prepend=0, append=0))
+        area += crossings * sides.prod() / sides[axis]
+    return float(area / sides.min() ** 2)
+
+
+def _coarsened(
+    mask: NDArray[np.bool_], spacing: NDArray[np.float64], max_vertices: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Shares of larger voxels, and how many of the given ones each takes along each axis."""
+    share, factor = mask.astype(np.float32), np.ones(3, dtype=np.int64)
+    n_pieces = ndimage.label(mask, _TOUCHING)[1]
+    while _n_vertices(mask, spacing * factor) > _SPARE * max_vertices:
+        sides = spacing * factor
+        halved = sides < 1.5 * sides.min()
+        if not _is_thick(mask, halved):
+            break
+        coarse = share
+        for axis in np.nonzero(halved)[0]:
+            if coarse.shape[axis] % 2:
+                coarse = np.concatenate([coarse, np.zeros_like(coarse.take([0], axis))], axis=axis)
+            even, odd = (coarse[(slice(None),) * axis + (slice(start, None, 2),)] for start in (0, 1))
+            coarse = (even + odd) / np.float32(2)
+        # What hung on a thread and is small now goes, as it would have without the thread.
+        label, island, size = _islands(coarse >= 0.5)
+        if np.count_nonzero(size) - len(island) != n_pieces:
+            break
+        coarse[np.isin(label, island) & (label > 0)] = 0
+        share, factor, mask = coarse, factor * np.where(halved, 2, 1), np.asarray(coarse >= 0.5)
+    return share.astype(np.float64), factor
+
+
+def _is_thick(mask: NDArray[np.bool_], axes: NDArray[np.bool_]) -> bool:
+    """Whether hardly any of the body is less than three voxels thick along the axes."""
+    size = np.where(axes, 3, 1)
+    core = ndimage.minimum_filter(mask, tuple(size), mode="constant")
+    reached = ndimage.maximum_filter(core, tuple(np.where(axes, 5, 1)), mode="constant")
+    return bool(np.count_nonzero(mask & ~reached) <= _THIN * np.count_nonzero(mask))
+
+
+def _fineness(sides: NDArray[np.float64], n_vertices: float) -> NDArray[np.int64]:
+    """Into how many parts each side goes, so that the parts are about equal and make vertices enough."""
+    finer = min(max(math.ceil(math.sqrt(_FEWEST / n_vertices)), 1), _MOST_REFINED)
+    return np.maximum(np.round(finer * sides / sides.min()), 1).astype(np.int64)
+
+
+def _refined(
+    field: NDArray[np.float64], share: NDArray[np.float64], fineness: NDArray[np.int64], least: float
+) -> NDArray[np.float64]:
+    """The field between the centres of the voxels, at the level that gives their volume.
+
+    It is negative between neighbours in the body, which therefore hold together.
+    """
+    from scipy.interpolate import CubicSpline
+
+    inside = share >= 0.5
+    for axis, parts in enumerate(fineness.tolist()):
+        if parts > 1:
+            index = np.arange(field.shape[axis])
+            places = np.linspace(0, index[-1], index[-1] * parts + 1)
+            field = CubicSpline(index, field, axis=axis, bc_type="natural")(places)
+    volume = share.sum() * fineness.prod()
+    for _ in range(_N_LEVELS):
+        filled, slope = filled_share(field)
+        field -= (volume - filled.sum()) / max(slope.sum(), 1e-9)
+    for axis, parts in enumerate(fineness.tolist()):
+        both = inside & np.roll(inside, -1, axis)
+        for part in range(parts):
+            at = tuple(slice(part if k == axis else 0, None, step) for k, step in enumerate(fineness.tolist()))
+            line = field[at]
+            line[both[tuple(slice(n) for n in line.shape)] & (line > -least)] = -least
+    return field
+
+
+def _meshed(
+    field: NDArray[np.float64], sides: NDArray[np.float64], volume: float, max_vertices: int, name: str
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The zero level of a field as closed pieces, in the unit of the sides, which are about equal."""
+    cell = float(sides.min())
+    level = np.where(field < 0, np.minimum(field, -LEAST * cell), np.maximum(field, LEAST * cell)) / cell
+    vertices, faces = level_surface(without_bubbles(level.astype(np.float32)), name)
+    vertices = vertices * (sides / cell)
+    n_pieces, piece_of = components(faces, len(vertices))
+    pieces = [compact(vertices, faces[piece_of[faces[:, 0]] == piece]) for piece in range(n_pieces)]
+    volumes = np.abs([signed_volume(*piece) for piece in pieces])
+    parts, n_before = [], 0
+    # Specks between voxels are none of theirs.
+    for own in [piece for piece, size in zip(pieces, volumes, strict=True) if size > _SPECK * volumes.sum()]:
+        if signed_volume(*own) < 0:
+            own = own[0], own[1][:, ::-1]
+        points, triangles = simplified(*own, max(round(max_vertices * len(own[0]) / len(vertices)), 50))
+        parts.append((points, triangles + n_before))
+        n_before += len(points)
+    points, triangles = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return with_volume(points, triangles, volume / cell**3) * cell, np.ascontiguousarray(triangles)

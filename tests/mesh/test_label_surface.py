@@ -1,0 +1,203 @@
+"""Voxelised closed forms give back volume and area, whatever the spacing and the orientation of the voxels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import elliprg
+
+from igps.mesh._isosurface import largest
+from igps.mesh.label_surface import voxel_surface
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.surface import components
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A body about the origin: which points (..., 3) it holds, half its box, its volume, area and handles."""
+
+    holds: Callable[[Array], NDArray[np.bool_]]
+    half: Array
+    volume: float
+    area: float
+    genus: int = 0
+
+
+def solid(kind: str, thickness: float) -> Solid:
+    r = thickness / 2
+    if kind == "ellipsoid":
+        axes = r * np.array([1, 1.3, 2])
+        a, b, c = axes
+        area = 4 * np.pi * float(elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2))
+        return Solid(lambda p: ((p / axes) ** 2).sum(-1) < 1, axes, 4 / 3 * np.pi * axes.prod(), area)
+    if kind == "torus":
+        ring = 2.5 * r
+        return Solid(
+            lambda p: (np.hypot(p[..., 0], p[..., 1]) - ring) ** 2 + p[..., 2] ** 2 < r**2,
+            np.array([ring + r, ring + r, r]), 2 * np.pi**2 * ring * r**2, 4 * np.pi**2 * ring * r, 1,
+        )  # fmt: skip
+    if kind == "capsule":
+        return Solid(
+            lambda p: np.hypot(p[..., 0], p[..., 1]) ** 2 + np.maximum(abs(p[..., 2]) - 2 * r, 0) ** 2 < r**2,
+            np.array([r, r, 3 * r]), (4 + 4 / 3) * np.pi * r**3, (8 + 4) * np.pi * r**2,
+        )  # fmt: skip
+    if kind == "rod":
+        return Solid(
+            lambda p: (np.hypot(p[..., 0], p[..., 1]) < r) & (abs(p[..., 2]) < 4 * r),
+            np.array([r, r, 4 * r]), 8 * np.pi * r**3, 18 * np.pi * r**2,
+        )  # fmt: skip
+    half = r * np.array([3, 4, 1])
+    a, b, c = half
+    return Solid(lambda p: (abs(p) < half).all(-1), half, 8 * a * b * c, 8 * (a * b + b * c + a * c))
+
+
+def ball(radius: float) -> Solid:
+    return Solid(
+        lambda p: (p**2).sum(-1) < radius**2, np.full(3, radius), 4 / 3 * np.pi * radius**3, 4 * np.pi * radius**2
+    )
+
+
+def voxels(body: Solid, matrix: Array, rng: np.random.Generator) -> tuple[NDArray[np.bool_], Array]:
+    """The body, turned and moved at random, at the centres of voxels: (X, Y, Z), and the affine (4, 4)."""
+    turn = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+    size = np.linalg.norm(body.half)
+    reach = np.ceil(np.linalg.norm(np.linalg.inv(matrix), axis=1) * size).astype(int) + 1
+    index = np.stack(np.meshgrid(*(np.arange(2 * n + 1) for n in reach), indexing="ij"), axis=-1)
+    affine = np.eye(4)
+    affine[:3, :3] = matrix
+    affine[:3, 3] = -matrix @ (reach + rng.uniform(-0.5, 0.5, 3))
+    mask = body.holds((index @ matrix.T + affine[:3, 3]) @ turn)
+    affine[:3, 3] += (100, -50, 20)
+    return mask, affine
+
+
+def errors(body: Solid, matrix: Array, rng: np.random.Generator) -> tuple[float, float]:
+    mask, affine = voxels(body, matrix, rng)
+    vertices, faces, _ = voxel_surface(mask, affine)
+    mesh = Mesh(vertices, faces)  # closed, manifold, oriented, of one piece
+    assert mesh.notes == ()  # and not inside out
+    assert mesh.genus == body.genus
+    centre = np.mean([vertices.min(axis=0), vertices.max(axis=0)], axis=0)
+    np.testing.assert_allclose(centre, (100, -50, 20), atol=np.abs(matrix).max())
+    return abs(mesh.volume / body.volume - 1), abs(mesh.area / body.area - 1)
+
+
+KINDS = ("ellipsoid", "torus", "capsule", "rod", "plate")
+
+
+@pytest.mark.parametrize("length", [1, 2.5, 6])
+@pytest.mark.parametrize(("n_voxels", "most"), [(9, (0.01, 0.02)), (4, (0.05, 0.08))])
+def test_voxelised_bodies_give_back_volume_and_area(length: float, n_voxels: int, most: tuple[float, float]) -> None:
+    rng = np.random.default_rng([n_voxels, int(length)])
+    matrix = 0.8 * np.diag(rng.permutation([1, 1, length]))
+    found = [errors(solid(kind, 0.8 * n_voxels * length), matrix, rng) for kind in KINDS]
+    assert (np.median(found, axis=0) <= most).all()
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        np.diag([-1.0, 1, 2]),
+        np.array([[0, 1.0, 0], [0, 0, 3], [1, 0, 0]]),
+        np.array([[1, 0.5, 0.2], [0, 1, -0.4], [0, 0, 1.5]]),
+    ],
+    ids=["left-handed", "axes turned", "sheared"],
+)
+def test_the_affine_is_honoured(matrix: Array) -> None:
+    volume, area = errors(ball(14), matrix, np.random.default_rng(1))
+    assert volume < 0.01
+    assert area < 0.02
+
+
+def test_many_voxels_are_put_on_a_coarser_grid_and_nothing_is_lost_by_it() -> None:
+    mask, affine = voxels(ball(60), np.eye(3), np.random.default_rng(2))
+    vertices, faces, _ = voxel_surface(mask, affine, max_vertices=2000)
+    mesh = Mesh(vertices, faces)
+    assert len(mesh.vertices) <= 2000
+    assert mesh.volume == pytest.approx(np.count_nonzero(mask), rel=1e-6)
+    assert mesh.area == pytest.approx(4 * np.pi * 60**2, rel=0.01)
+    radius = np.linalg.norm(mesh.vertices - (100, -50, 20), axis=1)
+    assert abs(radius - 60).max() < 0.5
+
+
+def test_every_voxel_stays_on_its_side() -> None:
+    import igl
+
+    rng = np.random.default_rng(3)
+    mask, affine = voxels(solid("torus", 5.0), np.diag([1, 1, 2.0]), rng)
+    vertices, faces, _ = voxel_surface(mask, affine)
+    centres = np.argwhere(np.ones_like(mask)) @ affine[:3, :3].T + affine[:3, 3]
+    held = igl.fast_winding_number(vertices, faces, centres) > 0.5
+    assert np.count_nonzero(held != mask.ravel()) <= 0.001 * np.count_nonzero(mask)
+
+
+@pytest.mark.parametrize("direction", [(1, 0, 0), (1, 1, 0), (1, 1, 1), (3, 2, 1)])
+def test_a_rib_of_two_voxels_stays_one_body(direction: tuple[int, int, int]) -> None:
+    axis = np.array(direction) / np.linalg.norm(direction)
+    points = np.stack(np.meshgrid(*3 * [np.arange(40.0)], indexing="ij"), axis=-1) - 19.6
+    along = points @ axis
+    mask = (np.linalg.norm(points - along[..., None] * axis, axis=-1) < 1) & (abs(along) < 16)
+    mesh = Mesh(*voxel_surface(mask)[:2])
+    assert mesh.genus == 0
+    assert mesh.volume == pytest.approx(np.count_nonzero(mask), rel=0.05)
+    assert np.ptp(mesh.vertices @ axis) == pytest.approx(32, abs=1.5)
+
+
+def test_voxels_that_touch_at_a_corner_are_one_piece() -> None:
+    mask = np.zeros((9, 9, 9), dtype=bool)
+    mask[1:4, 1:4, 1:4] = mask[4:7, 4:7, 4:7] = True
+    assert Mesh(*voxel_surface(mask)[:2]).genus == 0
+
+
+def test_a_body_at_the_border_is_closed() -> None:
+    mesh = Mesh(*voxel_surface(np.ones((5, 6, 7)))[:2])
+    assert mesh.volume == pytest.approx(5 * 6 * 7, rel=1e-3)
+    assert mesh.vertices.min() == pytest.approx(-0.5, abs=0.3)
+
+
+def test_neighbours_that_touch_meet_in_the_middle_between_their_voxels() -> None:
+    labels = np.zeros((24, 20, 20), dtype=int)
+    labels[3:12, 3:17, 3:17], labels[12:21, 3:17, 3:17] = 1, 2
+    one, two = (Mesh(*voxel_surface(labels == label)[:2]) for label in (1, 2))
+    for mesh in (one, two):
+        near = np.linalg.norm(mesh.vertices[:, 1:] - 9.5, axis=1) < 5
+        at = mesh.vertices[near & (abs(mesh.vertices[:, 0] - 11.5) < 2), 0]
+        assert len(at)
+        np.testing.assert_allclose(at, 11.5, atol=0.15)
+
+
+def test_small_pieces_apart_are_dropped_and_large_ones_stay() -> None:
+    mask = np.zeros((40, 20, 20), dtype=bool)
+    mask[2:18, 2:18, 2:18] = mask[22:30, 2:18, 2:18] = mask[35:37, 5:7, 5:7] = True
+    vertices, faces, notes = voxel_surface(mask)
+    assert components(faces, len(vertices))[0] == 2
+    assert notes == ("dropped 1 small pieces apart, 8 voxels, 0.1% of the label",)
+    assert Mesh(*largest(vertices, faces)).volume == pytest.approx(16**3, rel=0.01)
+
+
+def test_holes_inside_are_filled() -> None:
+    mask = np.ones((12, 12, 12), dtype=bool)
+    mask[5:7, 5:7, 5:7] = False
+    vertices, faces, notes = voxel_surface(mask)
+    assert notes == ("filled holes of 8 voxels",)
+    assert Mesh(vertices, faces).volume == pytest.approx(12**3, rel=1e-3)
+
+
+def test_what_is_no_body_is_refused_with_its_count() -> None:
+    mask = np.zeros((9, 9, 9), dtype=bool)
+    mask[2:9, 4, 4] = True
+    with pytest.raises(MeshError, match="liver: 7 voxels, at least 8 expected"):
+        voxel_surface(mask, name="liver")
+    with pytest.raises(MeshError, match="singular"):
+        voxel_surface(np.ones((9, 9, 9)), np.diag([1.0, 1, 0, 1]))
+    with pytest.raises(MeshError, match=r"got shape \(9, 9\)"):
+        voxel_surface(np.ones((9, 9)))
+    with pytest.raises(MeshError, match="finite matrix"):
+        voxel_surface(np.ones((9, 9, 9)), np.full((4, 4), np.nan))
