@@ -16,10 +16,7 @@ from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.nn._kernels import counted_pairs
 from igps.retrieval import distances
-from igps.signature import _closed_forms as closed_forms
-from igps.signature import _far_field as far_field
 from igps.signature import mean_value as coordinates
-from igps.signature import surface_potential
 from igps.spectra import _direct as direct
 from igps.spectra import _krylov as krylov
 from igps.spectra import _ordering as ordering
@@ -44,9 +41,6 @@ def both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
             eigensolver,
             ordering,
             counted_pairs,
-            surface_potential,
-            far_field,
-            closed_forms,
             distances,
         ):
             monkeypatch.setattr(module, "is_available", lambda: False)
@@ -113,7 +107,7 @@ def surface_genus(mesh: Mesh) -> int:
 
 @pytest.fixture
 def approximate_small_meshes() -> Iterator[None]:
-    """Else small meshes would be evaluated exactly. It outlives a test's `monkeypatch.undo`."""
+    """Else small meshes would be evaluated more accurately. It outlives a test's `monkeypatch.undo`."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(coordinates, "_FEW_VERTICES", 0)
         yield

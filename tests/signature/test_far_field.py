@@ -8,21 +8,22 @@ import logging
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import Rotation
 
 from bodies import Mesh, bumpy_sphere, interior_points, smooth_functions, torus
 from conftest import with_slivers
 from igps.mesh import mesh as geometry
-from igps.signature import _closed_forms as closed_forms
 from igps.signature import _far_field as far_field
 from igps.signature import mean_value as coordinates
+from igps.signature._far_field import Clusters, Surface
+from igps.signature._spatial_order import spatial_order
+from igps.signature._weight_loops import fill_hats
 from igps.signature.laplacian import laplacian
-from igps.signature.mean_value import extend
+from igps.signature.mean_value import Extension, extend
 from igps.spectra import eigenpairs
 
-pytestmark = pytest.mark.usefixtures("approximate_small_meshes", "both_ways")
+pytestmark = pytest.mark.usefixtures("approximate_small_meshes")
 
 
 @functools.cache
@@ -48,16 +49,22 @@ def test_approximation_keeps_its_accuracy_and_spends_it(name: str, accuracy: flo
         assert accuracy / 20 < np.quantile(error, 0.99) < accuracy
 
 
-def test_approximation_tends_to_the_exact_result(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_approximation_tends_to_the_exact_result() -> None:
     mesh = bumpy_sphere(4)
     points = interior_points(mesh, 60)
     functions = smooth_functions(mesh[0])
     exact = extend(*mesh, functions, points)
     assert np.array_equal(extend(*mesh, functions, points, accuracy=1e-9), exact)  # nothing is far
-    monkeypatch.setattr(coordinates, "_NEAR_SHARE", 1.0)
     errors = [np.abs(extend(*mesh, functions, points, accuracy=10.0**-k) - exact).max() for k in (3, 4, 5, 9)]
-    assert errors[-1] < 1e-10  # all listed
+    assert errors[-1] < 1e-10  # all near
     assert all(after < before / 4 for before, after in itertools.pairwise(errors))
+
+
+def all_weights(surface: Surface, x: np.ndarray, ratio: float) -> np.ndarray:
+    """(V, n) at points (3, n): series with a ratio of 0, the closed form with an infinite one."""
+    weights = np.empty((len(surface.hats), x.shape[1]))
+    surface.weights(x, np.arange(len(weights)), ratio, weights)
+    return weights
 
 
 @pytest.mark.parametrize(("bend", "factor"), [(0.0, 1 / 8), (1.0, 1 / 4)])
@@ -68,17 +75,13 @@ def test_far_rule_error_falls_with_the_third_power_in_a_flat_hat_and_the_second_
     ring = np.array([[1.0, 0, 0.2], [0.2, 1.1, 0], [-0.9, 0.4, 0.3], [-0.5, -0.8, -0.1], [0.6, -0.9, 0.1]])
     vertices = np.concatenate([[[0.1, 0, 0.4]], ring]) * [1, 1, bend]
     faces = np.array([[0, i + 1, (i + 1) % 5 + 1] for i in range(5)])
-    tensors = torch.as_tensor(vertices), torch.as_tensor(faces)
-    surface = closed_forms.Surface.of(*tensors)
-    hats, listed = far_field.HatMoments.of(surface), closed_forms.ListedRule.of(surface)
+    surface, order = Surface.of(vertices, faces)
+    assert sorted(order) == [0, 1, 2, 3, 4, 5]
     errors = []
     for distance in (10.0, 20.0, 40.0):
-        x = distance * torch.nn.functional.normalize(torch.tensor([[0.3, -0.5, -0.8]], dtype=torch.float64))
-        far = torch.empty(6, 1, dtype=torch.float64)
-        hats.fill_weights(x, torch.arange(6), far)
-        exact = listed.weights(torch.arange(5), x.T.expand(3, 5))[0]
-        total = torch.zeros(6, dtype=torch.float64).index_add_(0, tensors[1].T.flatten(), exact.flatten())
-        errors.append(((far[:, 0] - total).abs().sum() / total.abs().sum()).item())
+        x = distance * surface.axes.T @ [[0.3], [-0.5], [-0.8]] / np.sqrt(0.98)
+        far, exact = (all_weights(surface, x, ratio)[:, 0] for ratio in (0.0, np.inf))
+        errors.append(np.abs(far - exact).sum() / np.abs(exact).sum())
     assert errors[0] < 5e-3
     assert errors[1] / errors[0] == pytest.approx(factor, rel=0.25)
     assert errors[2] / errors[1] == pytest.approx(factor, rel=0.2)
@@ -99,7 +102,7 @@ def test_surface_points_are_interpolated_also_where_most_of_the_surface_is_far()
     chosen, barycentric = rng.integers(len(faces), size=60), rng.dirichlet(np.ones(3), size=60)
     points = np.einsum("pi,pix->px", barycentric, vertices[faces[chosen]])
     expected = np.einsum("pi,pik->pk", barycentric, functions[faces[chosen]])
-    result = extend(vertices, faces, functions, points, accuracy=1e-2, dtype=torch.float64)
+    result = extend(vertices, faces, functions, points, accuracy=1e-2, dtype=np.float64)
     np.testing.assert_allclose(result, expected, atol=1e-12)
 
 
@@ -118,7 +121,7 @@ def test_clusters_turn_with_the_mesh() -> None:
     points, functions = interior_points((vertices, faces), 400), smooth_functions(vertices)
     rotation = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix().T
     exact, still, turned = (
-        extend(vertices @ turn, faces, functions, points @ turn, accuracy=accuracy, dtype=torch.float64)
+        extend(vertices @ turn, faces, functions, points @ turn, accuracy=accuracy, dtype=np.float64)
         for accuracy, turn in ((None, np.eye(3)), (1e-3, np.eye(3)), (1e-3, rotation))
     )
     np.testing.assert_allclose(turned, still, atol=1e-9)
@@ -137,7 +140,7 @@ def test_approximation_reproduces_positions() -> None:
 def test_spatial_order_cuts_a_grid_into_cubes(size: int) -> None:
     grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), -1).reshape(-1, 3)
     points = np.random.default_rng(0).permutation(grid)
-    order = closed_forms.spatial_order(torch.as_tensor(points), size).numpy()
+    order = spatial_order(points, size)
     np.testing.assert_array_equal(np.sort(order), np.arange(512))
     for run, side in ((8, 1), (64, 3)):
         assert (np.ptp(points[order].reshape(-1, run, 3), axis=1) == side).all()
@@ -146,83 +149,89 @@ def test_spatial_order_cuts_a_grid_into_cubes(size: int) -> None:
 @pytest.mark.parametrize("n", [0, 1, 7, 8, 9, 83, 512])
 def test_spatial_order_is_one_for_any_number(n: int) -> None:
     points = np.random.default_rng(n).normal(size=(n, 3))
-    order = closed_forms.spatial_order(torch.as_tensor(points), 8).numpy()
+    order = spatial_order(points, 8)
     np.testing.assert_array_equal(np.sort(order), np.arange(n))
 
 
-def hats_and_tree(mesh: Mesh) -> tuple[closed_forms.Surface, far_field.HatMoments, far_field.HatTree]:
-    surface, _ = coordinates._renumbered(coordinates._prepare(*mesh, np.zeros((0, 3)), "cpu")[0])
-    hats = far_field.HatMoments.of(surface)
-    return surface, hats, far_field.HatTree.of(hats)
+def scaled_surface(mesh: Mesh) -> tuple[Surface, np.ndarray]:
+    """The surface, and its vertices (V, 3) in its own axes and order."""
+    vertices, faces, _ = coordinates._scaled(*mesh, np.zeros((0, 3)))
+    surface, order = Surface.of(vertices, faces)
+    return surface, (vertices @ surface.axes)[order]
 
 
 @pytest.mark.parametrize("ratio", [1.1, 2.0, 1e9])
-def test_blocks_see_each_hat_once_and_none_that_is_near_in_a_cluster(ratio: float) -> None:
-    surface, hats, tree = hats_and_tree(torus(160, 60))
-    members = [np.arange(tree.n_hats)[i : i + size] for size in tree.sizes for i in range(0, tree.n_hats, size)]
-    centres, radii = torch.cat(tree.centres).numpy(), torch.cat(tree.radii).numpy()
-    assert len(members) == len(centres)
-    for member, centre, radius in zip(members, centres, radii, strict=True):
-        around = np.isin(surface.faces.numpy(), member).any(1)
-        corners = surface.vertices[surface.faces].numpy()[around].reshape(-1, 3)
+def test_a_box_sees_each_hat_once_and_none_that_is_near_in_a_cluster(ratio: float) -> None:
+    surface, vertices = scaled_surface(torus(160, 60))
+    n_hats = len(vertices)
+    tree = Clusters.of(surface.hats, vertices)
+    sizes = [32 * 4**level for level in range(len(tree.first) - 1)]
+    members = [np.arange(n_hats)[i : i + size] for size in sizes for i in range(0, n_hats, size)]
+    assert len(sizes) > 2
+    assert len(members) == len(tree.centres) == len(tree.radii) == len(tree.sums)
+    for member, centre, radius in zip(members, tree.centres, tree.radii, strict=True):
+        around = np.isin(surface.faces, member).any(axis=1)
+        corners = vertices[surface.faces][around].reshape(-1, 3)
         assert np.linalg.norm(corners - centre, axis=1).max() <= radius
-    points = np.random.default_rng(0).uniform(-0.7, 0.7, (400, 3))
-    blocks = list(tree.blocks(torch.as_tensor(points), 32, ratio))
-    np.testing.assert_array_equal(np.sort(np.concatenate([block.points.numpy() for block in blocks])), np.arange(400))
     n_clusters = 0
-    for block in blocks:
-        x, clusters = points[block.points.numpy()], block.clusters.numpy()
-        seen = np.concatenate([block.hats.numpy(), *(members[cluster] for cluster in clusters)])
-        np.testing.assert_array_equal(np.sort(seen), np.arange(tree.n_hats))
-        assert (cdist(x, centres[clusters]) >= ratio * radii[clusters]).all()
-        is_near = (cdist(x, hats.centres.numpy()) < ratio * hats.radii.numpy()).any(0)
-        assert np.isin(np.nonzero(is_near)[0], block.hats.numpy()).all()
+    points = np.random.default_rng(0).uniform(-0.7, 0.7, (12, 1, 3))
+    for x in points + np.random.default_rng(1).uniform(-0.1, 0.1, (12, 32, 3)):
+        clusters, hats = tree.seen_from(x.T, ratio)
+        np.testing.assert_array_equal(hats, np.sort(hats))
+        seen = np.concatenate([hats, *(members[cluster] for cluster in clusters)])
+        np.testing.assert_array_equal(np.sort(seen), np.arange(n_hats))
+        assert (cdist(x, tree.centres[clusters]) >= ratio * tree.radii[clusters]).all()
+        is_near = (cdist(x, surface.hats[:, :3]) < ratio * surface.hats[:, 3]).any(axis=0)
+        assert np.isin(np.nonzero(is_near)[0], hats).all()
         n_clusters += len(clusters)
     assert (n_clusters > 0) == (ratio < 1e9)
 
 
-def test_near_pairs_equal_all_distances() -> None:
-    _, hats, _ = hats_and_tree(bumpy_sphere(3))
-    points = torch.as_tensor(interior_points(bumpy_sphere(3), 50)) / 2
-    chosen = torch.arange(17, 600, 3)
-    distances = cdist(hats.centres.numpy(), points.numpy())
-    for given, rows in ((None, np.arange(642)), (chosen, chosen.numpy())):
-        hat, point = hats.near(points, 1.5, given).numpy()
-        found = np.zeros(distances.shape, bool)
-        found[hat, point] = True
-        ratios = distances / hats.radii.numpy()[:, None]
-        assert found[rows][ratios[rows] < 1.5].all()
-        assert found.sum() == len(hat)
-        assert found.sum() <= (ratios[rows] < 1.51).sum()
-        assert found.any()
+def test_near_pairs_equal_all_distances_and_have_no_series() -> None:
+    surface, vertices = scaled_surface(bumpy_sphere(3))
+    x = np.ascontiguousarray(interior_points(bumpy_sphere(3), 50).T) / 2
+    for chosen in (np.arange(642), np.arange(17, 600, 3)):
+        weights, near = np.empty((len(chosen), 50)), np.empty((len(chosen) + 1, 50), bool)
+        fill_hats(x, chosen, surface.hats, 1.5, weights, near)
+        ratios = cdist(surface.hats[chosen, :3], x.T) / surface.hats[chosen, 3:4]
+        np.testing.assert_array_equal(near[:-1], ratios < 1.5)
+        np.testing.assert_array_equal(weights == 0, near[:-1])
+        assert near[:-1].any()
+    # The ball about a hat's centroid holds the faces around its vertex.
+    for corner in range(3):
+        of_hat = surface.hats[surface.faces[:, corner]]
+        apart = np.linalg.norm(vertices[surface.faces] - of_hat[:, None, :3], axis=2)
+        assert (apart <= of_hat[:, 3:4]).all()
 
 
 def test_clusters_of_point_elements_leave_an_error_of_third_order() -> None:
     """Hats that are two surface elements n dS each, the kernel of which is n·r/|r|⁴."""
     rng = np.random.default_rng(0)
-    centres, offsets, one, two = torch.as_tensor(rng.normal(size=(4, 50, 3)))
+    centres, offsets, one, two = rng.normal(size=(4, 50, 3))
     offsets *= 0.3
-    hats = far_field.HatMoments(
-        centres=centres,
-        radii=offsets.norm(dim=1),
-        fluxes=one + two,
-        tilts=(one - two)[:, :, None] * offsets[:, None],
-        covariances=offsets[:, :, None] * offsets[:, None],
-        polynomials=torch.empty(50, 4, 10, dtype=torch.float64),
-    )
-    functions = torch.as_tensor(rng.normal(size=(50, 3)))
-    moments = far_field.ClusterMoments.of(far_field.HatTree.of(hats), hats, functions)
-    clusters = torch.arange(2)
+    tilts = (one - two)[:, :, None] * offsets[:, None]
+    covariances = offsets[:, :, None] * offsets[:, None]
+    unused = np.full((50, 1), np.nan)
+    radii = np.linalg.norm(offsets, axis=1, keepdims=True)
+    hats = np.concatenate(
+        [centres, radii, unused, one + two, unused, np.full((50, 3), np.nan)]
+        + [(form + form.transpose(0, 2, 1))[:, i, [j]] / (2 if i == j else 1)
+           for form in (-4 * tilts, 12 * covariances) for i in range(3) for j in range(i, 3)],
+        axis=1,
+    )  # fmt: skip
+    functions = rng.normal(size=(50, 3))
+    tree = Clusters.of(hats, functions)
+    clusters = np.arange(2)
     errors = []
     for distance in (200.0, 400.0, 800.0):
-        x = distance * torch.nn.functional.normalize(torch.tensor([[0.3, -0.5, -0.8]], dtype=torch.float64))
-        terms = torch.empty(19 * 2, 1, dtype=torch.float64)
-        moments.fill_terms(x, clusters, terms)
-        r = torch.stack([centres + offsets, centres - offsets]) - x
-        kernel = (torch.stack([one, two]) * r).sum(-1) / r.square().sum(-1).square()
-        exact = kernel.sum(0) @ functions
-        far = terms.T @ moments.sums[moments.rows(clusters)]
-        errors.append(((far - exact) / (kernel.abs().sum(0) @ functions.abs())).abs().max().item())
+        x = distance * np.array([0.3, -0.5, -0.8]) / np.sqrt(0.98)
+        terms = np.empty((19 * 2, 1))
+        tree.fill_terms(x[:, None], clusters, terms)
+        r = np.stack([centres + offsets, centres - offsets]) - x
+        kernel = (np.stack([one, two]) * r).sum(axis=-1) / np.square(r).sum(axis=-1) ** 2
+        exact = kernel.sum(axis=0) @ functions
+        far = terms[:, 0] @ tree.sums[clusters].reshape(-1, 3)
+        errors.append(np.abs((far - exact) / (np.abs(kernel).sum(axis=0) @ np.abs(functions))).max())
     assert errors[0] < 1e-5
     assert errors[1] / errors[0] == pytest.approx(1 / 8, rel=0.1)
     assert errors[2] / errors[1] == pytest.approx(1 / 8, rel=0.1)
@@ -230,22 +239,19 @@ def test_clusters_of_point_elements_leave_an_error_of_third_order() -> None:
 
 def test_cluster_error_falls_with_the_third_power() -> None:
     """All clusters of one level together, seen from ever farther away, against the closed form of all faces."""
-    surface, hats, tree = hats_and_tree(bumpy_sphere(3))
-    functions = torch.as_tensor(smooth_functions(surface.vertices.numpy()))
-    moments = far_field.ClusterMoments.of(tree, hats, functions)
-    listed = closed_forms.ListedRule.of(surface)
-    clusters = torch.arange(len(tree.radii[0]))
-    faces = torch.arange(len(surface.faces))
+    surface, vertices = scaled_surface(bumpy_sphere(3))
+    functions = smooth_functions(vertices)
+    tree = Clusters.of(surface.hats, functions)
+    clusters = np.arange(tree.first[1])
     errors = []
     for distance in (2.0, 4.0, 8.0, 16.0):
-        x = distance * torch.nn.functional.normalize(torch.tensor([[0.3, -0.5, -0.8]], dtype=torch.float64))
-        terms = torch.empty(19 * len(clusters), 1, dtype=torch.float64)
-        moments.fill_terms(x, clusters, terms)
-        far = terms.T @ moments.sums[moments.rows(clusters)]
-        weights = listed.weights(faces, x.T.expand(3, len(faces)))[0]
-        exact = (weights[..., None] * functions[surface.faces.T]).sum((0, 1))
-        scale = (weights.abs()[..., None] * functions[surface.faces.T].abs()).sum((0, 1))
-        errors.append(((far[0] - exact).abs() / scale).max().item())
+        x = distance * surface.axes.T @ [[0.3], [-0.5], [-0.8]] / np.sqrt(0.98)
+        terms = np.empty((19 * len(clusters), 1))
+        tree.fill_terms(x, clusters, terms)
+        far = terms[:, 0] @ tree.sums[clusters].reshape(-1, functions.shape[1])
+        weights = all_weights(surface, x, np.inf)[:, 0]
+        scale = np.abs(weights) @ np.abs(functions)
+        errors.append((np.abs(far - weights @ functions) / scale).max())
     assert errors[0] < 1e-2
     for before, after in itertools.pairwise(errors):
         assert after < before / 6.5
@@ -270,7 +276,7 @@ def test_a_mesh_on_which_the_approximation_is_worse_gets_a_finer_one(
     monkeypatch.setattr(coordinates, "_CLUSTER_ERROR", 1e-7)
     monkeypatch.setattr(coordinates, "_HAT_ERROR", 1e-4)
     with monkeypatch.context() as unchecked:
-        unchecked.setattr(coordinates, "_sampled_error", lambda *_: 0.0)
+        unchecked.setattr(Extension, "_sampled_error", lambda *_: 0.0)
         assert error(accuracy) > 2 * accuracy
     assert error(accuracy) < accuracy
     assert "evaluated again" in caplog.text
@@ -285,8 +291,8 @@ def test_where_no_approximation_serves_the_closed_form_does(monkeypatch: pytest.
         settings.append(1)
         return 1.0
 
-    monkeypatch.setattr(coordinates, "_sampled_error", never)
-    found = extend(*mesh, functions, points, accuracy=1e-3, dtype=torch.float64)
+    monkeypatch.setattr(Extension, "_sampled_error", never)
+    found = extend(*mesh, functions, points, accuracy=1e-3, dtype=np.float64)
     np.testing.assert_allclose(found, extend(*mesh, functions, points), atol=1e-12)
     assert settings
 
@@ -294,23 +300,22 @@ def test_where_no_approximation_serves_the_closed_form_does(monkeypatch: pytest.
 def test_the_sampled_error_is_that_of_the_distances() -> None:
     mesh = bumpy_sphere(4)
     points, functions = interior_points(mesh, 100), smooth_functions(mesh[0])
-    surface, x = coordinates._prepare(*mesh, points, "cpu")
-    hats, listed = far_field.HatMoments.of(surface), closed_forms.ListedRule.of(surface)
-    columns = torch.cat([torch.as_tensor(functions), torch.ones(len(functions), 1)], 1).double()
+    extension = Extension(*mesh, functions, dtype=np.float64)
+    x = coordinates._scaled(*mesh, points)[2] @ extension._surface.axes
     exact = extend(*mesh, functions, points)
-    assert coordinates._sampled_error(hats, listed, columns, x, exact, 1e-3) < 1e-4
+    assert extension._sampled_error(x, exact) < 1e-12
     generator = np.random.default_rng(1)
     for size in (1e-3, 1e-2):
         wrong = exact + size * generator.normal(size=exact.shape)
         expected = np.quantile(np.abs(pdist(wrong) / pdist(exact) - 1), 0.99)
-        found = coordinates._sampled_error(hats, listed, columns, x, wrong, 1e-3)
+        found = extension._sampled_error(x, wrong)
         assert 0.6 * expected < found < 1.7 * expected
     # Errors that go together, here by the same share of every distance, are never taken for less than they are.
     larger = exact.mean(axis=0) + 1.01 * (exact - exact.mean(axis=0))
-    assert coordinates._sampled_error(hats, listed, columns, x, larger, 1e-3) > 0.01
+    assert extension._sampled_error(x, larger) > 0.01
     order = np.random.default_rng(0).permutation(len(points))
     half = exact.copy()
     half[:50] *= 1.003
-    expected = coordinates._sampled_error(hats, listed, columns, x, half, 1e-3)
-    shuffled = coordinates._sampled_error(hats, listed, columns, x[order], half[order], 1e-3)
+    expected = extension._sampled_error(x, half)
+    shuffled = extension._sampled_error(x[order], half[order])
     assert shuffled == pytest.approx(expected, rel=1e-6)  # the same points, whatever the order

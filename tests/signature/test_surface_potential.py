@@ -7,10 +7,7 @@ import pytest
 import scipy.integrate
 import trimesh
 
-from igps.signature import surface_potential as module
 from igps.signature.surface_potential import surface_potential
-
-pytestmark = pytest.mark.usefixtures("both_ways")
 
 
 def by_quadrature(triangle: np.ndarray, point: np.ndarray) -> float:
@@ -183,11 +180,3 @@ def test_faces_without_area_add_nothing_and_no_points_give_none() -> None:
     )
     assert surface_potential(vertices, faces, np.empty((0, 3))).shape == (0,)
     assert (surface_potential(vertices, flat[-2:], points[:2]) == 0).all()
-
-
-def test_groups_of_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    vertices, faces = body()
-    points = samples(vertices, faces)
-    expected = surface_potential(vertices, faces, points)
-    monkeypatch.setattr(module, "_BLOCKS", 2)
-    np.testing.assert_array_equal(surface_potential(vertices, faces, points), expected)

@@ -132,7 +132,11 @@ def add_face(
 
 @compiled(error_model="numpy")
 def near_potential(face: NDArray[np.float64], x: float, y: float, z: float) -> float:
-    """Σ p ln((r + r' + l)/(r + r' − l)) − |h Ω| of a face (25,) at a point, see `surface_potential`.
+    """The potential of a face (25,) at a point: Σ p ln((r + r' + l)/(r + r' − l)) − |h Ω| over its sides.
+
+    For a side of length l, p is the distance of the point's projection from its line, positive inside, and r, r' are
+    the distances of its ends; h is that from the plane and Ω the solid angle (Van Oosterom and Strackee 1983). On a
+    side both p and the quotient's denominator vanish, and their product is 0.
 
     A face's numbers are its corners, its normal, the outward normals of its sides in its plane, the lengths of these,
     and twice its area.

@@ -1,114 +1,289 @@
-"""Loops that Numba compiles for `far_field` and `closed_forms`: the weights of hats far from points and near them."""
+"""Compiled loops of the mean value weights: Taylor series far from the surface, the closed form near it.
+
+Points x are (3, n) and close together. What describes the surface is explained in `igps.signature._far_field`.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import TypeVar
 
 import numpy as np
+from numpy.polynomial import Chebyshev, Polynomial
 from numpy.typing import NDArray
 
 from igps._compiled import compiled
 
-Real = TypeVar("Real", np.float32, np.float64)
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Booleans = NDArray[np.bool_]
+Arrays = tuple[Integers, Floats, Integers, Integers]
+
+_PAIRS = 128  # pairs of a face and a point at a time: their numbers stay in the first-level cache
+_ON_SURFACE = 2e-9  # half-diagonals: closer points take the surface value, and coplanar faces count as exactly so
+_TAN = math.tan(math.pi / 8)
+# arctan(√q)/√q for √q up to tan π/8, to rounding, the highest power first
+_ARCTAN = tuple(
+    Chebyshev.interpolate(lambda q: np.arctan(np.sqrt(q)) / np.sqrt(q), 12, domain=[1e-9, _TAN**2])
+    .convert(kind=Polynomial)
+    .coef[::-1]
+    .tolist()
+)
+
+
+@compiled(error_model="numpy")
+def seen_from(
+    low: Floats, high: Floats, centres: Floats, radii: Floats, first: Integers, ratio: float, leaf: int, n_hats: int
+) -> tuple[Integers, Integers]:
+    """The clusters that are `ratio` radii or more away from all of a box, and the hats in none of them, ascending."""
+    clusters, hats = np.empty(len(radii), np.int64), np.empty(n_hats, np.int64)
+    n_clusters, n_opened, n_waiting = 0, 0, 0
+    n_levels = len(first) - 1
+    waiting = np.empty((first[n_levels] - first[n_levels - 1] + 4 * n_levels, 2), np.int64)
+    for cluster in range(first[n_levels] - 1, first[n_levels - 1] - 1, -1):
+        waiting[n_waiting, 0], waiting[n_waiting, 1] = cluster, n_levels - 1
+        n_waiting += 1
+    while n_waiting > 0:
+        n_waiting -= 1
+        cluster, level = waiting[n_waiting, 0], waiting[n_waiting, 1]
+        squared_gap = 0.0
+        for axis in range(3):
+            centre = centres[cluster, axis]
+            squared_gap += (centre - min(max(centre, low[axis]), high[axis])) ** 2
+        number = cluster - first[level]
+        if squared_gap >= (ratio * radii[cluster]) ** 2:
+            clusters[n_clusters] = cluster
+            n_clusters += 1
+        elif level > 0:
+            children = first[level - 1] + 4 * number
+            for child in range(min(children + 4, first[level]) - 1, children - 1, -1):
+                waiting[n_waiting, 0], waiting[n_waiting, 1] = child, level - 1
+                n_waiting += 1
+        else:
+            for hat in range(leaf * number, min(leaf * number + leaf, n_hats)):
+                hats[n_opened] = hat
+                n_opened += 1
+    return clusters[:n_clusters], hats[:n_opened]
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def fill_hat_weights(polynomials: NDArray[Real], monomials: NDArray[Real], weights: NDArray[Real]) -> None:
-    """Fill weights (h, n) from the polynomials (h, 4, 10) of h hats and the monomials (10, n) of n points.
+def fill_hats(x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: Floats, near: Booleans) -> None:
+    """Fill the weights (h, n) of the chosen hats (h,), 0 within `ratio` radii, and which points (h, n) are so near."""
+    n = x.shape[1]
+    squared = np.empty(n)
+    for k in range(len(chosen)):
+        p = hats[chosen[k]]
+        p0, p1, p2, limit = p[0], p[1], p[2], (ratio * p[3]) ** 2
+        f, f0, f1, f2 = p[4], p[5], p[6], p[7]
+        s, s0, s1, s2 = p[8], p[9], p[10], p[11]
+        s00, s01, s02, s11, s12, s22 = p[12], p[13], p[14], p[15], p[16], p[17]
+        b00, b01, b02, b11, b12, b22 = p[18], p[19], p[20], p[21], p[22], p[23]
+        row = weights[k]
+        for i in range(n):
+            a, b, c = p0 - x[0, i], p1 - x[1, i], p2 - x[2, i]
+            distance = a * a + b * b + c * c
+            inverse = 1 / distance
+            linear = f + f0 * a + f1 * b + f2 * c
+            second = s + a * (s0 + s00 * a + s01 * b + s02 * c) + b * (s1 + s11 * b + s12 * c) + c * (s2 + s22 * c)
+            third = a * (b00 * a + b01 * b + b02 * c) + b * (b11 * b + b12 * c) + b22 * c * c
+            value = ((third * linear * inverse + second) * inverse + linear) * (inverse * inverse)
+            row[i] = 0.0 if distance < limit else value
+            squared[i] = distance
+        for i in range(n):
+            near[k, i] = squared[i] < limit
 
-    With r², L, S and T the polynomials in the order of `HatMoments.polynomials`: ((T L/r² + S)/r² + L)/r⁴.
-    """
-    for hat in range(len(weights)):
-        p = polynomials[hat]
-        for point in range(weights.shape[1]):
-            squared, linear, second, third = p[0, 0], p[1, 0], p[2, 0], p[3, 0]
-            for k in range(1, 10):
-                monomial = monomials[k, point]
-                squared += p[0, k] * monomial
-                linear += p[1, k] * monomial
-                second += p[2, k] * monomial
-                third += p[3, k] * monomial
-            inverse = 1 / squared
-            weights[hat, point] = ((third * inverse * linear + second) * inverse + linear) * (inverse * inverse)
 
-
-@compiled(error_model="numpy")
-def replace_weights(
-    points: NDArray[np.float64],
-    near: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    faces: NDArray[np.int64],
-    table: NDArray[np.float64],
-    first: NDArray[np.int64],
-    around: NDArray[np.int64],
-    on_surface: float,
-    weights: NDArray[Real],
-) -> None:
-    """`ListedRule.replace` of points (n, 3), with the fields of the rule, and the distance below which one is on it."""
-    is_near = np.zeros(weights.shape, dtype=np.bool_)
-    for pair in range(near.shape[1]):
-        row, point = rows[near[0, pair]], near[1, pair]
-        is_near[row, point] = True
-        weights[row, point] = 0
-    touched = np.full(len(points), -1)
-    shares = np.empty((len(points), 3))
-    of_face = np.empty((3, 3))
-    for pair in range(near.shape[1]):
-        hat, point = near[0, pair], near[1, pair]
-        for place in range(first[hat], first[hat + 1]):
-            face = around[place]
-            corners = faces[face]
-            counted = False
-            for i in range(3):
-                # A face counts once: with its first near corner.
-                counted |= corners[i] < hat and is_near[rows[corners[i]], point]
-            if counted:
-                continue
-            if _weigh_face(table[face], points[point], on_surface, of_face) and touched[point] < 0:
-                touched[point] = face
-                shares[point] = of_face[1]
-            for i in range(3):
-                row = rows[corners[i]]
-                if is_near[row, point]:
-                    weights[row, point] += of_face[0, i]
-    for point in range(len(points)):
-        if touched[point] >= 0:
-            weights[:, point] = 0
-            for i in range(3):
-                weights[rows[faces[touched[point], i]], point] = shares[point, i]
+@compiled(error_model="numpy", fastmath={"contract"})
+def fill_clusters(x: Floats, chosen: Integers, centres: Floats, radii: Floats, terms: Floats) -> None:
+    """Fill the terms (19 c, n) of the chosen clusters (c,): |e|² times e, its products of two, and of three."""
+    for k in range(len(chosen)):
+        c0, c1, c2, radius = centres[chosen[k], 0], centres[chosen[k], 1], centres[chosen[k], 2], radii[chosen[k]]
+        out = terms[19 * k : 19 * k + 19]
+        for i in range(x.shape[1]):
+            a, b, c = c0 - x[0, i], c1 - x[1, i], c2 - x[2, i]
+            inverse = radius / (a * a + b * b + c * c)
+            a, b, c = a * inverse, b * inverse, c * inverse
+            scale = radius * inverse
+            sa, sb, sc = scale * a, scale * b, scale * c
+            aa, ab, ac, bb, bc, cc = sa * a, sa * b, sa * c, sb * b, sb * c, sc * c
+            out[0, i], out[1, i], out[2, i] = sa, sb, sc
+            out[3, i], out[4, i], out[5, i], out[6, i], out[7, i], out[8, i] = aa, ab, ac, bb, bc, cc
+            out[9, i], out[10, i], out[11, i], out[12, i], out[13, i] = aa * a, aa * b, aa * c, ab * b, ab * c
+            out[14, i], out[15, i], out[16, i], out[17, i], out[18, i] = ac * c, bb * b, bb * c, bc * c, cc * c
 
 
 @compiled(error_model="numpy")
-def _weigh_face(
-    row: NDArray[np.float64], point: NDArray[np.float64], on_surface: float, found: NDArray[np.float64]
-) -> bool:
-    """`ListedRule.weights` of one row of the table and one point: whether it is on the face.
+def replace_near(x: Floats, chosen: Integers, near: Booleans, surface: Arrays, weights: Floats) -> None:
+    """Add the closed form to the weights (…, n), the last rows of which are the chosen hats' (h,).
 
-    What is found (3, 3) are weights, barycentric coordinates and, for this function alone, angles over lengths.
+    Only near pairs get it; `near` (h + 1, n) ends with a row of none. Points on the surface get their triangle's
+    barycentric coordinates, and nothing else. The surface is given by its faces, table, first and around.
     """
-    a0, a1, a2 = row[0] - point[0], row[1] - point[1], row[2] - point[2]
-    b0, b1, b2 = row[3] - point[0], row[4] - point[1], row[5] - point[2]
-    c0, c1, c2 = row[6] - point[0], row[7] - point[1], row[8] - point[2]
-    height = row[9] * a0 + row[10] * a1 + row[11] * a2
-    area_0 = -(row[12] * b0 + row[13] * b1 + row[14] * b2)
-    area_1 = -(row[15] * c0 + row[16] * c1 + row[17] * c2)
-    areas = (area_0, area_1, row[21] - area_0 - area_1)
-    cosines = (b0 * c0 + b1 * c1 + b2 * c2, c0 * a0 + c1 * a1 + c2 * a2, a0 * b0 + a1 * b1 + a2 * b2)
-    sides = (row[18], row[19], row[20])
-    half = (sides[0] + sides[1] + sides[2]) / 2
-    total, whole, on_face = 0.0, 0.0, abs(height) <= on_surface
-    for i in range(3):
-        length = max(math.sqrt(areas[i] * areas[i] + sides[i] * height * height), 1e-150)
-        found[2, i] = math.atan2(length, cosines[i]) / length
-        total += found[2, i] * areas[i]
-        on_face &= areas[i] >= -on_surface * math.sqrt(sides[i])
-        whole += max(areas[i], 0.0)
-    outside = abs(height) < on_surface and total < 1e-2
-    for i in range(3):
-        left, right = (i + 2) % 3, (i + 1) % 3
-        second = found[2, left] * (sides[right] - half) + found[2, right] * (sides[left] - half)
-        flat = 0.0 if outside else total / height * areas[i]
-        found[0, i] = ((found[2, i] * sides[i] + second) * height + flat) / (2 * row[21])
-        found[1, i] = max(areas[i], 0.0) / whole
-    return on_face
+    faces, table, first, around = surface
+    n, n_chosen = x.shape[1], len(chosen)
+    of_hats = weights[len(weights) - n_chosen :]
+    place = np.empty(len(first) - 1, np.int64)
+    place[:] = n_chosen
+    for k in range(n_chosen):
+        place[chosen[k]] = k
+    pairs = np.empty((2, n + _PAIRS), np.int64)
+    touched, shares = np.empty(n, np.int64), np.empty((n, 3))
+    touched[:] = -1
+    n_pairs = 0
+    for k in range(n_chosen):
+        hat, any_near = chosen[k], False
+        for i in range(n):
+            any_near |= near[k, i]
+        if not any_near:
+            continue
+        for at in range(first[hat], first[hat + 1]):
+            face = around[at]
+            # A face counts once: with its first near corner.
+            one, two = n_chosen, n_chosen
+            for corner in range(3):
+                if faces[face, corner] < hat:
+                    one, two = place[faces[face, corner]], one
+            for i in range(n):
+                if near[k, i] and not near[one, i] and not near[two, i]:
+                    pairs[0, n_pairs], pairs[1, n_pairs] = face, i
+                    n_pairs += 1
+            if n_pairs >= _PAIRS:
+                add_faces(x, pairs[:, :n_pairs], faces, table, place, near, of_hats, touched, shares)
+                n_pairs = 0
+    add_faces(x, pairs[:, :n_pairs], faces, table, place, near, of_hats, touched, shares)
+    for i in range(n):
+        if touched[i] >= 0:
+            for k in range(len(weights)):
+                weights[k, i] = 0
+            for corner in range(3):
+                of_hats[place[faces[touched[i], corner]], i] = shares[i, corner]
+
+
+@compiled(error_model="numpy")
+def add_faces(
+    x: Floats, pairs: Integers, faces: Integers, table: Floats, place: Integers, near: Booleans, weights: Floats,
+    touched: Integers, shares: Floats,
+) -> None:  # fmt: skip
+    """Add the closed form of pairs (2, m) of a face and a point, accurate up to the surface.
+
+    Noted are the first face that a point lies on, and the point's barycentric coordinates there.
+
+    With λ the barycentric coordinates of the projection of x, h its distance to the plane, e_l the sides, N_l the
+    product of the vectors from x to the ends of side l and θ_l the angle between them, the published N_i·m / (N_i·v_i)
+    becomes ½ [λ_i s/h + h Σ_l g_l e_l·e_i / |n|²] |n|, with g_l = θ_l/|N_l| and s = Σ_l g_l λ_l, because
+    N_l = λ_l n + h n̂×e_l. The length of N_l taken from that too makes all terms agree near side l.
+    """
+    n_pairs = pairs.shape[1]
+    kept, squares, cosines = np.empty((n_pairs, 4)), np.empty(3 * n_pairs), np.empty(3 * n_pairs)
+    for m in range(n_pairs):
+        row, i = table[pairs[0, m]], pairs[1, m]
+        a0, a1, a2 = row[0] - x[0, i], row[1] - x[1, i], row[2] - x[2, i]
+        b0, b1, b2 = row[3] - x[0, i], row[4] - x[1, i], row[5] - x[2, i]
+        c0, c1, c2 = row[6] - x[0, i], row[7] - x[1, i], row[8] - x[2, i]
+        height = row[9] * a0 + row[10] * a1 + row[11] * a2
+        # λ |n|, twice the area of the projection with each side
+        area_0 = -(row[12] * b0 + row[13] * b1 + row[14] * b2)
+        area_1 = -(row[15] * c0 + row[16] * c1 + row[17] * c2)
+        area_2 = row[21] - area_0 - area_1
+        squares[3 * m] = area_0 * area_0 + row[18] * height * height
+        squares[3 * m + 1] = area_1 * area_1 + row[19] * height * height
+        squares[3 * m + 2] = area_2 * area_2 + row[20] * height * height
+        cosines[3 * m] = b0 * c0 + b1 * c1 + b2 * c2
+        cosines[3 * m + 1] = c0 * a0 + c1 * a1 + c2 * a2
+        cosines[3 * m + 2] = a0 * b0 + a1 * b1 + a2 * b2
+        kept[m, 0], kept[m, 1], kept[m, 2], kept[m, 3] = area_0, area_1, area_2, height
+    divide_angles(squares, cosines)
+    for m in range(n_pairs):
+        face, i = pairs[0, m], pairs[1, m]
+        row, areas, height = table[face], kept[m], kept[m, 3]
+        g, sides = squares[3 * m : 3 * m + 3], table[face, 18:21]
+        half = (sides[0] + sides[1] + sides[2]) / 2
+        total = g[0] * areas[0] + g[1] * areas[1] + g[2] * areas[2]
+        # In the plane of a face but outside it s vanishes like h², the weight like h: what is left is rounding.
+        flat = 0.0 if abs(height) < _ON_SURFACE and total < 1e-2 else total / height
+        on_face, whole = abs(height) <= _ON_SURFACE and touched[i] < 0, 0.0
+        for corner in range(3):
+            left, right, k = (corner + 2) % 3, (corner + 1) % 3, place[faces[face, corner]]
+            if near[k, i]:
+                second = g[corner] * sides[corner] + g[left] * (sides[right] - half) + g[right] * (sides[left] - half)
+                weights[k, i] += (second * height + flat * areas[corner]) / (2 * row[21])
+            on_face &= areas[corner] >= -_ON_SURFACE * math.sqrt(sides[corner])
+            whole += max(areas[corner], 0.0)
+        if on_face:
+            touched[i] = face
+            for corner in range(3):
+                shares[i, corner] = max(areas[corner], 0.0) / whole
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def divide_angles(squares: Floats, cosines: Floats) -> None:
+    """Angles over lengths in place of the lengths' squares: arctan2(length, cosine) / length, to rounding."""
+    for m in range(len(squares)):
+        y, cosine = max(math.sqrt(squares[m]), 1e-150), cosines[m]
+        x = abs(cosine)
+        small, large = min(x, y), max(x, y)
+        steep = small > _TAN * large
+        z = (small - large if steep else small) / (small + large if steep else large)
+        q = z * z
+        series = 0.0
+        for coefficient in _ARCTAN:
+            series = series * q + coefficient
+        angle = z * series + (math.pi / 4 if steep else 0.0)
+        angle = math.pi / 2 - angle if y > x else angle
+        squares[m] = (math.pi - angle if cosine < 0 else angle) / y
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def fill_cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats, terms: NDArray[np.float32]) -> None:
+    """Fill what each hat adds (V, 19) to the sums of its cluster, which is one of `size` consecutive hats.
+
+    The moments of n dS about the cluster's centre are F = ∫ λ n, T + F sᵀ with T the symmetric part of ∫ λ n (y − p)ᵀ,
+    and 2 T s + F E with E the second moment of y under λ; s is from the centre to the hat's. They are contracted with
+    the derivatives of u, which are |e|² times e, −4 e eᵀ + |e|², and 24 e e e − 4 |e|² e in each of three ways.
+    """
+    for hat in range(len(hats)):
+        p, out, centre, scale = hats[hat], terms[hat], centres[hat // size], 1 / radii[hat // size]
+        s0, s1, s2 = scale * (p[0] - centre[0]), scale * (p[1] - centre[1]), scale * (p[2] - centre[2])
+        cubed, squared = scale * scale * scale, scale * scale
+        f0, f1, f2 = cubed * p[5], cubed * p[6], cubed * p[7]
+        # S is −4 dᵀTd, and B is 12 dᵀCd; entries off the diagonal count twice.
+        tilt, spread = -squared * squared / 4, squared / 12
+        t00, t01, t02, t11, t12, t22 = (
+            tilt * p[12], tilt * p[13], tilt * p[14], tilt * p[15], tilt * p[16], tilt * p[17]
+        )  # fmt: skip
+        e00, e11, e22 = spread * p[18] + s0 * s0, spread * p[21] + s1 * s1, spread * p[23] + s2 * s2
+        e01, e02, e12 = spread * p[19] + 2 * s0 * s1, spread * p[20] + 2 * s0 * s2, spread * p[22] + 2 * s1 * s2
+        out[0], out[1], out[2] = f0, f1, f2
+        n00, n11, n22 = t00 + f0 * s0, t11 + f1 * s1, t22 + f2 * s2
+        trace = n00 + n11 + n22
+        out[3], out[6], out[8] = trace - 4 * n00, trace - 4 * n11, trace - 4 * n22
+        out[4], out[5] = -4 * (t01 + f0 * s1 + f1 * s0), -4 * (t02 + f0 * s2 + f2 * s0)
+        out[7] = -4 * (t12 + f1 * s2 + f2 * s1)
+        trace_t, trace_e = t00 + t11 + t22, e00 + e11 + e22
+        g0 = 2 * trace_t * s0 + trace_e * f0 + 2 * (2 * t00 * s0 + t01 * s1 + t02 * s2)
+        g1 = 2 * trace_t * s1 + trace_e * f1 + 2 * (t01 * s0 + 2 * t11 * s1 + t12 * s2)
+        g2 = 2 * trace_t * s2 + trace_e * f2 + 2 * (t02 * s0 + t12 * s1 + 2 * t22 * s2)
+        g0 += 2 * e00 * f0 + e01 * f1 + e02 * f2
+        g1 += e01 * f0 + 2 * e11 * f1 + e12 * f2
+        g2 += e02 * f0 + e12 * f1 + 2 * e22 * f2
+        # 12 (F·e) eᵀEe + 24 (s·e) eᵀTe − 2 (g·e) |e|²
+        f0, f1, f2, s0, s1, s2, g0, g1, g2 = (
+            12 * f0,
+            12 * f1,
+            12 * f2,
+            24 * s0,
+            24 * s1,
+            24 * s2,
+            2 * g0,
+            2 * g1,
+            2 * g2,
+        )
+        out[9] = f0 * e00 + s0 * t00 - g0
+        out[10] = f0 * e01 + f1 * e00 + s0 * t01 + s1 * t00 - g1
+        out[11] = f0 * e02 + f2 * e00 + s0 * t02 + s2 * t00 - g2
+        out[12] = f0 * e11 + f1 * e01 + s0 * t11 + s1 * t01 - g0
+        out[13] = f0 * e12 + f1 * e02 + f2 * e01 + s0 * t12 + s1 * t02 + s2 * t01
+        out[14] = f0 * e22 + f2 * e02 + s0 * t22 + s2 * t02 - g0
+        out[15] = f1 * e11 + s1 * t11 - g1
+        out[16] = f1 * e12 + f2 * e11 + s1 * t12 + s2 * t11 - g2
+        out[17] = f1 * e22 + f2 * e12 + s1 * t22 + s2 * t12 - g1
+        out[18] = f2 * e22 + s2 * t22 - g2
