@@ -107,9 +107,10 @@ def surface_genus(mesh: Mesh) -> int:
 
 @pytest.fixture
 def approximate_small_meshes() -> Iterator[None]:
-    """Else small meshes would be evaluated more accurately. It outlives a test's `monkeypatch.undo`."""
+    """Else small meshes are evaluated more accurately, without clusters. It outlives a test's `monkeypatch.undo`."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(coordinates, "_FEW_VERTICES", 0)
+        patch.setattr(coordinates, "_CLUSTERED", 0)
         yield
 
 

@@ -41,6 +41,7 @@ _FAR = 1.1  # least distance in radii at which a series may serve
 _HAT_ERROR = 3.5e-3  # of the hats' series a radius away; it falls with the third power
 _CLUSTER_ERROR = 2.2e-3  # of the clusters' series a radius away from the cluster's ball; it falls with the third power
 _FEW_VERTICES = 2000  # meshes so coarse were up to three times worse
+_CLUSTERED = 2**13  # vertices from which clusters pay; below, a value depends on its own point alone
 _COARSE_GAIN = 3  # by which they are evaluated more accurately
 _FLOAT32_ACCURACY = 1e-4  # from here on, single precision is enough for the product with the functions
 _SAMPLE = 12  # points that are evaluated exactly too, to check the approximation
@@ -82,18 +83,7 @@ def extend(
 ) -> Floats:
     """Extend surface functions (V, K) to points (P, 3) by mean value interpolation (Ju, Schaefer, Warren 2005): (P, K).
 
-    Vertices (V, 3) and points share one unit; faces (F, 3) are oriented alike, either way. Functions are divided by
-    ``divisors`` (K,) on the way, so that there need be no second copy of them. ``accuracy`` None evaluates
-    the closed form for all pairs. Otherwise it is the relative error below which 99 % of the interior distances stay
-    (Euclidean distances of rows of the result, for points inside a closed surface), and far faces are integrated
-    approximately. Some points of each mesh are also evaluated exactly; where their distances do not have the accuracy,
-    a finer approximation takes over, or the closed form. Neighbouring points share work, so that a value depends within
-    the accuracy on the points beside it. ``dtype``, float32 or float64, is that of the product with the functions; None
-    takes the cheapest that keeps the accuracy. Memory beside arguments and result: at most 256 MiB of weights at a time
-    and thread, and three times the functions.
-
-    Raises:
-        ValueError: a shape, an index or a value of an argument is invalid, or the weights of a point sum to zero.
+    See `Extension` for the arguments and the errors.
     """
     return Extension(vertices, faces, functions, divisors=divisors, accuracy=accuracy, dtype=dtype)(points)
 
@@ -101,8 +91,18 @@ def extend(
 class Extension:
     """Functions on a surface, to be extended to points: `extend` in two steps, between which the functions may go.
 
+    Memory beside arguments and result: at most 256 MiB of weights at a time and thread, and three times the functions.
+
     Args:
-        vertices, faces, functions, divisors, accuracy, dtype: see `extend`.
+        vertices: (V, 3), in the unit of the points.
+        faces: (F, 3), oriented alike, either way.
+        functions: (V, K).
+        divisors: (K,) by which the functions are divided on the way, so that there need be no second copy of them.
+        accuracy: relative error below which 99 % of the interior distances stay (Euclidean distances of rows of the
+            result, for points inside a closed surface); None for the closed form everywhere. Some points of each mesh
+            are evaluated exactly too; where their distances do not have the accuracy, a finer approximation takes over,
+            or the closed form. On large meshes a value depends, within the accuracy, on the points beside it.
+        dtype: float32 or float64, of the product with the functions; None for the cheapest that keeps the accuracy.
 
     Raises:
         ValueError: a shape, an index or a value of an argument is invalid.
@@ -203,7 +203,8 @@ class Extension:
             return found
 
         with Team(None if len(columns) >= _TEAM_VERTICES else 1) as team:
-            clusters = None if math.isinf(cluster_ratio) else Clusters.of(surface.hats, columns, team)
+            clustered = setting is not None and len(columns) >= _CLUSTERED
+            clusters = Clusters.of(surface.hats, columns, team) if clustered else None
             for found in team.each(partial(of_group, clusters), range(0, len(x), _GROUP)):
                 yield from found
 
