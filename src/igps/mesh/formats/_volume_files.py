@@ -1,0 +1,232 @@
+"""What files of volumes hold, read by nibabel, SimpleITK, highdicom and tifffile; sizes are checked before."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.mesh.formats.label_names import names_in_extensions
+from igps.mesh.limits import available_memory
+from igps.mesh.mesh import MeshError
+
+# Bytes for each voxel beside those of the file: the labels, and what counts them.
+_BESIDE = 4
+_FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])  # from LPS, which DICOM and ITK have, to RAS
+_TO_MM = {"m": 1000.0, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "micron": 1e-3, "nm": 1e-6, "inch": 25.4}
+_TO_MM |= {"meter": 1000.0, "millimeter": 1.0, "\\u00b5m": 1e-3}
+
+
+@dataclass
+class RawVolume:
+    """As it was read: layers (X, Y, Z) of any values, the affine (4, 4), and what the file says of its segments.
+
+    `segments` are (name, layer, value in it), where the file lists them; `names` are of values of a single layer.
+    `unit` is "mm", or None of a file that gives no lengths.
+    """
+
+    layers: list[NDArray[Any]]
+    affine: NDArray[np.float64]
+    names: dict[int, str] = field(default_factory=dict)
+    segments: list[tuple[str, int, int]] = field(default_factory=list)
+    unit: str | None = "mm"
+
+
+def check_voxels(path: Path, shape: Sequence[int], n_bytes: int, n_components: int = 1) -> None:
+    """Refuse what is no volume, or does not fit into memory.
+
+    Raises:
+        MeshError: an array of other than three axes, a single slice, several values for each voxel, or too many voxels.
+    """
+    if n_components != 1:
+        raise MeshError(
+            f"{path}: {n_components} values in each voxel, as of colours; one label expected. Export labels."
+        )
+    size = [*shape]
+    while len(size) > 3 and size[-1] == 1:
+        size.pop()
+    if len(size) != 3:
+        raise MeshError(
+            f"{path}: an array of {len(size)} axes, {' × '.join(map(str, size))}; three expected. Export each volume "
+            "to a file of its own."
+        )
+    if min(size) < 2:
+        raise MeshError(
+            f"{path}: {' × '.join(map(str, size))} voxels are a single slice, which has no volume. Export "
+            "the whole stack."
+        )
+    needed, free = math.prod(map(int, size)) * (n_bytes + _BESIDE), available_memory()
+    if free is not None and needed > free:
+        raise MeshError(
+            f"{path}: {math.prod(map(int, size)):,} voxels need {needed / 1e9:,.1f} GB of memory, and "
+            f"{max(free, 0) / 1e9:.1f} GB are free. Crop or resample the volume; if it is "
+            "smaller, its header is damaged."
+        )
+
+
+def _nibabel(path: Path) -> RawVolume:
+    import nibabel
+
+    image: Any = nibabel.load(path)
+    dtype = np.dtype(image.get_data_dtype())
+    if dtype.fields or dtype.kind not in "biuf":
+        kind = "colours" if dtype.fields else "complex numbers"
+        raise MeshError(f"{path}: voxels of {kind} ({dtype}); whole numbers expected. Export the labels.")
+    check_voxels(path, image.shape, max(dtype.itemsize, 1))
+    values = np.asanyarray(image.dataobj).reshape(image.shape[:3])
+    affine, names = np.array(image.affine, dtype=np.float64), {}
+    if isinstance(image, nibabel.Nifti1Image):
+        affine[:3] *= _TO_MM.get(image.header.get_xyzt_units()[0], 1.0)
+        names = names_in_extensions(
+            bytes(extension.get_content_bytes())
+            if hasattr(extension, "get_content_bytes")
+            else str(extension.get_content()).encode()
+            for extension in image.header.extensions
+        )
+    return RawVolume([values], affine, names)
+
+
+def _simple_itk(path: Path) -> RawVolume:
+    import SimpleITK
+
+    _check_detached(path)
+    SimpleITK.ProcessObject.GlobalWarningDisplayOff()
+    reader = SimpleITK.ImageFileReader()
+    reader.SetFileName(str(path))
+    reader.ReadImageInformation()
+    about = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys()}
+    segments = _slicer_segments(about)
+    n_layers = reader.GetNumberOfComponents() if segments else 1
+    if "complex" in SimpleITK.GetPixelIDValueAsString(reader.GetPixelID()):
+        raise MeshError(f"{path}: voxels of complex numbers; whole numbers expected. Export the labels.")
+    check_voxels(path, reader.GetSize(), 8 * n_layers, 1 if segments else reader.GetNumberOfComponents())
+    image = reader.Execute()
+    values = SimpleITK.GetArrayFromImage(image)  # (Z, Y, X), and layers last
+    layers = [values[..., i].T for i in range(values.shape[3])] if values.ndim == 4 else [values.T]
+    affine = np.eye(4)
+    affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
+    affine[:3, 3] = image.GetOrigin()
+    return RawVolume(layers, _FLIP @ affine, segments=[one for one in segments if one[1] < len(layers)])
+
+
+def _slicer_segments(about: dict[str, str]) -> list[tuple[str, int, int]]:
+    """(name, layer, value) of the segments that 3D Slicer writes into a NRRD header."""
+    segments = []
+    for key, value in about.items():
+        if (found := re.fullmatch(r"Segment(\d+)_LabelValue", key)) and value.strip().isdigit():
+            layer = about.get(f"Segment{found[1]}_Layer", "0").strip()
+            segments.append(
+                (about.get(f"Segment{found[1]}_Name", ""), int(layer) if layer.isdigit() else 0, int(value))
+            )
+    return segments
+
+
+def _check_detached(path: Path) -> None:
+    """Refuse a header whose voxels lie outside its folder."""
+    with path.open("rb") as file:
+        head = file.read(1 << 16)
+    key = rb"^(?:ElementDataFile[ \t]*=|data ?file:)[ \t]*(.*?)[ \t]*\r?$"
+    lines = re.findall(key, head.split(b"\n\n")[0], re.MULTILINE | re.IGNORECASE)
+    for name in (line.decode("utf-8", "replace") for line in lines):
+        if "/" in name or "\\" in name or name.upper().startswith("LIST"):
+            raise MeshError(
+                f"{path}: its voxels are said to lie in {name!r}; a file of its own folder expected. Save the "
+                "volume as one file."
+            )
+
+
+def _highdicom(path: Path) -> RawVolume:
+    import pydicom
+    from highdicom.seg import Segmentation
+
+    dataset = pydicom.dcmread(path)
+    if dataset.get("Modality") != "SEG":
+        raise MeshError(
+            f"{path}: DICOM of modality {dataset.get('Modality', 'none')}, not SEG; labels expected. Export the "
+            "segmentation as DICOM SEG."
+        )
+    segmentation = Segmentation.from_dataset(dataset, copy=False)
+    geometry = segmentation.get_volume_geometry()
+    if geometry is None:
+        raise MeshError(f"{path}: its slices are not evenly spaced. Resample the segmentation to even slices.")
+    numbers = [int(number) for number in segmentation.segment_numbers]
+    check_voxels(path, geometry.spatial_shape, 4)
+    try:
+        layers = [_volume(segmentation, combine_segments=True)]
+    except (RuntimeError, ValueError):  # segments overlap, or are fractional
+        check_voxels(path, geometry.spatial_shape, 8 * len(numbers))
+        # What was tried keeps its tables locked
+        segmentation = Segmentation.from_dataset(pydicom.dcmread(path), copy=False)
+        layers = [_volume(segmentation, segment_numbers=[number])[..., 0] for number in numbers]
+    alone = (len(layers) == len(numbers) and len(numbers) > 1) or layers[0].dtype.kind == "f"
+    segments = [
+        (str(segmentation.get_segment_description(number).segment_label), at if alone else 0, 1 if alone else number)
+        for at, number in enumerate(numbers)
+    ]
+    # The slices come first, and rows before columns
+    return RawVolume(layers, _FLIP @ np.array(geometry.affine, dtype=np.float64), segments=segments)
+
+
+def _volume(segmentation: Any, **options: Any) -> NDArray[Any]:
+    return np.asarray(segmentation.get_volume(**options).array)
+
+
+def _tifffile(path: Path) -> RawVolume:
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        series = file.series[0]
+        axes, dtype = series.axes, np.dtype(series.dtype)
+        if "S" in axes:
+            check_voxels(path, series.shape[:3], dtype.itemsize, series.shape[axes.index("S")])
+        if dtype.kind not in "biuf":
+            raise MeshError(f"{path}: voxels of {dtype}; whole numbers expected. Export the labels.")
+        shape = [n for n in series.shape if n > 1] if len(series.shape) > 3 else list(series.shape)
+        check_voxels(path, shape if len(shape) > 2 else [1, *shape], dtype.itemsize)
+        values = series.asarray().reshape(shape).T
+        spacing = _tiff_spacing(file)
+    affine = np.diag([*(spacing or (1.0, 1.0, 1.0)), 1.0])
+    return RawVolume([values], affine, unit="mm" if spacing else None)
+
+
+def _tiff_spacing(file: Any) -> tuple[float, float, float] | None:
+    """Sides of a voxel along x, y and z in millimetres, of OME's or ImageJ's metadata; None where they say none."""
+    if file.ome_metadata:
+        found = {}
+        for axis in "XYZ":
+            size = re.search(rf'\bPhysicalSize{axis}="([\d.eE+-]+)"', file.ome_metadata)
+            unit = re.search(rf'\bPhysicalSize{axis}Unit="([^"]*)"', file.ome_metadata)
+            scale = _TO_MM.get(unit[1] if unit else "µm")
+            if size and scale:
+                found[axis] = float(size[1]) * scale
+        return (found["X"], found["Y"], found["Z"]) if len(found) == 3 else None
+    about, tags = file.imagej_metadata or {}, file.pages[0].tags
+    scale = _TO_MM.get(str(about.get("unit", "")))
+    if scale is None or not about.get("spacing") or "XResolution" not in tags or "YResolution" not in tags:
+        return None
+    sides = [tags[f"{axis}Resolution"].value for axis in "XY"]
+    if not all(count for count, _ in sides):
+        return None
+    x, y = (scale * per / count for count, per in sides)
+    return x, y, scale * abs(float(about["spacing"]))
+
+
+READERS: dict[str, Callable[[Path], RawVolume]] = {
+    ".nii": _nibabel,
+    ".nii.gz": _nibabel,
+    ".mgh": _nibabel,
+    ".mgz": _nibabel,
+    ".nrrd": _simple_itk,
+    ".mha": _simple_itk,
+    ".mhd": _simple_itk,
+    ".dcm": _highdicom,
+    ".tif": _tifffile,
+    ".tiff": _tifffile,
+}
+"""Who reads files of which suffix."""

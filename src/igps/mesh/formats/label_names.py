@@ -1,0 +1,126 @@
+"""Names of labels: by a table of ITK-SNAP, 3D Slicer or FreeSurfer, of nnU-Net, by CSV, or by a NIfTI extension."""
+
+from __future__ import annotations
+
+import csv
+import html
+import json
+import logging
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from igps.mesh.mesh import MeshError
+
+logger = logging.getLogger(__name__)
+
+TABLE_SUFFIXES = (".label", ".ctbl", ".lut", ".txt", ".csv", ".json")
+"""Suffixes of tables that are looked for beside a volume, under its name."""
+
+_BESIDE = ("FreeSurferColorLUT.txt", "dataset.json")  # for all volumes of a folder
+_MOST_BYTES = 1 << 24
+# ITK-SNAP: index, three colours, opacity, visibility, mesh visibility, "name".
+_SNAP = re.compile(r'(\d+)(?:\s+[\d.]+){6}\s+"([^"]*)"')
+# 3D Slicer and FreeSurfer: index, name, colours; 3D Slicer quotes names, or has _ for a space.
+_COLOURS = re.compile(r'(\d+)\s+("[^"]*"|\S+)(?:\s+[\d.]+){3,4}')
+_WORKBENCH = re.compile(rb"<Label\b([^>]*)>(.*?)</Label>", re.DOTALL)
+_KEY = re.compile(rb"""\bKey\s*=\s*["'](\d+)["']""")
+
+
+def read_label_names(path: str | Path) -> dict[int, str]:
+    """The names that a table gives to labels.
+
+    Label descriptions of ITK-SNAP, colour tables of 3D Slicer and FreeSurfer, JSON from numbers to names or from names
+    to numbers, also under "labels" as nnU-Net has it, and CSV whose first line names a column of labels (label,
+    LabelValue, index, id or value) and one of names (name or label_name).
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(f"{folder}/names.txt").write_text("# FreeSurfer\\n17  Left-Hippocampus  220 216 20 0\\n")
+        ...     read_label_names(f"{folder}/names.txt")
+        {17: 'Left-Hippocampus'}
+
+    Raises:
+        MeshError: the file is missing, unreadable, or names no label.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise MeshError(f"{path}: {path.stat().st_size:,} bytes are no table of names. Give the table.")
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise MeshError(f"{path}: the names of labels are not readable ({error}). Check the path.") from error
+    names = _of_json(text) if path.suffix.lower() == ".json" else _of_csv(text) or _of_lines(text)
+    if not names:
+        raise MeshError(
+            f"{path}: names no label. Expected label descriptions of ITK-SNAP, a colour table of 3D Slicer or "
+            "FreeSurfer, CSV with the columns label,name, or JSON from numbers to names."
+        )
+    return names
+
+
+def names_beside(path: Path) -> dict[int, str]:
+    """Those of the first table beside a volume: under its name, or one of FreeSurfer or nnU-Net; else none."""
+    stem = re.sub(r"(\.seg)?\.[^.]+(\.gz)?$", "", path.name, flags=re.IGNORECASE)
+    for name in (*(stem + suffix for suffix in TABLE_SUFFIXES), *_BESIDE):
+        table = path.with_name(name)
+        if table != path and table.is_file():
+            try:
+                return read_label_names(table)
+            except MeshError as error:
+                logger.info("%s: no names from the file beside it: %s", path, error)
+    return {}
+
+
+def names_in_extensions(contents: Iterable[bytes]) -> dict[int, str]:
+    """Those of a label table of Connectome Workbench's form in the extensions of a NIfTI header, else none.
+
+    TotalSegmentator writes such tables, too.
+    """
+    names: dict[int, str] = {}
+    for content in contents:
+        for attributes, name in _WORKBENCH.findall(content):
+            if key := _KEY.search(attributes):
+                inner = re.sub(rb"<!\[CDATA\[(.*?)\]\]>", rb"\1", name, flags=re.DOTALL)
+                names[int(key[1])] = html.unescape(inner.decode("utf-8", "replace"))
+    return _clean(names)
+
+
+def _clean(names: dict[int, str]) -> dict[int, str]:
+    """On one line each, without those that are empty, and without the background."""
+    words = {label: " ".join(name.split()) for label, name in names.items()}
+    return {label: name for label, name in words.items() if name and label > 0}
+
+
+def _of_lines(text: str) -> dict[int, str]:
+    names: dict[int, str] = {}
+    for line in text.splitlines():
+        if found := _SNAP.match(line.strip()) or _COLOURS.match(line.strip()):
+            names[int(found[1])] = found[2].strip('"')
+    return _clean(names)
+
+
+def _of_csv(text: str) -> dict[int, str]:
+    rows = csv.DictReader(text.splitlines())
+    columns = {(column or "").strip().lower(): column for column in rows.fieldnames or ()}
+    number = next((columns[key] for key in ("labelvalue", "label", "index", "id", "value") if key in columns), None)
+    name = next((columns[key] for key in ("name", "label_name", "labelname") if key in columns), None)
+    if number is None or name is None:
+        return {}
+    pairs = ((str(row[number] or "").strip(), str(row[name] or "")) for row in rows)
+    return _clean({int(label): words for label, words in pairs if label.isascii() and label.isdigit()})
+
+
+def _of_json(text: str) -> dict[int, str]:
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    table = content.get("labels", content) if isinstance(content, dict) else {}
+    names: dict[int, str] = {}
+    for key, value in table.items() if isinstance(table, dict) else ():
+        label, name = (value, key) if isinstance(value, int) else (key, value)
+        if str(label).isascii() and str(label).isdigit() and isinstance(name, str):
+            names[int(label)] = name
+    return _clean(names)

@@ -1,0 +1,293 @@
+"""Label volumes: NIfTI, NRRD, MetaImage, MGH, DICOM SEG and TIFF stacks; every label is a body.
+
+The world is RAS, x to the patient's right, y to the front and z up, in millimetres. No volume is resampled.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+from scipy.optimize import linear_sum_assignment
+
+from igps.mesh.formats._volume_files import READERS, RawVolume
+from igps.mesh.formats.label_names import names_beside, read_label_names
+from igps.mesh.label_surface import MAX_VERTICES, checked_spacing, voxel_surface
+from igps.mesh.mending import Mending, mend
+from igps.mesh.mesh import Mesh, MeshError
+
+logger = logging.getLogger(__name__)
+
+SUFFIXES = tuple(READERS)
+"""Of the files that hold label volumes."""
+
+# More labels are a picture's intensities.
+_MOST_LABELS = 20_000
+
+
+@dataclass(frozen=True)
+class VolumeOptions:
+    """How a label volume is read.
+
+    Args:
+        threshold: a voxel of probability at least this belongs to the body; only for values between 0 and 1.
+        names: a table of names, see `read_label_names`; None for those of the file, or of a table beside it.
+
+    Raises:
+        ValueError: a threshold that is not above 0 and at most 1.
+    """
+
+    threshold: float = 0.5
+    names: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.threshold <= 1:
+            raise ValueError(f"threshold: expected above 0 and at most 1, got {self.threshold}.")
+
+
+@dataclass(frozen=True)
+class LabelBody:
+    """A body of a volume: its label and name, its number of voxels, and where in the arrays it lies."""
+
+    label: int
+    name: str
+    n_voxels: int
+    layer: int
+    value: int
+    box: tuple[slice, slice, slice]
+
+
+@dataclass(frozen=True, eq=False)
+class LabelVolume:
+    """Labels of voxels, and where they are in the world.
+
+    Example:
+        >>> labels = np.zeros((20, 20, 20), dtype=np.uint8)
+        >>> labels[2:10, 2:18, 2:18], labels[10:18, 2:18, 2:18] = 1, 2
+        >>> volume = LabelVolume((labels,), np.diag([1.0, 1.0, 2.0, 1.0]), names={2: "liver"})
+        >>> [(body.label, body.name, body.n_voxels) for body in volume.bodies]
+        [(1, '1', 2048), (2, 'liver', 2048)]
+        >>> round(label_surface(volume, "liver").volume)
+        4096
+
+    Args:
+        layers: arrays (X, Y, Z) of whole numbers from 0, the background; several where segments overlap.
+        affine: (4, 4) from indices of voxels to the world.
+        name: what error messages call the volume, usually its file.
+        names: of labels.
+        segments: (label, layer, value in it) of files that list their segments; None for one layer of labels.
+        unit: of length, None if unknown.
+        notes: what was done to the volume.
+
+    Raises:
+        MeshError: no labels, labels that are no whole numbers from 0, names that repeat, or a singular affine.
+    """
+
+    layers: tuple[NDArray[Any], ...]
+    affine: NDArray[np.float64]
+    name: str = "volume"
+    names: dict[int, str] | None = None
+    segments: tuple[tuple[int, int, int], ...] | None = None
+    unit: str | None = "mm"
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        checked_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
+        if not self.bodies:
+            raise MeshError(f"{self.name}: no voxel has a label, all are 0. Check that the right file was exported.")
+        seen: dict[str, int] = {}
+        for body in self.bodies:
+            if body.name in seen:
+                raise MeshError(
+                    f"{self.name}: labels {seen[body.name]} and {body.label} are both named {body.name!r}. Rename one, "
+                    "or give names by a table."
+                )
+            seen[body.name] = body.label
+
+    @cached_property
+    def bodies(self) -> tuple[LabelBody, ...]:
+        """Of every label that any voxel has, in ascending order."""
+        names, found = self.names or {}, []
+        for layer, labels in enumerate(self.layers):
+            values, counts, compact = _counted(labels, self.name)
+            boxes = ndimage.find_objects(compact)
+            known = {value: label for label, at, value in self.segments or () if at == layer}
+            for index, (value, count) in enumerate(zip(values.tolist(), counts.tolist(), strict=True), start=1):
+                label = known.get(value, value if len(self.layers) == 1 else None)
+                if label is not None:
+                    at = boxes[(value if compact is labels else index) - 1]
+                    found.append(LabelBody(label, names.get(label, str(label)), count, layer, value, at))
+        return tuple(sorted(found, key=lambda body: body.label))
+
+    def body(self, part: int | str) -> LabelBody:
+        """The body of a label, or of a name.
+
+        Raises:
+            MeshError: there is none; names those that there are.
+        """
+        for body in self.bodies:
+            if part in (body.label, body.name) or part == str(body.label):
+                return body
+        known = ", ".join(body.name for body in self.bodies[:10]) + (", …" if len(self.bodies) > 10 else "")
+        raise MeshError(f"{self.name}: no label {part!r}. It has {len(self.bodies)}: {known}.")
+
+
+def is_label_volume(path: str | Path) -> bool:
+    """Whether a file has the suffix of a label volume."""
+    return _suffix(Path(path)) in READERS
+
+
+def read_label_volume(path: str | Path, options: VolumeOptions = VolumeOptions()) -> LabelVolume:
+    """Read a label volume: `.nii`, `.nii.gz`, `.mgh`, `.mgz`, `.nrrd`, `.mha`, `.mhd`, `.dcm` (SEG), `.tif`, `.tiff`.
+
+    Names of labels come from `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, extensions of NIfTI), else
+    from a table beside it (see `names_beside`); without one a label is its number.
+
+    Raises:
+        MeshError: the file is missing, cut short, too large, or holds no labels in three axes.
+        ImportError: the library that reads the format is not installed.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MeshError(f"{path}: no such file. Check the path.")
+    reader = READERS.get(_suffix(path))
+    if reader is None:
+        raise MeshError(f"{path}: no format of label volumes. Expected one of {', '.join(READERS)}.")
+    try:
+        raw = reader(path)
+    except ModuleNotFoundError as error:
+        raise ImportError(f'{path}: needs {error.name}: pip install "interior-gps[volumes]".') from error
+    except (MeshError, MemoryError):
+        raise
+    except Exception as error:  # whatever the libraries raise
+        why = " ".join(str(error).split())[:300]
+        raise MeshError(
+            f"{path}: not readable as a label volume ({type(error).__name__}: {why}). Check that the file is complete, "
+            "or export it again."
+        ) from error
+    return _labelled(raw, path, options)
+
+
+def label_bodies(volume: LabelVolume) -> list[tuple[int, str, int]]:
+    """(label, name, number of voxels) of every label that any voxel has, in ascending order."""
+    return [(body.label, body.name, body.n_voxels) for body in volume.bodies]
+
+
+def label_surface(
+    volume: LabelVolume, part: int | str, *, how: Mending = "auto", max_vertices: int = MAX_VERTICES
+) -> Mesh:
+    """The surface of a label as a body in the world, in the unit of the volume, see `voxel_surface`.
+
+    Args:
+        volume: the labels.
+        part: a label, or a name.
+        how: what is done to a label of several pieces, see `mend`.
+        max_vertices: about so many vertices at most.
+
+    Raises:
+        MeshError: no such label, too few voxels, or no body can be made of it.
+    """
+    body = volume.body(part)
+    name = f"{volume.name}#{body.name}"
+    affine = np.array(volume.affine, dtype=np.float64)
+    affine[:3, 3] += affine[:3, :3] @ [side.start for side in body.box]
+    mask, affine = _canonical(volume.layers[body.layer][body.box] == body.value, affine)
+    vertices, faces, notes = voxel_surface(mask, affine, max_vertices=max_vertices, name=name)
+    return mend(vertices, faces, how=how, name=name, notes=(*volume.notes, *notes))
+
+
+def _canonical(mask: NDArray[np.bool_], affine: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """With axes that run as nearly along x, y and z as they can: formats store the same voxels in different orders."""
+    order = linear_sum_assignment(-np.abs(affine[:3, :3]) / np.linalg.norm(affine[:3, :3], axis=0))[1]
+    mask, affine = mask.transpose(order), affine[:, [*order, 3]]
+    for axis in np.nonzero(np.diag(affine)[:3] < 0)[0]:
+        affine[:3, 3] += affine[:3, axis] * (mask.shape[axis] - 1)
+        affine[:3, axis] *= -1
+        mask = np.flip(mask, int(axis))
+    return np.ascontiguousarray(mask), affine
+
+
+def _suffix(path: Path) -> str:
+    name = path.name.lower()
+    return ".nii.gz" if name.endswith(".nii.gz") else path.suffix.lower()
+
+
+def _labelled(raw: RawVolume, path: Path, options: VolumeOptions) -> LabelVolume:
+    notes: list[str] = []
+    layers = tuple(_whole_numbers(values, path, options.threshold, notes) for values in raw.layers)
+    segments, names = None, raw.names
+    if raw.segments:
+        # A value may stand for one segment in each layer
+        values = [value for _, _, value in raw.segments]
+        unique = len(set(values)) == len(values)
+        labels = values if unique else list(range(1, len(values) + 1))
+        segments = tuple((label, layer, value) for label, (_, layer, value) in zip(labels, raw.segments, strict=True))
+        names = {label: name for label, (name, _, _) in zip(labels, raw.segments, strict=True) if name.strip()}
+    if options.names is not None:
+        names = read_label_names(options.names)
+    elif not names:
+        names = names_beside(path)
+    return LabelVolume(layers, raw.affine, str(path), names, segments, raw.unit, tuple(dict.fromkeys(notes)))
+
+
+def _whole_numbers(values: NDArray[Any], path: Path, threshold: float, notes: list[str]) -> NDArray[Any]:
+    """Labels from 0, of the smallest type; probabilities are cut at the threshold."""
+    if values.dtype.kind == "f":
+        n_bad = int(np.count_nonzero(~np.isfinite(values)))
+        if n_bad:
+            raise MeshError(f"{path}: {n_bad} voxels are NaN or infinite; labels expected. Set them to 0.")
+        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+        n_odd = int(np.count_nonzero(values != np.round(values)))
+        if n_odd and low >= 0 and high <= 1:
+            notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
+            return (values >= threshold).astype(np.uint8)
+        if n_odd:
+            odd = float(values[values != np.round(values)][0])
+            raise MeshError(
+                f"{path}: {n_odd} voxels have fractional labels, such as {odd:g}. Resample labels to the nearest "
+                "neighbour, or give probabilities between 0 and 1."
+            )
+        if low < 0 or high >= 2**31:
+            values = values.astype(np.float64)
+    if values.size and values.dtype.kind in "if" and values.min() < 0:
+        raise MeshError(
+            f"{path}: {int(np.count_nonzero(values < 0))} voxels have negative labels, such as {int(values.min())}; "
+            "0 for the background and positive numbers expected. Is it an image? Export its labels."
+        )
+    if values.size and values.max() >= 2**31:
+        raise MeshError(f"{path}: label {int(values.max())} is too large; below 2³¹ expected. Number the labels anew.")
+    highest = int(values.max()) if values.size else 0
+    return np.asarray(values, dtype=np.min_scalar_type(highest))
+
+
+def _counted(labels: ArrayLike, name: str) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """The values that occur, without 0; how often; and labels below 65536: the given ones, or else from 1 in order."""
+    array = np.asarray(labels)
+    if array.ndim != 3 or array.dtype.kind not in "biu":
+        raise MeshError(f"{name}: expected whole numbers of shape (X, Y, Z), got {array.dtype} of shape {array.shape}.")
+    array = array.view(np.uint8) if array.dtype.kind == "b" else array
+    if array.size and array.min() < 0:
+        raise MeshError(f"{name}: negative labels, such as {array.min()}; numbers from 0 expected.")
+    if not array.size or array.max() < 2**16:
+        counts = np.zeros(int(array.max(initial=0)) + 1, dtype=np.int64)
+        for plane in array:
+            counts += np.bincount(plane.ravel(), minlength=len(counts))
+        counts[0] = 0
+        values = np.nonzero(counts)[0]
+        compact, counts = array, counts[values]
+    else:
+        values, index, counts = np.unique(array, return_inverse=True, return_counts=True)
+        start = int(values[0] == 0)
+        compact = index.reshape(array.shape) + (1 - start)
+        values, counts = values[start:], counts[start:]
+    if len(values) > _MOST_LABELS:
+        raise MeshError(
+            f"{name}: {len(values)} different values, which look like an image and not like labels. Export the labels."
+        )
+    return values, counts, compact

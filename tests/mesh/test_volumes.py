@@ -1,0 +1,335 @@
+"""The same labels in every format give the same bodies; what is no label volume is refused in a sentence."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from igps.mesh.formats.label_names import read_label_names
+from igps.mesh.formats.volumes import (
+    LabelVolume,
+    VolumeOptions,
+    is_label_volume,
+    label_bodies,
+    label_surface,
+    read_label_volume,
+)
+from igps.mesh.mesh import MeshError
+
+nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+sitk = pytest.importorskip("SimpleITK", reason="the extra [volumes]")
+tifffile = pytest.importorskip("tifffile", reason="the extra [volumes]")
+
+# Left-handed, turned about z, with voxels of 1 × 1.5 × 2.5 mm.
+TURN = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
+AFFINE = np.eye(4)
+AFFINE[:3, :3] = TURN @ np.diag([-1, 1.5, 2.5])
+AFFINE[:3, 3] = (30, -20, 10)
+
+
+def two_boxes() -> NDArray[np.uint8]:
+    labels = np.zeros((14, 12, 10), dtype=np.uint8)
+    labels[1:7, 2:10, 1:9] = 3
+    labels[7:12, 2:10, 1:9] = 7
+    return labels
+
+
+def itk_image(labels: NDArray[Any], affine: NDArray[np.float64] = AFFINE, vector: bool = False) -> Any:
+    image = sitk.GetImageFromArray(np.ascontiguousarray(np.swapaxes(labels, 0, 2)), isVector=vector)
+    lps = np.diag([-1, -1, 1, 1]) @ affine
+    spacing = np.linalg.norm(lps[:3, :3], axis=0)
+    image.SetSpacing(spacing.tolist())
+    image.SetDirection((lps[:3, :3] / spacing).ravel().tolist())
+    image.SetOrigin(lps[:3, 3].tolist())
+    return image
+
+
+def write_nibabel(path: Path, labels: NDArray[Any]) -> None:
+    kind = nibabel.MGHImage if path.suffix in (".mgh", ".mgz") else nibabel.Nifti1Image
+    nibabel.save(kind(labels, AFFINE), path)
+
+
+def write_itk(path: Path, labels: NDArray[Any]) -> None:
+    sitk.WriteImage(itk_image(labels), str(path), useCompression=True)
+
+
+def write_dicom(path: Path, labels: NDArray[Any]) -> None:
+    write_segmentation(path, labels, ["left part", "right part"])
+
+
+def write_segmentation(path: Path, labels: NDArray[Any], names: list[str], overlap: bool = False) -> None:
+    """Planes of a scanner whose axes are those of the affine, as highdicom writes them."""
+    pytest.importorskip("highdicom", reason="the extra [volumes]")
+    from highdicom.seg import Segmentation, SegmentDescription
+    from pydicom.dataset import Dataset, FileMetaDataset
+    from pydicom.sr.codedict import codes
+    from pydicom.uid import ExplicitVRLittleEndian, generate_uid
+
+    lps = np.diag([-1, -1, 1, 1]) @ AFFINE
+    spacing = np.linalg.norm(lps[:3, :3], axis=0)
+    planes, study, series, frame = [], generate_uid(), generate_uid(), generate_uid()
+    for k in range(labels.shape[2]):
+        plane = Dataset()
+        plane.file_meta = FileMetaDataset()
+        plane.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        plane.SOPClassUID, plane.SOPInstanceUID = "1.2.840.10008.5.1.4.1.1.2", generate_uid()
+        plane.StudyInstanceUID, plane.SeriesInstanceUID, plane.FrameOfReferenceUID = study, series, frame
+        plane.PatientID, plane.PatientName, plane.PatientBirthDate, plane.PatientSex = "1", "A^B", "", ""
+        plane.StudyDate, plane.StudyTime, plane.StudyID, plane.AccessionNumber = "20200101", "000000", "1", ""
+        plane.ReferringPhysicianName, plane.SeriesNumber, plane.InstanceNumber, plane.Modality = "", 1, k + 1, "CT"
+        plane.Rows, plane.Columns = labels.shape[1], labels.shape[0]
+        plane.PixelSpacing = [spacing[1], spacing[0]]
+        plane.SliceThickness = spacing[2]
+        plane.ImageOrientationPatient = [*(lps[:3, 0] / spacing[0]), *(lps[:3, 1] / spacing[1])]
+        plane.ImagePositionPatient = list(lps[:3, 3] + k * lps[:3, 2])
+        plane.BitsAllocated = plane.BitsStored = 16
+        plane.SamplesPerPixel, plane.PhotometricInterpretation, plane.PixelRepresentation = 1, "MONOCHROME2", 0
+        planes.append(plane)
+    masks = np.stack([labels == value for value in np.unique(labels)[1:]], axis=-1)
+    if overlap:
+        masks[..., 1] |= masks[..., 0]
+    described = [
+        SegmentDescription(number, name, codes.SCT.Organ, codes.SCT.Organ, "MANUAL")
+        for number, name in enumerate(names, start=1)
+    ]
+    Segmentation(
+        planes, masks.transpose(2, 1, 0, 3).astype(np.uint8), "BINARY", described, generate_uid(), 1, generate_uid(), 1,
+        "maker", "model", "1", "1",
+    ).save_as(path)  # fmt: skip
+
+
+WRITERS: dict[str, Callable[[Path, NDArray[Any]], None]] = {
+    "x.nii": write_nibabel,
+    "x.nii.gz": write_nibabel,
+    "x.mgz": write_nibabel,
+    "x.nrrd": write_itk,
+    "x.mha": write_itk,
+    "x.mhd": write_itk,
+    "x.dcm": write_dicom,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_format_gives_the_same_bodies_in_the_world(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    WRITERS[name](path, two_boxes())
+    assert is_label_volume(path)
+    volume = read_label_volume(path)
+    assert volume.unit == "mm"
+    bodies = label_bodies(volume)
+    assert [n_voxels for _, _, n_voxels in bodies] == [384, 320]
+    given = LabelVolume((two_boxes(),), AFFINE)
+    for (label, _, n_voxels), at in zip(bodies, (3, 7), strict=True):
+        mesh = label_surface(volume, label)
+        np.testing.assert_allclose(
+            sorted(mesh.vertices[:, 0]), sorted(label_surface(given, at).vertices[:, 0]), atol=1e-3
+        )
+        assert mesh.volume == pytest.approx(n_voxels * 1 * 1.5 * 2.5, rel=1e-3)
+        centre = AFFINE[:3, :3] @ np.argwhere(two_boxes() == at).mean(axis=0) + AFFINE[:3, 3]
+        np.testing.assert_allclose(mesh.vertices.mean(axis=0), centre, atol=0.4)
+
+
+def test_a_stack_of_pictures_has_the_spacing_of_imagej_or_none(tmp_path: Path) -> None:
+    stack = np.ascontiguousarray(two_boxes().T)
+    tifffile.imwrite(
+        tmp_path / "x.tif", stack, imagej=True, resolution=(1 / 0.5, 1 / 0.25),
+        metadata={"spacing": 2.0, "unit": "um", "axes": "ZYX"},
+    )  # fmt: skip
+    volume = read_label_volume(tmp_path / "x.tif")
+    np.testing.assert_allclose(np.diag(volume.affine), [0.5e-3, 0.25e-3, 2e-3, 1])
+    assert volume.unit == "mm"
+    np.testing.assert_array_equal(volume.layers[0], two_boxes())
+    tifffile.imwrite(tmp_path / "y.tiff", stack, photometric="minisblack")
+    plain = read_label_volume(tmp_path / "y.tiff")
+    assert plain.unit is None
+    assert label_surface(plain, 3).volume == pytest.approx(384, rel=1e-3)
+
+
+def test_segments_of_slicer_have_names_and_may_overlap(tmp_path: Path) -> None:
+    one, two = two_boxes() == 3, two_boxes() > 0
+    image = itk_image(np.stack([one, two], axis=-1).astype(np.uint8), vector=True)
+    for key, value in {
+        "Segment0_Name": "liver", "Segment0_LabelValue": "1", "Segment0_Layer": "0",
+        "Segment1_Name": "body", "Segment1_LabelValue": "1", "Segment1_Layer": "1",
+    }.items():  # fmt: skip
+        image.SetMetaData(key, value)
+    sitk.WriteImage(image, str(tmp_path / "x.seg.nrrd"))
+    volume = read_label_volume(tmp_path / "x.seg.nrrd")
+    assert label_bodies(volume) == [(1, "liver", 384), (2, "body", 704)]
+    assert label_surface(volume, "body").volume == pytest.approx(704 * 3.75, rel=1e-3)
+
+
+@pytest.mark.parametrize("overlap", [False, True])
+def test_segments_of_dicom_have_names_and_may_overlap(overlap: bool, tmp_path: Path) -> None:
+    write_segmentation(tmp_path / "x.dcm", two_boxes(), ["liver", "spleen"], overlap)
+    assert label_bodies(read_label_volume(tmp_path / "x.dcm")) == [
+        (1, "liver", 384),
+        (2, "spleen", 704 if overlap else 320),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        (
+            "x.label",
+            '# ITK-SnAP\n    0     0    0    0        0  0  0    "Clear"\n    3   255    0    0   1  1  1    "a b"\n',
+        ),
+        ("x.ctbl", "# Color table\n3 a_b 10 20 30 255\n"),
+        ("FreeSurferColorLUT.txt", "#No. Label Name: R G B A\n\n3   a_b      70  130 180 0\n"),
+        ("x.csv", "LabelValue,Name,Color_R\n3,a b,1\n"),
+        ("dataset.json", json.dumps({"labels": {"background": 0, "a b": 3}})),
+        ("x.json", json.dumps({"3": "a b"})),
+    ],
+)
+def test_a_table_beside_the_volume_names_its_labels(name: str, text: str, tmp_path: Path) -> None:
+    write_nibabel(tmp_path / "x.nii.gz", two_boxes())
+    (tmp_path / name).write_text(text)
+    named, plain = read_label_volume(tmp_path / "x.nii.gz").bodies
+    assert named.name.replace("_", " ") == "a b"
+    assert plain.name == "7"
+
+
+def test_names_come_from_the_header_and_a_given_table_goes_first(tmp_path: Path) -> None:
+    image = nibabel.Nifti1Image(two_boxes(), AFFINE)
+    xml = b'<LabelTable><Label Key="3" Red="1"><![CDATA[left & right]]></Label></LabelTable>'
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, xml))
+    nibabel.save(image, tmp_path / "x.nii.gz")
+    assert [body.name for body in read_label_volume(tmp_path / "x.nii.gz").bodies] == ["left & right", "7"]
+    (tmp_path / "names.csv").write_text("label,name\n7,spleen\n")
+    given = read_label_volume(tmp_path / "x.nii.gz", VolumeOptions(names=tmp_path / "names.csv"))
+    assert [body.name for body in given.bodies] == ["3", "spleen"]
+
+
+def test_probabilities_are_cut_at_the_threshold(tmp_path: Path) -> None:
+    ball = np.linalg.norm(np.indices((20, 20, 20)) - 9.5, axis=0)
+    nibabel.save(nibabel.Nifti1Image(np.clip(1.5 - ball / 8, 0, 1).astype(np.float32), np.eye(4)), tmp_path / "x.nii")
+    radius = {}
+    for threshold in (0.5, 0.75):
+        mesh = label_surface(read_label_volume(tmp_path / "x.nii", VolumeOptions(threshold)), 1)
+        radius[threshold] = (mesh.volume * 3 / 4 / np.pi) ** (1 / 3)
+        assert any("probabilities" in note for note in mesh.notes)
+    assert radius == pytest.approx({0.5: 8, 0.75: 6}, rel=0.02)
+
+
+def test_large_labels_are_kept(tmp_path: Path) -> None:
+    labels = two_boxes().astype(np.int32) * 100_000_000
+    nibabel.save(nibabel.Nifti1Image(labels, AFFINE), tmp_path / "x.nii.gz")
+    volume = read_label_volume(tmp_path / "x.nii.gz")
+    assert label_bodies(volume) == [(300_000_000, "300000000", 384), (700_000_000, "700000000", 320)]
+    assert label_surface(volume, 700_000_000).volume == pytest.approx(320 * 3.75, rel=1e-3)
+
+
+def nifti(path: Path, values: Any, affine: Any = AFFINE) -> None:
+    nibabel.save(nibabel.Nifti1Image(values, affine), path)
+
+
+def broken(path: Path, kind: str) -> None:
+    labels = two_boxes()
+    if kind == "cut short":
+        nifti(path, np.random.default_rng(0).integers(0, 3, (40, 40, 40)).astype(np.uint8))
+        path.write_bytes(path.read_bytes()[:3000])
+    elif kind == "huge":
+        nifti(path, labels)
+        content = bytearray(gzip.decompress(path.read_bytes()))
+        content[40:48] = np.array([3, 32767, 32767, 32767], dtype="<i2").tobytes()
+        path.write_bytes(gzip.compress(content))
+    elif kind == "4D":
+        nifti(path, np.stack([labels, labels], axis=-1))
+    elif kind == "colours":
+        nifti(path, np.zeros((4, 4, 4), dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")]))
+    elif kind == "complex":
+        nifti(path, labels.astype(np.complex64))
+    elif kind == "NaN":
+        nifti(path, np.where(labels == 3, np.nan, labels).astype(np.float32))
+    elif kind == "negative":
+        nifti(path, labels.astype(np.int16) - 1)
+    elif kind == "fractional":
+        nifti(path, labels.astype(np.float32) / 2)
+    elif kind == "one slice":
+        nifti(path, labels[:, :, 3:4])
+    elif kind == "no label":
+        nifti(path, labels * np.uint8(0))
+    elif kind == "singular":
+        image = nibabel.Nifti1Image(labels, AFFINE)
+        image.header["sform_code"], image.header["qform_code"] = 1, 0
+        image.header["srow_x"] = image.header["srow_y"]
+        with gzip.open(path, "wb") as file:
+            file.write(image.header.binaryblock + bytes(4) + labels.tobytes(order="F"))
+    elif kind == "same names":
+        nifti(path, labels)
+        path.with_name("x.csv").write_text("label,name\n3,rib\n7,rib\n")
+    elif kind == "image":
+        nifti(path, np.arange(40**3).reshape(40, 40, 40).astype(np.int32))
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("cut short", "not readable as a label volume.*complete"),
+        ("huge", "35,181,150,961,663 voxels need .* GB of memory.*damaged"),
+        ("4D", "4 axes.*each volume"),
+        ("colours", "colours.*Export the labels"),
+        ("complex", "complex numbers.*Export the labels"),
+        ("NaN", "384 voxels are NaN.*Set them to 0"),
+        ("negative", "negative labels, such as -1.*Export"),
+        ("fractional", "fractional labels, such as [13].5.*nearest"),
+        ("one slice", "single slice.*whole stack"),
+        ("no label", "no voxel has a label"),
+        ("singular", "affine.*singular.*Write the file again"),
+        ("same names", "labels 3 and 7 are both named 'rib'.*Rename"),
+        ("image", "look like an image"),
+    ],
+)
+def test_what_is_no_label_volume_is_refused_in_a_sentence(kind: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.nii.gz"
+    broken(path, kind)
+    with pytest.raises(MeshError, match=f"^{re.escape(str(path))}: .*{words}"):
+        read_label_volume(path)
+
+
+def test_one_small_label_leaves_the_others() -> None:
+    labels = two_boxes()
+    labels[13, 3:10, 5] = 9
+    volume = LabelVolume((labels,), AFFINE, name="x.nii")
+    with pytest.raises(MeshError, match=r"^x\.nii#9: 7 voxels, at least 8 expected"):
+        label_surface(volume, 9)
+    assert label_surface(volume, 3).volume > 0
+    with pytest.raises(MeshError, match=r"^x\.nii: no label 'heart'. It has 3: 3, 7, 9\."):
+        label_surface(volume, "heart")
+
+
+def test_no_header_leads_out_of_its_folder(tmp_path: Path) -> None:
+    write_itk(tmp_path / "x.mhd", two_boxes())
+    text = (tmp_path / "x.mhd").read_text()
+    (tmp_path / "x.mhd").write_text(re.sub("ElementDataFile = .*", "ElementDataFile = ../../etc/passwd", text))
+    with pytest.raises(MeshError, match="a file of its own folder expected"):
+        read_label_volume(tmp_path / "x.mhd")
+    header = "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 4 4 4\nencoding: raw\ndata file: /etc/passwd\n\n"
+    (tmp_path / "x.nrrd").write_text(header)
+    with pytest.raises(MeshError, match="a file of its own folder expected"):
+        read_label_volume(tmp_path / "x.nrrd")
+
+
+def test_dicom_that_is_no_segmentation_is_refused(tmp_path: Path) -> None:
+    path = Path(nibabel.__file__).parent / "tests" / "data" / "0.dcm"
+    if not path.is_file():
+        pytest.skip("nibabel is installed without its test data")
+    with pytest.raises(MeshError, match="not SEG; labels expected"):
+        read_label_volume(path)
+
+
+def test_a_table_that_names_nothing_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "names.txt").write_text("hello\n")
+    with pytest.raises(MeshError, match="names no label"):
+        read_label_names(tmp_path / "names.txt")
+    with pytest.raises(MeshError, match="Check the path"):
+        read_label_names(tmp_path / "missing.txt")
