@@ -165,6 +165,13 @@ def test_water_is_left_out_and_ligands_as_said(tmp_path: Path) -> None:
         read_molecule(written(tmp_path, water, "water.pdb"))
 
 
+def test_water_and_ions_of_simulations_belong_to_no_polymer(tmp_path: Path) -> None:
+    water = [("OW", 9.0, 9.0), ("HW1", 9.5, 9.0), ("HW2", 9.0, 9.5), ("MW", 9.1, 9.1)]
+    text = residue(1) + residue(2, "SOL", water) + residue(3, "SOD", [("NA", 9.0, 0.0)]) + residue(4, "QQQ")
+    (molecule,) = read_molecule(written(tmp_path, text))
+    assert molecule.residue_names == ("ALA", "QQQ")
+
+
 def test_hydrogens_are_left_out_unless_asked_for(tmp_path: Path) -> None:
     path = written(tmp_path, residue(1, atoms=[*ALANINE, ("H", 0.0, -1.0)]))
     assert len(read_molecule(path)[0].radii) == 5
@@ -218,11 +225,13 @@ def test_negative_inserted_and_repeated_numbers_lose_nothing(tmp_path: Path) -> 
 
 
 def test_unknown_elements_and_residues_are_kept_with_a_note(tmp_path: Path) -> None:
-    (molecule,) = read_molecule(written(tmp_path, residue(1, "QQQ") + residue(2, element="Xx")))
-    assert len(molecule.radii) == 10
+    odd = residue(2, atoms=[*ALANINE, ("X1", 3.0, -2.0), ("1HB", 3.0, -3.0)], element="Xx")
+    (molecule,) = read_molecule(written(tmp_path, residue(1, "QQQ") + odd))
+    np.testing.assert_allclose(molecule.radii[5:], [1.55, 1.70, 1.70, 1.52, 1.70, 1.70], atol=1e-6)
     assert molecule.residue_names == ("QQQ", "ALA")
     assert molecule.notes == (
-        "5 atoms of an unknown element: a radius of 1.7 Å was taken",
+        "5 atoms without an element: their names tell it",
+        "1 atoms of an unknown element: a radius of 1.7 Å was taken",
         "1 residues of an unknown name",
     )
 

@@ -42,7 +42,7 @@ def molecular_surface(
     *,
     probe: float = 1.4,
     spacing: float = 0.8,
-    max_vertices: int | None = 4000,
+    max_vertices: int | None = 3000,
     pieces: Pieces = "joined",
 ) -> Mesh:
     """The closed surface of a molecule, in ångström; hollows inside that it does not open to are filled.

@@ -45,6 +45,9 @@ STANDARD = {
 }  # fmt: skip
 """Names that simulations give to residues in other states of protonation."""
 
+WATER = frozenset({"SOL", "SPC", "T3P", "T4P", "TIP", "TIP3", "TIP4", "TP3", "TP4", "TP5"})
+"""Names that simulations give to water, beside those of the Protein Data Bank."""
+
 BACKBONE = frozenset({"N", "CA", "C", "O", "OXT", "OT1", "OT2", "H", "HA", "HA2", "HA3", "H1", "H2", "H3"})
 """Names of the atoms that all amino acids have, and of those at the ends of chains."""
 

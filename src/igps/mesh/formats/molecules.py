@@ -19,6 +19,7 @@ from igps.mesh.residues import (
     CHARGED_ATOMS,
     PHOSPHATE_OXYGENS,
     STANDARD,
+    WATER,
     residue_ball,
     side_chain_ball,
 )
@@ -30,12 +31,15 @@ logger = logging.getLogger(__name__)
 
 MoleculeBodies = Literal["chains", "models", "assembly"]
 
+# What the first letter of an atom's name tells where its element is not given.
+_ELEMENTS = frozenset("HCNOSP")
 # Radius of an atom whose element is not known, carbon's.
 _UNKNOWN_RADIUS = 1.7
 
 _NOTES = {
     "alternative": "{} alternative locations: that of the highest occupancy was taken",
     "nowhere": "{} atoms without a position were left out",
+    "named": "{} atoms without an element: their names tell it",
     "element": f"{{}} atoms of an unknown element: a radius of {_UNKNOWN_RADIUS} Å was taken",
     "residue": "{} residues of an unknown name",
     "side chain": "{} residues without side chain: balls of the side chain's volume stand for them",
@@ -202,7 +206,7 @@ class _Builder:
     def add_chain(self, chain: gemmi.Chain) -> None:
         seen: set[str] = set()
         for residue in self._conformers(chain):
-            if residue.is_water():
+            if residue.is_water() or residue.name in WATER:
                 continue
             atoms = self._atoms(residue)
             if self._add_residue(residue, atoms):
@@ -216,7 +220,9 @@ class _Builder:
         name = _standard(residue.name, kind)
         named = {atom.name for atom in atoms}
         is_known = name != residue.name or (kind.is_amino_acid() or kind.is_nucleic_acid())
-        in_polymer = residue.het_flag == "A" or is_known or {"N", "CA", "C"} <= named
+        # An ion whose name is not known is an atom by itself, which is no polymer.
+        is_alone = len(atoms) == 1 and not named & {"CA", "P"}
+        in_polymer = is_known or {"N", "CA", "C"} <= named or (residue.het_flag == "A" and not is_alone)
         if not atoms or not (in_polymer or self.ligands):
             self._count["ligand"] += bool(atoms)
             return False
@@ -235,11 +241,18 @@ class _Builder:
             if self.is_pqr:
                 self._add_ball(position, atom.b_iso, atom.occ)
                 continue
-            has_element = atom.element.atomic_number > 0
-            self._count["element"] += not has_element
-            radius = atom.element.vdw_r if has_element else _UNKNOWN_RADIUS
-            self._add_ball(position, radius, charged.get(atom.name, 0.0))
+            self._add_ball(position, self._radius(atom), charged.get(atom.name, 0.0))
         return True
+
+    def _radius(self, atom: gemmi.Atom) -> float:
+        """The van der Waals radius of the atom's element, or of that which its name tells."""
+        if atom.element.atomic_number:
+            return float(atom.element.vdw_r)
+        if (letter := _letter(atom)) in _ELEMENTS:
+            self._count["named"] += 1
+            return float(gemmi_module().Element(letter).vdw_r)
+        self._count["element"] += 1
+        return _UNKNOWN_RADIUS
 
     def _add_ball(self, position: NDArray[np.float64], radius: float, charge: float) -> None:
         self._positions.append(position)
@@ -286,7 +299,7 @@ class _Builder:
         """Those that have a position, one of each that has alternatives."""
         chosen: dict[Any, Any] = {}
         for number, atom in enumerate(residue):
-            if not self.hydrogens and atom.is_hydrogen():
+            if not self.hydrogens and (atom.is_hydrogen() or (not atom.element.atomic_number and _letter(atom) == "H")):
                 continue
             if not np.isfinite(atom.pos.tolist()).all():
                 self._count["nowhere"] += 1
@@ -296,6 +309,11 @@ class _Builder:
             if key not in chosen or atom.occ > chosen[key].occ:
                 chosen[key] = atom
         return list(chosen.values())
+
+
+def _letter(atom: gemmi.Atom) -> str:
+    """The first letter of an atom's name, which may have digits before it."""
+    return str(atom.name).lstrip("0123456789'\"*").upper()[:1]
 
 
 def _standard(name: str, kind: gemmi.ResidueInfo) -> str:
