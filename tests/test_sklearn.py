@@ -19,8 +19,9 @@ from sklearn.utils.estimator_checks import check_estimator
 from igps.data.dataset import SignatureDataset
 from igps.descriptors.d2 import D2
 from igps.descriptors.interior import interior
-from igps.mesh.loading import LoadOptions, load_mesh
+from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
+from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig

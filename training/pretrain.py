@@ -21,7 +21,7 @@ from torch import Tensor
 
 import igps
 from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained_parts, save_pretrained, two_levels
-from igps.mesh.loading import LoadOptions
+from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead

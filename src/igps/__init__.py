@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 from igps.data.batch import SignatureBatch, collate
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
-from igps.mesh.loading import LoadOptions, load_mesh
+from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import BodyDescriptor, Descriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding

@@ -16,8 +16,8 @@ from igps.data.batch import collate
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
 from igps.gallery.gallery import cache_tag
-from igps.mesh.loading import LoadOptions
 from igps.mesh.mesh import Mesh
+from igps.mesh.options import LoadOptions
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor, HistogramDescriptor
 from igps.signature.signature import SignatureConfig, compute_signature

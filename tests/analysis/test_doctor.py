@@ -21,7 +21,7 @@ from damaged_files import (
 from igps._parallel import Limits
 from igps.analysis.doctor import Finding, examine, expected_cost, usable
 from igps.data.sources import find_bodies
-from igps.mesh.loading import LoadOptions
+from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)

@@ -26,7 +26,7 @@ from reference import confirm
 from igps import LoadOptions, MeshError, SignatureConfig, compute_signature, load_mesh
 from igps._parallel import Failed, Limits, run
 from igps.mesh import mending
-from igps.mesh.loading import Component
+from igps.mesh.options import Component
 from igps.mesh.simplification import simplify
 from igps.mesh.watertight import watertight
 from igps.spectra._lanczos import ConvergenceError

@@ -10,8 +10,8 @@ import trimesh
 from bodies_on_disk import write_body
 
 from igps.data.datamodule import SignatureDataModule
-from igps.mesh.loading import LoadOptions
 from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=12, resolution=8, min_samples=0, n_surface_samples=20)

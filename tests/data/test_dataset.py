@@ -15,8 +15,8 @@ import igps.data.pipeline as pipeline_module
 from igps._parallel import Failed, Limits
 from igps.data.batch import LabelledSignature, SignatureBatch, collate
 from igps.data.dataset import Failure, SignatureDataset
-from igps.mesh.loading import LoadOptions
 from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)

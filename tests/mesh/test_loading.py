@@ -9,8 +9,9 @@ import pytest
 import trimesh
 
 from conftest import FACES, TETRAHEDRON
-from igps.mesh.loading import LoadOptions, load_mesh, read_surface
+from igps.mesh.loading import load_mesh, read_surface
 from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
 
 
 def write_off(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:

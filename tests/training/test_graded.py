@@ -16,7 +16,8 @@ from training.graded.kinds import KINDS, LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLAT
 from training.graded.plates import MACHINES, SHEETS, Helix, Plate, machine, sheet
 
 from igps.data.sources import find_bodies
-from igps.mesh.loading import LoadOptions, load_mesh
+from igps.mesh.loading import load_mesh
+from igps.mesh.options import LoadOptions
 from igps.shapes import ArticulatedShapes
 from igps.shapes.files import off_text
 from igps.shapes.templates import TEMPLATES

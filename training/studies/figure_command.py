@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from igps.cli.reading import signatures
 from igps.data.sources import labelled_bodies
-from igps.mesh.loading import LoadOptions, load_mesh
+from igps.mesh.loading import load_mesh
 from igps.mesh.mending import Mending
 from igps.mesh.mesh import Mesh
+from igps.mesh.options import LoadOptions
 from igps.mesh.surface import genus
 from training.studies.paper import pose_curves, potential_slice, weld_change
 

@@ -13,9 +13,10 @@ from tqdm import tqdm
 
 from igps._parallel import Failed, Limits, run
 from igps.data.sources import Bodies
-from igps.mesh.loading import LoadOptions, load_mesh, read_surface
+from igps.mesh.loading import load_mesh, read_surface
 from igps.mesh.mending import Step, mended_by
 from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
 # Of a signature on one core: seconds and bytes by vertices and eigenpairs, as tests/benchmarks/cost.py fits them.
@@ -93,12 +94,12 @@ def expected_cost(n_vertices: int, n_eigenpairs: int) -> tuple[float, float]:
 def _examine(reading: LoadOptions, config: SignatureConfig, path: Path) -> Finding:
     start = time.process_time()
     try:
-        vertices, _, _ = read_surface(path)
+        vertices = read_surface(path, reading).vertices
     except MeshError as error:
         return Finding(path.name, fault=str(error), error=str(error))
     fault = None
     try:
-        load_mesh(path, LoadOptions("never", reading.component, reading.allow_open))
+        load_mesh(path, replace(reading, mend="never"))
     except MeshError as error:
         fault = str(error)
     try:

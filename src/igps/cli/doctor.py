@@ -9,8 +9,8 @@ from igps._parallel import Limits
 from igps.analysis.doctor import Finding, examine, usable
 from igps.cli.reading import Verdict, write_rows
 from igps.data.sources import find_bodies
-from igps.mesh.loading import Component, LoadOptions
 from igps.mesh.mending import Mending
+from igps.mesh.options import Component, LoadOptions
 from igps.report.tables import findings_table
 from igps.signature.signature import SignatureConfig
 

@@ -11,7 +11,7 @@ from igps.data.dataset import Failure
 from igps.data.sources import find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.gallery.gallery import Gallery, about_of
-from igps.mesh.loading import LoadOptions
+from igps.mesh.options import LoadOptions
 from igps.retrieval.index import check_alike
 from igps.signature.signature import SignatureConfig
 

@@ -15,8 +15,8 @@ from igps._parallel import Limits
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
 from igps.data.sources import Bodies
-from igps.mesh.loading import Component, LoadOptions
 from igps.mesh.mending import Mending, mended_by
+from igps.mesh.options import Component, LoadOptions
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig
 

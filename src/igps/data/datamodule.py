@@ -16,7 +16,7 @@ from igps.data.batch import LabelledSignature, SignatureBatch, collate
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import labelled_bodies
 from igps.data.splits import SplitProtocol, split_seen, split_unseen
-from igps.mesh.loading import LoadOptions
+from igps.mesh.options import LoadOptions
 from igps.signature.signature import Samples, SignatureConfig
 
 

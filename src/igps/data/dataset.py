@@ -24,8 +24,8 @@ from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.file_stat_cache import FileStatCache
 from igps.data.pipeline import CacheHit, SignaturePipeline, fill_elsewhere, version
 from igps.data.sources import Bodies, find_bodies, given_bodies
-from igps.mesh.loading import LoadOptions
 from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.options import LoadOptions
 from igps.signature.signature import Samples, SignatureConfig
 
 logger = logging.getLogger(__name__)

@@ -14,9 +14,10 @@ from pathlib import Path
 
 from igps._parallel import MachineError
 from igps.data.cache import SignatureCache
-from igps.mesh.loading import LoadOptions, load_mesh
+from igps.mesh.loading import load_mesh
 from igps.mesh.mending import MENDING_VERSION, mended_by
 from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature, SignatureConfig, compute_signature
 
 

@@ -8,9 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import trimesh
-
-from igps.mesh.loading import NEED_MODULES, POINT_CLOUDS
+from igps.mesh.formats import is_searched, searched_suffixes
 
 LABELS_FILE = "labels.csv"
 
@@ -65,7 +63,7 @@ def find_bodies(root: str | Path) -> Bodies:
     if not paths:
         raise FileNotFoundError(
             f"{root}: no mesh found. Expected a folder per class, or mesh files with a {LABELS_FILE} (file,label), "
-            f"in one of the formats {', '.join(sorted(_suffixes()))}."
+            f"in one of the formats {', '.join(searched_suffixes())}."
         )
     return Bodies(paths, _names(paths, root), None)
 
@@ -115,19 +113,10 @@ def _from_labels_file(root: Path) -> Bodies:
 
 
 def _meshes_in(folder: Path) -> list[Path]:
-    suffixes = _suffixes()
     return sorted(
-        path
-        for path in folder.rglob("*")
-        if path.suffix.lower().lstrip(".") in suffixes and not path.name.startswith(".") and path.is_file()
+        path for path in folder.rglob("*") if is_searched(path) and not path.name.startswith(".") and path.is_file()
     )
 
 
 def _names(paths: Sequence[Path], root: Path) -> tuple[str, ...]:
     return tuple(path.relative_to(root).as_posix() for path in paths)
-
-
-def _suffixes() -> frozenset[str]:
-    # JSON files are read by trimesh too, but a folder's JSON files are seldom meshes.
-    known = frozenset(trimesh.available_formats()) | {suffix.lstrip(".") for suffix in POINT_CLOUDS | NEED_MODULES}
-    return known - {"json", "dict", "dict64", "zip", "tar.gz", "tar.bz2"}

@@ -17,8 +17,8 @@ from tqdm import tqdm
 from igps.data.dataset import Failure, SignatureDataset
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
-from igps.mesh.loading import LoadOptions
 from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
 from igps.nn.description import describe_usable
 from igps.nn.descriptor import Descriptor
 from igps.nn.heads.base import distances_of

@@ -26,12 +26,11 @@ def welded(
 
     Vertices and faces that stay keep their order. What was done is added to `notes`.
     """
-    # Welding happens on a lattice in units of the bounding box, so that the unit of length does not matter.
-    lattice = np.round((vertices - vertices.mean(axis=0)) / (_WELD * max(diagonal(vertices), np.finfo(float).tiny)))
-    _, first, index = np.unique(lattice.astype(np.int64), axis=0, return_index=True, return_inverse=True)
-    if len(first) < len(vertices):
-        notes.append(f"welded {len(vertices) - len(first)} coincident vertices")
-        faces = first[index.ravel()][faces]
+    place = places(vertices)
+    n_places = len(np.unique(place))
+    if n_places < len(vertices):
+        notes.append(f"welded {len(vertices) - n_places} coincident vertices")
+        faces = place[faces]
     sharp = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     if not sharp.all():
         notes.append(f"dropped {int((~sharp).sum())} degenerate faces")
@@ -40,11 +39,27 @@ def welded(
     if len(once) < len(faces):
         notes.append(f"dropped {len(faces) - len(once)} duplicate faces")
         faces = faces[np.sort(once)]
-    unused = len(first) - len(np.unique(faces))
+    unused = n_places - len(np.unique(faces))
     if unused:
         notes.append(f"dropped {unused} unreferenced vertices")
     vertices, faces = compact(vertices, faces)
     return vertices, oriented(faces, notes)
+
+
+def places(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(V,) of each vertex the first that is in the same place.
+
+    On a lattice in units of the bounding box, so that the unit of length does not matter.
+    """
+    lattice = np.round((vertices - vertices.mean(axis=0)) / (_WELD * max(diagonal(vertices), np.finfo(float).tiny)))
+    _, first, index = np.unique(lattice.astype(np.int64), axis=0, return_index=True, return_inverse=True)
+    return np.asarray(first[index.ravel()])
+
+
+def are_specks(areas: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which of some parts with these areas are crumbs beside the others; none if all of them together are many."""
+    specks = areas < SPECK * areas.sum()
+    return specks & (areas[specks].sum() < 10 * SPECK * areas.sum())
 
 
 def oriented(faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.int64]:
@@ -100,8 +115,8 @@ def tidied(
         notes.append(f"dropped {len(faces) - len(kept)} faces of fins")
         faces = kept
     part, areas = face_parts(vertices, faces)
-    specks = areas < SPECK * areas.sum()
-    if specks.any() and areas[specks].sum() < 10 * SPECK * areas.sum():
+    specks = are_specks(areas)
+    if specks.any():
         notes.append(f"dropped {int(specks.sum())} specks")
         faces = faces[~specks[part]]
     # Only now is it plain which faces are neighbours.

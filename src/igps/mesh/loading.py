@@ -1,79 +1,70 @@
-"""How a mesh is read from a file, and what may be done to it on the way."""
+"""A file becomes bodies: which it holds, and each as a closed surface."""
 
 from __future__ import annotations
 
 import logging
-import re
-from dataclasses import dataclass
-from io import BytesIO
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
 
 import numpy as np
-import trimesh
-from numpy.typing import NDArray
 
 from igps._threads import one_thread
+from igps.mesh._tidying import are_specks, places
+from igps.mesh.formats import FORMATS, Format, RawBody, format_of
+from igps.mesh.formats._format import joined
 from igps.mesh.limits import check_memory
-from igps.mesh.mending import Mending, mend
+from igps.mesh.mending import mend
 from igps.mesh.mesh import Mesh, MeshError, check_arrays
+from igps.mesh.options import BodyKind, LoadOptions
 from igps.mesh.surface import compact, face_parts
 
 logger = logging.getLogger(__name__)
-# What a file has against it is told by an error that names it; a traceback on the terminal, from trimesh's last resort
-# where nobody has set up logging, says nothing to its reader
-logging.getLogger("trimesh").addHandler(logging.NullHandler())
-
-Component = Literal["largest"]
-
-POINT_CLOUDS = frozenset({".xyz"})
-"""Suffixes of files that hold points alone, as lines of three coordinates, or of six with normals."""
-
-NEED_MODULES = frozenset({".3mf", ".3dxml", ".dae", ".zae", ".xaml", ".step", ".stp"})
-"""Suffixes of files that trimesh reads by further modules. They are meshes where these are missing, too: a file that
-cannot be read is to be named, not passed over."""
-
-_WHOLE_NUMBERS = re.compile(r"\s*\d[\d\s]*", re.ASCII)
 
 
 @dataclass(frozen=True)
-class LoadOptions:
-    """How a mesh file is read.
-
-    Example:
-        >>> import tempfile, trimesh
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = trimesh.creation.box((1, 2, 3)).export(f"{folder}/box.stl")  # corners of triangles, not vertices
-        ...     load_mesh(f"{folder}/box.stl", LoadOptions()).notes
-        ('welded 28 coincident vertices',)
+class BodyRef:
+    """A body that a file holds.
 
     Args:
-        mend: "auto" does the least that makes a body of the surface, and leaves a body as it is, see `mend`; "never"
-            refuses what is no body; "always" makes every surface watertight that does not bound one body without
-            crossing itself, for collections of mixed quality.
-        component: "largest" keeps only the connected component of the largest area.
-        allow_open: accept open boundaries; the winding number then decides what is inside.
-
-    Raises:
-        ValueError: an unknown way to mend, or an unknown component.
+        path: the file.
+        part: its name among the bodies of the file; None where the file is one body.
     """
 
-    mend: Mending = "auto"
-    component: Component | None = None
-    allow_open: bool = False
+    path: Path
+    part: str | None = None
 
-    def __post_init__(self) -> None:
-        if self.mend not in get_args(Mending):
-            raise ValueError(f"mend: expected 'auto', 'never' or 'always', got {self.mend!r}.")
-        if self.component is not None and self.component not in get_args(Component):
-            raise ValueError(f"component: expected 'largest' or None, got {self.component!r}.")
+    def __str__(self) -> str:
+        return str(self.path) if self.part is None else f"{self.path}#{self.part}"
+
+
+def list_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[BodyRef]:
+    """The bodies of a file, without making surfaces of them where the format can tell.
+
+    Raises:
+        MeshError: the file is missing or unreadable.
+    """
+    path = Path(path)
+    kind = _format(path)
+    how = _bodies(kind, options)
+    if how == "whole":
+        return [BodyRef(path)]
+    options = replace(options, bodies=how)
+    if how != "pieces" and kind.parts is not None:
+        with _faults(path, kind):
+            return [BodyRef(path, part) for part in kind.parts(path, options)]
+    return [BodyRef(path, body.part) for body in _read(path, options)]
 
 
 @one_thread()
-def load_mesh(path: str | Path, reading: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> Mesh:
-    """Read a mesh file of any format that trimesh reads, or a cloud of points, and make a body of it.
+def load_mesh(
+    path: str | Path, options: LoadOptions = LoadOptions(), *, part: str | None = None, least_vertices: int = 0
+) -> Mesh:
+    """Read a mesh, a cloud of points, a label volume or a molecule, and make a body of it.
 
-    Polygons are cut into triangles. The vertices of a body keep their order and are not merged.
+    Polygons are cut into triangles. The vertices of a body keep their order and are not merged, but for an STL file,
+    which has none: there corners in one place are a vertex.
 
     Example:
         >>> import tempfile, trimesh
@@ -85,144 +76,165 @@ def load_mesh(path: str | Path, reading: LoadOptions = LoadOptions(), *, least_v
 
     Args:
         path: the file.
-        reading: what may be done to it; what was done is kept in `Mesh.notes`.
-        least_vertices: a body with fewer is subdivided, unless `reading` mends never.
+        options: what of it is a body, and what may be done to it; what was done is kept in `Mesh.notes`.
+        part: which of its bodies, see `list_bodies`; needed where there are several.
+        least_vertices: a body with fewer is subdivided, unless `options` mends never.
 
     Raises:
-        MeshError: the file is missing or unreadable, or the mesh is not usable.
+        MeshError: the file is missing or unreadable, has no such part, or the surface is not usable.
     """
-    vertices, faces, normals = read_surface(path)
-    if reading.mend == "never" or len(faces):
-        check_arrays(vertices, faces, str(path))
-    notes: tuple[str, ...] = ()
-    if reading.component == "largest" and len(faces):
-        vertices, faces, notes = _largest_component(vertices, faces)
-    if reading.allow_open and reading.mend != "always":
-        try:
-            return Mesh(vertices, faces, name=str(path), allow_open=True, notes=notes)
-        except MeshError:
-            if reading.mend == "never":
-                raise
-    return mend(
-        vertices,
-        faces,
-        how=reading.mend,
-        least_vertices=least_vertices,
-        normals=normals,
-        name=str(path),
-        notes=notes,
-    )
+    return _body(read_surface(path, options, part=part), Path(path), options, least_vertices)
 
 
-def read_surface(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
-    """What a file holds, unchecked.
+def load_bodies(path: str | Path, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> list[Mesh]:
+    """All bodies of a file that can be used; of the others the log tells.
 
-    Returns:
-        Vertices (V, 3); triangles (F, 3), none of a cloud of points; and the normals (V, 3) of a cloud that has them.
+    Raises:
+        MeshError: the file is missing or unreadable, or none of its bodies is usable.
+    """
+    found, faults = [], []
+    for _, body in each_body(path, options, least_vertices=least_vertices):
+        if isinstance(body, MeshError):
+            logger.warning("%s", body)
+            faults.append(body)
+        else:
+            found.append(body)
+    if not found:
+        raise faults[0] if faults else MeshError(f"{path}: no body in it. Check the file.")
+    return found
+
+
+def each_body(
+    path: str | Path,
+    options: LoadOptions = LoadOptions(),
+    *,
+    parts: Sequence[str | None] | None = None,
+    least_vertices: int = 0,
+) -> Iterator[tuple[BodyRef, Mesh | MeshError]]:
+    """The bodies of a file, or those of the given parts, one after the other; what is wrong with one in its place.
+
+    The file is read once.
 
     Raises:
         MeshError: the file is missing or unreadable.
     """
     path = Path(path)
+    for raw in _read(path, options):
+        if parts is None or raw.part in parts:
+            with one_thread():
+                try:
+                    body: Mesh | MeshError = _body(raw, path, options, least_vertices)
+                except MeshError as error:
+                    body = error
+            yield BodyRef(path, raw.part), body
+
+
+def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part: str | None = None) -> RawBody:
+    """The surface of a body as the file has it, unchecked.
+
+    Raises:
+        MeshError: the file is missing or unreadable, has several bodies and none is named, or not the one that is.
+    """
+    path = Path(path)
+    bodies = _read(path, options, part)
+    found = [body for body in bodies if body.part == part] if part is not None else bodies
+    if len(found) == 1:
+        return found[0]
+    names = [body.part for body in bodies] if part is None else [one.part for one in list_bodies(path, options)]
+    shown = ", ".join(repr(name) for name in names[:8]) + (", ..." if len(names) > 8 else "")
+    if part is None:
+        raise MeshError(f"{path}: holds {len(names)} bodies: {shown}. Name one as part=, or read all by load_bodies.")
+    raise MeshError(f"{path}: has no body {part!r}; there are: {shown}. Choose one of them.")
+
+
+def _body(raw: RawBody, path: Path, options: LoadOptions, least_vertices: int) -> Mesh:
+    name = str(BodyRef(path, raw.part))
+    vertices, faces, notes = raw.vertices, raw.faces, raw.notes
+    if options.mend == "never" or len(faces):
+        check_arrays(vertices, faces, name)
+    if options.component == "largest" and len(faces):
+        owner, areas = face_parts(vertices, faces)
+        if len(areas) > 1:
+            n_before = len(vertices)
+            vertices, faces = compact(vertices, faces[owner == int(np.argmax(areas))])
+            kept = f"kept the largest of {len(areas)} components ({len(vertices)} of {n_before} vertices)"
+            notes = (*notes, kept)
+    if options.allow_open and options.mend != "always":
+        try:
+            return Mesh(vertices, faces, name=name, allow_open=True, notes=notes, unit=raw.unit)
+        except MeshError:
+            if options.mend == "never":
+                raise
+    mesh = mend(
+        vertices,
+        faces,
+        how=options.mend,
+        least_vertices=least_vertices,
+        normals=raw.normals,
+        name=name,
+        notes=notes,
+    )
+    return mesh.told(unit=raw.unit)
+
+
+def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[RawBody]:
+    """The bodies of a file, or at least the one that is named."""
+    kind = _format(path)
+    how = _bodies(kind, options)
+    with _faults(path, kind):
+        bodies = list(kind.read(path, replace(options, bodies=how), part if how not in ("whole", "pieces") else None))
+        if how == "whole":
+            return [joined(bodies)]
+        return _pieces(joined(bodies)) if how == "pieces" else bodies
+
+
+def _pieces(whole: RawBody) -> list[RawBody]:
+    """What is not connected, in the order of the file; specks are left out."""
+    if not len(whole.faces):
+        return [whole]
+    vertices, faces = whole.vertices, whole.faces
+    check_arrays(vertices, faces, "the whole")
+    owner, areas = face_parts(vertices, places(vertices)[faces])  # loose triangles are connected where they meet
+    small = are_specks(areas)
+    notes = (*whole.notes, f"left out {int(small.sum())} specks") if small.any() else whole.notes
+    order = [k for k in np.argsort(np.unique(owner, return_index=True)[1]) if not small[k]]
+    surfaces = [compact(vertices, faces[owner == k]) for k in order]
+    return [replace(whole, vertices=v, faces=f, part=f"piece {i}", notes=notes) for i, (v, f) in enumerate(surfaces, 1)]
+
+
+def _bodies(kind: Format, options: LoadOptions) -> BodyKind:
+    """What of a file is a body: what is asked for, if the format has it."""
+    known = (*kind.bodies, "whole", "pieces")
+    return options.bodies if options.bodies in known else kind.bodies[0]
+
+
+def _format(path: Path) -> Format:
     if not path.is_file():
         raise MeshError(f"{path}: no such file. Check the path.")
     if path.stat().st_size == 0:
         raise MeshError(f"{path}: the file is empty (0 bytes). Export it again.")
+    kind = format_of(path)
+    if kind is None:
+        known = ", ".join(suffix for one in FORMATS for suffix in one.suffixes)
+        raise MeshError(f"{path}: not a format that is read. Convert it to one of {known}.")
+    return kind
+
+
+@contextmanager
+def _faults(path: Path, kind: Format) -> Iterator[None]:
+    """What a reader raises, told as a fault of the file; memory that is lacking is none."""
     check_memory(path)
     try:
-        return _read(path)
+        yield
+    except (MeshError, MemoryError):
+        raise
     except ImportError as error:
         raise MeshError(
-            f"{path}: the format needs a module that is not installed ({error}). Install it, pip install "
-            '"interior-gps[formats]" has those of trimesh, or convert the file to OFF, OBJ, PLY or STL.'
+            f"{path}: {kind.name} needs a module that is not installed ({error}). Install it: pip install "
+            f'"interior-gps[{kind.extra}]"; or convert the file to OFF, OBJ, PLY or STL.'
         ) from error
-    except MemoryError:
-        raise
-    except Exception as error:  # the loaders of some twenty formats raise whatever they like
+    except Exception as error:  # the loaders of some thirty formats raise whatever they like
         raise MeshError(
-            f"{path}: not readable as a mesh ({type(error).__name__}: {error}). "
-            "Check that the file is complete and in a format that trimesh reads (OFF, OBJ, PLY, STL, GLB, ...)."
+            f"{path}: not readable as {kind.name} ({type(error).__name__}: {error}). "
+            "Check that the file is complete and in the format that its name tells; or export it again."
         ) from error
-
-
-def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
-    """Vertices (V, 3), faces (F, 3), none of a cloud of points, and the normals (V, 3) of one that has them."""
-    if path.suffix.lower() in POINT_CLOUDS:
-        rows = np.loadtxt(path, ndmin=2, comments=("#", "//"), encoding="latin-1")  # which has a letter for any byte
-        if rows.shape[1] not in (3, 6):
-            raise ValueError(f"expected lines of 3 numbers, or of 6 with normals, got {rows.shape[1]}")
-        return rows[:, :3], np.zeros((0, 3), dtype=np.int64), rows[:, 3:] if rows.shape[1] == 6 else None
-    if path.suffix.lower() == ".off" and (plain := _plain_off(path)) is not None:
-        return *plain, None
-    scene = _scene(path)
-    parts = list(scene.geometry.values())
-    if parts and all(isinstance(part, trimesh.PointCloud) for part in parts):
-        points = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts])
-        return points, np.zeros((0, 3), dtype=np.int64), _normals(scene, len(points))
-    mesh = scene.to_mesh()
-    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces), None
-
-
-def _scene(path: Path) -> Any:
-    """What trimesh reads."""
-    options = {"process": False, "force": "scene", **_loader_options(path)}
-    try:
-        return trimesh.load(path, **options)
-    except UnicodeDecodeError:
-        if path.suffix.lower() != ".ply":
-            raise
-        # of other text it guesses the encoding, but the header of a PLY file must be UTF-8
-        head, end, body = path.read_bytes().partition(b"end_header")
-        return trimesh.load(BytesIO(head.decode("latin-1").encode() + end + body), file_type="ply", **options)
-
-
-def _plain_off(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
-    """What trimesh reads of an OFF file of coordinates and triangles alone, in a tenth of the time.
-
-    None where it holds anything else, or is broken.
-    """
-    try:
-        head, counts, *lines = path.read_text(encoding="utf-8").splitlines()
-        n_vertices, n_faces, _ = map(int, counts.split())
-        places, rows = lines[: max(n_vertices, 0)], lines[max(n_vertices, 0) :]
-        # Of no lines NumPy warns, and an older one makes whole numbers of broken ones
-        plain = head.strip() == "OFF" and "".join(places[:1]).strip() and _WHOLE_NUMBERS.fullmatch("\n".join(rows))
-        if not plain:
-            return None
-        vertices = np.loadtxt(places, np.float64, comments=None, ndmin=2)
-        faces = np.loadtxt(rows, np.int64, comments=None, ndmin=2)
-    except ValueError:  # comments, colours, polygons of several sizes, or no text
-        return None
-    if vertices.shape != (n_vertices, 3) or faces.shape != (n_faces, 4) or (faces[:, 0] != 3).any():
-        return None
-    return (vertices, np.ascontiguousarray(faces[:, 1:])) if faces[:, 1:].max() < n_vertices else None
-
-
-def _normals(cloud: Any, n_points: int) -> NDArray[np.float64] | None:
-    """Those of a PLY file, which trimesh keeps as they were read, (n_points, 3)."""
-    found = [geometry.metadata.get("_ply_raw", {}) for geometry in (cloud, *cloud.geometry.values())]
-    for raw in found:
-        rows = raw.get("vertex", {}).get("data")
-        try:
-            normals = np.column_stack([np.asarray(rows[name], dtype=np.float64) for name in ("nx", "ny", "nz")])
-        except (KeyError, ValueError, IndexError, TypeError):
-            continue
-        if normals.shape == (n_points, 3):
-            return normals
-    return None
-
-
-def _loader_options(path: Path) -> dict[str, Any]:
-    # Materials and texture seams would split vertices of an OBJ file that are one point of the surface.
-    return {"skip_materials": True, "maintain_order": True} if path.suffix.lower() == ".obj" else {}
-
-
-def _largest_component(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64], tuple[str, ...]]:
-    part, areas = face_parts(vertices, faces)
-    if len(areas) == 1:
-        return vertices, faces, ()
-    kept, new_faces = compact(vertices, faces[part == int(np.argmax(areas))])
-    note = f"kept the largest of {len(areas)} components ({len(kept)} of {len(vertices)} vertices)"
-    return kept, new_faces, (note,)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -96,7 +95,7 @@ def mend(
         mesh = subdivided(mesh, _PLENTY * least_vertices)
     for note in mesh.notes:
         logger.info("%s: %s", name, note)
-    return replace(mesh, notes=(*notes, *mesh.notes)) if notes else mesh
+    return mesh.told(notes=notes)
 
 
 def mended_by(notes: Iterable[str]) -> tuple[Step, ...]:
@@ -118,7 +117,7 @@ def _mended(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) 
         if len(surface[1]) and (body := _body(*attempt(*surface, done), done, name)):
             return body
     body = watertight(_smoothed(vertices, faces, notes), faces, name=name)
-    return replace(body, notes=(*notes, *body.notes))
+    return body.told(notes=tuple(notes))
 
 
 def _body(vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str], name: str) -> Mesh | None:
@@ -143,7 +142,7 @@ def _remade(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) 
         notes = []
     smooth = _smoothed(neat, triangles, notes)
     body = watertight(smooth, triangles, name=name) if notes else watertight(vertices, faces, name=name)
-    return replace(body, notes=(*notes, *body.notes))
+    return body.told(notes=tuple(notes))
 
 
 def _smoothed(vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -63,6 +64,7 @@ class Mesh:
         name: what error messages call the mesh, usually its file.
         allow_open: accept boundary edges; the winding number then decides what is inside.
         notes: what was done to the mesh on its way here, in words.
+        unit: of length, such as "mm"; None where it is not known.
 
     Raises:
         MeshError: no faces, NaN or infinite vertices, out-of-range or repeated indices, unreferenced vertices,
@@ -75,6 +77,7 @@ class Mesh:
     name: str = "mesh"
     allow_open: bool = False
     notes: tuple[str, ...] = field(default=())
+    unit: str | None = None
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype=np.float64, order="C")
@@ -96,6 +99,24 @@ class Mesh:
         vertices.flags.writeable = faces.flags.writeable = False
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
+
+    def told(self, *, notes: tuple[str, ...] = (), unit: str | None = None) -> Mesh:
+        """The same mesh with more notes, before its own, and with a unit if one is given; nothing is checked again."""
+        other = copy.copy(self)
+        object.__setattr__(other, "notes", (*notes, *self.notes))
+        object.__setattr__(other, "unit", unit or self.unit)
+        return other
+
+    def numbered_by_faces(self) -> Mesh:
+        """The same mesh with its vertices in the order in which the faces first use them, whatever file it came from."""
+        used, first = np.unique(self.faces, return_index=True)
+        order = used[np.argsort(first)]
+        rank = np.empty(len(self.vertices), dtype=np.int64)
+        rank[order] = np.arange(len(order))
+        other = copy.copy(self)
+        object.__setattr__(other, "vertices", self.vertices[order])
+        object.__setattr__(other, "faces", rank[self.faces])
+        return other
 
     @cached_property
     def area(self) -> float:

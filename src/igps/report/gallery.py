@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from igps.mesh.loading import LoadOptions, load_mesh
+from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
 from igps.mesh.simplification import simplify
 from igps.report.drawing import GREY, new_figure, paint
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies
-from igps.mesh.loading import LoadOptions
+from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
 MESHES_FILE = "meshes.json"

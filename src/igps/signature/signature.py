@@ -260,6 +260,7 @@ def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Sign
         ConvergenceError: the eigensolver failed.
     """
     config = (config or SignatureConfig()).resolved()
+    mesh = mesh.numbered_by_faces()  # to rounding, results depend on the numbers
     if config.max_vertices is not None:
         mesh = simplify(mesh, config.max_vertices)
     if len(mesh.vertices) < config.n_kept + 2:

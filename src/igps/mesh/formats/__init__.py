@@ -1,1 +1,54 @@
-"""File formats that are no triangle meshes, a module each: a file becomes bodies."""
+"""Formats: a file becomes bodies. A module each, and `FORMATS` tells of all.
+
+**To add a format**, write a module here with a function `read(path, options, part)` that returns a list of `RawBody`
+and raises anything where the file is faulty; make it a `Format` with its suffixes; and add that to `FORMATS` below.
+The rest is done for it: error messages that name the file, "whole" and "pieces", mending, listing, caching. What a
+header claims is checked before memory is taken (`check_unpacked`), modules that not everybody has are imported within
+`read`, and no path that the file holds leads out of its folder.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from igps.mesh.formats import archives, brain_surfaces, clouds, obj, off, ply, scenes, stl, threemf, vtk
+from igps.mesh.formats._format import Format, RawBody
+
+__all__ = ["FORMATS", "Format", "RawBody", "format_of", "is_searched", "searched_suffixes"]
+
+FORMATS: tuple[Format, ...] = (
+    off.FORMAT,
+    obj.FORMAT,
+    ply.FORMAT,
+    stl.FORMAT,
+    clouds.FORMAT,
+    threemf.FORMAT,
+    scenes.GLTF,
+    scenes.STEP,
+    scenes.OTHERS,
+    vtk.LEGACY,
+    vtk.XML,
+    brain_surfaces.GIFTI,
+    brain_surfaces.FREESURFER,
+    archives.ARCHIVE,
+    archives.COMPRESSED,
+)
+
+
+def format_of(path: str | Path) -> Format | None:
+    """The format whose suffix ends the file's name, the longest of several; None if there is none."""
+    name = Path(path).name.lower()
+    found = [(len(suffix), kind) for kind in FORMATS for suffix in kind.suffixes if name.endswith(suffix)]
+    ignored = any(name.endswith(suffix) for kind in FORMATS for suffix in kind.ignored)
+    return None if ignored or not found else max(found, key=lambda one: one[0])[1]
+
+
+def is_searched(path: str | Path) -> bool:
+    """Whether a file that lies in a folder is taken for bodies, by its name."""
+    found = format_of(path)
+    return found is not None and found.is_searched
+
+
+def searched_suffixes() -> list[str]:
+    """Those of files that are taken for bodies where they lie in a folder, in order."""
+    return sorted(suffix for kind in FORMATS if kind.is_searched for suffix in kind.suffixes)

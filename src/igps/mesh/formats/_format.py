@@ -1,0 +1,133 @@
+"""What a format is, and what a file gives."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.mesh.mesh import MeshError
+from igps.mesh.options import BodyKind, LoadOptions
+
+
+def no_faces() -> NDArray[np.int64]:
+    """Those of a cloud of points, (0, 3)."""
+    return np.zeros((0, 3), dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class RawBody:
+    """A surface as a file has it, unchecked.
+
+    Args:
+        vertices: (V, 3) length.
+        faces: (F, 3) vertex indices; none of a cloud of points.
+        part: its name among the bodies of the file; None where the file is one body.
+        unit: of length, such as "mm"; None where the file does not tell.
+        normals: (V, 3) of a cloud of points that has them.
+        notes: what was noticed on reading, in words.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64] = field(default_factory=no_faces)
+    part: str | None = None
+    unit: str | None = None
+    normals: NDArray[np.float64] | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Format:
+    """A file format.
+
+    Args:
+        name: for messages.
+        suffixes: lower case, with the dot. The longest that ends a file's name decides.
+        read: the bodies of a file, or the one that is named; raises anything where the file is faulty. The names of
+            parts are distinct.
+        parts: the names of the bodies, told without making them; None: read them.
+        bodies: what the format itself may call a body, the usual first. "whole" and "pieces" need not be told apart by
+            `read`: they are made of what it gives.
+        is_searched: whether files below a folder are taken for bodies by their suffix.
+        ignored: suffixes of files of the same format that hold no surface.
+        extra: of this package, that has the modules that it needs.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    read: Callable[[Path, LoadOptions, str | None], Sequence[RawBody]]
+    parts: Callable[[Path, LoadOptions], Sequence[str]] | None = None
+    bodies: tuple[BodyKind, ...] = ("whole",)
+    is_searched: bool = True
+    ignored: tuple[str, ...] = ()
+    extra: str | None = None
+
+
+def joined(bodies: Sequence[RawBody]) -> RawBody:
+    """All of them as one."""
+    if len(bodies) == 1:
+        return replace(bodies[0], part=None)
+    meshes = [body for body in bodies if len(body.faces)]
+    kept = meshes or [body for body in bodies if len(body.vertices)]
+    if not kept:
+        return RawBody(np.zeros((0, 3)))
+    starts = np.cumsum([0, *(len(body.vertices) for body in kept)])
+    faces = np.concatenate([body.faces + start for body, start in zip(kept, starts, strict=False)])
+    units = {body.unit for body in kept}
+    normals = [body.normals for body in kept if body.normals is not None]
+    return RawBody(
+        np.concatenate([body.vertices for body in kept]),
+        faces,
+        unit=units.pop() if len(units) == 1 else None,
+        normals=np.concatenate(normals) if len(normals) == len(kept) else None,
+        notes=tuple(dict.fromkeys(note for body in kept for note in body.notes)),
+    )
+
+
+def distinct(names: Iterable[str]) -> list[str]:
+    """The names, those that repeat with a number behind them."""
+    found: list[str] = []
+    taken: Counter[str] = Counter()
+    for name in names:
+        new = name
+        while new in taken:
+            taken[name] += 1
+            new = f"{name} ({taken[name]})"
+        taken[new] += 1
+        found.append(new)
+    return found
+
+
+def triangles(corners: NDArray[np.int64], n_corners: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Polygons, with their corners laid end to end, cut into triangles from their first corners, (F, 3).
+
+    Triangles come first, then the first and the second halves of quadrilaterals, then larger polygons.
+    """
+    starts = np.cumsum(n_corners) - n_corners
+    pieces = [corners[starts[n_corners == 3][:, None] + np.arange(3)]]
+    quads = corners[starts[n_corners == 4][:, None] + np.arange(4)]
+    pieces += [quads[:, [0, 1, 2]], quads[:, [2, 3, 0]]]
+    large = np.flatnonzero(n_corners > 4)
+    if len(large):
+        n = n_corners[large] - 2
+        at = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+        first = np.repeat(starts[large], n)
+        pieces.append(np.stack([corners[first], corners[first + at + 1], corners[first + at + 2]], axis=1))
+    return np.concatenate(pieces)
+
+
+def check_unpacked(n_bytes: int, path: Path, limit: int) -> None:
+    """Refuse what would take more bytes than allowed.
+
+    Raises:
+        MeshError: names the file, both numbers, and the remedy.
+    """
+    if n_bytes > limit:
+        raise MeshError(
+            f"{path}: unpacks to {n_bytes / 1e9:.2g} GB or more, and at most {limit / 1e9:.2g} GB are allowed. If you "
+            "trust the file, read it with LoadOptions(max_unpacked=...), on the command line --max_unpacked."
+        )

@@ -1,0 +1,90 @@
+"""What trimesh reads: from bytes, with no way to files elsewhere."""
+
+from __future__ import annotations
+
+import logging
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from igps.mesh.formats._format import RawBody, check_unpacked, distinct, joined
+from igps.mesh.options import LoadOptions
+
+# What a file has against it is told by an error that names it; a traceback on the terminal, from trimesh's last resort
+# where nobody has set up logging, says nothing to its reader
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
+
+
+class _Beside(trimesh.resolvers.Resolver):
+    """The files of one folder, and those below it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder.resolve()
+
+    def get(self, name: str) -> bytes:
+        place = (self._folder / name).resolve()
+        if not place.is_relative_to(self._folder):
+            raise ValueError(f"it refers to {name!r}, outside of its folder")
+        return place.read_bytes()
+
+    def keys(self) -> list[str]:
+        return []
+
+    def namespaced(self, namespace: str) -> _Beside:
+        return self
+
+    def write(self, name: str, data: bytes) -> None:
+        raise NotImplementedError
+
+
+def surfaces(path: Path, options: LoadOptions, content: bytes | None = None) -> list[RawBody]:
+    """All that a file holds, as one body."""
+    return [joined(objects(path, options, content))]
+
+
+def objects(path: Path, options: LoadOptions, content: bytes | None = None, **loading: Any) -> list[RawBody]:
+    """A body for each place of a scene where a geometry stands, with the scene's unit."""
+    kind = path.suffix.lower().lstrip(".")
+    stream = BytesIO(path.read_bytes() if content is None else content)
+    scene = trimesh.load_scene(stream, file_type=kind, resolver=_Beside(path.parent), process=False, **loading)
+    nodes = [(node, *scene.graph.get(node)) for node in scene.graph.nodes_geometry]
+    sizes = {name: _n_bytes(geometry) for name, geometry in scene.geometry.items()}
+    check_unpacked(sum(sizes[name] for _, _, name in nodes), path, options.max_unpacked)
+    bodies = []
+    for part, (_, matrix, name) in zip(distinct(str(node) for node, _, _ in nodes), nodes, strict=True):
+        geometry = scene.geometry[name]
+        if not isinstance(geometry, trimesh.Trimesh | trimesh.PointCloud):
+            continue
+        vertices = np.asarray(geometry.vertices, dtype=np.float64)
+        if not np.array_equal(matrix, np.eye(4)):
+            vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        if isinstance(geometry, trimesh.PointCloud):
+            bodies.append(RawBody(vertices, part=part, normals=_normals(scene, geometry, len(vertices))))
+            continue
+        faces = np.asarray(geometry.faces, dtype=np.int64)
+        turned = faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces
+        bodies.append(RawBody(vertices, np.ascontiguousarray(turned), part))
+    if not bodies:
+        raise ValueError("it holds no surface")
+    return bodies
+
+
+def _n_bytes(geometry: Any) -> int:
+    return 24 * (len(geometry.vertices) + len(getattr(geometry, "faces", ())))
+
+
+def _normals(scene: Any, cloud: Any, n_points: int) -> NDArray[np.float64] | None:
+    """Those of a PLY file, which trimesh keeps as they were read, (n_points, 3)."""
+    for raw in (scene.metadata.get("_ply_raw", {}), cloud.metadata.get("_ply_raw", {})):
+        rows = raw.get("vertex", {}).get("data")
+        try:
+            normals = np.column_stack([np.asarray(rows[name], dtype=np.float64) for name in ("nx", "ny", "nz")])
+        except (KeyError, ValueError, IndexError, TypeError):
+            continue
+        if normals.shape == (n_points, 3):
+            return normals
+    return None

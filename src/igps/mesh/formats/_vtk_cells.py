@@ -1,0 +1,64 @@
+"""The surface of cells as VTK numbers their kinds: polygons as they are, of volumes the sides that no two share."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.mesh.formats._format import triangles
+
+Integers = NDArray[np.int64]
+
+TRIANGLE, STRIP, POLYGON, PIXEL, QUAD = 5, 6, 7, 8, 9
+# Sides of volumes, seen from outside, as VTK orders their corners: of tetrahedra, voxels, hexahedra, wedges, pyramids.
+_SIDES: dict[int, tuple[tuple[int, ...], ...]] = {
+    10: ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)),
+    11: ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)),
+    12: ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)),
+    13: ((0, 1, 2), (3, 5, 4), (0, 3, 4, 1), (1, 4, 5, 2), (2, 5, 3, 0)),
+    14: ((0, 3, 2, 1), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
+}
+# Points, lines and their like have no area.
+_WITHOUT_AREA = (0, 1, 2, 3, 4)
+
+
+def surface(corners: Integers, n_corners: Integers, kinds: Integers) -> Integers:
+    """Triangles (F, 3) of cells, whose corners are laid end to end.
+
+    Raises:
+        ValueError: a kind of cell that is not known, such as a curved one.
+    """
+    unknown = set(np.unique(kinds).tolist()) - {*_WITHOUT_AREA, TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, *_SIDES}
+    if unknown:
+        raise ValueError(
+            f"cells of the kind {min(unknown)}; only flat polygons and volumes with straight edges are read"
+        )
+    flat = np.isin(kinds, (TRIANGLE, POLYGON, QUAD))
+    found = [triangles(corners[np.repeat(flat, n_corners)], n_corners[flat])]
+    starts = np.cumsum(n_corners) - n_corners
+    for kind, n in ((PIXEL, 4), *((kind, int(max(map(max, of_kind))) + 1) for kind, of_kind in _SIDES.items())):
+        if (n_corners[kinds == kind] != n).any():
+            raise ValueError(f"cells of the kind {kind} with other than {n} corners")
+    pixels = starts[kinds == PIXEL, None]
+    found.append(triangles(corners[pixels + np.array([0, 1, 3, 2])].ravel(), np.full(len(pixels), 4)))
+    for strip in np.flatnonzero(kinds == STRIP):
+        row = corners[starts[strip] : starts[strip] + n_corners[strip]]
+        three = np.lib.stride_tricks.sliding_window_view(row, 3).copy()
+        three[1::2] = three[1::2, ::-1]
+        found.append(three)
+    sides: dict[int, list[Integers]] = {3: [], 4: []}
+    for kind, of_kind in _SIDES.items():
+        at = starts[kinds == kind, None]
+        for side in of_kind if len(at) else ():
+            sides[len(side)].append(corners[at + np.array(side)])
+    for n, rows in sides.items():
+        if rows:
+            free = _alone(np.concatenate(rows))
+            found.append(triangles(free.ravel(), np.full(len(free), n)))
+    return np.concatenate(found)
+
+
+def _alone(sides: Integers) -> Integers:
+    """Those whose corners no other has."""
+    _, index, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return sides[count[index.ravel()] == 1]

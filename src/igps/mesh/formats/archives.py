@@ -1,0 +1,106 @@
+"""Archives and compressed files: unpacked to a folder of their own, as far as is allowed, and read there."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import lzma
+import shutil
+import tarfile
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
+
+from igps.mesh.formats._format import Format, RawBody, check_unpacked, joined
+from igps.mesh.options import LoadOptions
+
+_OPENERS: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
+
+
+def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    """A body for each file that is one, by its name."""
+    from igps.mesh.formats import format_of
+
+    bodies = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, place in _unpacked(path, Path(folder), options):
+            found = format_of(place)
+            if found is not None and found.is_searched and part in (None, name):
+                body = joined(found.read(place, options, None))
+                bodies.append(replace(body, part=name))
+    if not bodies:
+        raise ValueError("no surface in it")
+    return bodies
+
+
+def read_compressed(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    """What a single compressed file holds."""
+    from igps.mesh.formats import format_of
+
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / path.stem
+        with _OPENERS[path.suffix.lower()](path) as stream:
+            _copy(_Counted(stream, path, options), place)
+        found = format_of(place)
+        if found is None or not found.is_searched:
+            raise ValueError(f"{path.stem} has no suffix of a format that is known")
+        return list(found.read(place, options, part))
+
+
+def _unpacked(path: Path, folder: Path, options: LoadOptions) -> list[tuple[str, Path]]:
+    """The names of the files in an archive, and where they are now. Links, and ways out of it, are passed over."""
+    found = []
+    with _members(path, options) as members:
+        for name, stream in members:
+            inside = PurePosixPath(name.replace("\\", "/"))
+            if inside.is_absolute() or ".." in inside.parts or not inside.name:
+                continue
+            place = folder / inside
+            place.parent.mkdir(parents=True, exist_ok=True)
+            _copy(stream, place)
+            found.append((name, place))
+    return found
+
+
+@contextmanager
+def _members(path: Path, options: LoadOptions) -> Iterator[Iterator[tuple[str, IO[bytes]]]]:
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            files = [one for one in archive.infolist() if not one.is_dir()]
+            check_unpacked(sum(one.file_size for one in files), path, options.max_unpacked)  # no more is read of any
+            yield ((one.filename, archive.open(one)) for one in files)
+        return
+    opener = _OPENERS.get({".tgz": ".gz", ".tbz2": ".bz2"}.get(path.suffix.lower(), path.suffix.lower()), open)
+    with opener(path, "rb") as stream, tarfile.open(fileobj=_Counted(stream, path, options), mode="r|") as packed:
+        yield ((one.name, file) for one in packed if one.isreg() and (file := packed.extractfile(one)))
+
+
+class _Counted(io.RawIOBase):
+    """A stream that gives no more than is allowed."""
+
+    def __init__(self, stream: Any, path: Path, options: LoadOptions) -> None:
+        self._stream, self._path, self._limit, self._n_read = stream, path, options.max_unpacked, 0
+
+    def read(self, size: int = -1) -> bytes:
+        content = bytes(self._stream.read(min(size, self._limit + 1) if size >= 0 else self._limit + 1))
+        self._n_read += len(content)
+        check_unpacked(self._n_read, self._path, self._limit)
+        return content
+
+
+def _copy(stream: Any, place: Path) -> None:
+    with place.open("wb") as out:
+        shutil.copyfileobj(stream, out)
+
+
+ARCHIVE = Format(
+    *("an archive", (".zip", ".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2"), read),
+    bodies=("whole", "objects"),
+    is_searched=False,
+)
+COMPRESSED = Format("a compressed file", tuple(_OPENERS), read_compressed, is_searched=False)

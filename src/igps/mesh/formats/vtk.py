@@ -1,0 +1,217 @@
+"""VTK: legacy files of polygons or cells (.vtk), and XML files (.vtp, .vtu), as text or bytes.
+
+Read here, because meshio knows no PolyData, and VTK itself is a hundred megabytes and ends the process where a header
+promises too much.
+"""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+from typing import Literal
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.mesh.formats import _data_arrays, _vtk_cells, _xml
+from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct
+from igps.mesh.options import LoadOptions
+
+_LEGACY_TYPES = {
+    "float": "f4",
+    "double": "f8",
+    "int": "i4",
+    "unsigned_int": "u4",
+    "long": "i8",
+    "vtktypeint64": "i8",
+    "vtktypeint32": "i4",
+    "short": "i2",
+    "unsigned_short": "u2",
+    "char": "i1",
+    "unsigned_char": "u1",
+    "vtkidtype": "i8",
+}
+_CELLS = {"POLYGONS": _vtk_cells.POLYGON, "TRIANGLE_STRIPS": _vtk_cells.STRIP}
+_POLYS = {"Polys": _vtk_cells.POLYGON, "Strips": _vtk_cells.STRIP}
+_COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
+Cells = tuple[NDArray[np.int64], NDArray[np.int64]]  # corners laid end to end, and how many each cell has
+
+
+class _Legacy:
+    """A legacy file, read from the front."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content, self._at = content, 0
+        header, _, kind = self.line(), self.line(), self.line().upper()
+        if not header.lower().startswith("# vtk datafile") or kind not in ("ASCII", "BINARY"):
+            raise ValueError("not a legacy file of VTK")
+        self._is_text = kind == "ASCII"
+
+    def line(self) -> str:
+        """The next line that is not blank; "" at the end."""
+        while self._at < len(self._content):
+            end = self._content.find(b"\n", self._at)
+            end = len(self._content) if end < 0 else end
+            text, self._at = self._content[self._at : end].decode("latin-1").strip(), end + 1
+            if text:
+                return text
+        return ""
+
+    def numbers(self, n: int, name: str) -> NDArray[np.generic]:
+        kind = np.dtype(_LEGACY_TYPES[name.lower()])
+        left = len(self._content) - self._at
+        if not 0 <= n <= left // (2 if self._is_text else kind.itemsize) + 1:
+            raise ValueError(f"{n} numbers announced, {left} bytes left")
+        if not self._is_text:
+            values = np.frombuffer(self._content, kind.newbyteorder(">"), n, self._at)
+            self._at += values.nbytes
+            return values
+        words = self._content[self._at :].split(None, n)
+        rest = words.pop() if len(words) > n else b""
+        if len(words) != n:
+            raise ValueError(f"{n} numbers announced, {len(words)} there")
+        self._at = len(self._content) - len(rest)
+        return np.array(words, dtype="S").astype(kind) if n else np.zeros(0, kind)
+
+    def cells(self, n: int, size: int) -> Cells:
+        """Of a section of n cells: in later versions two arrays, in earlier ones each with its number of corners."""
+        before = self._at
+        words = self.line().split()
+        if words[:1] == ["OFFSETS"]:
+            offsets = self.numbers(n, words[1]).astype(np.int64)
+            kind = self.line().split()[1]
+            return self.numbers(size, kind).astype(np.int64), np.diff(offsets)
+        self._at = before
+        row, at = self.numbers(size, "int").astype(np.int64), 0
+        n_corners: list[int] = []
+        while at < size and len(n_corners) < n:
+            n_corners.append(int(row[at]))
+            at += max(n_corners[-1], 0) + 1
+        if len(n_corners) != n or at != size:
+            raise ValueError("the numbers of corners do not add up")
+        counts = np.array(n_corners, dtype=np.int64)
+        is_corner = np.ones(size, dtype=bool)
+        is_corner[np.cumsum(counts + 1) - counts - 1] = False
+        return row[is_corner], counts
+
+
+def read_legacy(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    """The surface of a legacy file of polygons or cells."""
+    file = _Legacy(path.read_bytes())
+    vertices = np.zeros((0, 3))
+    cells: list[tuple[Cells, NDArray[np.int64]]] = []
+    while (words := file.line().split()) and words[0].upper() not in ("POINT_DATA", "CELL_DATA"):
+        word = words[0].upper()
+        if word == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
+            raise ValueError(f"a data set of the kind {words[1]}; surfaces are POLYDATA or UNSTRUCTURED_GRID")
+        if word == "POINTS":
+            vertices = file.numbers(3 * int(words[1]), words[2]).astype(np.float64).reshape(-1, 3)
+        elif word in ("POLYGONS", "TRIANGLE_STRIPS", "CELLS", "VERTICES", "LINES"):
+            found = file.cells(int(words[1]), int(words[2]))
+            cells.append((found, np.full(len(found[1]), _CELLS.get(word, 0), dtype=np.int64)))
+        elif word == "CELL_TYPES" and cells:
+            cells[-1] = (cells[-1][0], file.numbers(int(words[1]), "int").astype(np.int64))
+    return [_body(vertices, cells)]
+
+
+def read_xml(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    """The surface of an XML file of polygons or cells, a body for each of its pieces."""
+    file = _Xml(path, options)
+    pieces = list(file.root.iter("Piece"))
+    if len(pieces) > 1:
+        names = distinct(f"piece {i}" for i in range(1, len(pieces) + 1))
+        return [file.body(piece, name) for piece, name in zip(pieces, names, strict=True)]
+    return [file.body(piece) for piece in pieces]
+
+
+class _Xml:
+    """An XML file; what it appends in raw bytes is no XML."""
+
+    def __init__(self, path: Path, options: LoadOptions) -> None:
+        content = path.read_bytes()
+        self._path, self._options, self._appended = path, options, b""
+        start = content.find(b"<AppendedData")
+        self._is_raw = start >= 0 and b'"raw"' in content[start : content.find(b">", start)]
+        if start >= 0:
+            begin = content.find(b"_", content.find(b">", start)) + 1
+            self._appended = content[begin : content.rfind(b"</AppendedData>")]
+            content = content[:start] + b"</VTKFile>"
+        self.root = _xml.parse(content)
+        self._order: Literal["<", ">"] = "<" if self.root.get("byte_order") != "BigEndian" else ">"
+        self._header = np.dtype(f"{self._order}u{8 if self.root.get('header_type') == 'UInt64' else 4}")
+        name = self.root.get("compressor")
+        if name is not None and name not in _COMPRESSORS:
+            raise ValueError(f"it is compressed by {name}, which is not read; write it with zlib or without")
+        self._compressor = None if name is None else _COMPRESSORS[name]
+
+    def body(self, piece: Element, part: str | None = None) -> RawBody:
+        points = piece.find("Points/DataArray")
+        if points is None:
+            raise ValueError("no points in it")
+        vertices = self._array(points).astype(np.float64).reshape(-1, 3)
+        cells: list[tuple[Cells, NDArray[np.int64]]] = []
+        for group in (*_POLYS, "Cells"):
+            arrays = {one.get("Name"): self._array(one) for one in piece.findall(f"{group}/DataArray")}
+            if len(arrays) >= 2:
+                offsets = arrays["offsets"].astype(np.int64)
+                n_corners = np.asarray(np.diff(offsets, prepend=0), dtype=np.int64)
+                kinds = arrays.get("types", np.full(len(n_corners), _POLYS.get(group, 0)))
+                cells.append(((arrays["connectivity"].astype(np.int64), n_corners), kinds.astype(np.int64)))
+        return _body(vertices, cells, part)
+
+    def _array(self, element: Element) -> NDArray[np.generic]:
+        name = element.get("type", "")
+        kind = np.dtype(f"{'f' if name.startswith('F') else name[0].lower()}{int(name.lstrip('UIntFloa')) // 8}")
+        kind = kind.newbyteorder(self._order)
+        where, text = element.get("format"), element.text or ""
+        if where == "ascii":
+            return _data_arrays.from_text(text, kind)
+        if where == "appended":
+            return np.frombuffer(self._block(self._appended[int(element.get("offset", "0")) :], self._is_raw), kind)
+        return np.frombuffer(self._block("".join(text.split()).encode(), False), kind)
+
+    def _block(self, content: bytes, is_raw: bool) -> bytes:
+        """What stands behind a header that tells its size, or the sizes of its compressed blocks."""
+        size = self._header.itemsize
+        (n,) = np.frombuffer(_first(size, content, is_raw), self._header).tolist()
+        if self._compressor is None:
+            return _first(size + n, content, is_raw)[size:]
+        head = _first((3 + n) * size, content, is_raw)
+        _, n_bytes, n_last, *packed = np.frombuffer(head, self._header).tolist()
+        check_unpacked(n * n_bytes, self._path, self._options.max_unpacked)
+        rest = _first(sum(packed), content[len(head) if is_raw else _n_letters(len(head)) :], is_raw)
+        blocks, at = [], 0
+        for number, n_packed in enumerate(packed):
+            unpacked = n_last if number == n - 1 and n_last else n_bytes
+            blocks.append(_data_arrays.inflated(rest[at : at + n_packed], unpacked, self._compressor))
+            at += n_packed
+        return b"".join(blocks)
+
+
+def _first(n: int, content: bytes, is_raw: bool) -> bytes:
+    """The first n bytes of a content that is raw or in base64."""
+    found = content[:n] if is_raw else base64.b64decode(content[: _n_letters(n)])[:n]
+    if len(found) < n:
+        raise ValueError(f"an array announces {n} bytes, {len(found)} are there")
+    return found
+
+
+def _n_letters(n_bytes: int) -> int:
+    return 4 * -(-n_bytes // 3)
+
+
+def _body(
+    vertices: NDArray[np.float64], cells: list[tuple[Cells, NDArray[np.int64]]], part: str | None = None
+) -> RawBody:
+    """The surface of some cells, whose corners are checked: they are laid end to end."""
+    faces = [np.zeros((0, 3), dtype=np.int64)]
+    for (corners, n_corners), kinds in cells:
+        if len(kinds) != len(n_corners) or (n_corners < 0).any() or n_corners.sum() != len(corners):
+            raise ValueError("numbers of cells and corners do not agree")
+        faces.append(_vtk_cells.surface(corners, n_corners, kinds))
+    return RawBody(vertices, np.concatenate(faces), part)
+
+
+LEGACY = Format("VTK", (".vtk",), read_legacy)
+XML = Format("VTK XML", (".vtp", ".vtu"), read_xml, bodies=("whole", "objects"))

@@ -1,0 +1,61 @@
+"""How a file is read, and which bodies it gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from igps.mesh.mending import Mending
+
+Component = Literal["largest"]
+BodyKind = Literal["whole", "labels", "objects", "pieces", "chains", "models", "assembly"]
+
+MAX_UNPACKED = 2**30
+"""Bytes that a compressed file, an archive or repeated objects may unpack to where nothing else is said."""
+
+
+@dataclass(frozen=True)
+class LoadOptions:
+    """How a file is read.
+
+    Example:
+        >>> import tempfile, trimesh
+        >>> from igps.mesh.loading import load_mesh
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     loose = trimesh.creation.box((1, 2, 3))
+        ...     loose.unmerge_vertices()
+        ...     _ = loose.export(f"{folder}/box.off")
+        ...     load_mesh(f"{folder}/box.off", LoadOptions()).notes
+        ('welded 28 coincident vertices',)
+
+    Args:
+        mend: "auto" does the least that makes a body of the surface, and leaves a body as it is, see `mend`; "never"
+            refuses what is no body; "always" makes every surface watertight that does not bound one body without
+            crossing itself, for collections of mixed quality.
+        component: "largest" keeps only the connected component of the largest area.
+        allow_open: accept open boundaries; the winding number then decides what is inside.
+        bodies: what of a file is a body. "whole": all of it; "labels" of a volume; "objects" of a scene, solids of a
+            CAD file, files of an archive; "pieces": what is not connected. "chains", "models" or the "assembly" of a
+            molecule. None, or what a format does not have: the labels of a volume, the chains of a molecule, the whole
+            of anything else.
+        max_unpacked: bytes that a file may unpack to.
+
+    Raises:
+        ValueError: a value that is not among those.
+    """
+
+    mend: Mending = "auto"
+    component: Component | None = None
+    allow_open: bool = False
+    bodies: BodyKind | None = None
+    max_unpacked: int = MAX_UNPACKED
+
+    def __post_init__(self) -> None:
+        if self.mend not in get_args(Mending):
+            raise ValueError(f"mend: expected 'auto', 'never' or 'always', got {self.mend!r}.")
+        if self.component is not None and self.component not in get_args(Component):
+            raise ValueError(f"component: expected 'largest' or None, got {self.component!r}.")
+        if self.bodies is not None and self.bodies not in get_args(BodyKind):
+            raise ValueError(f"bodies: expected one of {', '.join(get_args(BodyKind))}, or None, got {self.bodies!r}.")
+        if self.max_unpacked < 1:
+            raise ValueError(f"max_unpacked: expected a positive number of bytes, got {self.max_unpacked}.")
