@@ -62,7 +62,7 @@ def write_unusable(folder: Path) -> dict[str, str]:
         "triangle.off": "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
         "line.obj": "v 0 0 0\nv 1 2 3\nv 2 4 6\nv 3 6 9\nf 1 2 3\nf 2 3 4\n",
         "five.xyz": "0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 1 1\n",
-        "part.3mf": "PK",
+        "part.dae": "<COLLADA/>",
     }
     for name, text in texts.items():
         (folder / name).write_text(text)
@@ -74,15 +74,15 @@ def write_unusable(folder: Path) -> dict[str, str]:
         "line.obj": "no triangle has an area; a surface was expected. If the file holds lines, give them thickness.",
         "five.xyz": "a cloud of 5 points; at least 10 are needed for a surface. "
         "Check that the file holds faces, or scan more points.",
-        "part.3mf": "the format needs a module that is not installed (No module named 'lxml'). Install it, "
-        'pip install "interior-gps[formats]" has those of trimesh, or convert the file to OFF, OBJ, PLY or STL.',
+        "part.dae": "COLLADA, 3DXML or XAML needs a module that is not installed (No module named 'collada'). "
+        'Install it: pip install "interior-gps[formats]"; or convert the file to OFF, OBJ, PLY or STL.',
     }
 
 
-def without_lxml(monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    """What trimesh knows of 3MF files where lxml is not installed, wherever these tests run."""
-    error = ModuleNotFoundError("No module named 'lxml'")
-    monkeypatch.setitem(trimesh.exchange.load.mesh_loaders, "3mf", trimesh.exceptions.ExceptionWrapper(error))
+def without_collada(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """What trimesh knows of COLLADA files where pycollada is not installed, wherever these tests run."""
+    error = ModuleNotFoundError("No module named 'collada'")
+    monkeypatch.setitem(trimesh.exchange.load.mesh_loaders, "dae", trimesh.exceptions.ExceptionWrapper(error))
 
 
 def free_edges(path: Path) -> int:

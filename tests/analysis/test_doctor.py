@@ -10,7 +10,7 @@ from damaged_files import (
     N_FACES,
     N_VERTICES,
     free_edges,
-    without_lxml,
+    without_collada,
     write_box,
     write_clean,
     write_crossing,
@@ -67,7 +67,7 @@ def test_each_fault_and_what_will_be_done(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_used_costs_the_others_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    without_lxml(monkeypatch)
+    without_collada(monkeypatch)
     write_clean(tmp_path / "clean.off")
     sentences = write_unusable(tmp_path)
     found = findings(tmp_path)

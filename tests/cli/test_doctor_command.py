@@ -11,7 +11,7 @@ import pytest
 from damaged_files import (
     N_FACES,
     N_VERTICES,
-    without_lxml,
+    without_collada,
     write_box,
     write_clean,
     write_holed,
@@ -62,7 +62,7 @@ def test_table_and_file_of_a_folder_that_can_be_used(
 def test_status_is_1_if_a_file_cannot_be_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    without_lxml(monkeypatch)
+    without_collada(monkeypatch)
     root, out = tmp_path / "meshes", tmp_path / "doctor.csv"
     write_clean(root / "clean.off")
     sentences = write_unusable(root)

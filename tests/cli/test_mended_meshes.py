@@ -14,7 +14,7 @@ import pytest
 from damaged_files import (
     N_FACES,
     N_VERTICES,
-    without_lxml,
+    without_collada,
     write_box,
     write_clean,
     write_holed,
@@ -158,7 +158,7 @@ def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    without_lxml(monkeypatch)
+    without_collada(monkeypatch)
     root, out = tmp_path / "meshes", tmp_path / "out"
     for label, height in (("ball", 1.0), ("egg", 2.0)):
         for i in range(2):

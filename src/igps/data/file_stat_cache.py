@@ -10,7 +10,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from igps.data.cache import SignatureCache
@@ -52,7 +52,7 @@ class FileStatCache:
     def __init__(self, pipeline: SignaturePipeline) -> None:
         self._pipeline = pipeline
         self._path = pipeline.cache_dir / _FILE
-        told = json.dumps([asdict(pipeline.reading), pipeline.config.as_dict(), MENDING_VERSION], sort_keys=True)
+        told = json.dumps([pipeline.reading.as_dict(), pipeline.config.as_dict(), MENDING_VERSION], sort_keys=True)
         self._name = hashlib.sha256(told.encode()).hexdigest()[:32]
 
     def ready(self, paths: Sequence[Path]) -> dict[Path, Known]:

@@ -8,7 +8,7 @@ import json
 import os
 import socket
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -158,7 +158,7 @@ class SignaturePipeline:
 def _parameters(suffix: str, reading: LoadOptions, config: SignatureConfig, versions: tuple[int, int | None]) -> bytes:
     """What a key depends on beside the content of the file, the same for thousands of files."""
     algorithm, mending = versions
-    how: list[object] = [suffix, asdict(reading)]
+    how: list[object] = [suffix, reading.as_dict()]
     if mending is not None:
         how.append({"mending_version": mending})
     return json.dumps([how, {**config.as_dict(), "algorithm_version": algorithm}], sort_keys=True).encode()

@@ -237,7 +237,7 @@ def about_of(config: SignatureConfig, reading: LoadOptions, descriptor: str | De
         "descriptor": name_of(descriptor),
         "model": fingerprint(descriptor_of(descriptor)),
         "signature": {**signature, "attributes": list(config.attributes)},
-        "reading": asdict(reading),
+        "reading": reading.as_dict(),
     }
 
 

@@ -108,7 +108,7 @@ class Mesh:
         return other
 
     def numbered_by_faces(self) -> Mesh:
-        """The same mesh with its vertices in the order in which the faces first use them, whatever file it came from."""
+        """The same mesh with its vertices in the order in which the faces first use them."""
         used, first = np.unique(self.faces, return_index=True)
         order = used[np.argsort(first)]
         rank = np.empty(len(self.vertices), dtype=np.int64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 
 from igps.mesh.mending import Mending
@@ -59,3 +59,8 @@ class LoadOptions:
             raise ValueError(f"bodies: expected one of {', '.join(get_args(BodyKind))}, or None, got {self.bodies!r}.")
         if self.max_unpacked < 1:
             raise ValueError(f"max_unpacked: expected a positive number of bytes, got {self.max_unpacked}.")
+
+    def as_dict(self) -> dict[str, object]:
+        """All on which a body depends, for the keys of caches: no limits, and no kind of bodies where none is said."""
+        left_out = {"max_unpacked"} | ({"bodies"} if self.bodies is None else set())
+        return {name: value for name, value in asdict(self).items() if name not in left_out}

@@ -24,7 +24,7 @@ def write_sources(folder: Path, dataset: SignatureDataset) -> None:
         "meshes": [
             {"file": name, "path": str(path.resolve())} for name, path in zip(files.names, files.paths, strict=True)
         ],
-        "reading": asdict(pipeline.reading),
+        "reading": pipeline.reading.as_dict(),
         "signature": asdict(pipeline.config),
         "cache_dir": str(pipeline.cache_dir.resolve()),
     }

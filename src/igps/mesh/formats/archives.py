@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from igps.mesh.formats._format import Format, RawBody, check_unpacked, joined
+from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
 _OPENERS: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
@@ -24,15 +25,11 @@ _OPENERS: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """A body for each file that is one, by its name."""
-    from igps.mesh.formats import format_of
-
     bodies = []
     with tempfile.TemporaryDirectory() as folder:
         for name, place in _unpacked(path, Path(folder), options):
-            found = format_of(place)
-            if found is not None and found.is_searched and part in (None, name):
-                body = joined(found.read(place, options, None))
-                bodies.append(replace(body, part=name))
+            if part in (None, name) and (found := _inside(place, path, options, None)):
+                bodies.append(replace(joined(found), part=name))
     if not bodies:
         raise ValueError("no surface in it")
     return bodies
@@ -40,16 +37,27 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
 
 def read_compressed(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """What a single compressed file holds."""
-    from igps.mesh.formats import format_of
-
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / path.stem
         with _OPENERS[path.suffix.lower()](path) as stream:
             _copy(_Counted(stream, path, options), place)
-        found = format_of(place)
-        if found is None or not found.is_searched:
-            raise ValueError(f"{path.stem} has no suffix of a format that is known")
-        return list(found.read(place, options, part))
+        found = _inside(place, path, options, part)
+    if not found:
+        raise ValueError(f"{path.stem} has no suffix of a format that is known")
+    return found
+
+
+def _inside(place: Path, path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    """What an unpacked file holds; nothing if it is none of a body."""
+    from igps.mesh.formats import format_of
+
+    kind = format_of(place)
+    if kind is None or not kind.is_searched:
+        return []
+    try:
+        return list(kind.read(place, options, part))
+    except MeshError as error:
+        raise MeshError(str(error).replace(str(place), f"{path}: {place.name}")) from error
 
 
 def _unpacked(path: Path, folder: Path, options: LoadOptions) -> list[tuple[str, Path]]:

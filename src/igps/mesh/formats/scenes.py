@@ -31,4 +31,6 @@ def read_step(path: Path, options: LoadOptions, part: str | None) -> list[RawBod
 
 GLTF = Format("glTF", (".glb", ".gltf"), read_gltf, bodies=("whole", "objects"))
 STEP = Format("STEP", (".step", ".stp"), read_step, bodies=("whole", "objects"), extra="cad")
-OTHERS = Format("a scene", (".dae", ".zae", ".3dxml", ".xaml"), read, bodies=("whole", "objects"), extra="formats")
+OTHERS = Format(
+    "COLLADA, 3DXML or XAML", (".dae", ".zae", ".3dxml", ".xaml"), read, bodies=("whole", "objects"), extra="formats"
+)

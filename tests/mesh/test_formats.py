@@ -1,0 +1,272 @@
+"""Formats: the same surface from all of them, against the libraries that write them, and what files get wrong."""
+
+from __future__ import annotations
+
+import gzip
+import tarfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import meshio
+import nibabel
+import numpy as np
+import pytest
+import trimesh
+
+from igps import SignatureConfig, compute_signature
+from igps.mesh.formats import FORMATS, format_of, is_searched
+from igps.mesh.formats.stl import merged
+from igps.mesh.loading import load_mesh, read_surface
+from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
+from igps.signature.signature import Signature
+
+BALL = trimesh.creation.icosphere(subdivisions=2)
+# Exactly representable in single precision; no two faces and no two vertices are alike.
+VERTICES = np.asarray(BALL.vertices * [1, 0.8, 1.3] + 0.1 * BALL.vertices**2, dtype=np.float32).astype(np.float64)
+FACES = np.asarray(BALL.faces, dtype=np.int64)
+
+
+def lines(rows: np.ndarray, before: str = "") -> str:
+    return "".join(before + " ".join(map(repr, row)) + "\n" for row in rows.tolist())
+
+
+def off() -> str:
+    return f"OFF\n{len(VERTICES)} {len(FACES)} 0\n" + lines(VERTICES) + lines(FACES, "3 ")
+
+
+def relative_obj() -> str:
+    """Indices that count from the last vertex, with textures and normals, lines that go on, comments."""
+    corners = [[f"{i - len(VERTICES)}/-1/-1" for i in face] for face in FACES.tolist()]
+    faces = "".join(f"f {a} {b} \\\n {c} # a face\n" for a, b, c in corners)
+    return "vt 0 0\nvn 0 0 1\n" + lines(VERTICES, "v ") + faces
+
+
+def polydata(version: str) -> str:
+    head = f"# vtk DataFile Version {version}\na ball\nASCII\nDATASET POLYDATA\nPOINTS {len(VERTICES)} double\n"
+    if version < "5":
+        return head + lines(VERTICES) + f"POLYGONS {len(FACES)} {4 * len(FACES)}\n" + lines(FACES, "3 ")
+    offsets = " ".join(map(str, range(0, 3 * len(FACES) + 1, 3)))
+    cells = f"POLYGONS {len(FACES) + 1} {3 * len(FACES)}\nOFFSETS vtktypeint64\n{offsets}\nCONNECTIVITY vtktypeint64\n"
+    return head + lines(VERTICES) + cells + lines(FACES) + f"CELL_DATA {len(FACES)}\n"
+
+
+def binary_polydata() -> bytes:
+    head = f"# vtk DataFile Version 3.0\na ball\nBINARY\nDATASET POLYDATA\nPOINTS {len(VERTICES)} float\n".encode()
+    cells = np.column_stack([np.full(len(FACES), 3), FACES]).astype(">i4").tobytes()
+    return head + VERTICES.astype(">f4").tobytes() + f"\nPOLYGONS {len(FACES)} {4 * len(FACES)}\n".encode() + cells
+
+
+def vtp(form: str) -> bytes:
+    arrays = {
+        "points": VERTICES.astype("<f4"),
+        "connectivity": FACES.ravel().astype("<i8"),
+        "offsets": np.arange(3, 3 * len(FACES) + 1, 3, dtype="<i8"),
+    }
+    kinds = {"points": "Float32", "connectivity": "Int64", "offsets": "Int64"}
+    appended, written = b"", {}
+    for name, array in arrays.items():
+        text = " ".join(map(repr, array.ravel().tolist())) if form == "ascii" else ""
+        where = "ascii" if form == "ascii" else f'appended" offset="{len(appended)}'
+        n = 3 if name == "points" else 1
+        written[name] = (
+            f'<DataArray type="{kinds[name]}" Name="{name}" NumberOfComponents="{n}" format="{where}">{text}'
+        )
+        appended += np.uint32(array.nbytes).tobytes() + array.tobytes()
+    points, connectivity, offsets = (text + "</DataArray>" for text in written.values())
+    body = f"<PolyData><Piece><Points>{points}</Points><Polys>{connectivity}{offsets}</Polys></Piece></PolyData>"
+    tail = b"" if form == "ascii" else b'<AppendedData encoding="raw">\n_' + appended + b"\n</AppendedData>"
+    head = '<?xml version="1.0"?><VTKFile type="PolyData" byte_order="LittleEndian">'
+    return (head + body).encode() + tail + b"</VTKFile>"
+
+
+def gifti(path: Path, encoding: str) -> None:
+    points = nibabel.gifti.GiftiDataArray(VERTICES.astype("f4"), "NIFTI_INTENT_POINTSET", encoding=encoding)
+    triangles = nibabel.gifti.GiftiDataArray(FACES.astype("i4"), "NIFTI_INTENT_TRIANGLE", encoding=encoding)
+    nibabel.save(nibabel.gifti.GiftiImage(darrays=[points, triangles]), path)
+
+
+def zipped(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("in/a.off", off())
+        archive.writestr("readme.txt", "a ball")
+
+
+def tarred(path: Path) -> None:
+    (path.parent / "a.off").write_text(off())
+    with tarfile.open(path, "w:gz") as archive:
+        archive.add(path.parent / "a.off", "a.off")
+
+
+SOLID = trimesh.Trimesh(VERTICES, FACES, process=False)
+CELLS = meshio.Mesh(VERTICES, [("triangle", FACES)])
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "plain.off": lambda path: path.write_text(off()),
+    "relative.obj": lambda path: path.write_text(relative_obj()),
+    "binary.ply": lambda path: SOLID.export(path),
+    "text.ply": lambda path: meshio.write(path, CELLS, binary=False),
+    "binary.stl": lambda path: SOLID.export(path),
+    "text.stl": lambda path: SOLID.export(path, file_type="stl_ascii"),
+    "scene.glb": lambda path: SOLID.export(path),
+    "plate.3mf": lambda path: SOLID.export(path),
+    "cells51.vtk": lambda path: meshio.write(path, CELLS),
+    "cells42.vtk": lambda path: meshio.write(path, CELLS, file_format="vtk42"),
+    "polygons3.vtk": lambda path: path.write_text(polydata("3.0")),
+    "polygons5.vtk": lambda path: path.write_text(polydata("5.1")),
+    "binary.vtk": lambda path: path.write_bytes(binary_polydata()),
+    "text.vtp": lambda path: path.write_bytes(vtp("ascii")),
+    "raw.vtp": lambda path: path.write_bytes(vtp("raw")),
+    "zlib.vtu": lambda path: meshio.write(path, CELLS, compression="zlib"),
+    "lzma.vtu": lambda path: meshio.write(path, CELLS, compression="lzma"),
+    "base64.vtu": lambda path: meshio.write(path, CELLS, compression=None),
+    "zipped.surf.gii": lambda path: gifti(path, "GIFTI_ENCODING_B64GZ"),
+    "base64.gii": lambda path: gifti(path, "GIFTI_ENCODING_B64BIN"),
+    "lh.pial": lambda path: nibabel.freesurfer.write_geometry(path, VERTICES, FACES),
+    "one.zip": zipped,
+    "one.tar.gz": tarred,
+    "one.off.gz": lambda path: path.write_bytes(gzip.compress(off().encode())),
+}
+UNITS = {".glb": "m", ".3mf": "mm", ".gii": "mm", ".pial": "mm"}
+
+
+def numbers(signature: Signature) -> bytes:
+    inside, outside = signature.interior, signature.surface
+    arrays = signature.eigenvalues, inside.points, inside.eigenfunctions, outside.points, outside.eigenfunctions
+    return b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("plain") / "plain.off"
+    path.write_text(off())
+    return numbers(compute_signature(load_mesh(path), SignatureConfig(n_eigenpairs=10, min_samples=100)))
+
+
+@pytest.mark.parametrize("name", sorted(WRITERS))
+def test_every_format_gives_the_same_signature_to_the_byte(name: str, tmp_path: Path, expected: bytes) -> None:
+    WRITERS[name](tmp_path / name)
+    mesh = load_mesh(tmp_path / name, LoadOptions("never"))
+    np.testing.assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
+    assert len(mesh.vertices) == len(VERTICES)
+    assert mesh.notes == ()
+    assert mesh.unit == UNITS.get(Path(name).suffix)
+    assert numbers(compute_signature(mesh, SignatureConfig(n_eigenpairs=10, min_samples=100))) == expected
+
+
+def test_a_binary_stl_with_a_wrong_count_gives_what_is_there(tmp_path: Path) -> None:
+    path = tmp_path / "count.stl"
+    SOLID.export(path)
+    content = bytearray(path.read_bytes())
+    for count in (55_866, 0):
+        content[80:84] = count.to_bytes(4, "little")
+        path.write_bytes(content + b"\0" * 7)
+        mesh = load_mesh(path)
+        np.testing.assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
+        assert mesh.notes == (f"the header announces {count} triangles: the {len(FACES)} that are there were read",)
+    path.write_bytes(content[:100])
+    with pytest.raises(MeshError, match=r"count\.stl: not readable as STL.*no triangle"):
+        load_mesh(path)
+
+
+def test_corners_in_one_place_are_one_vertex_in_the_order_in_which_they_come() -> None:
+    generator = np.random.default_rng(0)
+    corners = generator.integers(-1, 2, (300, 3)) * generator.choice([1.0, -1.0], (300, 3))  # zeros of both signs
+    vertices, faces = merged(corners)
+    np.testing.assert_array_equal(vertices[faces.ravel()], corners)
+    places = list(dict.fromkeys(map(tuple, corners.tolist())))
+    np.testing.assert_array_equal(vertices, places)
+
+
+def test_volumes_of_cells_give_the_surface_around_them(tmp_path: Path) -> None:
+    """Two cells of every kind side by side: the wall between them is inside, and the volume is that of both."""
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+    cube = np.vstack([square, square + np.array([0, 0, 1])])
+    twice = np.vstack([cube, square + np.array([0, 0, 2])])
+    hexahedra = meshio.Mesh(twice, [("hexahedron", [[0, 1, 2, 3, 4, 5, 6, 7], [4, 5, 6, 7, 8, 9, 10, 11]])])
+    wedges = meshio.Mesh(cube, [("wedge", [[0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7]])])
+    tips = np.vstack([square, [[0.5, 0.5, 1], [0.5, 0.5, -1]]])
+    pyramids = meshio.Mesh(tips, [("pyramid", [[0, 1, 2, 3, 4], [0, 3, 2, 1, 5]])])
+    tetrahedra = meshio.Mesh(tips, [("tetra", [[0, 1, 2, 4], [0, 2, 3, 4]])])
+    for cells, n_faces, volume in ((hexahedra, 20, 2), (wedges, 12, 1), (pyramids, 8, 2 / 3), (tetrahedra, 6, 1 / 3)):
+        for suffix in ("vtk", "vtu"):
+            meshio.write(tmp_path / f"cells.{suffix}", cells)
+            mesh = load_mesh(tmp_path / f"cells.{suffix}")
+            assert len(mesh.faces) == n_faces
+            assert mesh.volume == pytest.approx(volume)
+            assert not any("inside out" in note for note in mesh.notes)
+
+
+def test_strips_and_polygons_of_vtk_files(tmp_path: Path) -> None:
+    """A tetrahedron as a strip, and a prism of two pentagons and five quadrilaterals."""
+    head = "# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\n"
+    corners = "POINTS 4 float\n0 0 0 1 0 0 0 1 0 0 0 1\n"
+    (tmp_path / "strip.vtk").write_text(head + corners + "TRIANGLE_STRIPS 1 7\n6 0 1 2 3 0 1\n")
+    assert load_mesh(tmp_path / "strip.vtk").volume == pytest.approx(1 / 6)
+    angle = 2 * np.pi * np.arange(5) / 5
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(5)], axis=1)
+    sides = [[i, (i + 1) % 5, (i + 1) % 5 + 5, i + 5] for i in range(5)]
+    polygons = [[4, 3, 2, 1, 0], [5, 6, 7, 8, 9], *sides]
+    cells = "".join(" ".join(map(str, [len(row), *row])) + "\n" for row in polygons)
+    text = f"POINTS 10 double\n{lines(np.vstack([ring, ring + np.array([0, 0, 1])]))}POLYGONS 7 37\n{cells}"
+    (tmp_path / "prism.vtk").write_text(head + text)
+    mesh = load_mesh(tmp_path / "prism.vtk")
+    assert len(mesh.faces) == 16
+    assert mesh.volume == pytest.approx(2.5 * np.sin(2 * np.pi / 5))
+
+
+FAULTY = {
+    "cut.vtk": (polydata("3.0")[:4000].encode(), "announced"),
+    "huge.vtk": (b"# vtk DataFile Version 3.0\nx\nBINARY\nDATASET POLYDATA\nPOINTS 1000000000000 float\n", "announced"),
+    "image.vtk": (b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET STRUCTURED_POINTS\n", "STRUCTURED_POINTS"),
+    "cut.vtp": (vtp("raw").replace(np.uint32(12 * len(VERTICES)).tobytes(), b"\xff\xff\xff\x7f", 1), "announces"),
+    "lz4.vtu": (b'<VTKFile compressor="vtkLZ4DataCompressor"/>', "vtkLZ4DataCompressor"),
+    "curved.vtk": (
+        b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 6 float\n" + b"0 0 1\n" * 6
+        + b"CELLS 1 7\n6 0 1 2 3 4 5\nCELL_TYPES 1\n22\n",
+        "kind 22",
+    ),
+    "map.gii": (b"<GIFTI><DataArray Intent='NIFTI_INTENT_SHAPE'/></GIFTI>", "points or triangles"),
+    "lh.white": (b"\xff\xff\xfemade\n\n" + b"\x7f\xff\xff\xff" * 2, "announced"),
+    "zero.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "counted from 1"),
+    "entities.vtu": (b'<!DOCTYPE a [<!ENTITY b "bb"><!ENTITY c "&b;&b;">]><VTKFile>&c;</VTKFile>', "entity"),
+    "file.gii": (b'<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]><GIFTI>&b;</GIFTI>', "entity"),
+    "empty.3mf": (b"PK\x05\x06" + bytes(18), "no model"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(FAULTY))
+def test_what_is_wrong_with_a_file_is_told_in_a_sentence_that_names_it(name: str, tmp_path: Path) -> None:
+    content, words = FAULTY[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(MeshError, match=rf"{name}: not readable as .*{words}.*\. .*[Ee]xport"):
+        load_mesh(tmp_path / name)
+
+
+def test_an_array_that_promises_too_much_is_not_unpacked(tmp_path: Path) -> None:
+    gifti(tmp_path / "a.gii", "GIFTI_ENCODING_B64GZ")
+    text = (tmp_path / "a.gii").read_text()
+    (tmp_path / "a.gii").write_text(text.replace(f'Dim0="{len(VERTICES)}"', 'Dim0="1000000000000"'))
+    with pytest.raises(MeshError, match=r"a\.gii: unpacks to .* GB or more"):
+        load_mesh(tmp_path / "a.gii")
+    (tmp_path / "a.gii").write_text(text.replace(f'Dim0="{len(VERTICES)}"', 'Dim0="10"'))
+    with pytest.raises(MeshError, match="a block unpacks to"):
+        load_mesh(tmp_path / "a.gii")
+
+
+def test_files_are_known_by_the_longest_suffix_and_maps_on_surfaces_are_none() -> None:
+    assert format_of("a.tar.gz").name == "an archive"  # type: ignore[union-attr]
+    assert format_of("A.OFF").name == "OFF"  # type: ignore[union-attr]
+    assert format_of("fsaverage/surf/lh.pial") is not None
+    assert format_of("pial") is format_of("a.txt") is format_of("a.label.gii") is None
+    assert is_searched("a.stl")
+    assert not is_searched("a.zip")
+    suffixes = [suffix for one in FORMATS for suffix in one.suffixes]
+    assert len(set(suffixes)) == len(suffixes)
+    assert all(suffix == suffix.lower() for suffix in suffixes)
+
+
+def test_an_unknown_format_is_told_with_those_that_are_known(tmp_path: Path) -> None:
+    (tmp_path / "a.blend").write_bytes(b"x")
+    with pytest.raises(MeshError, match=r"a\.blend: not a format that is read.*\.off.*\.3mf"):
+        read_surface(tmp_path / "a.blend")
