@@ -73,3 +73,21 @@ def test_genus_and_diagonal() -> None:
     assert Mesh(TETRAHEDRON * [1, 2, 2], FACES).diagonal == pytest.approx(3)
     with pytest.raises(MeshError, match="open surface has no genus"):
         _ = Mesh(TETRAHEDRON, FACES[:3], allow_open=True).genus
+
+
+def test_numbered_by_faces_is_the_same_surface_whatever_the_numbers(blob: Mesh) -> None:
+    order = np.random.default_rng(0).permutation(len(blob.vertices))
+    rank = np.argsort(order)
+    found, again = blob.numbered_by_faces(), Mesh(blob.vertices[order], rank[blob.faces]).numbered_by_faces()
+    np.testing.assert_array_equal(found.vertices[found.faces], blob.vertices[blob.faces])
+    np.testing.assert_array_equal(found.vertices, again.vertices)
+    np.testing.assert_array_equal(found.faces, again.faces)
+    assert found.numbered_by_faces().faces.tolist() == found.faces.tolist()
+
+
+def test_more_notes_and_a_unit_leave_the_surface_as_it_is(blob: Mesh) -> None:
+    told = blob.told(notes=("first",), unit="mm")
+    assert told.notes == ("first", *blob.notes)
+    assert (told.unit, told.told().unit, blob.unit) == ("mm", "mm", None)
+    assert told.vertices is blob.vertices
+    assert told.area == blob.area
