@@ -15,12 +15,8 @@ from igps._compiled import is_available
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.nn._kernels import counted_pairs
-from igps.retrieval import distances
 from igps.signature import mean_value as coordinates
-from igps.spectra import _direct as direct
-from igps.spectra import _krylov as krylov
-from igps.spectra import _ordering as ordering
-from igps.spectra import eigensolver
+from igps.spectra import _products as products
 
 # The meshes are small: on two threads they are hardly faster, and many times slower where another process takes a core.
 torch.set_num_threads(1)
@@ -36,18 +32,16 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 def both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The test runs with loops compiled, where they can be, and without."""
     if request.param == "plain":
-        for module in (
-            direct,
-            eigensolver,
-            ordering,
-            counted_pairs,
-            distances,
-        ):
+        for module in (counted_pairs,):
             monkeypatch.setattr(module, "is_available", lambda: False)
     elif not is_available():
         pytest.skip("needs numba, the extra [fast]")
-    # On either kind of processor
-    monkeypatch.setattr(krylov, "beats_blas", lambda: request.param == "compiled")
+
+
+@pytest.fixture(params=["loops", "BLAS"])
+def either_processor(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The basis is multiplied as on a processor where loops are faster than BLAS, and as where they are not."""
+    monkeypatch.setattr(products, "loops_beat_blas", lambda: request.param == "loops")
 
 
 @contextlib.contextmanager

@@ -23,9 +23,7 @@ from igps.signature.laplacian import laplacian
 from igps.spectra import ConvergenceError, Spectrum, eigenpairs, eigensolver
 from igps.spectra import _krylov as krylov
 from igps.spectra import _lanczos as lanczos
-from igps.spectra._direct import analyse
-
-pytestmark = pytest.mark.usefixtures("both_ways")
+from igps.spectra._multifrontal import analyse
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +47,7 @@ def assert_pairs(spectrum: Spectrum, problem: Problem, tolerance: float = 1e-7) 
     assert np.abs(mass @ functions).max() < 1e-9 * np.sqrt(mass.sum())
 
 
+@pytest.mark.usefixtures("either_processor")
 @pytest.mark.parametrize("n_eigenpairs", [1, 7, 100, 280])
 def test_agrees_with_a_dense_solver(
     n_eigenpairs: int, torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray]
@@ -113,6 +112,7 @@ def test_more_copies_than_distinct_eigenvalues() -> None:
     assert_pairs(spectrum, problem)
 
 
+@pytest.mark.usefixtures("either_processor")
 def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """10,242 vertices: two pieces of the basis, two subtrees; and a team, though the result is small."""
     sphere = trimesh.creation.icosphere(subdivisions=5)
@@ -147,6 +147,7 @@ def filled(vectors: np.ndarray, steps: list[Callable[[], None]]) -> np.ndarray:
     return vectors
 
 
+@pytest.mark.usefixtures("either_processor")
 def test_krylov_basis_keeps_its_promises(torus_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     """Orthonormal rows, a projection that is the operator's, residuals that are the vectors'; also when widened."""
     monkeypatch.setattr(krylov, "COLUMNS_AT_ONCE", 100)  # the eigenvectors take many steps
@@ -175,6 +176,7 @@ def test_krylov_basis_keeps_its_promises(torus_problem: Problem, monkeypatch: py
     np.testing.assert_allclose(estimated, actual, rtol=1e-5, atol=1e-8)
 
 
+@pytest.mark.usefixtures("either_processor")
 @pytest.mark.parametrize("distance", [1e-3, 1e-6, 1e-9])
 def test_a_shift_beside_an_eigenvalue_costs_no_orthogonality(
     distance: float, torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray]
@@ -207,6 +209,7 @@ def test_eigenvalues_are_the_quotients_of_their_vectors(torus_problem: Problem) 
     np.testing.assert_allclose(spectrum.eigenvalues, quotients, rtol=1e-13)
 
 
+@pytest.mark.usefixtures("either_processor")
 def test_a_large_basis_gives_its_place_to_the_eigenvectors(
     torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:

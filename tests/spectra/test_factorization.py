@@ -14,12 +14,7 @@ from scipy import sparse
 from conftest import with_slivers
 from igps._threads import Team
 from igps.spectra import _multifrontal as multifrontal
-from igps.spectra._direct import Factors, analyse
-from igps.spectra._factorization import Factorization, SingularMatrixError
-from igps.spectra._multifrontal import Factors as CompiledFactors
-from igps.spectra._symbolic import dissect
-
-pytestmark = pytest.mark.usefixtures("both_ways")
+from igps.spectra._multifrontal import Factors, SingularMatrixError, analyse
 
 EPSILON = float(np.finfo(float).eps)
 
@@ -68,17 +63,10 @@ def backward_error(matrix: np.ndarray, solution: np.ndarray, right: np.ndarray, 
 
 def eliminations(factors: Factors) -> list[np.ndarray]:
     """E of every node that has one."""
-    found = []
-    if isinstance(factors, CompiledFactors):
-        tree = factors.tree
-        for node, n_own in enumerate(np.diff(tree.first)):
-            block = factors.blocks[tree.block_start[node] : tree.block_start[node + 1]]
-            found.append(block.reshape(n_own, -1)[:, n_own:] if n_own else block)
-    else:
-        assert isinstance(factors, Factorization)
-        for level, blocks in zip(factors.dissection.levels, factors.blocks, strict=True):
-            for batch, of_batch in zip(level.batches, blocks, strict=True):
-                found += list(of_batch[:, :, batch.shape[1] :].numpy())
+    tree, found = factors.tree, []
+    for node, n_own in enumerate(np.diff(tree.first)):
+        block = factors.blocks[tree.block_start[node] : tree.block_start[node + 1]]
+        found.append(block.reshape(n_own, -1)[:, n_own:] if n_own else block)
     return [elimination for elimination in found if elimination.size]
 
 
@@ -192,8 +180,7 @@ def test_coinciding_places_are_allowed() -> None:
 def test_a_separator_keeps_blocks_small() -> None:
     """On an n × n grid the root needs about n unknowns; a cut through the wrong place would need many more."""
     matrix, places = grid_matrix(40)
-    root = dissect(matrix, places).levels[-1]
-    assert len(root.own) <= 1.5 * 40
+    assert np.diff(analyse(matrix, places).first)[-1] <= 1.5 * 40
 
 
 def test_one_dissection_serves_other_values() -> None:

@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 from torch.autograd.function import once_differentiable
 
-from igps._compiled import is_available
 from igps._threads import Team
+from igps.retrieval import distance_loops
 
 Distance = Callable[[Tensor, Tensor], Tensor]
 """A distance function: queries (Q, ...) and gallery (G, ...) to distances (Q, G) ≥ 0, smaller is closer."""
@@ -123,9 +123,7 @@ class _ChiSquare(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor, w: Tensor | None) -> Tensor:
         ctx.save_for_backward(a, b, w)
-        if a.device.type == "cpu" and is_available():
-            from igps.retrieval import distance_loops
-
+        if _is_for_loops(a):
             weights = (a.new_ones(a.shape[1]) if w is None else w.detach()).contiguous().numpy()
             return _by_loops(partial(distance_loops.chi_squares, weights), a, b).mul_(0.5)
         distances = a.new_zeros(len(a), len(b))
@@ -156,6 +154,11 @@ class _ChiSquare(torch.autograd.Function):
         if w is not None:
             grad_a, grad_b = grad_a * w, grad_b * w
         return grad_a, grad_b, None if grad_w is None else grad_w / 2
+
+
+def _is_for_loops(tensor: Tensor) -> bool:
+    """Whether compiled loops can read it: those of a device compute by PyTorch's tiles."""
+    return tensor.device.type == "cpu"
 
 
 def _by_loops(loop: Callable[[np.ndarray, np.ndarray, np.ndarray], None], a: Tensor, b: Tensor) -> Tensor:
@@ -199,9 +202,7 @@ def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
 
 
 def _row_distance(a: Tensor, b: Tensor) -> Tensor:
-    if a.device.type == "cpu" and is_available() and not (_is_derived(a) or _is_derived(b)):
-        from igps.retrieval import distance_loops
-
+    if _is_for_loops(a) and not (_is_derived(a) or _is_derived(b)):
         return _by_loops(distance_loops.squares, a, b).sqrt_()
     # The faster form by a matrix product cancels: it leaves a diagonal that is not zero.
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from scipy.linalg import qr
 
-from igps._compiled import beats_blas
 from igps._threads import ALONE, Team
 from igps.spectra._checks import ROUNDING
-from igps.spectra._direct import Factors
+from igps.spectra._multifrontal import Factors
+from igps.spectra._products import combinations, overlaps, subtract
 
 # Below this, relative to what it came from, a pivot makes a Cholesky factor inaccurate
 CHOLESKY_QR_PIVOT = 1e-6
@@ -133,12 +133,12 @@ class Krylov:
         last = slice(self._current, self._stop)
         near = self._basis[self._previous : self._stop]
         product = self._apply(self._basis[last])
-        (projection,) = self._sums(lambda piece: (_overlaps(product, near, piece),))
+        (projection,) = self._sums(lambda piece: (overlaps(product, near, piece),))
         diagonal = projection[:, self._current - self._previous :]
 
         def leave_new(piece: slice) -> tuple[torch.Tensor]:
             product[:, piece].addmm_(projection, near[:, piece], alpha=-1)
-            return (_overlaps(product, product, piece),)
+            return (overlaps(product, product, piece),)
 
         (remainder,) = self._sums(leave_new)
         # the longest row of the product, by Pythagoras: what the recurrence took from it, and what is left
@@ -189,7 +189,7 @@ class Krylov:
         vectors = _empty(self._basis.shape[1], len(index)).numpy()
 
         def combine(piece: slice) -> None:
-            vectors[order[piece]] = _combinations(self._basis[1 : self._stop], coefficients, piece)
+            vectors[order[piece]] = combinations(self._basis[1 : self._stop], coefficients, piece)
 
         return vectors, [partial(combine, piece) for piece in self._small_pieces()]
 
@@ -217,7 +217,7 @@ class Krylov:
 
     def _apply(self, block: torch.Tensor) -> torch.Tensor:
         """The products (b, V) of the operator with b rows."""
-        return self._factors.solve(block.T, self._team).T.contiguous()
+        return self._factors.solve(block.T, self._team).T
 
     def _sums(self, parts: Callable[[slice], tuple[torch.Tensor, ...]]) -> tuple[torch.Tensor, ...]:
         """What each piece of the columns contributes, added in the order of the pieces."""
@@ -271,7 +271,7 @@ class Krylov:
         old, new = self._basis[: self._swept], self._basis[self._swept : self._stop]
         if not len(new):
             return 0.0
-        (lost,) = self._sums(lambda piece: (_overlaps(new, old, piece),))
+        (lost,) = self._sums(lambda piece: (overlaps(new, old, piece),))
         largest = float(lost.abs().max())
         single = self._single if largest <= SINGLE_LOSS else None
 
@@ -279,8 +279,8 @@ class Krylov:
             if single is None:
                 new[:, piece].addmm_(lost, old[:, piece], alpha=-1)
             else:
-                _subtract(new, lost.float(), single[: self._swept], piece)
-            return (_overlaps(new, new, piece),)
+                subtract(new, lost.float(), single[: self._swept], piece)
+            return (overlaps(new, new, piece),)
 
         (squares,) = self._sums(take_out)
         if float((squares - torch.eye(len(new))).abs().max()) > ROUNDING:
@@ -346,7 +346,7 @@ class Krylov:
         self._multiply(_inverse(first), block, rows)
         if smallest > ROUND_PIVOT * largest:
             return rows, first.T
-        (squares,) = self._sums(lambda piece: (_overlaps(rows, rows, piece),))
+        (squares,) = self._sums(lambda piece: (overlaps(rows, rows, piece),))
         second = torch.linalg.cholesky(squares)
         self._multiply(_inverse(second), rows, rows)
         return rows, second.T @ first.T
@@ -356,39 +356,6 @@ def _coefficients(ritz: RitzPairs, index: torch.Tensor) -> torch.Tensor:
     """(m + b, K) of the Ritz pairs with these indices, of length 1."""
     coefficients = ritz.coefficients[:, index]
     return coefficients / torch.linalg.norm(coefficients, dim=0)
-
-
-def _overlaps(rows: torch.Tensor, others: torch.Tensor, piece: slice) -> torch.Tensor:
-    """The products (n, m) of rows with others, over a piece of the columns."""
-    if beats_blas():
-        from igps.spectra import _row_loops as row_loops
-
-        return torch.from_numpy(row_loops.overlaps(rows.numpy(), others.numpy(), piece.start, piece.stop))
-    return (others[:, piece] @ rows[:, piece].T).T  # the many first: MKL is faster so
-
-
-def _subtract(rows: torch.Tensor, factors: torch.Tensor, others: torch.Tensor, piece: slice) -> None:
-    """Take factors (n, m) times others from rows, in a piece of the columns; in the precision of the others."""
-    if beats_blas():
-        from igps.spectra import _row_loops as row_loops
-
-        row_loops.subtract(rows.numpy(), factors.numpy(), others.numpy(), piece.start, piece.stop)
-    else:
-        rows[:, piece].sub_(factors @ others[:, piece])
-
-
-def _combinations(rows: torch.Tensor, coefficients: torch.Tensor, piece: slice) -> np.ndarray:
-    """The products (n, K) of n columns, a piece of rows (m, V), with coefficients (m, K)."""
-    if beats_blas():
-        from igps.spectra._tiles import product
-
-        shape = piece.stop - piece.start, coefficients.shape[1], len(rows)
-        found = np.empty(shape[:2])
-        columns = rows.numpy().ravel(), piece.start, rows.shape[1], 1
-        out = found.ravel(), 0, shape[1]
-        product(shape, 1.0, columns, (coefficients.numpy().ravel(), 0, shape[1]), False, out, out)
-        return found
-    return (coefficients.T @ rows[:, piece]).numpy().T
 
 
 def _pieces(size: int, number: int) -> list[slice]:

@@ -14,8 +14,8 @@ from scipy import sparse
 
 from igps._threads import Team
 from igps.spectra._checks import ROUNDING
-from igps.spectra._direct import Factors, Structure, analyse
 from igps.spectra._krylov import Krylov
+from igps.spectra._multifrontal import Factors, Tree, analyse
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ def lanczos(
     With the shift inside the spectrum it is fast. With the shift below, A − σI is definite: its factors are accurate.
     """
     # a solve reads and writes long vectors in the order of elimination: so they had better lie
-    structure, matrix, order = analyse(matrix, positions).arranged(matrix)
+    tree, matrix, order = analyse(matrix, positions).arranged(matrix)
     zero_mode = zero_mode[order]
     few = n_eigenpairs <= FEW_EIGENPAIRS or n_eigenpairs * len(zero_mode) > LARGE_RESULT
     block_size = SMALL_BLOCK if few else LARGE_BLOCK
@@ -72,9 +72,9 @@ def lanczos(
     generator = np.random.default_rng(seed)
     with Team(None if n_eigenpairs * len(zero_mode) >= TEAM_RESULT else 1) as team:
         if inside:
-            shift, factors = _factorize_inside(structure, matrix, zero_mode, n_eigenpairs, tolerance, team)
+            shift, factors = _factorize_inside(tree, matrix, zero_mode, n_eigenpairs, tolerance, team)
         else:
-            shift, factors = SHIFT_BELOW, structure.factorize(matrix, SHIFT_BELOW, team)
+            shift, factors = SHIFT_BELOW, tree.factorize(matrix, SHIFT_BELOW, team)
         n_below = factors.n_negative - 1 if inside else 0  # without the zero mode
         krylov = Krylov(factors, zero_mode, block_size, first_look + 3 * block_size, generator, team)
         while krylov.size < first_look:
@@ -87,7 +87,7 @@ def lanczos(
             if gap is not None:
                 n_found, bound = gap
                 wanted = found[:n_eigenpairs]
-                count = partial(structure.inertia, matrix, bound, team)
+                count = partial(tree.inertia, matrix, bound, team)
                 if krylov.loses_basis:  # which must be kept in case that some are missing
                     vectors, n_negative = None, count()
                 else:  # side by side
@@ -114,7 +114,7 @@ def lanczos(
 
 
 def _factorize_inside(
-    structure: Structure,
+    tree: Tree,
     matrix: sparse.csr_array,
     zero_mode: np.ndarray,
     n_eigenpairs: int,
@@ -130,7 +130,7 @@ def _factorize_inside(
     mode = torch.from_numpy(zero_mode)[:, None]
     best: tuple[float, float, float, Factors] | None = None
     for _ in range(6):
-        factors = structure.factorize(matrix, shift, team)
+        factors = tree.factorize(matrix, shift, team)
         rank = factors.n_negative
         off_target = max(0.0, abs(rank - target) - 0.2 * target - 1)
         defect = float(torch.linalg.norm(shift * factors.solve(mode, team) + mode))

@@ -1,8 +1,30 @@
-"""The factorization of `factorization` by compiled loops: node by node, depth first, without padding.
+"""Sparse symmetric factorization as a sequence of dense eliminations, compiled.
 
-A node's Schur complement is added to its parent's front soon after it was made, while the processor's cache still holds
-it, and only the complements along one branch are kept. Pivot blocks of more than LARGE unknowns go to PyTorch, and so
-do those that are indefinite and ask for pivots in another order.
+Solvers such as SuperLU walk a sparse factor column by column and reach a few per cent of the machine's speed. Here
+the matrix is cut into a binary tree of small dense blocks:
+
+1. *Nested dissection* (George 1973; `_ordering`). A vertex separator splits the graph of the matrix in two halves, each
+   half is split again, down to leaves of some tens of vertices. On a surface the first separator has O(√V) vertices.
+2. *Multifrontal elimination* (Duff & Reid 1983), children first. A node owns the vertices of its separator, a leaf all
+   that is left to it; its *boundary* are the vertices of its ancestors that its subtree touches. Of its dense *front*
+
+       F = [F₁₁ F₁₂]   own rows
+           [F₂₁ F₂₂]   boundary rows
+
+   the own unknowns are eliminated, and the Schur complement F₂₂ − F₂₁ F₁₁⁻¹ F₁₂ is added into the parent's front. As
+   the nodes come depth first, that is soon, while the processor's cache still holds it, and only the complements along
+   one branch are kept.
+3. *Solve*. Each node keeps D = F₁₁⁻¹ and E = −F₁₁⁻¹ F₁₂. On the way up, Eᵀ b_own is added to the right-hand sides of
+   the boundary; on the way down, x_own = D b_own + E x_boundary.
+
+The negative eigenvalues of all pivot blocks F₁₁ together number as many as those of the matrix (Sylvester's law of
+inertia). For A − σI that is the number of eigenvalues of A below σ, and proves that an eigensolver missed none.
+
+No pivot moves from one block to another. That is stable for a positive definite matrix. For an indefinite A − σI it is
+so unless σ lies close to an eigenvalue of a leading block, which is rare but does happen: check a residual.
+
+`_fronts` has the compiled loops. Pivot blocks of more than LARGE unknowns are PyTorch's, and so are those that are
+indefinite and need pivots in another order.
 """
 
 from __future__ import annotations
@@ -14,29 +36,30 @@ import torch
 from scipy import sparse
 
 from igps._threads import ALONE, Team
+from igps.spectra import _fronts as loops
 from igps.spectra._checks import canonical, check_entries
-from igps.spectra._factorization import invert
 from igps.spectra._ordering import LEAF_SIZE, checked_graph, nested_dissection
+from igps.spectra._tree import Nodes, arranged, side_by_side, stacked_places, tree_nodes
 
-# Unknowns from which a subtree is worth a thread of its own, and the most subtrees, as a power of two
-SUBTREE, MOST_SUBTREES = 2**13, 3
 # Own unknowns of a node above which its dense algebra is PyTorch's, for which a team can work
 LARGE = 127
 # Rows or columns of such a node that are multiplied at once
 AT_ONCE = 256
 
 
+SINGULAR = "a pivot block of the shifted matrix is singular: use a slightly different shift"
+
+
+class SingularMatrixError(ValueError):
+    """A pivot block of the shifted matrix is singular: the shift hits an eigenvalue of it."""
+
+
 @dataclass(frozen=True)
-class Tree:
-    """Elimination order and fronts for one sparsity pattern. Nodes and unknowns are numbered depth first.
+class Tree(Nodes):
+    """Elimination order and fronts for one sparsity pattern; serves any number of values and shifts.
 
     Attributes:
         indptr, indices: (V + 1,), (E,) int32, of the csr matrix.
-        order, number: (V,) the vertex of each number, the number of each vertex.
-        first: (N + 1,) where each node's own numbers start.
-        children: (N, 2) nodes, or -1.
-        start, boundary: (N + 1,) where each node's boundary starts among all boundaries, sorted numbers each.
-        parent_row: the row of each vertex of a boundary in the front of the node's parent.
         block_start: (N + 1,) where each node's block [D E] starts among all blocks.
         update_start: (N,) where its complement starts among those that wait to be added.
         n_updates: entries of all complements that wait at the same time, at most.
@@ -48,13 +71,6 @@ class Tree:
 
     indptr: np.ndarray
     indices: np.ndarray
-    order: np.ndarray
-    number: np.ndarray
-    first: np.ndarray
-    children: np.ndarray
-    start: np.ndarray
-    boundary: np.ndarray
-    parent_row: np.ndarray
     block_start: np.ndarray
     update_start: np.ndarray
     n_updates: int
@@ -64,21 +80,29 @@ class Tree:
     n_carried: int
 
     def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> Factors:
-        """Factorize ``matrix − shift · I``; arguments and errors are those of `factorization.factorize`."""
+        """The factors of ``matrix − shift · I``; their bits do not depend on the team.
+
+        Args:
+            matrix: (V, V) symmetric, with the stored entries of the one that was analysed; both triangles are read.
+            shift: any number that is not an eigenvalue.
+            team: threads that work side by side.
+
+        Raises:
+            ValueError: the stored entries of the matrix are others.
+            SingularMatrixError: a pivot block is singular.
+        """
         blocks = np.empty(self.block_start[-1])
         return Factors(self, blocks, self._eliminate(matrix, shift, team, blocks))
 
     def inertia(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> int:
-        """The number of negative eigenvalues of ``matrix − shift · I``."""
+        """The number of negative eigenvalues of ``matrix − shift · I``; arguments and errors as of `factorize`."""
         return self._eliminate(matrix, shift, team, None)
 
     def arranged(self, matrix: sparse.csr_array) -> tuple[Tree, sparse.csr_array, np.ndarray]:
         """The structure for unknowns in the order of elimination, such a matrix, and which each was before (V,)."""
-        from igps.spectra import _loops as loops
-
         matrix = canonical(matrix)
         check_entries(matrix, self.indptr, self.indices)
-        indptr, indices, data = loops.arranged(self.indptr, self.indices, matrix.data, self.order, self.number)
+        indptr, indices, data = arranged(self.indptr, self.indices, matrix.data, self.order, self.number)
         same = np.arange(len(self.order))
         structure = replace(self, indptr=indptr, indices=indices, order=same, number=same)
         return structure, sparse.csr_array((data, indices, indptr), shape=matrix.shape), self.order
@@ -104,8 +128,6 @@ class Tree:
         team: Team,
     ) -> int:
         """Write the blocks of a range of nodes, and what they leave to nodes behind it; their negative pivots."""
-        from igps.spectra import _loops as loops
-
         begin, end = nodes
         n_own, n_boundary = np.diff(self.first[begin : end + 1]), np.diff(self.start[begin : end + 1])
         front = np.empty(int((n_own + n_boundary).max()) ** 2)
@@ -151,12 +173,10 @@ class Factors:
     n_negative: int
 
     def solve(self, right_hand_sides: torch.Tensor, team: Team = ALONE) -> torch.Tensor:
-        """The solutions (V, b) for right-hand sides (V, b), float64, stored by columns."""
-        from igps.spectra import _loops as loops
-
+        """The solutions (V, b) for right-hand sides (V, b), float64, both best stored by columns."""
         tree = self.tree
         n_vertices, b = right_hand_sides.shape
-        right, solution = right_hand_sides.numpy(), torch.empty(b, n_vertices, dtype=torch.float64)
+        right, solution = right_hand_sides.T.contiguous().numpy(), torch.empty(b, n_vertices, dtype=torch.float64)
         x, carried = (torch.empty(n * b, dtype=torch.float64).numpy() for n in (n_vertices, tree.n_carried))
         largest = int((np.diff(tree.first) + np.diff(tree.start)).max())
 
@@ -182,29 +202,31 @@ class Factors:
 
 
 def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, leaf_size: int = LEAF_SIZE) -> Tree:
-    """Elimination order and fronts; arguments and errors are those of `symbolic.dissect`."""
-    from igps.spectra import _loops as loops
+    """Elimination order and fronts for all matrices with one symmetric sparsity pattern.
 
+    Args:
+        matrix: (V, V) with a symmetric pattern that holds the whole diagonal; only the pattern is read.
+        coordinates: (V, d) places along which the graph is cut, any unit; short edges make good cuts. Without
+            them hop distances to a few far-apart vertices serve, with somewhat larger blocks.
+        leaf_size: a part of about so many vertices is not split any more.
+
+    Raises:
+        ValueError: the pattern is not symmetric or lacks diagonal entries, or coordinates do not fit it.
+    """
     matrix, coordinates = checked_graph(matrix, coordinates)
     node, n_levels = nested_dissection(matrix, coordinates, leaf_size)
     indptr, indices = (array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices))
-    order, number, first, children, start, boundary, parent_row = loops.tree(node, 2**n_levels - 1, indptr, indices)
-    n_own, n_boundary = np.diff(first), np.diff(start)
-    subtrees = _subtrees(n_levels, len(order))
-    inside = {node for begin, end in subtrees for node in range(begin, end)}
-    above = [(node, node + 1) for node in range(len(n_own)) if node not in inside]
-    update_start, n_updates = _stacks(children, n_boundary**2, [*subtrees, *above])
-    carried_start, n_carried = _stacks(children, n_boundary, [*subtrees, *above])
+    nodes = tree_nodes(node, n_levels, indptr, indices)
+    n_own, n_boundary = np.diff(nodes.first), np.diff(nodes.start)
+    subtrees = side_by_side(n_levels, len(node))
+    inside = {number for begin, end in subtrees for number in range(begin, end)}
+    above = [(number, number + 1) for number in range(len(n_own)) if number not in inside]
+    update_start, n_updates = stacked_places(nodes.children, n_boundary**2, [*subtrees, *above])
+    carried_start, n_carried = stacked_places(nodes.children, n_boundary, [*subtrees, *above])
     return Tree(
+        **vars(nodes),
         indptr=indptr,
         indices=indices,
-        order=order,
-        number=number,
-        first=first,
-        children=children,
-        start=start,
-        boundary=boundary,
-        parent_row=parent_row,
         block_start=np.append(0, np.cumsum(n_own * (n_own + n_boundary))),
         update_start=update_start,
         n_updates=n_updates,
@@ -215,47 +237,17 @@ def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, 
     )
 
 
-def _subtrees(n_levels: int, n_unknowns: int) -> list[tuple[int, int]]:
-    """The ranges of nodes of a few large subtrees, in the order in which a full tree is numbered depth first.
-
-    They depend on the matrix alone, not on the threads that there are: neither do rounding errors.
-    """
-    depth = min(MOST_SUBTREES, n_levels - 1, max(0, int(n_unknowns / SUBTREE).bit_length()))
-    subtrees, begin = [], 0
-    for number in range(1, 2**depth + 1):
-        subtrees.append((begin, begin + 2 ** (n_levels - depth) - 1))
-        begin = subtrees[-1][1] + (number & -number).bit_length() - 1  # behind it come the nodes that it completes
-    return subtrees
-
-
-def _stacks(children: np.ndarray, sizes: np.ndarray, ranges: list[tuple[int, int]]) -> tuple[np.ndarray, int]:
-    """Where the result of each node starts, of these sizes, and the size of all; each range of nodes has its own place.
-
-    In a range, a node's result waits until its parent takes it: when a node is done, its children's results are the
-    last two that wait, and its own takes their place.
-    """
-    place, length, left = np.zeros(len(sizes), dtype=np.int64), sizes.tolist(), children[:, 0].tolist()
-    end = 0
-    for first, last in ranges:
-        top = end
-        for n in range(first, last):
-            place[n] = top if left[n] < first else place[left[n]]
-            top = int(place[n]) + length[n]
-            end = max(end, top)
-    return place, end
-
-
 def _eliminate_alone(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor, team: Team) -> int:
     """Write D, E and the complement of a front; of both only the upper triangle counts. Its negative pivots."""
     n_own, n_bound = len(block), len(update)
     pivot, coupling = front[:n_own, :n_own].triu(), front[:n_own, n_own:]
-    inverse, n_negative = invert((pivot + pivot.triu(1).T)[None])
-    block[:, :n_own] = inverse[0]
+    inverse, n_negative = _invert(pivot + pivot.triu(1).T)
+    block[:, :n_own] = inverse
     elimination, below = block[:, n_own:], front[n_own:, n_own:]
     pieces = [slice(begin, begin + AT_ONCE) for begin in range(0, n_bound, AT_ONCE)]
 
     def eliminate(piece: slice) -> None:
-        elimination[:, piece] = -(inverse[0] @ coupling[:, piece])
+        elimination[:, piece] = -(inverse @ coupling[:, piece])
 
     def complement(piece: slice) -> None:
         behind = slice(piece.start, None)
@@ -264,3 +256,18 @@ def _eliminate_alone(front: torch.Tensor, block: torch.Tensor, update: torch.Ten
     team.each(eliminate, pieces)
     team.each(complement, pieces)
     return n_negative
+
+
+def _invert(pivot: torch.Tensor) -> tuple[torch.Tensor, int]:
+    """The inverse of a symmetric block (S, S), and its number of negative eigenvalues."""
+    factor, failed = torch.linalg.cholesky_ex(pivot)
+    if not failed:
+        return torch.cholesky_inverse(factor), 0
+    factor, order, failed = torch.linalg.ldl_factor_ex(pivot)
+    if failed:
+        raise SingularMatrixError(SINGULAR)
+    inverse = torch.linalg.ldl_solve(factor, order, torch.eye(len(pivot), dtype=pivot.dtype))
+    # Bunch & Kaufman's pivots: a 1×1 one counts by its sign, a 2×2 one (marked by a negative index) has one eigenvalue
+    # of either sign
+    n_negative = ((order > 0) & (factor.diagonal() < 0)).sum() + (order < 0).sum() // 2
+    return (inverse + inverse.T) / 2, int(n_negative)

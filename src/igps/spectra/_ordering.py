@@ -1,6 +1,6 @@
 """The order in which the unknowns of a sparse symmetric matrix are eliminated: nested dissection (George 1973).
 
-It is the first step of `factorization`. Only the pattern of the matrix is read.
+It is the first step of a factorization, see `_multifrontal`. Only the pattern of the matrix is read.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
-from igps._compiled import is_available
+from igps._compiled import compiled
 from igps.spectra._checks import canonical
 
 # A part of about so many vertices is not split any more: fewer make more and smaller products, more make fuller fronts
@@ -34,7 +34,7 @@ def hop_coordinates(graph: sparse.csr_array, n_landmarks: int = 3) -> np.ndarray
 
 
 def checked_graph(matrix: sparse.csr_array, coordinates: np.ndarray | None) -> tuple[sparse.csr_array, np.ndarray]:
-    """The matrix with sorted entries, and coordinates for its vertices; the arguments are those of `symbolic.dissect`.
+    """The matrix with sorted entries, and coordinates for its vertices; the arguments are those of `analyse`.
 
     Raises:
         ValueError: the pattern is not symmetric or lacks diagonal entries, or coordinates do not fit it.
@@ -57,93 +57,93 @@ def checked_graph(matrix: sparse.csr_array, coordinates: np.ndarray | None) -> t
 def nested_dissection(graph: sparse.csr_array, coordinates: np.ndarray, leaf_size: int) -> tuple[np.ndarray, int]:
     """The tree node of each vertex, numbered as in a heap (root 0, children 2i+1 and 2i+2), and the number of levels.
 
-    Each part is cut across the coordinate, and at the place within a window around the median, where the
-    separator is smallest. Sweeping the cut along the sorted vertices, the separator on the left are the
-    vertices before the cut with a neighbour behind it. Their number at all places is a difference of two counts, so
-    that a level costs a few sorts, whatever its number of parts.
+    Each part is cut across the coordinate, and at the place within a window around the median, where the separator is
+    smallest. As the cut moves along the sorted vertices, the separator on its left are the vertices before it with a
+    neighbour behind it. Their number is a difference of two counts, known at all places after one pass.
     """
     n_vertices = graph.shape[0]
     depth = max(0, int(np.ceil(np.log2(n_vertices / leaf_size))))
     orders = [np.argsort(column, kind="stable") for column in coordinates.T]
-    if is_available():
-        from igps.spectra import _loops as loops
-
-        indptr, indices = (array.astype(np.int32, copy=False) for array in (graph.indptr, graph.indices))
-        return loops.dissect(np.stack(orders), indptr, indices, depth, CUT_WINDOW), depth + 1
-    node = np.full(n_vertices, -1)
-    part = np.zeros(n_vertices, dtype=np.int32)
-    rows = np.repeat(np.arange(n_vertices), np.diff(graph.indptr))
-    columns = graph.indices
-    for level in range(depth):
-        inside = node < 0
-        orders = [_sorted_by_part(order[inside[order]], part) for order in orders]
-        behind, separator = _best_cuts(orders, part, rows, columns, 2**level)
-        node[separator] = 2**level - 1 + part[separator]
-        part = 2 * part + behind
-        kept = (part[rows] == part[columns]) & (node[rows] < 0) & (node[columns] < 0)
-        rows, columns = rows[kept], columns[kept]
-    return np.where(node < 0, 2**depth - 1 + part, node), depth + 1
+    indptr, indices = (array.astype(np.int32, copy=False) for array in (graph.indptr, graph.indices))
+    return _dissect(np.stack(orders), indptr, indices, depth, CUT_WINDOW), depth + 1
 
 
-def _sorted_by_part(order: np.ndarray, part: np.ndarray) -> np.ndarray:
-    keys = part[order]
-    # a stable sort of 16-bit integers is a radix sort
-    return order[np.argsort(keys.astype(np.int16) if keys.max(initial=0) < 2**15 else keys, kind="stable")]
+@compiled()
+def _dissect(orders: np.ndarray, indptr: np.ndarray, indices: np.ndarray, depth: int, window: float) -> np.ndarray:
+    """The node of each vertex, part by part. The orders (d, V), vertices sorted by each coordinate, are overwritten.
 
-
-def _best_cuts(
-    orders: list[np.ndarray], part: np.ndarray, rows: np.ndarray, columns: np.ndarray, n_parts: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which vertices lie behind the cut of their part, and which form its separator: two (V,) masks.
-
-    Args:
-        orders: the vertices still to be placed, sorted by part and then by one coordinate; one array per coordinate.
-        part: (V,) part of each vertex.
-        rows, columns: edges within the parts, sorted by row, both directions.
-        n_parts: number of parts, some of which may be empty.
+    Outside of the part at hand a vertex has rank −1: the largest as an unsigned number, so that neither the highest
+    rank among neighbours nor the lowest asks where they are.
     """
-    size = np.bincount(part[orders[0]], minlength=n_parts)
-    filled = np.flatnonzero(size)
-    start = np.cumsum(size) - size
-    place = np.arange(len(orders[0]))
-    off_centre = np.abs(place - np.repeat(start + size / 2, size))
-    # a cut at place t has t − start vertices before it; the window always holds a cut with some vertex on both sides
-    allowed = (off_centre <= np.maximum(CUT_WINDOW * size, 1).repeat(size)) & (place > np.repeat(start, size))
-    first_edge = np.flatnonzero(np.diff(rows, prepend=-1))
-    with_edges = rows[first_edge]
-
-    behind = np.zeros(len(part), dtype=bool)
-    separator = np.zeros(len(part), dtype=bool)
-    fewest = np.full(n_parts, len(place) + 1)
-    for order in orders:
-        rank = np.zeros(len(part), dtype=np.int64)
-        rank[order] = place
-        foremost, rearmost = rank.copy(), rank.copy()  # place of the first and the last of a vertex and its neighbours
-        if len(rows):
-            neighbours = rank[columns]
-            foremost[with_edges] = np.minimum(foremost[with_edges], np.minimum.reduceat(neighbours, first_edge))
-            rearmost[with_edges] = np.maximum(rearmost[with_edges], np.maximum.reduceat(neighbours, first_edge))
-        n_before = place - _count_below(rearmost[order])  # before the cut, less those wholly before it
-        n_behind = _count_below(foremost[order]) - place
-        n_cut = np.where(allowed, np.minimum(n_before, n_behind), len(place))
-        cut = np.zeros(n_parts, dtype=np.int64)
-        cut[filled] = np.minimum.reduceat(n_cut * len(place) + place, start[filled]) % len(place)
-        better = n_cut[cut] < fewest
-        better[size == 0] = False
-        fewest = np.where(better, n_cut[cut], fewest)
-
-        vertices = order[np.repeat(better, size)]
-        cuts = cut[part[vertices]]
-        behind[vertices] = rank[vertices] >= cuts
-        separator[vertices] = np.where(
-            (n_before <= n_behind)[cuts],
-            (rank[vertices] < cuts) & (rearmost[vertices] >= cuts),
-            (rank[vertices] >= cuts) & (foremost[vertices] < cuts),
-        )
-    return behind, separator
-
-
-def _count_below(values: np.ndarray) -> np.ndarray:
-    """How many of the values, integers in [0, len), are below 0, 1, …, len − 1."""
-    counts = np.bincount(values, minlength=len(values))
-    return np.cumsum(counts) - counts
+    n_coordinates, n_vertices = orders.shape
+    node = np.empty(n_vertices, np.int64)
+    rank = np.full(n_vertices, -1, np.int32)
+    low, high = np.empty(n_vertices, np.int32), np.empty(n_vertices, np.int32)
+    whole_before, touched_before = np.empty(n_vertices + 1, np.int32), np.empty(n_vertices + 1, np.int32)
+    side = np.empty(n_vertices, np.int8)
+    behind = np.empty(n_vertices, orders.dtype)
+    begin, end = np.zeros(1, np.int64), np.full(1, n_vertices, np.int64)
+    for level in range(depth):
+        next_begin, next_end = np.zeros(2 ** (level + 1), np.int64), np.zeros(2 ** (level + 1), np.int64)
+        for part in range(2**level):
+            first, size = begin[part], end[part] - begin[part]
+            if size == 0:
+                continue
+            here = 2**level - 1 + part
+            fewest = n_vertices + 1
+            for c in range(n_coordinates):
+                order = orders[c, first : first + size]
+                for i in range(size):
+                    rank[order[i]] = i
+                whole_before[: size + 1] = 0
+                touched_before[: size + 1] = 0
+                for i in range(size):
+                    lowest, highest = np.uint32(i), np.int32(i)
+                    for k in range(np.uint64(indptr[order[i]]), np.uint64(indptr[order[i] + 1])):
+                        of_neighbour = rank[np.uint32(indices[k])]
+                        lowest, highest = min(lowest, np.uint32(of_neighbour)), max(highest, of_neighbour)
+                    low[i], high[i] = lowest, highest
+                    whole_before[highest + 1] += 1
+                    touched_before[lowest + 1] += 1
+                cut, cut_size, cut_before = 0, n_vertices, True
+                before = after = 0
+                for i in range(size):
+                    before += whole_before[i]
+                    after += touched_before[i]
+                    if i > 0 and abs(i - size / 2) <= max(window * size, 1.0):
+                        n_before, n_behind = i - before, after - i
+                        if min(n_before, n_behind) < cut_size:
+                            cut, cut_size, cut_before = i, min(n_before, n_behind), n_before <= n_behind
+                if cut_size >= fewest:
+                    continue
+                fewest = cut_size
+                for i in range(size):
+                    if i < cut:
+                        side[order[i]] = 2 if cut_before and high[i] >= cut else 0
+                    else:
+                        side[order[i]] = 2 if not cut_before and low[i] < cut else 1
+            for i in range(first, first + size):
+                rank[orders[0, i]] = -1
+            for c in range(n_coordinates):
+                order = orders[c, first : first + size]
+                n_before = n_behind = 0
+                for i in range(size):
+                    vertex = order[i]
+                    if side[vertex] == 0:
+                        order[n_before] = vertex
+                        n_before += 1
+                    elif side[vertex] == 1:
+                        behind[n_behind] = vertex
+                        n_behind += 1
+                    elif c == 0:
+                        node[vertex] = here
+                for i in range(n_behind):
+                    order[n_before + i] = behind[i]
+                if c == 0:
+                    next_begin[2 * part], next_end[2 * part] = first, first + n_before
+                    next_begin[2 * part + 1], next_end[2 * part + 1] = first + n_before, first + n_before + n_behind
+        begin, end = next_begin, next_end
+    for part in range(2**depth):
+        for i in range(begin[part], end[part]):
+            node[orders[0, i]] = 2**depth - 1 + part
+    return node

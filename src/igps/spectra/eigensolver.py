@@ -6,7 +6,7 @@ Lewis & Simon 1994):
 1. With y = M^½ φ the problem is A y = λ y, A = M^-½ L M^-½, and orthogonality is Euclidean. Lengths are measured in
    units of √area, so that nothing depends on the scale of the coordinates.
 2. Weyl's law N(λ) ≈ λ · area / 4π places a shift σ where about SHIFT_RANK of the wanted eigenvalues lie below it.
-   (A − σI)⁻¹ is applied by `direct`. It maps λ to θ = 1/(λ − σ), so that the wanted eigenvalues lie at both ends
+   (A − σI)⁻¹ is applied by `_multifrontal`. It maps λ to θ = 1/(λ − σ), so that the wanted eigenvalues lie at both ends
    of the spectrum, and those below σ have nothing unwanted on their side. The basis that is needed is a third smaller
    than with a shift below the spectrum. Bands with a shift each (manifold harmonics, Vallet & Lévy 2008) would shrink
    it further, but cost a factorization each and leave vectors of neighbouring bands to be made orthogonal.
@@ -35,12 +35,11 @@ from scipy import sparse
 from scipy.linalg import eigh
 from scipy.sparse.linalg import ArpackError, eigsh
 
-from igps._compiled import is_available
+from igps._compiled import compiled
 from igps._threads import one_thread
 from igps.spectra._checks import ROUNDING, checked_mass, checked_stiffness
-from igps.spectra._direct import analyse
-from igps.spectra._factorization import SingularMatrixError
 from igps.spectra._lanczos import ConvergenceError, gap_behind, lanczos
+from igps.spectra._multifrontal import SingularMatrixError, analyse
 
 logger = logging.getLogger(__name__)
 
@@ -223,7 +222,9 @@ def _residual(
         ConvergenceError: one is above the tolerance though rounding allows a smaller one, or above RESIDUAL_LIMIT.
     """
     largest = 0.0
-    defects, corrections = _defects(matrix, eigenvalues, vectors)
+    defects, corrections = _defects(
+        matrix.data, matrix.indptr, matrix.indices, eigenvalues, np.ascontiguousarray(vectors)
+    )
     for start in range(0, len(eigenvalues), 64):
         part = slice(start, start + 64)
         values = eigenvalues[part]
@@ -242,17 +243,21 @@ def _residual(
     return largest, corrections
 
 
-def _defects(matrix: sparse.csr_array, eigenvalues: np.ndarray, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(K,) lengths of A y − λ y and (K,) its products with y."""
-    if is_available():
-        from igps.spectra import _loops as loops
-
-        return loops.defects(matrix.data, matrix.indptr, matrix.indices, eigenvalues, np.ascontiguousarray(vectors))
-    pieces = [slice(start, start + 64) for start in range(0, len(eigenvalues), 64)]
-    lengths, products = [], []
-    for piece in pieces:  # to keep the memory small
-        y = np.ascontiguousarray(vectors[:, piece])
-        defect = matrix @ y - y * eigenvalues[piece]
-        lengths.append(np.linalg.norm(defect, axis=0))
-        products.append(np.einsum("vk,vk->k", defect, y))
-    return np.concatenate(lengths), np.concatenate(products)
+@compiled()
+def _defects(
+    values: np.ndarray, indptr: np.ndarray, indices: np.ndarray, eigenvalues: np.ndarray, vectors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(K,) lengths of A y − λ y and (K,) its products with y, for a csr matrix and vectors (V, K)."""
+    n_vertices, n_vectors = vectors.shape
+    defect, squares, products = np.empty(n_vectors), np.zeros(n_vectors), np.zeros(n_vectors)
+    for i in range(n_vertices):
+        for c in range(n_vectors):
+            defect[c] = -eigenvalues[c] * vectors[i, c]
+        for k in range(indptr[i], indptr[i + 1]):
+            value, j = values[k], indices[k]
+            for c in range(n_vectors):
+                defect[c] += value * vectors[j, c]
+        for c in range(n_vectors):
+            squares[c] += defect[c] * defect[c]
+            products[c] += defect[c] * vectors[i, c]
+    return np.sqrt(squares), products

@@ -1,21 +1,15 @@
-"""Products in tiles, and inverses by them, against NumPy's."""
+"""Pivot blocks inverted by the compiled loops, against NumPy."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from igps._compiled import is_available
-
-pytestmark = pytest.mark.skipif(not is_available(), reason="needs numba, the extra [fast]")
-
-SHAPES = [(1, 1, 1), (6, 8, 5), (7, 9, 3), (13, 7, 20), (5, 1, 40), (30, 31, 30), (12, 12, 0), (0, 8, 4), (2, 16, 1)]
+from igps.spectra._fronts import AT_ONCE, invert_front
 
 
 def invert(matrix: np.ndarray) -> tuple[int, np.ndarray]:
-    """What `loops` says of a pivot block: its negative eigenvalues, and its inverse."""
-    from igps.spectra._loops import AT_ONCE, invert_front
-
+    """What the loops say of a pivot block: its negative eigenvalues, and its inverse."""
     n = len(matrix)
     width = -(-n // AT_ONCE) * AT_ONCE
     front = np.full((n, n + 3), np.nan)
@@ -24,40 +18,6 @@ def invert(matrix: np.ndarray) -> tuple[int, np.ndarray]:
     strips = [np.full(AT_ONCE * (width + AT_ONCE), np.nan) for _ in range(2)]
     n_negative = invert_front(inverse, front.ravel(), n, n + 3, width, copy, room, *strips)
     return n_negative, inverse.reshape(n, width)[:, :n]
-
-
-@pytest.mark.parametrize("keep", [True, False])
-@pytest.mark.parametrize("transposed", [True, False])
-@pytest.mark.parametrize("shape", SHAPES)
-def test_a_product_in_tiles(shape: tuple[int, int, int], transposed: bool, keep: bool) -> None:
-    """Between other numbers, which stay as they are."""
-    from igps.spectra._tiles import product
-
-    m, n, k = shape
-    rng = np.random.default_rng(0)
-    a, x, source = rng.normal(size=(k, m)), rng.normal(size=(k, n + 2)), rng.normal(size=(m, n + 1))
-    before = rng.normal(size=(m + 2, n + 5))
-    out = before.copy()
-    laid_out = np.ascontiguousarray(a.T) if transposed else a
-    strides = (1, k) if transposed else (m, 1)
-    product(
-        shape, -0.5, (laid_out.ravel(), 0, *strides), (x.ravel(), 1, n + 2), keep, (source.ravel(), 0, n + 1),
-        (out.ravel(), n + 5 + 3, n + 5),
-    )  # fmt: skip
-    expected = before.copy()
-    expected[1 : m + 1, 3 : n + 3] = keep * source[:, :n] - 0.5 * a.T @ x[:, 1 : n + 1]
-    np.testing.assert_allclose(out, expected, rtol=0, atol=1e-13)
-
-
-def test_a_product_of_whole_tiles_may_be_added_in_place() -> None:
-    from igps.spectra._tiles import product
-
-    rng = np.random.default_rng(0)
-    a, x, out = rng.normal(size=(5, 9)), rng.normal(size=(5, 24)), rng.normal(size=(9, 24))
-    expected = out + a.T @ x
-    whole = out.ravel(), 0, 24
-    product((9, 24, 5), 1.0, (a.ravel(), 0, 9, 1), (x.ravel(), 0, 24), True, whole, whole)
-    np.testing.assert_allclose(out, expected, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 8, 9, 26, 63, 120])

@@ -1,0 +1,281 @@
+"""Products of small or long matrices, where they are faster than with a BLAS.
+
+A BLAS is made for matrices that are large both ways: it first copies its operands into an order of its own. Two kinds
+of products of the eigensolver are not, and take most of its time.
+
+*Fronts of some tens of unknowns, and solves with few right-hand sides* (`product`). A tile of the result, ROWS by
+COLUMNS, stays in the processor's registers until it is complete, and takes a third of the time. Numba's compiler does
+not find this by itself: with loops that it arranges over rows of four, all of `eigenpairs` takes 1.9 times as long at
+10,000 vertices. So the tile is written in LLVM's own words (`_tile`); everything around it is plain Numba.
+
+*A few long rows with many* (`overlaps`, `subtract`, `combinations`), of which the Krylov basis is made. On AMD's
+processors compiled loops take down to half the time of PyTorch's BLAS. On Intel's with AVX-512, for which MKL is made,
+they take up to twice its time, and all of `eigenpairs` 1.14 times. So the processor decides (`loops_beat_blas`).
+"""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from igps._compiled import SUMS, Lazy, compiled
+
+Real = TypeVar("Real", np.float32, np.float64)
+Four = tuple[float, float, float, float]
+
+# Of a tile: as many sums as the registers of AVX2 hold, beside what they are made of
+ROWS, COLUMNS = 6, 8
+# Columns of a few rows that the processor's second cache holds, and sums of as many rows that the first one holds
+CHUNK, STRIP = 4096, 512
+# In a tuple for `product` a plain 0 or 1 would be part of its type, for each of which Numba compiles once more
+ZERO, ONE = cast(int, np.int64(0)), cast(int, np.int64(1))
+
+Rows = tuple[np.ndarray, int, int]
+"""A matrix in a flat array: where it begins, and how far its rows lie apart."""
+Strided = tuple[np.ndarray, int, int, int]
+"""The same, and how far its columns lie apart."""
+
+
+@cache
+def loops_beat_blas() -> bool:
+    """Whether compiled loops are faster than PyTorch's BLAS at products of a few long rows with many."""
+    from llvmlite import binding
+
+    wide = torch.backends.mkl.is_available() and binding.get_host_cpu_features().get("avx512f", False)
+    return not wide or binding.get_host_cpu_name().startswith("znver")
+
+
+def overlaps(rows: torch.Tensor, others: torch.Tensor, piece: slice) -> torch.Tensor:
+    """The products (n, m) of rows (n, V) with others (m, V), over a piece of the columns."""
+    if loops_beat_blas():
+        return torch.from_numpy(overlaps_by_loops(rows.numpy(), others.numpy(), piece.start, piece.stop))
+    return (others[:, piece] @ rows[:, piece].T).T  # the many first: MKL is faster so
+
+
+def subtract(rows: torch.Tensor, factors: torch.Tensor, others: torch.Tensor, piece: slice) -> None:
+    """Take factors (n, m) times others from rows, in a piece of the columns; in the precision of the others."""
+    if loops_beat_blas():
+        subtract_by_loops(rows.numpy(), factors.numpy(), others.numpy(), piece.start, piece.stop)
+    else:
+        rows[:, piece].sub_(factors @ others[:, piece])
+
+
+def combinations(rows: torch.Tensor, coefficients: torch.Tensor, piece: slice) -> np.ndarray:
+    """The products (n, K) of n columns, a piece of rows (m, V), with coefficients (m, K)."""
+    if not loops_beat_blas():
+        return (coefficients.T @ rows[:, piece]).numpy().T
+    shape = piece.stop - piece.start, coefficients.shape[1], len(rows)
+    found = np.empty(shape[:2])
+    columns = rows.numpy().ravel(), piece.start, rows.shape[1], 1
+    out = found.ravel(), 0, shape[1]
+    product(shape, 1.0, columns, (coefficients.numpy().ravel(), 0, shape[1]), False, out, out)
+    return found
+
+
+def _tile(n_columns: int) -> Any:
+    """A function for one tile of `_product`, ROWS rows of so many numbers, each row one of LLVM's vectors.
+
+    Of fewer rows the last stands in for the others: it is computed and written several times.
+    """
+    from llvmlite import ir
+    from numba import types
+    from numba.core import cgutils
+    from numba.extending import intrinsic
+
+    number, whole = ir.DoubleType(), ir.IntType(64)
+    vector = ir.VectorType(number, n_columns) if n_columns > 1 else number
+    fused = ("contract",)
+
+    def tile(
+        context: Any,
+        a: Any, a_at: Any, a_step: Any, a_stride: Any,
+        x: Any, x_at: Any, x_step: Any,
+        keep: Any, source: Any, source_at: Any, source_step: Any,
+        out: Any, out_at: Any, out_step: Any,
+        n_rows: Any, n_terms: Any, factor: Any,
+    ) -> Any:  # fmt: skip
+        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            names = ("a", "a_at", "a_step", "a_stride", "x", "x_at", "x_step", "keep", "source", "source_at",
+                     "source_step", "out", "out_at", "out_step", "n_rows", "n_terms", "factor")  # fmt: skip
+            given = dict(zip(names, values, strict=True))
+            for kind, name in zip(signature.args, names, strict=True):
+                if isinstance(kind, types.Array):
+                    given[name] = context.make_array(kind)(context, builder, given[name]).data
+
+            def place(name: str, offset: Any) -> Any:
+                return builder.gep(given[name], [builder.add(given[name + "_at"], offset)])
+
+            def spread(value: Any) -> Any:
+                """The number in all places of a vector."""
+                if n_columns == 1:
+                    return value
+                one = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.IntType(32)(0))
+                return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(ir.IntType(32), n_columns), None))
+
+            def row(name: str, number_of_row: Any) -> Any:
+                at = place(name, builder.mul(number_of_row, given[name + "_step"]))
+                return builder.bitcast(at, vector.as_pointer())
+
+            last = builder.sub(given["n_rows"], whole(1))
+            rows = [builder.select(builder.icmp_signed("<", whole(i), last), whole(i), last) for i in range(ROWS)]
+            columns_of_a = [place("a", builder.mul(i, given["a_stride"])) for i in rows]
+            sums = [cgutils.alloca_once_value(builder, ir.Constant(vector, None)) for _ in rows]
+            with cgutils.for_range(builder, given["n_terms"]) as loop:
+                of_x = builder.load(row("x", loop.index), align=8)
+                offset = builder.mul(loop.index, given["a_step"])
+                for column, total in zip(columns_of_a, sums, strict=True):
+                    term = builder.fmul(spread(builder.load(builder.gep(column, [offset]))), of_x, flags=fused)
+                    builder.store(builder.fadd(builder.load(total), term, flags=fused), total)
+            factor = spread(given["factor"])
+            products = [builder.fmul(builder.load(total), factor, flags=fused) for total in sums]
+            with builder.if_else(given["keep"]) as (added, alone):
+                with added:
+                    kept = [builder.load(row("source", i), align=8) for i in rows]
+                    for i, of_source, found in zip(rows, kept, products, strict=True):
+                        builder.store(builder.fadd(of_source, found, flags=fused), row("out", i), align=8)
+                with alone:
+                    for i, found in zip(rows, products, strict=True):
+                        builder.store(found, row("out", i), align=8)
+            return context.get_dummy_value()
+
+        i64 = types.int64
+        arguments = (
+            a, i64, i64, i64, x, i64, i64, types.boolean, source, i64, i64, out, i64, i64, i64, i64, types.float64,
+        )  # fmt: skip
+        return types.void(*arguments), generate
+
+    return intrinsic(tile)
+
+
+tile: Any = Lazy(partial(_tile, COLUMNS))
+narrow_tile: Any = Lazy(partial(_tile, 1))
+
+
+@compiled()
+def product(
+    shape: tuple[int, int, int],
+    factor: float,
+    a: Strided,
+    x: Rows,
+    keep: bool,
+    source: Rows,
+    out: Rows,
+) -> None:
+    """out ← factor · Aᵀ X, plus the source if it is to be kept; shape (m, n, k) of out (m, n) and of A and X, k rows.
+
+    Rows of n numbers are written once or twice: ``out`` may not be the source, unless n is a multiple of COLUMNS.
+    """
+    m, n, k = shape
+    for i in range(0, m, ROWS):
+        n_rows = min(ROWS, m - i)
+        if n < COLUMNS:
+            for j in range(n):
+                narrow_tile(
+                    a[0], a[1] + i * a[3], a[2], a[3], x[0], x[1] + j, x[2], keep, source[0],
+                    source[1] + i * source[2] + j, source[2], out[0], out[1] + i * out[2] + j, out[2], n_rows, k,
+                    factor,
+                )  # fmt: skip
+        for begin in range(0, n if n >= COLUMNS else 0, COLUMNS):
+            j = min(begin, n - COLUMNS)
+            tile(
+                a[0], a[1] + i * a[3], a[2], a[3], x[0], x[1] + j, x[2], keep, source[0],
+                source[1] + i * source[2] + j, source[2], out[0], out[1] + i * out[2] + j, out[2], n_rows, k, factor,
+            )  # fmt: skip
+
+
+@compiled()
+def overlaps_by_loops(a: NDArray[np.float64], b: NDArray[np.float64], begin: int, end: int) -> NDArray[np.float64]:
+    """The products (n, m) of rows (n, V) with rows (m, V), over the columns from ``begin`` to ``end``."""
+    found = np.zeros((len(a), len(b)))
+    for start in range(begin, end, CHUNK):
+        stop = min(start + CHUNK, end)
+        for j in range(0, len(b), 6):
+            for i in range(0, len(a), 4):
+                sums = four_by_six(a, i, b, j, start, stop)
+                for column in range(min(6, len(b) - j)):
+                    for row in range(min(4, len(a) - i)):
+                        found[i + row, j + column] += sums[column][row]
+    return found
+
+
+@compiled(fastmath=SUMS)
+def four_by_six(
+    a: NDArray[np.float64], i: int, b: NDArray[np.float64], j: int, begin: int, end: int
+) -> tuple[Four, Four, Four, Four, Four, Four]:
+    """The products of four rows of one array, from ``i`` on, with each of six of another; the last stands in for more.
+
+    By hand, as only sums that have names are kept in registers.
+    """
+    last, last_b = len(a) - 1, len(b) - 1
+    a0, a1, a2, a3 = a[i], a[min(i + 1, last)], a[min(i + 2, last)], a[min(i + 3, last)]
+    b0, b1, b2 = b[j], b[min(j + 1, last_b)], b[min(j + 2, last_b)]
+    b3, b4, b5 = b[min(j + 3, last_b)], b[min(j + 4, last_b)], b[min(j + 5, last_b)]
+    s0 = s1 = s2 = s3 = s4 = s5 = (0.0, 0.0, 0.0, 0.0)
+    # An unsigned index is one that need not be counted from the end.
+    for v in range(np.uint64(begin), np.uint64(end)):
+        x = a0[v], a1[v], a2[v], a3[v]
+        s0, s1, s2 = added(s0, x, b0[v]), added(s1, x, b1[v]), added(s2, x, b2[v])
+        s3, s4, s5 = added(s3, x, b3[v]), added(s4, x, b4[v]), added(s5, x, b5[v])
+    return s0, s1, s2, s3, s4, s5
+
+
+@compiled(fastmath=SUMS)
+def added(sums: Four, x: Four, y: float) -> Four:
+    """Sums with y times x added."""
+    return sums[0] + x[0] * y, sums[1] + x[1] * y, sums[2] + x[2] * y, sums[3] + x[3] * y
+
+
+@compiled()
+def subtract_by_loops(
+    rows: NDArray[np.float64], factors: NDArray[Real], others: NDArray[Real], begin: int, end: int
+) -> None:
+    """Take (n, m) times (m, V) from rows (n, V), in the columns from ``begin`` to ``end``.
+
+    The product is computed in the precision of the others, the difference in that of the rows.
+    """
+    n, m = factors.shape
+    padded = np.zeros((-(-n // 4) * 4, -(-m // 4) * 4), others.dtype)
+    for i in range(n):
+        for j in range(m):
+            padded[i, j] = factors[i, j]
+    sums = np.empty((len(padded), STRIP), others.dtype)
+    for start in range(begin, end, STRIP):
+        width = min(STRIP, end - start)
+        sums[:] = 0
+        for j in range(0, m, 4):
+            for i in range(0, n, 4):
+                add_four(sums[i : i + 4], padded[i : i + 4, j : j + 4], others, j, start, width)
+        for i in range(n):
+            for v in range(width):
+                rows[i, start + v] -= sums[i, v]
+
+
+@compiled(fastmath=SUMS)
+def add_four(
+    sums: NDArray[Real], factors: NDArray[Real], others: NDArray[Real], j: int, begin: int, width: int
+) -> None:
+    """Add to four rows of sums four of the others, from ``j`` on, times factors (4, 4); beyond the last, by 0."""
+    last = len(others) - 1
+    y0, y1 = others[j, begin:], others[min(j + 1, last), begin:]
+    y2, y3 = others[min(j + 2, last), begin:], others[min(j + 3, last), begin:]
+    f0 = factors[0, 0], factors[0, 1], factors[0, 2], factors[0, 3]
+    f1 = factors[1, 0], factors[1, 1], factors[1, 2], factors[1, 3]
+    f2 = factors[2, 0], factors[2, 1], factors[2, 2], factors[2, 3]
+    f3 = factors[3, 0], factors[3, 1], factors[3, 2], factors[3, 3]
+    s0, s1, s2, s3 = sums[0], sums[1], sums[2], sums[3]
+    for v in range(np.uint64(width)):
+        y = y0[v], y1[v], y2[v], y3[v]
+        s0[v] += dot(f0, y)
+        s1[v] += dot(f1, y)
+        s2[v] += dot(f2, y)
+        s3[v] += dot(f3, y)
+
+
+@compiled(fastmath=SUMS)
+def dot(x: Four, y: Four) -> float:
+    """Inner product."""
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3]

@@ -1,0 +1,178 @@
+"""The elimination tree of a dissected matrix: which unknowns each node owns, which it touches, and where fronts meet.
+
+Nodes and unknowns are numbered depth first, each node behind its children: in the order of their elimination.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from igps._compiled import compiled
+
+# Unknowns from which a subtree is worth a thread of its own, and the most subtrees, as a power of two
+SUBTREE, MOST_SUBTREES = 2**13, 3
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """The nodes of the tree, N in number, and their vertices.
+
+    Attributes:
+        order, number: (V,) the vertex of each number, the number of each vertex.
+        first: (N + 1,) where each node's own numbers start.
+        children: (N, 2) nodes, or -1.
+        start, boundary: (N + 1,) where each node's boundary starts among all boundaries, sorted numbers each.
+        parent_row: the row of each vertex of a boundary in the front of the node's parent.
+    """
+
+    order: np.ndarray
+    number: np.ndarray
+    first: np.ndarray
+    children: np.ndarray
+    start: np.ndarray
+    boundary: np.ndarray
+    parent_row: np.ndarray
+
+
+def tree_nodes(node: np.ndarray, n_levels: int, indptr: np.ndarray, indices: np.ndarray) -> Nodes:
+    """The nodes of a full binary tree for vertices (V,) assigned to the places of a heap."""
+    n_nodes = 2**n_levels - 1
+    post = np.full(n_nodes, n_nodes - 1)  # the number of each place in the heap
+    children, parent = np.full((n_nodes, 2), -1), np.full(n_nodes, -1)
+    for level in range(n_levels - 1):
+        above = np.arange(2**level - 1, 2 ** (level + 1) - 1)
+        right = post[above] - 1
+        left = right - (2 ** (n_levels - level - 1) - 1)  # before it comes all of the right one's subtree
+        post[2 * above + 1], post[2 * above + 2] = left, right
+        children[post[above]] = np.stack([left, right], axis=1)
+        parent[left] = parent[right] = post[above]
+    of_vertex = post[node]
+    order = np.argsort(of_vertex, kind="stable")
+    number = np.empty_like(order)
+    number[order] = np.arange(len(node))
+    first = np.append(0, np.cumsum(np.bincount(of_vertex, minlength=n_nodes)))
+    start, boundary = _boundaries(first, children, order, number, indptr, indices)
+    owner = np.repeat(np.arange(n_nodes), np.diff(start))
+    boundary = np.sort(owner * len(node) + boundary) - owner * len(node)
+    return Nodes(order, number, first, children, start, boundary, _parent_rows(first, parent, start, boundary))
+
+
+@compiled()
+def _boundaries(
+    first: np.ndarray,
+    children: np.ndarray,
+    order: np.ndarray,
+    number: np.ndarray,
+    indptr: np.ndarray,
+    indices: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where each node's boundary starts, and the boundaries, not sorted.
+
+    A node's boundary is what its own edges reach, and its children's boundaries, less what it owns.
+    """
+    n_nodes = len(children)
+    seen = np.full(len(order), -1, np.int64)
+    start = np.zeros(n_nodes + 1, np.int64)
+    boundary = np.empty(4 * len(order), np.int64)
+    for n in range(n_nodes):
+        stop, end = first[n + 1], start[n]
+        need = end
+        for side in range(2):
+            child = children[n, side]
+            if child >= 0:
+                need += start[child + 1] - start[child]
+        for i in range(first[n], stop):
+            need += indptr[order[i] + 1] - indptr[order[i]]
+        if need > len(boundary):
+            larger = np.empty(2 * need, np.int64)
+            for k in range(end):  # a slice set to a slice takes Numba two seconds to compile
+                larger[k] = boundary[k]
+            boundary = larger
+        for side in range(2):
+            child = children[n, side]
+            if child >= 0:
+                for k in range(start[child], start[child + 1]):
+                    j = boundary[k]
+                    if j >= stop and seen[j] != n:
+                        seen[j] = n
+                        boundary[end] = j
+                        end += 1
+        for i in range(first[n], stop):
+            for k in range(indptr[order[i]], indptr[order[i] + 1]):
+                j = number[indices[k]]
+                if j >= stop and seen[j] != n:
+                    seen[j] = n
+                    boundary[end] = j
+                    end += 1
+        start[n + 1] = end
+    return start, boundary[: start[n_nodes]]
+
+
+@compiled()
+def _parent_rows(first: np.ndarray, parent: np.ndarray, start: np.ndarray, boundary: np.ndarray) -> np.ndarray:
+    """The row of each vertex of a boundary in the front of the node's parent, whose boundary is sorted as well."""
+    rows = np.empty(len(boundary), np.int64)
+    for n in range(len(parent) - 1):
+        p = parent[n]
+        n_own, place = first[p + 1] - first[p], start[p]
+        for k in range(start[n], start[n + 1]):
+            if boundary[k] < first[p + 1]:
+                rows[k] = boundary[k] - first[p]
+                continue
+            while boundary[place] < boundary[k]:
+                place += 1
+            rows[k] = n_own + place - start[p]
+    return rows
+
+
+@compiled()
+def arranged(
+    indptr: np.ndarray, indices: np.ndarray, values: np.ndarray, order: np.ndarray, number: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A csr matrix whose row i and column i are those of ``order[i]`` before; its entries are sorted."""
+    new_indptr, new_indices = np.zeros_like(indptr), np.empty_like(indices)
+    new_values = np.empty_like(values)
+    end = 0
+    for i in range(len(order)):
+        begin = end
+        for k in range(indptr[order[i]], indptr[order[i] + 1]):
+            j, place = number[indices[k]], end
+            while place > begin and new_indices[place - 1] > j:
+                new_indices[place], new_values[place] = new_indices[place - 1], new_values[place - 1]
+                place -= 1
+            new_indices[place], new_values[place] = j, values[k]
+            end += 1
+        new_indptr[i + 1] = end
+    return new_indptr, new_indices, new_values
+
+
+def side_by_side(n_levels: int, n_unknowns: int) -> list[tuple[int, int]]:
+    """The ranges of nodes of a few large subtrees, in the order in which a full tree is numbered depth first.
+
+    They depend on the matrix alone, not on the threads that there are: neither do rounding errors.
+    """
+    depth = min(MOST_SUBTREES, n_levels - 1, max(0, int(n_unknowns / SUBTREE).bit_length()))
+    subtrees, begin = [], 0
+    for number in range(1, 2**depth + 1):
+        subtrees.append((begin, begin + 2 ** (n_levels - depth) - 1))
+        begin = subtrees[-1][1] + (number & -number).bit_length() - 1  # behind it come the nodes that it completes
+    return subtrees
+
+
+def stacked_places(children: np.ndarray, sizes: np.ndarray, ranges: list[tuple[int, int]]) -> tuple[np.ndarray, int]:
+    """Where the result of each node starts, of these sizes, and the size of all; each range of nodes has its own place.
+
+    In a range, a node's result waits until its parent takes it: when a node is done, its children's results are the
+    last two that wait, and its own takes their place.
+    """
+    place, length, left = np.zeros(len(sizes), dtype=np.int64), sizes.tolist(), children[:, 0].tolist()
+    end = 0
+    for first, last in ranges:
+        top = end
+        for n in range(first, last):
+            place[n] = top if left[n] < first else place[left[n]]
+            top = int(place[n]) + length[n]
+            end = max(end, top)
+    return place, end
