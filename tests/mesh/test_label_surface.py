@@ -157,8 +157,8 @@ def test_voxels_that_touch_at_a_corner_are_one_piece() -> None:
 
 
 def test_a_body_at_the_border_is_closed() -> None:
-    mesh = Mesh(*voxel_surface(np.ones((5, 6, 7)))[:2])
-    assert mesh.volume == pytest.approx(5 * 6 * 7, rel=1e-3)
+    mesh = Mesh(*voxel_surface(np.ones((12, 13, 14)))[:2])
+    assert mesh.volume == pytest.approx(12 * 13 * 14, rel=1e-3)
     assert mesh.vertices.min() == pytest.approx(-0.5, abs=0.3)
 
 
