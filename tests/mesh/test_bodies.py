@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from step_files import write_step
 
 from igps.mesh.loading import each_body, list_bodies, load_bodies, load_mesh, read_surface
 from igps.mesh.mesh import MeshError
@@ -154,3 +155,19 @@ def test_what_a_format_does_not_have_is_its_usual_way(tmp_path: Path) -> None:
     trimesh.creation.box().export(tmp_path / "box.stl")
     for bodies in ("labels", "chains", "objects"):
         assert parts(tmp_path / "box.stl", LoadOptions(bodies=bodies)) == [None]
+
+
+@pytest.mark.parametrize(("unit", "scale"), [(".MILLI.", 1.0), ("$", 1000.0)])
+def test_solids_of_a_step_file_are_bodies_in_millimetres(unit: str, scale: float, tmp_path: Path) -> None:
+    """A part of one solid, and one of two; the file is in millimetres or in metres."""
+    path = tmp_path / "parts.step"
+    pair = [((5, 0, 0), (6, 1, 1)), ((10, 0, 0), (12, 2, 2))]
+    write_step(path, {"lid": [((0, 0, 0), (1, 2, 3))], "pair": pair}, unit)
+    bodies = {body.name.partition("#")[2]: body for body in load_bodies(path, OBJECTS)}
+    volumes = {name: body.volume / scale**3 for name, body in bodies.items()}
+    assert volumes == pytest.approx({"lid": 6, "pair": 1, "pair (2)": 8}, rel=1e-6)
+    assert {body.unit for body in bodies.values()} == {"mm"}
+    assert bodies["pair (2)"].vertices.max(axis=0) / scale == pytest.approx([12, 2, 2], rel=1e-6)
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(MeshError, match=r"parts\.step: not readable as STEP"):
+        load_mesh(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 
 import numpy as np
@@ -90,21 +91,21 @@ def test_the_volume_is_kept_by_the_grid_and_by_the_simplification(solid: trimesh
 
 
 def test_a_hole_is_closed_and_a_cup_stays_open() -> None:
-    holed = watertight(*cut_ball(0.9))
+    holed = watertight(*cut_ball(0.9), resolution=64)
     assert holed.volume == pytest.approx(BALL, rel=0.02)
     assert any("opening" in note for note in holed.notes)
-    cup = watertight(*cut_ball(0.3))
+    cup = watertight(*cut_ball(0.3), resolution=64)
     assert_closed(cup)
     assert is_inside(cup, (0, 0, 0), (0, 0, -0.9), (0, 0, -1)) == [False, False, True]
     # A sheet of about a cell.
-    cell = 2 / 96
+    cell = 2 / 64
     assert 0.7 * cell < cup.volume / (2 * np.pi * 1.3) < 1.5 * cell
 
 
 def test_a_missing_base_is_no_leak_beyond_the_bounding_box() -> None:
     surface = trimesh.creation.box((1, 1, 4)).subdivide_to_size(0.2)
     faces = np.asarray(surface.faces)[surface.triangles_center[:, 2] > -1.99]
-    body = watertight(np.asarray(surface.vertices), faces)
+    body = watertight(np.asarray(surface.vertices), faces, resolution=64)
     assert_closed(body)
     assert body.volume == pytest.approx(4, rel=0.03)
     assert np.ptp(body.vertices[:, 2]) == pytest.approx(4, abs=0.05)
@@ -112,15 +113,15 @@ def test_a_missing_base_is_no_leak_beyond_the_bounding_box() -> None:
 
 def test_the_neck_of_a_bottle_is_closed_unless_its_wall_has_two_sides() -> None:
     outer = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.5), (0.2, 1.8), (0.2, 2.2)]
-    assert is_inside(watertight(*turned_profile(outer)), (0, 0, 0.8)) == [True]
+    assert is_inside(watertight(*turned_profile(outer), resolution=48), (0, 0, 0.8)) == [True]
     inner = [(0.14, 2.2), (0.14, 1.75), (0.94, 1.45), (0.94, 0.06), (0.0, 0.06)]
-    vase = watertight(*turned_profile(outer + inner))
+    vase = watertight(*turned_profile(outer + inner), resolution=64)
     assert is_inside(vase, (0, 0, 0.8), (0, 0, 0.03), (0, 0, 2.0), (0.97, 0, 0.8)) == [False, True, False, True]
 
 
 def test_what_is_hidden_is_filled() -> None:
-    body = watertight(*arrays(ball(), ball(0.3, (0.2, 0, 0)), trimesh.creation.box((0.5, 0.4, 0.3))))
-    alone = watertight(*arrays(ball()))
+    body = watertight(*arrays(ball(), ball(0.3, (0.2, 0, 0)), trimesh.creation.box((0.5, 0.4, 0.3))), resolution=64)
+    alone = watertight(*arrays(ball()), resolution=64)
     assert body.volume == pytest.approx(alone.volume, rel=1e-4)
     assert np.linalg.norm(body.vertices, axis=1).min() > 0.98
 
@@ -198,12 +199,12 @@ def test_a_sheet_gets_about_a_cell() -> None:
 
 
 def test_pieces_are_joined_and_specks_dropped() -> None:
-    apart = watertight(*arrays(ball(), ball(0.7, (2.5, 0, 0))))
+    apart = watertight(*arrays(ball(), ball(0.7, (2.5, 0, 0))), resolution=64)
     assert_closed(apart)
     assert apart.volume == pytest.approx(BALL * (1 + 0.7**3), rel=0.03)
     assert any("joined 2 pieces" in note for note in apart.notes)
-    speck = watertight(*arrays(ball(), ball(0.01, (5, 5, 5))))
-    alone = watertight(*arrays(ball()))
+    speck = watertight(*arrays(ball(), ball(0.01, (5, 5, 5))), resolution=48)
+    alone = watertight(*arrays(ball()), resolution=48)
     np.testing.assert_array_equal(speck.vertices, alone.vertices)
 
 
@@ -222,7 +223,7 @@ def test_wires_stay_in_one_piece() -> None:
 def test_point_clouds(with_normals: bool) -> None:
     points = np.random.default_rng(0).standard_normal((6000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    body = watertight(points, normals=points if with_normals else None)
+    body = watertight(points, normals=points if with_normals else None, resolution=64)
     assert_closed(body)
     assert body.volume == pytest.approx(BALL, rel=0.03)
 
@@ -245,8 +246,8 @@ def test_flat_places_have_a_delaunay_triangulation() -> None:
 
 def test_follows_the_surface_when_it_is_moved_and_scaled() -> None:
     vertices, faces = arrays(trimesh.creation.torus(1.0, 0.3))
-    body = watertight(vertices, faces)
-    moved = watertight(vertices * 8 + [16, -32, 64], faces)
+    body = watertight(vertices, faces, resolution=64)
+    moved = watertight(vertices * 8 + [16, -32, 64], faces, resolution=64)
     np.testing.assert_allclose(moved.vertices, body.vertices * 8 + [16, -32, 64], atol=8 * 0.02)
     assert body.volume == pytest.approx(2 * np.pi**2 * 0.09, rel=0.03)
     euler = len(body.vertices) - len(body.faces) // 2
@@ -255,8 +256,8 @@ def test_follows_the_surface_when_it_is_moved_and_scaled() -> None:
 
 def test_many_triangles_are_rounded_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_MANY_FACES", 1000)
-    body = watertight(*arrays(ball(subdivisions=5)))
-    assert np.abs(np.linalg.norm(body.vertices, axis=1) - 1).max() < 0.5 * 2 / 96
+    body = watertight(*arrays(ball(subdivisions=5)), resolution=64)
+    assert np.abs(np.linalg.norm(body.vertices, axis=1) - 1).max() < 0.5 * 2 / 64
     assert body.volume == pytest.approx(BALL, rel=0.01)
 
 
@@ -294,9 +295,46 @@ def test_no_point_of_the_field_is_nearly_on_the_surface(monkeypatch: pytest.Monk
         return fields[-1]
 
     monkeypatch.setattr(module, "level_set", kept)
-    watertight(*arrays(ball()), name="ball")
+    watertight(*arrays(ball()), resolution=48, name="ball")
     (field,) = fields
     smallest = np.abs(field).min()
     assert smallest == pytest.approx(0.02, rel=1e-6)
     # Of a smooth distance a fiftieth of a cell on either side of the surface holds many points.
     assert (np.abs(field) <= 0.0200001).sum() > 50
+
+
+def chain(n: int, gap: float) -> Surface:
+    """Unit balls in a row."""
+    return arrays(*(ball(centre=(gap * i, 0, 0), subdivisions=2) for i in range(n)))
+
+
+@pytest.mark.parametrize("gap", [1.9, 2.1])
+def test_a_chain_of_beads_gets_a_grid_as_fine_as_its_beads_ask_for(gap: float) -> None:
+    """Beads that overlap, and beads that do not touch and are joined."""
+    body = watertight(*chain(60, gap))
+    hidden = max(1 - gap / 2, 0)  # of the area, by the caps inside of other beads
+    assert_closed(body)
+    bead = ball(subdivisions=2)
+    assert body.volume == pytest.approx(60 * bead.volume, rel=0.015)
+    assert body.area == pytest.approx(60 * bead.area * (1 - hidden), rel=0.05)
+    # Between beads it is thin again.
+    near = np.abs(body.vertices[:, 0] - 30.5 * gap) < 0.1
+    assert np.linalg.norm(body.vertices[near, 1:], axis=1).max() < 0.6
+    assert not any("coarse" in note for note in body.notes)
+
+
+def test_a_long_rod_is_as_thick_as_it_was() -> None:
+    rod = trimesh.creation.cylinder(0.005, 1, sections=32)
+    body = watertight(*arrays(rod))
+    assert body.volume == pytest.approx(rod.volume, rel=0.03)
+    assert body.area == pytest.approx(rod.area, rel=0.03)
+
+
+def test_what_stays_coarse_is_told() -> None:
+    """Rods to all sides: there is no room for a finer grid."""
+    rods = [trimesh.creation.cylinder(0.004, 1, sections=12) for _ in range(12)]
+    generator = np.random.default_rng(0)
+    for rod in rods:
+        rod.apply_transform(trimesh.transformations.random_rotation_matrix(generator.random(3)))
+    body = watertight(*arrays(*rods), resolution=32)
+    assert any(re.match(r"coarse: about [01]\.\d cells thick", note) for note in body.notes)

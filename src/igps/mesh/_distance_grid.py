@@ -24,17 +24,9 @@ class Grid:
     shape: tuple[int, int, int]
 
     @classmethod
-    def around(cls, vertices: NDArray[np.float64], faces: NDArray[np.int64], resolution: int, spacing: float) -> Grid:
+    def around(cls, vertices: NDArray[np.float64], faces: NDArray[np.int64], cell: float) -> Grid:
         low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
-        sides = high - low
-        longest = float(sides.max())
-        area = float(face_areas(vertices, faces).sum())
-        # As many cells as the cube, and about as many on the surface as on that of the cube.
-        by_volume = float(np.prod(np.maximum(sides, longest / 1000)) ** (1 / 3)) / resolution
-        by_area = np.sqrt(area / (6 * resolution**2))
-        cell = float(np.clip(max(by_volume, by_area), longest / (2 * resolution), longest / (0.8 * resolution)))
-        cell = max(cell, spacing)
-        counts = np.ceil(sides / cell).astype(int) + 1 + 2 * MARGIN
+        counts = np.ceil((high - low) / cell).astype(int) + 1 + 2 * MARGIN
         # The body in the middle, so that moving it moves the grid.
         origin = (low + high) / 2 - (counts - 1) / 2 * cell
         return cls(origin, cell, (int(counts[0]), int(counts[1]), int(counts[2])))
@@ -44,6 +36,22 @@ class Grid:
 
     def from_cells(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         return points * self.cell + self.origin
+
+
+def cell_sizes(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], resolution: int, spacing: float
+) -> tuple[float, float]:
+    """The usual size of a cell, and the least, with as many cells as a cube, and about as many on the surface.
+
+    The least is smaller for long bodies alone: the usual grid has twice `resolution` along the longest side at most.
+    """
+    corners = vertices[faces]
+    sides = np.ptp(corners.reshape(-1, 3), axis=0)
+    longest, area = float(sides.max()), float(face_areas(vertices, faces).sum())
+    by_volume = float(np.prod(np.maximum(sides, longest / 1000)) ** (1 / 3)) / resolution
+    by_area = float(np.sqrt(area / (6 * resolution**2)))
+    least = max(min(max(by_volume, by_area), longest / (0.8 * resolution)), spacing)
+    return max(least, longest / (2 * resolution)), least
 
 
 def rounded(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from igps._threads import one_thread
-from igps.mesh._tidying import are_specks, places
 from igps.mesh.formats import FORMATS, Format, RawBody, format_of
-from igps.mesh.formats._format import joined
+from igps.mesh.formats._format import joined, pieces
 from igps.mesh.limits import check_memory
 from igps.mesh.mending import mend
 from igps.mesh.mesh import Mesh, MeshError, check_arrays
@@ -185,21 +184,7 @@ def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[Raw
         bodies = list(kind.read(path, replace(options, bodies=how), part if how not in ("whole", "pieces") else None))
         if how == "whole":
             return [joined(bodies)]
-        return _pieces(joined(bodies)) if how == "pieces" else bodies
-
-
-def _pieces(whole: RawBody) -> list[RawBody]:
-    """What is not connected, in the order of the file; specks are left out."""
-    if not len(whole.faces):
-        return [whole]
-    vertices, faces = whole.vertices, whole.faces
-    check_arrays(vertices, faces, "the whole")
-    owner, areas = face_parts(vertices, places(vertices)[faces])  # loose triangles are connected where they meet
-    small = are_specks(areas)
-    notes = (*whole.notes, f"left out {int(small.sum())} specks") if small.any() else whole.notes
-    order = [k for k in np.argsort(np.unique(owner, return_index=True)[1]) if not small[k]]
-    surfaces = [compact(vertices, faces[owner == k]) for k in order]
-    return [replace(whole, vertices=v, faces=f, part=f"piece {i}", notes=notes) for i, (v, f) in enumerate(surfaces, 1)]
+        return pieces(joined(bodies)) if how == "pieces" else bodies
 
 
 def _bodies(kind: Format, options: LoadOptions) -> BodyKind:

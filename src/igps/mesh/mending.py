@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 Mending = Literal["auto", "never", "always"]
 Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertight"]
 
-MENDING_VERSION = 4
+MENDING_VERSION = 5
 """Raised whenever a surface that is mended would give another body: part of the cache keys of such bodies alone."""
 
 # The first words of the notes of each step.

@@ -17,11 +17,13 @@ largest piece alone gives 40.5 and 50.0 %.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from igps.mesh._distance_grid import Grid, distances, rounded
+from igps.mesh._distance_grid import Grid, cell_sizes, distances, rounded
 from igps.mesh._isosurface import marched, simplified
 from igps.mesh._level_set import joined, level_set
 from igps.mesh._outside import OrientedSurface, outside_of
@@ -31,6 +33,9 @@ from igps.mesh.surface import diagonal, face_areas, longest_side
 
 # Groups of triangles of less than this share of the area are specks, if they are apart in a grid of so many cells.
 _SPECK_AREA, _SPECK_CELLS = 2e-3, 64
+# Volume over area in cells: long thin bodies get cells so small, if there are not too many of them; and what has less
+# than the second is told to be coarse. A rod of so many cells' radius has half of that.
+_THICK, _COARSE = 1.5, 0.75
 # Faces beyond which vertices are first rounded to a quarter of a cell, so that time and memory stay bounded.
 _MANY_FACES = 400_000
 
@@ -53,8 +58,8 @@ def watertight(
         vertices: (V, 3) positions, any length unit.
         faces: (F, 3) vertex indices in any order and orientation, or None for a cloud of points.
         normals: (V, 3) of a cloud, of any length and either sign; estimated from the neighbours if None.
-        resolution: the grid has about as many cells as a cube of this side; flat and long bodies get up to twice as
-            many along their longest side.
+        resolution: the grid has about as many cells as a cube of this side. Flat and long bodies get up to twice as
+            many along their longest side, and closed ones that are thin more, as long as there are no more in all.
         max_vertices: the surface is simplified to so many; None keeps all.
         name: what error messages call the surface.
 
@@ -76,12 +81,21 @@ def watertight(
         notes.append("points joined by small discs")
     vertices, faces = _with_area(vertices, np.asarray(faces, dtype=np.int64), name)
     vertices, faces = _without_specks(vertices, faces, notes)
-    grid = Grid.around(vertices, faces, resolution, spacing)
+    usual, least = cell_sizes(vertices, faces, resolution, spacing)
+    grid = Grid.around(vertices, faces, least)
     vertices = grid.to_cells(vertices)
     if len(faces) > _MANY_FACES:
         vertices, faces = rounded(vertices, faces)
-    distance, nearest = distances(vertices, faces, grid.shape)
     surface = OrientedSurface.of(vertices, faces)
+    thickness = surface.thickness * least if surface.is_nearly_closed else np.inf
+    cell = float(np.clip(thickness / _THICK, least, usual))
+    if thickness < _COARSE * cell:
+        notes.append(f"coarse: about {4 * thickness / cell:.1f} cells thick")
+    if cell > least:
+        finest, grid = grid, Grid.around(grid.from_cells(vertices), faces, cell)
+        vertices, of_surface = (grid.to_cells(finest.from_cells(places)) for places in (vertices, surface.vertices))
+        surface = replace(surface, vertices=of_surface)
+    distance, nearest = distances(vertices, faces, grid.shape)
     outside, closed = outside_of(distance, surface)
     if closed:
         notes.append(f"closed {closed} openings")

@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.mesh.mesh import MeshError
+from igps.mesh._tidying import are_specks, places
+from igps.mesh.mesh import MeshError, check_arrays
 from igps.mesh.options import BodyKind, LoadOptions
+from igps.mesh.surface import compact, face_parts
 
 
 def no_faces() -> NDArray[np.int64]:
@@ -86,6 +88,20 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
         normals=np.concatenate(normals) if len(normals) == len(kept) else None,
         notes=tuple(dict.fromkeys(note for body in kept for note in body.notes)),
     )
+
+
+def pieces(whole: RawBody) -> list[RawBody]:
+    """What is not connected, in the order of the file, as "piece 1" and so on; specks are left out."""
+    vertices, faces = whole.vertices, whole.faces
+    if not len(faces):
+        return [whole]
+    check_arrays(vertices, faces, "the whole")
+    owner, areas = face_parts(vertices, places(vertices)[faces])  # loose triangles are connected where they meet
+    small = are_specks(areas)
+    notes = (*whole.notes, f"left out {int(small.sum())} specks") if small.any() else whole.notes
+    order = [k for k in np.argsort(np.unique(owner, return_index=True)[1]) if not small[k]]
+    surfaces = [compact(vertices, faces[owner == k]) for k in order]
+    return [replace(whole, vertices=v, faces=f, part=f"piece {i}", notes=notes) for i, (v, f) in enumerate(surfaces, 1)]
 
 
 def distinct(names: Iterable[str]) -> list[str]:

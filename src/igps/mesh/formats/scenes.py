@@ -6,9 +6,13 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
-from igps.mesh.formats._format import Format, RawBody, check_unpacked
+from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct, pieces
 from igps.mesh.formats._trimesh import objects
 from igps.mesh.options import LoadOptions
+from igps.mesh.surface import signed_volume
+
+# How far triangles may be from a curved face, over the length of its edges, and the angle between two, radians.
+_DEFLECTION, _ANGLE = 0.005, 0.2
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
@@ -25,8 +29,20 @@ def read_gltf(path: Path, options: LoadOptions, part: str | None) -> list[RawBod
 
 
 def read_step(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The solids of a STEP file, in millimetres."""
-    return [replace(body, vertices=1000 * body.vertices, unit="mm") for body in objects(path, options)]
+    """The solids of a STEP file, in millimetres, each with the name of the part that it belongs to."""
+    parts = objects(path, options, tol_linear=_DEFLECTION, tol_relative=True, tol_angular=_ANGLE)
+    solids = [(str(part.part), solid) for part in parts for solid in _solids(part)]
+    names = distinct(name for name, _ in solids)
+    return [
+        replace(solid, vertices=1000 * solid.vertices, part=name, unit="mm")
+        for name, (_, solid) in zip(names, solids, strict=True)
+    ]
+
+
+def _solids(part: RawBody) -> list[RawBody]:
+    """The pieces of a part; but all of it where one of them is inside out, the wall of a hollow."""
+    found = pieces(part)
+    return found if all(signed_volume(one.vertices, one.faces) > 0 for one in found) else [part]
 
 
 GLTF = Format("glTF", (".glb", ".gltf"), read_gltf, bodies=("whole", "objects"))
