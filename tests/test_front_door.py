@@ -137,7 +137,7 @@ def test_every_import_is_declared() -> None:
     used = {normal(DISTRIBUTIONS.get(module, module)) for module in every}
     # trimesh imports these, where a file asks for them: text that is not UTF-8, or a format
     assert core - {"charset-normalizer"} <= used
-    assert optional - extras["formats"] - extras["volumes"] - extras["molecules"] - extras["cad"] <= used
+    assert optional - extras["formats"] - extras["cad"] <= used
 
 
 def test_modules_that_import_at_once_need_no_extra() -> None:
