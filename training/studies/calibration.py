@@ -68,8 +68,8 @@ def calibrate(
     """
     descriptor = pretrained(model)
     shapes = _generated(root, descriptor, n_classes, seed, cache_dir, n_workers)
-    bodies = np.array([body_of(name) for name in shapes.files.names])
-    classes = np.array(shapes.files.labels)
+    bodies = np.array([body_of(name) for name in shapes.bodies.names])
+    classes = np.array(shapes.bodies.labels)
     is_rigid = np.isin(classes, _still(GradedShapes(n_classes, 4, 4, seed)))
 
     made = _copies(shapes, copies, n_copied, seed)
@@ -154,7 +154,7 @@ def _copies(shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: in
     Which shape, way and file.
     """
     first: dict[str, int] = {}
-    for i, name in enumerate(shapes.files.names):
+    for i, name in enumerate(shapes.bodies.names):
         first.setdefault(body_of(name), i)
     chosen = [(body, i) for body, i in sorted(first.items()) if int(body.rsplit("/", 1)[1]) < n_bodies]
     made = []

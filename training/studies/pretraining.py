@@ -62,7 +62,7 @@ def pretrain(
     descriptor = pretrained_parts().eval()
     generated = _usable(root, descriptor, cache_dir, n_workers)
     histograms, labels = describe(generated, descriptor, progress=True, n_workers=n_workers), generated.labels
-    bodies = _numbers([body_of(name) for name in generated.files.names])
+    bodies = _numbers([body_of(name) for name in generated.bodies.names])
     parts = _dealt([family_of(name) for name in generated.classes], n_parts, seed)
 
     def fit(n: int, seed: int, among: Tensor) -> TwoLevelHead:
