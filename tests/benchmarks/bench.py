@@ -49,6 +49,7 @@ K = 250
 SPREAD, STEAL, ATTEMPTS = 0.3, 0.05, 3
 PROJECT = Path(__file__).parents[2]
 BEFORE = "8140bb3"  # whose time from meshes to the table is the baseline
+VERSION_0_2_0 = "fa3a05e"
 
 
 @dataclass(frozen=True)
@@ -354,37 +355,62 @@ def describe_before(data: Path | None) -> dict[str, Figure]:
     mesh = model(data, 10_000)
     needs = igps.descriptor("multiscale").requirements | igps.descriptor("rich").requirements
     signature = igps.compute_signature(mesh, needs.apply_to(igps.SignatureConfig()))
-    script = Path(__file__).with_name("describing.py")
-    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     figures = {}
-    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+    with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "signature.npz"
         save_signature(signature, path)
-        project = Path(__file__).parents[2]
-        archive = subprocess.run(
-            ["git", "archive", "8140bb3", "src"], check=True, capture_output=True, cwd=project
-        ).stdout
+        with two_versions("describing.py", path, BEFORE) as seconds_of:
+            for name in ("rich", "pretrained", "multiscale", "interior", "gps"):
+                ours, before = seconds_of(name)
+                note = f"{len(signature.interior)} and {len(signature.surface)} samples"
+                figures[f"describe_{name}"] = Figure(ours, "s", before, f"commit {BEFORE}", before / ours, note)
+    return figures
+
+
+def signature_1500(data: Path | None) -> Figure:
+    """A small body to its signature as `pretrained` requires it, one thread, over version 0.2.0 in turn."""
+    mesh = model(data, 1_500)
+    config = igps.descriptor("pretrained").requirements.apply_to(igps.SignatureConfig())
+    n_samples = len(igps.compute_signature(mesh, config).interior)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "body.npz"
+        np.savez(path, vertices=mesh.vertices, faces=mesh.faces)
+        with two_versions("signing.py", path, VERSION_0_2_0) as seconds_of:
+            ours, before = seconds_of(json.dumps(asdict(config)))
+    note = f"{len(mesh.vertices)} vertices, {n_samples} samples"
+    return Figure(ours, "s", before, "version 0.2.0", before / ours, note)
+
+
+@contextlib.contextmanager
+def two_versions(script: str, path: Path, commit: str) -> Iterator[Callable[[str], tuple[float, float]]]:
+    """A script beside this one, run by now's igps and by that of a commit on one thread: gives seconds for a line.
+
+    They are medians of seven turns.
+    """
+    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        archive = subprocess.run(["git", "archive", commit, "src"], check=True, capture_output=True, cwd=PROJECT).stdout
         subprocess.run(["tar", "x", "-C", folder], check=True, input=archive)
         ask = []
-        for source in (project / "src", Path(folder) / "src"):
+        for source in (PROJECT / "src", Path(folder) / "src"):
             process = subprocess.Popen(
-                [sys.executable, str(script), str(path)], text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                env={**os.environ, **one, "PYTHONPATH": str(source)},
+                [sys.executable, str(Path(__file__).with_name(script)), str(path)], text=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, **one, "PYTHONPATH": str(source)},
             )  # fmt: skip
             stack.enter_context(process)
             ask.append(process)
-        for name in ("rich", "pretrained", "multiscale", "interior", "gps"):
+
+        def seconds_of(line: str) -> tuple[float, float]:
             seconds: tuple[list[float], list[float]] = ([], [])
             for _ in range(7):
                 for of, process in zip(seconds, ask, strict=True):
-                    print(name, file=process.stdin, flush=True)
+                    print(line, file=process.stdin, flush=True)
                     of.append(float(process.stdout.readline()))  # type: ignore[union-attr]
-            ours, before = (float(np.median(of)) for of in seconds)
-            note = f"{len(signature.interior)} and {len(signature.surface)} samples"
-            figures[f"describe_{name}"] = Figure(ours, "s", before, "commit 8140bb3", before / ours, note)
+            return median(seconds[0]), median(seconds[1])
+
+        yield seconds_of
         for process in ask:
             process.stdin.close()  # type: ignore[union-attr]
-    return figures
 
 
 def descriptor_15k(data: Path | None) -> Figure:
@@ -581,6 +607,7 @@ FIGURES: dict[str, Callable[[Path | None], Figure | dict[str, Figure]]] = {
     "euclidean": euclidean_distances,
     "oriented_pairs": oriented_pairs,
     "describe_rich": describe_before,
+    "signature_1500": signature_1500,
     "descriptor_15k": descriptor_15k,
     "mesh_10k": mesh_10k,
     "mesh_250k": mesh_250k,

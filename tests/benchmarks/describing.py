@@ -17,7 +17,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from igps.signature.signature import Samples, Signature, SignatureConfig
+try:
+    from igps.signature.signature import Samples, Signature, SignatureConfig
+except ModuleNotFoundError:  # its place in commit 8140bb3
+    from igps.geometry.signature import Samples, Signature, SignatureConfig
 
 ROOMS = ("interior", "surface")
 
