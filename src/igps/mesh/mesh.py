@@ -6,6 +6,7 @@ import copy
 import logging
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,9 @@ from igps.mesh.surface import (
     signed_volume,
     undirected_edges,
 )
+
+if TYPE_CHECKING:
+    import trimesh
 
 logger = logging.getLogger(__name__)
 
@@ -117,6 +121,34 @@ class Mesh:
         object.__setattr__(other, "vertices", self.vertices[order])
         object.__setattr__(other, "faces", rank[self.faces])
         return other
+
+    @classmethod
+    def of(cls, body: Mesh | trimesh.Trimesh) -> Mesh:
+        """The Mesh of a body as another library keeps it; a Mesh is given back as it is.
+
+        Example:
+            >>> import trimesh
+            >>> Mesh.of(trimesh.creation.box((1, 2, 3)))
+            Mesh('mesh', 8 vertices, 12 faces)
+
+        Args:
+            body: a Mesh or a `trimesh.Trimesh`. Its file, if it knows one, becomes the name.
+
+        Raises:
+            TypeError: it is something else.
+            MeshError: it is not one closed surface, see `Mesh`.
+        """
+        if isinstance(body, cls):
+            return body
+        import trimesh
+
+        if isinstance(body, trimesh.Trimesh):
+            name = body.metadata.get("file_name") or "mesh"
+            return cls(np.asarray(body.vertices), np.asarray(body.faces), name=str(name))
+        raise TypeError(
+            f"mesh: expected a Mesh or a trimesh.Trimesh, got {type(body).__module__}.{type(body).__qualname__}. "
+            "Read a file with igps.load_mesh, or pass Mesh(vertices, faces)."
+        )
 
     @cached_property
     def area(self) -> float:

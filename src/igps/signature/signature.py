@@ -181,7 +181,7 @@ class Signature:
     Example:
         >>> import trimesh
         >>> ball = trimesh.creation.icosphere(subdivisions=3)
-        >>> signature = compute_signature(Mesh(ball.vertices, ball.faces), SignatureConfig(n_eigenpairs=20))
+        >>> signature = compute_signature(ball, SignatureConfig(n_eigenpairs=20))
         >>> signature.interior.eigenfunctions.shape[1], signature.surface.points.shape
         (20, (2000, 3))
         >>> bool(np.linalg.norm(signature.barycentroid) < 0.1)  # of the ball's radius
@@ -239,7 +239,7 @@ class Signature:
 
 
 @one_thread()
-def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Signature:
+def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | None = None) -> Signature:
     """Sample the eigenfunctions of a mesh in its interior and on its surface (Rustamov 2010, section 3).
 
     Example:
@@ -247,20 +247,21 @@ def compute_signature(mesh: Mesh, config: SignatureConfig | None = None) -> Sign
 
         >>> import trimesh
         >>> ball = trimesh.creation.icosphere(subdivisions=3)
-        >>> signature = compute_signature(Mesh(ball.vertices, ball.faces), SignatureConfig(n_eigenpairs=8))
+        >>> signature = compute_signature(ball, SignatureConfig(n_eigenpairs=8))
         >>> signature.eigenvalues.round(1).tolist()
         [2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]
 
     Args:
-        mesh: the body.
+        mesh: the body, or what `Mesh.of` makes one of.
         config: `SignatureConfig()` if None.
 
     Raises:
+        TypeError: the body is neither.
         MeshError: too few vertices for the eigenpairs asked, or no interior sample.
         ConvergenceError: the eigensolver failed.
     """
     config = (config or SignatureConfig()).resolved()
-    mesh = mesh.numbered_by_faces()  # to rounding, results depend on the numbers
+    mesh = Mesh.of(mesh).numbered_by_faces()  # to rounding, results depend on the numbers
     if config.max_vertices is not None:
         mesh = simplify(mesh, config.max_vertices)
     if len(mesh.vertices) < config.n_kept + 2:
