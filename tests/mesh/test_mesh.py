@@ -91,3 +91,25 @@ def test_more_notes_and_a_unit_leave_the_surface_as_it_is(blob: Mesh) -> None:
     assert (told.unit, told.told().unit, blob.unit) == ("mm", "mm", None)
     assert told.vertices is blob.vertices
     assert told.area == blob.area
+
+
+def test_a_trimesh_becomes_a_mesh_and_a_mesh_stays_itself() -> None:
+    box = trimesh.creation.box((1, 2, 3))
+    mesh = Mesh.of(box)
+    np.testing.assert_array_equal(mesh.vertices, box.vertices)
+    np.testing.assert_array_equal(mesh.faces, box.faces)
+    assert mesh.name == "mesh"
+    assert Mesh.of(mesh) is mesh
+    box.metadata["file_name"] = "box.ply"
+    assert Mesh.of(box).name == "box.ply"
+    box.update_faces(np.arange(12) > 0)
+    with pytest.raises(MeshError, match=r"box\.ply: open surface"):
+        Mesh.of(box)
+
+
+@pytest.mark.parametrize("body", [None, "box.ply", np.zeros((3, 3)), trimesh.Scene()])
+def test_what_is_no_mesh_is_named(body: object) -> None:
+    with pytest.raises(
+        TypeError, match=rf"mesh: expected a Mesh or a trimesh.Trimesh, got .*{type(body).__name__}\. Read"
+    ):
+        Mesh.of(body)  # type: ignore[arg-type]

@@ -187,6 +187,30 @@ def test_a_mesh_that_no_matrices_serve_is_refused(needles: Mesh, monkeypatch: py
         compute_signature(needles, CONFIG)
 
 
+def test_a_trimesh_has_the_signature_of_its_mesh(blob: Mesh, signature: Signature) -> None:
+    surface = trimesh.Trimesh(blob.vertices, blob.faces, process=False)
+    found = compute_signature(surface, CONFIG)
+    np.testing.assert_array_equal(found.interior.eigenfunctions, signature.interior.eigenfunctions)
+    with pytest.raises(TypeError, match=r"expected a Mesh or a trimesh\.Trimesh, got builtins\.str"):
+        compute_signature("blob.off", CONFIG)  # type: ignore[arg-type]
+
+
+def test_attributes_are_added_to_samples_and_nothing_else_changes(signature: Signature) -> None:
+    samples = signature.interior
+    height, away = samples.points[:, 2], samples.points - samples.points.mean(axis=0)
+    more = samples.with_attributes({"height": height, "away": away}).with_attributes({"height": 2 * height})
+    assert {name: values.dtype for name, values in more.attributes.items()} == {"height": "float32", "away": "float32"}
+    np.testing.assert_allclose(more.attributes["height"], 2 * height, rtol=1e-6)
+    np.testing.assert_allclose(more.attributes["away"], away, rtol=1e-6)
+    assert more.eigenfunctions is samples.eigenfunctions
+    assert samples.attributes == {}
+    wrong = height.copy()
+    wrong[3] = np.nan
+    for values, message in ((height[:-1], f"for each of {len(samples)} points"), (wrong, "1 values that are not")):
+        with pytest.raises(ValueError, match=f"height: expected a finite number.*{message}"):
+            samples.with_attributes({"height": values})
+
+
 def test_too_few_vertices_say_so(blob: Mesh) -> None:
     with pytest.raises(MeshError, match=r"blob: 642 vertices are too few for 641 eigenpairs.*lower n_eigenpairs"):
         compute_signature(blob, replace(CONFIG, n_eigenpairs=641))

@@ -22,7 +22,6 @@ def interior_attributes(
 
     Raises:
         ValueError: unknown name.
-        ImportError: "depth" or "surface_direction" without libigl.
     """
     check_attributes(names)
     functions = {
@@ -66,9 +65,6 @@ def depth(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
 
     Returns:
         (P,) dimensionless.
-
-    Raises:
-        ImportError: libigl is not installed.
     """
     return np.linalg.norm(_to_surface(mesh, points), axis=1) / np.sqrt(mesh.area)
 
@@ -84,20 +80,13 @@ def surface_direction(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.flo
 
     Returns:
         (P, 3); zero for a point on the surface.
-
-    Raises:
-        ImportError: libigl is not installed.
     """
     return unit(_to_surface(mesh, points))
 
 
 def _to_surface(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    try:
-        import igl
-    except ImportError as error:
-        raise ImportError(
-            'depth, surface_direction: these attributes need libigl: pip install "interior-gps[igl]".'
-        ) from error
+    import igl
+
     *_, nearest = igl.point_mesh_squared_distance(
         np.ascontiguousarray(points), np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
     )

@@ -1,0 +1,135 @@
+"""Every parameter that a Signature depends on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar, get_args
+
+from igps.signature.attributes import AttributeName, check_attributes
+from igps.signature.laplacian import Backend
+
+# The order of the samples, see `places`, depends on about so many eigenpairs. With as many or more of one body the same
+# samples come in the same order, to rounding.
+_ORDERED_BY = 64
+
+
+@dataclass(frozen=True)
+class SignatureConfig:
+    """Every parameter that a Signature depends on.
+
+    The samples of a Signature and their first eigenfunctions do not depend on how many there are, if at least 64. So
+    each is the beginning of those with more, see `larger` and `Signature.beginning`; but for that their meshes must be
+    the same, and one with fewer vertices than `least_vertices` is subdivided.
+
+    Example:
+        >>> SignatureConfig(n_eigenpairs=50).min_samples, SignatureConfig.paper().min_samples
+        (1000, 0)
+
+    Args:
+        n_eigenpairs: eigenpairs kept, without the constant one; None for as many as the descriptor needs that the
+            Signature is for (see `Requirements.apply_to`), 250 where there is none.
+        resolution: voxels along the longest side of the bounding box.
+        min_samples: the grid is refined until at least so many voxels lie inside; 0 keeps `resolution`.
+        n_surface_samples: area-weighted random samples of the surface.
+        backend: "cotangent" or "robust", see `laplacian`. Where the cotangent matrices have no eigenpairs to the
+            tolerance, the others are used, and the Signature's notes say so.
+        max_vertices: simplify larger meshes first; None keeps them.
+        accuracy: relative error that 99 % of the interior distances may have, which speeds up the mean value
+            coordinates; None evaluates them exactly.
+        attributes: of the samples: "depth" and "electrostatic_potential" of the interior ones, "surface_direction" of
+            all, see `interior_attributes` and `surface_attributes`.
+        seed: of the surface samples and of the eigensolver's start.
+        least_vertices: meshes with fewer are subdivided when they are read, unless they are mended never; None for the
+            two more than the eigenpairs without which these cannot be computed.
+    """
+
+    # Raise it whenever the same mesh and parameters would give another Signature: it is part of every cache key.
+    ALGORITHM_VERSION: ClassVar[int] = 4
+
+    DEFAULT_EIGENPAIRS: ClassVar[int] = 250
+    # What the library's descriptors ask for: known to be in caches.
+    SIZES: ClassVar[tuple[int, ...]] = (64, 100, 250)
+
+    n_eigenpairs: int | None = None
+    resolution: int = 32
+    min_samples: int = 1000
+    n_surface_samples: int = 2000
+    backend: Backend = "cotangent"
+    max_vertices: int | None = None
+    accuracy: float | None = 1e-3
+    attributes: tuple[AttributeName, ...] = ()
+    seed: int = 0
+    least_vertices: int | None = None
+
+    def __post_init__(self) -> None:
+        smallest = {"n_eigenpairs": 1, "resolution": 1, "min_samples": 0, "n_surface_samples": 1, "least_vertices": 0}
+        for name, least in smallest.items():
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"{name}: expected at least {least}, got {value}.")
+        if self.backend not in ("cotangent", "robust"):
+            raise ValueError(f"backend: expected 'cotangent' or 'robust', got {self.backend!r}.")
+        if self.max_vertices is not None and self.max_vertices <= self.n_kept + 1:
+            raise ValueError(
+                f"max_vertices: expected more than n_eigenpairs + 1 = {self.n_kept + 1}, got {self.max_vertices}."
+            )
+        if self.accuracy is not None and not 0 < self.accuracy < 1:
+            raise ValueError(f"accuracy: expected None or a number between 0 and 1, got {self.accuracy}.")
+        check_attributes(self.attributes)
+
+    @classmethod
+    def paper(cls) -> SignatureConfig:
+        """Rustamov 2010: 250 eigenpairs and a 32-voxel grid that is never refined."""
+        return cls(n_eigenpairs=250, min_samples=0)
+
+    @property
+    def n_kept(self) -> int:
+        """`n_eigenpairs`, or how many there are where it is None."""
+        return self.DEFAULT_EIGENPAIRS if self.n_eigenpairs is None else self.n_eigenpairs
+
+    @property
+    def n_vertices_read(self) -> int:
+        """`least_vertices`, or what the eigenpairs need where it is None."""
+        return self.n_kept + 2 if self.least_vertices is None else self.least_vertices
+
+    def resolved(self) -> SignatureConfig:
+        """The same with a number of eigenpairs."""
+        return replace(self, n_eigenpairs=self.n_kept)
+
+    def needing(self, n_eigenpairs: int) -> SignatureConfig:
+        """The same where only the first so many eigenpairs are needed, unless a number of them is given already.
+
+        Meshes are subdivided as for the default number, so that this is the beginning of that Signature.
+        """
+        if self.n_eigenpairs is not None:
+            return self
+        n_computed = max(n_eigenpairs, _ORDERED_BY)
+        if n_computed >= self.DEFAULT_EIGENPAIRS:
+            return replace(self, n_eigenpairs=n_computed)
+        return replace(self, n_eigenpairs=n_computed, least_vertices=self.n_vertices_read)
+
+    def larger(self) -> Iterator[SignatureConfig]:
+        """Those whose Signature of a body begins with this one's, smallest first, as far as a cache may well have them.
+
+        For a mesh that is subdivided that holds only of those with as many `n_vertices_read`.
+        """
+        everything: tuple[AttributeName, ...] = get_args(AttributeName)
+        sizes, n_vertices = [self.n_kept], self.n_vertices_read
+        if self.n_kept >= _ORDERED_BY:
+            most = math.inf if self.max_vertices is None else self.max_vertices - 2
+            sizes += [size for size in self.SIZES if self.n_kept < size <= most]
+            n_vertices = max(n_vertices, self.DEFAULT_EIGENPAIRS + 2)
+        for n_eigenpairs in sizes:
+            for attributes in dict.fromkeys((self.attributes, everything)):
+                one = replace(self, n_eigenpairs=n_eigenpairs, attributes=attributes, least_vertices=n_vertices)
+                if one.as_dict() != self.as_dict():
+                    yield one
+
+    def as_dict(self) -> dict[str, Any]:
+        """The parameters by name and the algorithm's version; `least_vertices` only where the others do not tell."""
+        found = {**asdict(self), "n_eigenpairs": self.n_kept, "algorithm_version": self.ALGORITHM_VERSION}
+        if self.n_vertices_read == self.n_kept + 2:
+            del found["least_vertices"]
+        return found
