@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
 import trimesh
@@ -171,3 +172,34 @@ def test_solids_of_a_step_file_are_bodies_in_millimetres(unit: str, scale: float
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(MeshError, match=r"parts\.step: not readable as STEP"):
         load_mesh(path)
+
+
+def test_labels_of_a_volume_are_bodies_and_one_too_small_costs_no_other(tmp_path: Path) -> None:
+    """Two boxes of voxels that touch, beside a label of seven voxels; the whole is both boxes."""
+    labels = np.zeros((20, 20, 12), dtype=np.uint8)
+    labels[2:8, 2:14, 2:10], labels[8:14, 2:14, 2:10], labels[18, 18, 2:9] = 1, 5, 9
+    nibabel.save(nibabel.Nifti1Image(labels, np.diag([1.0, 1.0, 2.0, 1.0])), tmp_path / "organs.nii.gz")
+    (tmp_path / "names.csv").write_text("label,name\n1,left\n5,right\n9,speck\n")
+    path, options = tmp_path / "organs.nii.gz", LoadOptions(names=str(tmp_path / "names.csv"))
+    assert parts(path, options) == ["left", "right", "speck"]
+    outcomes = {ref.part: body for ref, body in each_body(path, options)}
+    assert isinstance(outcomes["speck"], MeshError)
+    assert str(outcomes["speck"]).startswith(f"{path}#speck: 7 voxels")
+    for name in ("left", "right"):
+        body = load_mesh(path, options, part=name)
+        assert body.volume == pytest.approx(6 * 12 * 16, rel=1e-6)
+        assert body.unit == "mm"
+        np.testing.assert_array_equal(body.vertices, outcomes[name].vertices)  # type: ignore[union-attr]
+    assert load_mesh(path, LoadOptions(bodies="whole")).volume == pytest.approx(2 * 6 * 12 * 16, rel=0.02)
+
+
+def test_chains_of_a_structure_are_bodies_in_angstrom(tmp_path: Path) -> None:
+    """Two zinc ions far from each other, balls of 1.39 Å."""
+    line = "HETATM    {0} ZN    ZN {1}   1      {2:6.3f}   6.134  -6.504  1.00 20.00          ZN\n"
+    path = tmp_path / "zinc.pdb"
+    path.write_text(line.format(1, "A", 11) + line.format(2, "B", 41))
+    assert parts(path, LoadOptions()) == ["chain A", "chain B"]
+    for body in load_bodies(path):
+        assert body.unit == "Å"
+        assert body.volume == pytest.approx(4 / 3 * np.pi * 1.39**3, rel=0.05)
+    assert parts(path, LoadOptions(bodies="models")) == ["model"]

@@ -118,7 +118,7 @@ def each_body(
         MeshError: the file is missing or unreadable.
     """
     path = Path(path)
-    for raw in _read(path, options):
+    for raw in _read(path, options, parts[0] if parts and len(parts) == 1 else None):
         if parts is None or raw.part in parts:
             with one_thread():
                 try:
@@ -147,6 +147,8 @@ def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part
 
 
 def _body(raw: RawBody, path: Path, options: LoadOptions, least_vertices: int) -> Mesh:
+    if raw.fault is not None:
+        raise raw.fault
     name = str(BodyRef(path, raw.part))
     vertices, faces, notes = raw.vertices, raw.faces, raw.notes
     if options.mend == "never" or len(faces):
@@ -208,7 +210,8 @@ def _format(path: Path) -> Format:
 @contextmanager
 def _faults(path: Path, kind: Format) -> Iterator[None]:
     """What a reader raises, told as a fault of the file; memory that is lacking is none."""
-    check_memory(path)
+    if kind.bodies[0] == "whole":
+        check_memory(path)
     try:
         yield
     except (MeshError, MemoryError):

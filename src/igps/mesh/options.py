@@ -39,6 +39,8 @@ class LoadOptions:
             molecule. None, or what a format does not have: the labels of a volume, the chains of a molecule, the whole
             of anything else.
         max_unpacked: bytes that a file may unpack to.
+        names: a table of the names of labels, see `read_label_names`; None for those of the volume, or beside it.
+        threshold: a voxel of at least this probability belongs to the body, in volumes of probabilities.
 
     Raises:
         ValueError: a value that is not among those.
@@ -49,6 +51,8 @@ class LoadOptions:
     allow_open: bool = False
     bodies: BodyKind | None = None
     max_unpacked: int = MAX_UNPACKED
+    names: str | None = None
+    threshold: float = 0.5
 
     def __post_init__(self) -> None:
         if self.mend not in get_args(Mending):
@@ -59,8 +63,11 @@ class LoadOptions:
             raise ValueError(f"bodies: expected one of {', '.join(get_args(BodyKind))}, or None, got {self.bodies!r}.")
         if self.max_unpacked < 1:
             raise ValueError(f"max_unpacked: expected a positive number of bytes, got {self.max_unpacked}.")
+        if not 0 < self.threshold <= 1:
+            raise ValueError(f"threshold: expected above 0 and at most 1, got {self.threshold}.")
 
     def as_dict(self) -> dict[str, object]:
-        """All on which a body depends, for the keys of caches: no limits, and no kind of bodies where none is said."""
-        left_out = {"max_unpacked"} | ({"bodies"} if self.bodies is None else set())
+        """All on which a body depends, for the keys of caches; what says no more than the default is left out."""
+        said = {"bodies": self.bodies is not None, "threshold": self.threshold != 0.5}
+        left_out = {"max_unpacked", "names", *(name for name, is_said in said.items() if not is_said)}
         return {name: value for name, value in asdict(self).items() if name not in left_out}

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from igps.mesh.formats import archives, brain_surfaces, clouds, obj, off, ply, scenes, stl, threemf, vtk
+from igps.mesh.formats import archives, brain_surfaces, clouds, made_surfaces, obj, off, ply, scenes, stl, threemf, vtk
 from igps.mesh.formats._format import Format, RawBody
 
 __all__ = ["FORMATS", "Format", "RawBody", "format_of", "is_searched", "searched_suffixes"]
@@ -30,6 +30,8 @@ FORMATS: tuple[Format, ...] = (
     vtk.XML,
     brain_surfaces.GIFTI,
     brain_surfaces.FREESURFER,
+    made_surfaces.VOLUMES,
+    made_surfaces.MOLECULES,
     archives.ARCHIVE,
     archives.COMPRESSED,
 )

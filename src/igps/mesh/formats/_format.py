@@ -16,6 +16,11 @@ from igps.mesh.options import BodyKind, LoadOptions
 from igps.mesh.surface import compact, face_parts
 
 
+def no_vertices() -> NDArray[np.float64]:
+    """Those of a body of which there is no surface, (0, 3)."""
+    return np.zeros((0, 3))
+
+
 def no_faces() -> NDArray[np.int64]:
     """Those of a cloud of points, (0, 3)."""
     return np.zeros((0, 3), dtype=np.int64)
@@ -32,14 +37,16 @@ class RawBody:
         unit: of length, such as "mm"; None where the file does not tell.
         normals: (V, 3) of a cloud of points that has them.
         notes: what was noticed on reading, in words.
+        fault: why there is no surface of this body, where there are others.
     """
 
-    vertices: NDArray[np.float64]
+    vertices: NDArray[np.float64] = field(default_factory=no_vertices)
     faces: NDArray[np.int64] = field(default_factory=no_faces)
     part: str | None = None
     unit: str | None = None
     normals: NDArray[np.float64] | None = None
     notes: tuple[str, ...] = ()
+    fault: MeshError | None = None
 
 
 @dataclass(frozen=True)
@@ -76,7 +83,7 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
     meshes = [body for body in bodies if len(body.faces)]
     kept = meshes or [body for body in bodies if len(body.vertices)]
     if not kept:
-        return RawBody(np.zeros((0, 3)))
+        return RawBody(fault=next((body.fault for body in bodies if body.fault), None))
     starts = np.cumsum([0, *(len(body.vertices) for body in kept)])
     faces = np.concatenate([body.faces + start for body, start in zip(kept, starts, strict=False)])
     units = {body.unit for body in kept}

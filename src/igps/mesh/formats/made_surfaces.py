@@ -1,0 +1,88 @@
+"""Files that hold no surface, of which one is made for each body: label volumes and molecules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from igps.mesh.formats import _structures, _volume_files
+from igps.mesh.formats._format import Format, RawBody
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.options import LoadOptions
+
+if TYPE_CHECKING:
+    from igps.mesh.formats.molecules import Molecule
+    from igps.mesh.formats.volumes import VolumeOptions
+
+
+def read_volume(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    """The surfaces of the labels of a volume; or of all of them together as the whole."""
+    from igps.mesh.formats.volumes import label_surface, read_label_volume
+
+    volume = read_label_volume(path, _volume_options(options))
+    if options.bodies in ("whole", "pieces"):
+        labelled = np.any([layer > 0 for layer in volume.layers], axis=0).astype(np.uint8)
+        volume = replace(volume, layers=(labelled,), names=None, segments=None)
+        return [_made(partial(label_surface, volume, 1), None, volume.unit)]
+    names = [body.name for body in volume.bodies] if part is None else [volume.body(part).name]
+    return [_made(partial(label_surface, volume, name, how=options.mend), name, volume.unit) for name in names]
+
+
+def volume_parts(path: Path, options: LoadOptions) -> list[str]:
+    """The names of the labels of a volume."""
+    from igps.mesh.formats.volumes import read_label_volume
+
+    return [body.name for body in read_label_volume(path, _volume_options(options)).bodies]
+
+
+def _volume_options(options: LoadOptions) -> VolumeOptions:
+    from igps.mesh.formats.volumes import VolumeOptions
+
+    return VolumeOptions(options.threshold, options.names)
+
+
+def read_structure(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    """The surfaces of the chains, models or the assembly of a structure file, in ångström."""
+    from igps.mesh.molecular_surface import molecular_surface
+
+    found = _molecules(path, options)
+    return [
+        _made(partial(molecular_surface, molecule), name, "Å")
+        for name, molecule in found.items()
+        if part in (None, name)
+    ]
+
+
+def structure_parts(path: Path, options: LoadOptions) -> list[str]:
+    """The names of the chains, models or the assembly of a structure file."""
+    return list(_molecules(path, options))
+
+
+def _molecules(path: Path, options: LoadOptions) -> dict[str, Molecule]:
+    from igps.mesh.formats.molecules import read_molecule
+
+    how = options.bodies if options.bodies in ("chains", "models", "assembly") else "models"
+    found = read_molecule(path, how)
+    return {molecule.name.removeprefix(str(path)).strip() or "model": molecule for molecule in found}
+
+
+def _made(make: Callable[[], Mesh], part: str | None, unit: str | None) -> RawBody:
+    """A body, or why there is none: the others are made all the same."""
+    try:
+        mesh = make()
+    except MeshError as fault:
+        return RawBody(part=part, fault=fault)
+    return RawBody(mesh.vertices, mesh.faces, part, unit, notes=mesh.notes)
+
+
+_STRUCTURES = tuple(sorted(suffix + packed for suffix in _structures.SUFFIXES for packed in ("", ".gz")))
+_VOLUMES = tuple(_volume_files.READERS)
+VOLUMES = Format("a label volume", _VOLUMES, read_volume, volume_parts, ("labels",), extra="volumes")
+MOLECULES = Format(
+    "a structure", _STRUCTURES, read_structure, structure_parts, ("chains", "models", "assembly"), extra="molecules"
+)
