@@ -25,7 +25,7 @@ from igps._threads import Team, cpu_quota, n_cores, n_threads, one_thread
 from igps.cli import main
 from igps.data.batch import LabelledSignature
 from igps.mesh.mesh import Mesh
-from igps.nn.heads.learned import BlendedDistance, MetricHead
+from igps.nn.heads.learned import BlendedDistance, ProjectionHead
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
@@ -388,7 +388,7 @@ def test_a_training_step_is_computed_on_one_thread(blob: Mesh) -> None:
     signature = igps.compute_signature(blob, CONFIG)
     items = [LabelledSignature(signature, i // 2, str(i)) for i in range(4)]
     described = Watched()
-    learner = igps.RetrievalLearner(described, BlendedDistance(MetricHead(width=4, n_hidden=8)))
+    learner = igps.RetrievalLearner(described, BlendedDistance(ProjectionHead(width=4, n_hidden=8)))
     options = {"accelerator": "cpu", "logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
     trainer = Trainer(max_epochs=1, accumulate_grad_batches=2, enable_model_summary=False, **options)  # type: ignore[arg-type]
     with pytest.warns(UserWarning, match="val_dataloader"):

@@ -15,10 +15,10 @@ from sklearn.utils.validation import check_is_fitted
 from igps.data.batch import collate
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
-from igps.gallery.gallery import cache_tag
+from igps.descriptors.fingerprint import cache_tag
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
-from igps.nn.description import describe_usable
+from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, HistogramDescriptor
 from igps.signature.signature import SignatureConfig, compute_signature
 
@@ -104,8 +104,8 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         else:
             dataset = SignatureDataset(shapes, config, self.cache_dir, reading=self.reading)
             dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
-            kept = cache_tag(self.descriptor, chosen)
-            features, _ = describe_usable(dataset, chosen, cache_tag=kept, n_workers=self.n_workers, strict=True)
+            tag = cache_tag(self.descriptor, chosen)
+            features = describe(dataset, chosen, cache_tag=tag, n_workers=self.n_workers)
         cells = features.flatten(1)
         rooted = self.square_root and isinstance(chosen, HistogramDescriptor)
         return (cells.sqrt() if rooted else cells).numpy()

@@ -555,12 +555,12 @@ def training_step(batch: igps.SignatureBatch) -> Callable[[], object]:
     from pytorch_lightning import Trainer
     from torch.utils.data import DataLoader
 
-    from igps.nn.heads.learned import BlendedDistance, MetricHead
+    from igps.nn.heads.learned import BlendedDistance, ProjectionHead
 
     axes = [Potential(4, learnable=True), InteriorDistance(64, learnable=True)]
     embedding = igps.SpectralEmbedding(n_eigenpairs=64, n_knots=12)
     descriptor = igps.HistogramDescriptor(igps.PairHistogram(axes, embedding))
-    learner = igps.RetrievalLearner(descriptor, BlendedDistance(MetricHead(width=16, n_hidden=32)))
+    learner = igps.RetrievalLearner(descriptor, BlendedDistance(ProjectionHead(width=16, n_hidden=32)))
     batch = replace(batch, labels=torch.tensor([0, 0, 1, 1]))
     loader: DataLoader[igps.SignatureBatch] = DataLoader([batch], batch_size=None)  # type: ignore[arg-type]
     learner.on_train_start = lambda: None  # type: ignore[method-assign]  # the fit of the head is no part of a step

@@ -14,10 +14,11 @@ from pathlib import Path
 
 from igps import LoadOptions, SignatureConfig, SignatureDataset, descriptor, retrieval_scores
 from igps.analysis.comparison import pair_distances
+from igps.data.dataset import Failure
 from igps.data.requirements import Requirements
 from igps.data.sources import labelled_bodies
 from igps.descriptors import NAMES
-from igps.nn.description import describe_usable
+from igps.nn.description import describe
 
 EXPECTED = Path(__file__).with_name("shrec07.json")
 SCORES = ("nn", "ft", "st", "dcg")
@@ -38,7 +39,8 @@ def measure(folder: Path, names: list[str], cache_dir: Path | None, n_workers: i
     dataset.precompute(n_workers=n_workers, strict=True)
     found = {}
     for name, one in descriptors.items():
-        descriptions, failures = describe_usable(dataset, one, n_workers=n_workers, strict=False, progress=True)
+        failures: list[Failure] = []
+        descriptions = describe(dataset, one, failures=failures, n_workers=n_workers, progress=True)
         distances = pair_distances(one, descriptions)
         means = retrieval_scores(distances, dataset.usable(failures).bodies.labels or ()).mean()
         found[name] = {score: round(100 * _POINT * float(means[score])) / _POINT for score in SCORES}

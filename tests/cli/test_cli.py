@@ -142,10 +142,10 @@ def test_a_second_run_describes_nothing_and_leaves_the_same_table(
     first = run("first")
     assert {"scores.json", "ranking.csv"} <= first.keys()
 
-    def describe_one(job: object) -> None:
+    def described(job: object) -> None:
         raise AssertionError("described again")
 
-    monkeypatch.setattr("igps.nn.description._describe_one", describe_one)
+    monkeypatch.setattr("igps.nn.description._described", described)
     assert run("second") == first
 
 
@@ -285,7 +285,10 @@ def test_query_lists_the_nearest(
     [
         (["retrieve", "nowhere"], "no such folder"),
         (["retrieve", "ROOT/egg"], "no classes found"),
-        (["retrieve", "ROOT", "--descriptor", "best"], f"expected one of {', '.join(NAMES)}, or .*, got 'best'"),
+        (
+            ["retrieve", "ROOT", "--descriptor", "best"],
+            f"expected one of {', '.join(NAMES)}, molecular, or .*, got 'best'",
+        ),
         (["retrieve", "ROOT"], "n_eigenpairs: this descriptor needs signatures of at least 64, got 20"),
         (["query", "ROOT/egg/1.off", "--gallery", "ROOT", "--top", "0"], "top"),
         (["query", "nowhere.off", "--gallery", "ROOT", "--descriptor", "d2"], "no such file|cannot be read"),

@@ -133,6 +133,6 @@ def test_unknown_descriptor_is_named_before_anything_is_computed(
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, "compare", root, "--descriptors", "d2", "d5", "--cache_dir", tmp_path / "cache")
     error = capsys.readouterr().err
-    assert f"expected one of {', '.join(NAMES)}, or package.module:NAME" in error
+    assert f"expected one of {', '.join(NAMES)}, molecular, or package.module:NAME" in error
     assert "got 'd5'" in error
     assert not (tmp_path / "cache").exists()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from igps.descriptors import descriptor
+from igps.descriptors.fingerprint import fingerprint
 from igps.gallery.calibration import (
     KINDS,
     LEVELS,
@@ -20,7 +21,6 @@ from igps.gallery.calibration import (
     threshold_at,
     threshold_between,
 )
-from igps.gallery.gallery import fingerprint
 from igps.signature.signature import SignatureConfig
 from own_descriptors import Same
 

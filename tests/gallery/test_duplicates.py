@@ -21,9 +21,11 @@ from scipy.spatial.transform import Rotation
 from igps.cli import COMMANDS, main
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
+from igps.descriptors.fingerprint import fingerprint
 from igps.gallery.calibration import Calibration, calibration_params
-from igps.gallery.duplicates import Surfaces, _around_the_finest, compared, duplicates
-from igps.gallery.gallery import Gallery, fingerprint
+from igps.gallery.duplicates import _around_the_finest, body_distance, duplicates
+from igps.gallery.gallery import Gallery
+from igps.gallery.surfaces import Surfaces
 from igps.signature.signature import SignatureConfig
 from own_descriptors import Same
 
@@ -129,7 +131,7 @@ def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path: Path) -> No
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
     assert grouped(duplicates(dataset, n_workers=1).groups) == {frozenset({"one.off", "copy.off"})}
     names = dataset.bodies.names
-    apart = compared(dataset.subset([names.index("one.off"), names.index("longer.off")]))
+    apart = body_distance(dataset.subset([names.index("one.off"), names.index("longer.off")]))
     assert apart.limit < apart.surfaces < Calibration.load().same.distance
 
 
@@ -182,7 +184,7 @@ def test_handles_tell_bodies_apart_however_near_they_are(tmp_path: Path) -> None
     assert surfaces.limit(a_ball, a_ring, calibration) == 0
     assert surfaces.limit(a_ring, turned, calibration) > 0
     assert surfaces.limit(a_ball, a_cut, calibration) > 0
-    assert not compared(dataset.subset([a_ball, a_ring])).same
+    assert not body_distance(dataset.subset([a_ball, a_ring])).same
     assert grouped(duplicates(dataset, n_workers=1).groups) == {frozenset({"ring.off", "turned.off", "cut.off"})}
 
 
@@ -230,7 +232,7 @@ def test_a_distance_and_what_it_means(dataset: SignatureDataset) -> None:
     number = {name: i for i, name in enumerate(dataset.bodies.names)}
 
     def between(one: str, other: str) -> tuple[float, bool]:
-        found = compared(dataset.subset([number[one], number[other]]))
+        found = body_distance(dataset.subset([number[one], number[other]]))
         assert found.meaning == Calibration.load().words(found.distance)
         return found.surfaces, found.same
 
@@ -241,7 +243,7 @@ def test_a_distance_and_what_it_means(dataset: SignatureDataset) -> None:
     assert not between("bar.off", "bent.off")[1]
     assert not between("bar.off", "longer.off")[1]
     with pytest.raises(ValueError, match="dataset: expected two meshes to compare, got 7"):
-        compared(dataset)
+        body_distance(dataset)
 
 
 def test_the_commands(

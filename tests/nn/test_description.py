@@ -3,7 +3,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -14,19 +14,14 @@ from torch import Tensor
 
 import jobs
 from conftest import torch_threads
+from igps._parallel import one_thread
 from igps.data.batch import Body, SignatureBatch
-from igps.data.dataset import SignatureDataset
+from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
 from igps.mesh.mesh import MeshError
+from igps.nn._evaluation import evaluation_mode
 from igps.nn.axes import InteriorDistance, Potential
-from igps.nn.description import (
-    Description,
-    describe,
-    describe_each,
-    describe_usable,
-    evaluation_mode,
-    one_thread,
-)
+from igps.nn.description import describe
 from igps.nn.descriptor import BodyDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
@@ -44,6 +39,14 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataset:
         body.vertices *= [1.0, 1.0 + 0.2 * i, 1.5]
         body.export(root / f"{i}.off")
     return SignatureDataset(sorted(root.glob("*.off")), CONFIG, root / "cache")
+
+
+def describe_usable(
+    dataset: SignatureDataset, descriptor: torch.nn.Module, **options: Any
+) -> tuple[Tensor, list[Failure]]:
+    """Descriptions, and what could not be described."""
+    failures: list[Failure] = []
+    return describe(dataset, descriptor, failures=failures, **options), failures
 
 
 def histogram(n_eigenpairs: int = 12) -> HistogramDescriptor:
@@ -152,8 +155,6 @@ def test_what_cannot_be_described_is_listed(dataset: SignatureDataset) -> None:
     assert failure.path == dataset.bodies.paths[2]
     assert failure.error == f"{failure.path}: it is not to my liking"
     with pytest.raises(MeshError, match=re.escape(failure.error)):
-        describe_usable(dataset, area, n_workers=1, strict=True)
-    with pytest.raises(MeshError, match=re.escape(failure.error)):
         describe(dataset, area, n_workers=1)
     with pytest.raises(MeshError, match="it is not to my liking"):
         describe_usable(dataset, Area(refused=".off"), n_workers=1)
@@ -163,9 +164,10 @@ def test_a_mesh_that_cannot_be_read_is_listed(dataset: SignatureDataset, tmp_pat
     (tmp_path / "bad.off").write_text("nothing")
     paths = [dataset.bodies.paths[0], tmp_path / "bad.off"]
     both = SignatureDataset(paths, CONFIG, tmp_path / "cache")
-    values, failures = describe_usable(both, histogram(), n_workers=1)
-    assert values.shape == (1, 3, 8)
-    assert [failure.path for failure in failures] == [tmp_path / "bad.off"]
+    for batch_size in (1, 2):  # a bad mesh costs no other of its batch its description
+        values, failures = describe_usable(both, histogram(), batch_size=batch_size, n_workers=1)
+        assert values.shape == (1, 3, 8)
+        assert [failure.path for failure in failures] == [tmp_path / "bad.off"]
     with pytest.raises(MeshError, match=r"bad\.off"):
         describe(both, histogram(), n_workers=1)
 
@@ -177,19 +179,6 @@ def test_a_body_that_kills_its_process_costs_no_other_its_description(dataset: S
     assert "was killed, twice" in failures[0].error
 
 
-def test_several_descriptors_at_once(dataset: SignatureDataset) -> None:
-    work = [(one, dataset, i) for one in (histogram(), Area()) for i in (3, 0)]
-    found = dict(describe_each(work, n_workers=1))
-    assert sorted(found) == [0, 1, 2, 3]
-    for number, (descriptor, _, i) in enumerate(work):
-        description = found[number]
-        assert isinstance(description, Description)
-        assert description.seconds >= 0
-        expected = descriptor(dataset.batch([i], meshes=True))[0]
-        np.testing.assert_allclose(description.values, expected, atol=1e-6)
-    assert all(one.training for descriptor, *_ in work for one in descriptor.modules())
-
-
 def test_descriptions_that_are_not_finite_are_failures(dataset: SignatureDataset) -> None:
     class Broken(Area):
         def describe_body(self, body: Body) -> NDArray[np.float32]:
@@ -198,6 +187,11 @@ def test_descriptions_that_are_not_finite_are_failures(dataset: SignatureDataset
     values, failures = describe_usable(dataset, Broken(), n_workers=1)
     assert values.shape == (3, 1)
     assert "0.off: the description has entries that are not finite" in failures[0].error
+
+
+def test_an_empty_dataset_is_refused(dataset: SignatureDataset) -> None:
+    with pytest.raises(ValueError, match="dataset: expected at least one mesh to describe, got none"):
+        describe(dataset.subset([]), histogram())
 
 
 class Counting(HistogramDescriptor):

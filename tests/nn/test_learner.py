@@ -20,7 +20,7 @@ from igps.nn.description import describe
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
-from igps.nn.heads.learned import BlendedDistance, MetricHead
+from igps.nn.heads.learned import BlendedDistance, ProjectionHead
 from igps.nn.histograms.pairs import PairHistogram
 from igps.nn.learner import RetrievalLearner
 from igps.retrieval import chi_square, retrieval_scores
@@ -70,7 +70,7 @@ def two_parts() -> HistogramDescriptor:
 
 def learner(head: torch.nn.Module | None = None) -> RetrievalLearner:
     seed_everything(3, verbose=False)
-    return RetrievalLearner(bins(), BlendedDistance(head or MetricHead(width=8, n_hidden=16)))
+    return RetrievalLearner(bins(), BlendedDistance(head or ProjectionHead(width=8, n_hidden=16)))
 
 
 def state_of(model: torch.nn.Module) -> dict[str, torch.Tensor]:
@@ -164,7 +164,7 @@ def test_a_head_in_closed_form_follows_the_bins(shapes: Path, tmp_path: Path, va
         torch.testing.assert_close(model.distance.head.state_dict()[name].abs(), value.abs(), atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("make", [MetricHead, WhitenedHead, KernelHead])
+@pytest.mark.parametrize("make", [ProjectionHead, WhitenedHead, KernelHead])
 def test_any_loader_of_labelled_batches_trains(
     items: list[LabelledSignature], tmp_path: Path, make: type[torch.nn.Module]
 ) -> None:
@@ -190,7 +190,7 @@ def test_any_loader_of_labelled_batches_trains(
         torch.testing.assert_close(model(collate(items)), descriptions, atol=1e-6, rtol=0)
     head = loaded.distance.head
     fitted = head.whitened if isinstance(head, KernelHead) else head
-    if make is MetricHead:
+    if make is ProjectionHead:
         assert len(fitted.mean) == 48
         assert (fitted.mean > 0).any()
     else:
@@ -202,7 +202,7 @@ def test_any_loader_of_labelled_batches_trains(
     assert found[pairs].median() == pytest.approx(1, abs=0.5)
 
 
-@pytest.mark.parametrize("make", [MetricHead, WhitenedHead])
+@pytest.mark.parametrize("make", [ProjectionHead, WhitenedHead])
 def test_saving_a_checkpoint_changes_nothing(
     items: list[LabelledSignature], tmp_path: Path, make: type[torch.nn.Module]
 ) -> None:
@@ -250,7 +250,7 @@ def test_a_checkpoint_that_names_a_foreign_class_is_refused(items: list[Labelled
     model, run = learner(), trainer(1, tmp_path)
     run.fit(model, loader(items))
     run.save_checkpoint(tmp_path / "own.ckpt")
-    made = {"descriptor": bins(), "distance": BlendedDistance(MetricHead(width=8, n_hidden=16))}
+    made = {"descriptor": bins(), "distance": BlendedDistance(ProjectionHead(width=8, n_hidden=16))}
     loaded = RetrievalLearner.load_from_checkpoint(tmp_path / "own.ckpt", **made)
     assert loaded.hparams["learning_rate"] == 1e-3
     stored = torch.load(tmp_path / "own.ckpt", weights_only=True)
@@ -273,7 +273,7 @@ def test_a_checkpoint_that_names_a_foreign_class_is_refused(items: list[Labelled
 
 
 def test_a_lazy_head_has_its_size_before_the_optimiser_is_made() -> None:
-    model = RetrievalLearner(two_parts(), BlendedDistance(MetricHead(width=4)))
+    model = RetrievalLearner(two_parts(), BlendedDistance(ProjectionHead(width=4)))
     assert not any(isinstance(one, torch.nn.UninitializedParameter) for one in model.parameters())
     assert model.distance.head.layers[1].in_features == 3 * 16 + 9
     assert model.distance.head.training

@@ -55,10 +55,10 @@ def names(index: VectorIndex, indices: torch.Tensor) -> list[list[str]]:
     return [[entry.id for entry in index.entries(row.numpy())] for row in indices]
 
 
-@pytest.mark.parametrize("comparison", ["chi_square", None])
-def test_few_are_compared_one_by_one(tmp_path: Path, comparison: str | None) -> None:
+@pytest.mark.parametrize("searched_by", ["chi_square", None])
+def test_few_are_compared_one_by_one(tmp_path: Path, searched_by: str | None) -> None:
     rows = histograms(90, 12).reshape(90, 3, 4)
-    index = write_index(tmp_path / "g.igps", ABOUT, comparison, batches(rows))  # type: ignore[arg-type]
+    index = write_index(tmp_path / "g.igps", ABOUT, searched_by, batches(rows))  # type: ignore[arg-type]
     expected = search(rows[:5], rows, top=7)
     found = index.search(rows[:5], chi_square, top=7)
     assert names(index, found.indices) == [[str(i) for i in row] for row in expected.indices.tolist()]

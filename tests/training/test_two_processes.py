@@ -13,7 +13,7 @@ from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.description import describe
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.heads.learned import BlendedDistance, MetricHead
+from igps.nn.heads.learned import BlendedDistance, ProjectionHead
 from igps.nn.histograms.pairs import PairHistogram
 from igps.nn.learner import RetrievalLearner
 from igps.retrieval import retrieval_scores
@@ -61,7 +61,7 @@ def in_two_processes(work):  # type: ignore[no-untyped-def]
 def test_scores_on_two_processes_are_those_on_one(module: SignatureDataModule, tmp_path: Path) -> None:
     seed_everything(3, verbose=False)
     bins = PairHistogram([Potential(2, learnable=True), InteriorDistance(16, learnable=True)], SpectralEmbedding())
-    model = RetrievalLearner(HistogramDescriptor(bins), BlendedDistance(MetricHead(width=8, n_hidden=16)))
+    model = RetrievalLearner(HistogramDescriptor(bins), BlendedDistance(ProjectionHead(width=8, n_hidden=16)))
     before = {name: value.clone() for name, value in model.state_dict().items()}
 
     two = trainer(2, tmp_path)

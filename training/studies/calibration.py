@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import igps
 from igps._parallel import on_threads
+from igps.descriptors.fingerprint import fingerprint
 from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained
 from igps.gallery.calibration import (
     CALIBRATION,
@@ -24,8 +25,7 @@ from igps.gallery.calibration import (
     threshold_at,
     threshold_between,
 )
-from igps.gallery.duplicates import Surfaces, distance_if_alike
-from igps.gallery.gallery import fingerprint
+from igps.gallery.surfaces import Surfaces, distance_if_alike
 from igps.mesh.mesh import Mesh
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor

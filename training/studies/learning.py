@@ -16,7 +16,7 @@ from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, SplitProtocol, split_seen, split_unseen
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
-from igps.nn.heads.base import Head, distances_of
+from igps.nn.heads.base import Head
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
 from igps.nn.learner import RetrievalLearner
 from igps.report.learned import learned_layout
@@ -102,11 +102,11 @@ def score(
 ) -> dict[str, float]:
     """Scores of the test part, each shape against the others."""
     train, test = torch.tensor(split.train), torch.tensor(split.test)
-    metric = prior if head == "prior" else None
+    chosen = prior if head == "prior" else None
     if head in FITTED:
-        metric = FITTED[head](prior=prior).fit(histograms[train], labels[train], part_cells)
-    distance = chi_square if metric is None else distances_of(metric)
-    vectors = histograms[test] if metric is None else metric(histograms[test])
+        chosen = FITTED[head](prior=prior).fit(histograms[train], labels[train], part_cells)
+    distance = chi_square if chosen is None else chosen.distances
+    vectors = histograms[test] if chosen is None else chosen(histograms[test])
     return retrieval_scores(distance(vectors, vectors), labels[test]).mean()
 
 

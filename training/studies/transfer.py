@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from igps.data.splits import split_seen
-from igps.nn.heads.base import Head, distances_of
+from igps.nn.heads.base import Head
 from igps.nn.heads.closed_form import KernelHead
 from igps.report.learned import transfer_curve
 from igps.retrieval import chi_square, retrieval_scores
@@ -50,7 +50,7 @@ def curve(
 def scores(head: Head, histograms: Tensor, labels: Tensor) -> dict[str, float]:
     """Leave-one-out scores of a head's distance."""
     vectors = head(histograms)
-    return retrieval_scores(distances_of(head)(vectors, vectors), labels).mean()
+    return retrieval_scores(head.distances(vectors, vectors), labels).mean()
 
 
 def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: Head, part_cells: Sequence[int]) -> None:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from igps._parallel import one_thread
+from igps._parallel import Failed, one_thread, run
 from igps.data.dataset import Failure, SignatureDataset
 from igps.mesh.mesh import MeshError
-from igps.nn.description import Description, describe_each
 from igps.nn.descriptor import Descriptor
 from igps.retrieval.scores import SCORE_NAMES, RetrievalScores, retrieval_scores
 
@@ -91,21 +92,23 @@ def compare(
         raise ValueError("dataset: expected meshes with classes, got none. Give labels, or a folder per class.")
     check_descriptors(descriptors, dataset)
     n = len(dataset)
-    jobs = [(descriptor, dataset, i) for descriptor in descriptors for i in range(n)]
-    found: dict[int, Description | Failure] = {}
+    jobs = [(descriptor, dataset.subset([i])) for descriptor in descriptors for i in range(n)]
+    found: dict[int, _Description | Failure] = {}
     n_done = 0
     with (
         tqdm(total=len(jobs), desc="descriptions", disable=not progress) as bar,
-        contextlib.closing(describe_each(jobs, n_workers)) as outcomes,
+        contextlib.closing(run(_described, jobs, n_workers=n_workers)) as outcomes,
     ):
         for number, outcome in outcomes:
             bar.update()
-            if isinstance(outcome, Failure):
-                named = f"{descriptors[number // n].name}: {outcome.error}"
+            if isinstance(outcome, Failed):
+                found[number] = failure = dataset.failure(number % n, outcome)
+                named = f"{descriptors[number // n].name}: {failure.error}"
                 if strict:
                     raise MeshError(named)
                 logger.warning("skipped: %s", named)
-            found[number] = outcome
+            else:
+                found[number] = outcome
             while n_done < len(descriptors) and all(n_done * n + i in found for i in range(n)):
                 mine = [found.pop(n_done * n + i) for i in range(n)]
                 yield _result(descriptors[n_done], dataset, mine, progress)
@@ -124,11 +127,34 @@ def check_descriptors(descriptors: Sequence[Descriptor], dataset: SignatureDatas
         descriptor.requirements.check_config(dataset.config)
 
 
+@dataclass(frozen=True, eq=False)
+class _Description:
+    """What a descriptor says of one mesh, and how many seconds of processor time that took."""
+
+    values: NDArray[np.float32]
+    seconds: float
+
+
+def _described(job: tuple[Descriptor, SignatureDataset]) -> _Description:
+    """Of the one mesh of a dataset; timed from the cached signature on, with the reading of a mesh that is needed."""
+    descriptor, dataset = job
+    with one_thread(), torch.inference_mode():
+        batch = dataset.batch([0])
+        start = time.process_time()
+        if descriptor.requirements.mesh:
+            batch = dataset.batch([0], meshes=True)
+        values = descriptor(batch)[0].cpu().numpy()
+        seconds = time.process_time() - start
+    if not np.isfinite(values).all():
+        raise MeshError(f"{dataset.bodies.paths[0]}: the description has entries that are not finite.")
+    return _Description(values, seconds)
+
+
 def _result(
-    descriptor: Descriptor, dataset: SignatureDataset, outcomes: Sequence[Description | Failure], progress: bool
+    descriptor: Descriptor, dataset: SignatureDataset, outcomes: Sequence[_Description | Failure], progress: bool
 ) -> Result:
-    described = [i for i, outcome in enumerate(outcomes) if isinstance(outcome, Description)]
-    descriptions = [outcome for outcome in outcomes if isinstance(outcome, Description)]
+    described = [i for i, outcome in enumerate(outcomes) if isinstance(outcome, _Description)]
+    descriptions = [outcome for outcome in outcomes if isinstance(outcome, _Description)]
     labels = [dataset.bodies.labels[i] for i in described] if dataset.bodies.labels else []
     distances, scores, error = None, None, None
     try:

@@ -11,7 +11,7 @@ from igps.cli.reading import signatures, write_rows
 from igps.data.sources import find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.gallery.calibration import Calibration
-from igps.gallery.duplicates import Duplicates, compared
+from igps.gallery.duplicates import Duplicates, body_distance
 from igps.gallery.duplicates import duplicates as find_duplicates
 from igps.gallery.gallery import Gallery
 
@@ -80,7 +80,7 @@ def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
     chosen = descriptor_of(DESCRIPTOR)
     reading["strict"] = True
     dataset, _ = signatures(meshes, [chosen], **reading)
-    found = compared(dataset, DESCRIPTOR, progress=True)
+    found = body_distance(dataset, DESCRIPTOR, progress=True)
     print(f"{found.distance:.4g} by {DESCRIPTOR}: {found.meaning}")
     told = "the same shape" if found.same else "not the same shape"
     why = f"at their level of detail, the same up to {found.limit:.3%}" if found.limit else "one has more handles"

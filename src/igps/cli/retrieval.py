@@ -20,8 +20,9 @@ from igps.cli.report import report as write_report
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies, find_bodies, labelled_bodies
 from igps.descriptors import descriptor as descriptor_of
-from igps.gallery.gallery import Gallery, cache_tag
-from igps.nn.description import describe_usable
+from igps.descriptors.fingerprint import cache_tag
+from igps.gallery.gallery import Gallery
+from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.report.sources import write_sources
 from igps.report.tables import scores_table
@@ -193,10 +194,16 @@ def _described(
     """The meshes that could be used, their descriptions, and the failures of the others."""
     module = descriptor_of(descriptor)
     dataset, unread = signatures(source, [module], n_workers=n_workers, strict=strict, **reading)
-    descriptions, undescribed = describe_usable(
-        dataset, module, cache_tag=cache_tag(descriptor, module), n_workers=n_workers, strict=strict, progress=True
+    failures: list[Failure] = []
+    descriptions = describe(
+        dataset,
+        module,
+        failures=None if strict else failures,
+        cache_tag=cache_tag(descriptor, module),
+        n_workers=n_workers,
+        progress=True,
     )
-    return dataset.usable(undescribed), descriptions, [*unread, *undescribed]
+    return dataset.usable(failures), descriptions, [*unread, *failures]
 
 
 def _summary(

@@ -82,7 +82,7 @@ class SizedHistograms(HistogramDescriptor):
     s is |Δ log area| + |Δ log volume|. The last two numbers of a description are these logarithms.
     """
 
-    comparison = None  # type: ignore[assignment]
+    searched_by = None
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, cells + 2)."""

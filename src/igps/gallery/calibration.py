@@ -12,8 +12,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from igps.descriptors.fingerprint import fingerprint, name_of
 from igps.descriptors.pretrained.descriptor import PRETRAINED
-from igps.gallery.gallery import fingerprint, name_of
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig
 

@@ -1,59 +1,44 @@
 """Files that show the same body, whatever its scale, mirror image, triangulation, level of detail or file format.
 
-Two surfaces are laid onto each other, which tells the same shape from another pose and from a sibling. That is done for
-those alone whose samples lie at about the same distances from each other, or in an index, whose descriptions are near.
-They may be as far apart as their levels of detail explain: about as far as the coarser of the two is from itself with
-every vertex in the middle of its neighbours. What "about" means is calibrated on generated bodies, see `Calibration`.
-Bodies with different numbers of handles are not the same. And no file joins two that are not the same as each other.
+Two surfaces are laid onto each other, which tells the same shape from another pose and from a sibling, see
+`igps.gallery.surfaces`. Only those are laid whose samples lie at about the same distances from each other, or in an
+index, whose descriptions are near. And no file joins two that are not the same as each other.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.cluster.hierarchy import DisjointSet
 from torch import Tensor
 from tqdm import tqdm
 
-from igps._parallel import Failed, on_threads
+from igps._parallel import on_threads
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
-from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
+from igps.gallery._alignment import surface_distance
 from igps.gallery.calibration import Calibration
 from igps.gallery.gallery import Gallery
-from igps.mesh.mending import Step, mended_by
-from igps.mesh.mesh import Mesh, MeshError
-from igps.mesh.surface import mean_of_neighbours
-from igps.nn.description import describe_usable
+from igps.gallery.surfaces import Surfaces
+from igps.mesh.mesh import MeshError
+from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 from igps.retrieval.distances import Distance, euclidean
-from igps.signature.attributes import AttributeName
-from igps.signature.signature import Signature
 
-# Rows of distances, pairs whose surfaces are compared, samples of surfaces, and surfaces, in memory at once.
-_ROWS, _PAIRS, _SURFACES, _TRIANGLES = 256, 256, 512, 64
+# Rows of distances, and pairs whose surfaces are compared, in memory at once.
+_ROWS, _PAIRS = 256, 256
 # Pairs as near as copies are asked for among so many of an index, then among ever more.
 _FIRST_TOP = 32
-_NORMALS: AttributeName = "surface_direction"
 # What sampling adds to the difference of the profiles of one surface: between copies, it is up to 0.01.
 _PROFILE_NOISE = 0.02
-# Copies differ by up to 0.045 in the logarithms of their extents; what differs by more is not laid onto each other.
-_MOST_STRETCHED = 0.15
-# A tenth of this is much between copies.
-_HOPELESS = 0.03
-
-# What is done to a mesh that leaves its handles as they are.
-_KEEP_HANDLES: set[Step] = {"welded", "smoothed", "subdivided"}
 
 _Pairs = dict[tuple[int, int], float]
 
@@ -80,8 +65,8 @@ class Duplicates:
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """How far two bodies are from each other.
+class BodyDistance:
+    """How far two bodies are from each other, and what that means.
 
     Args:
         distance: by the descriptor.
@@ -229,13 +214,13 @@ def _groups(joined: _Pairs) -> list[list[int]]:
     return sorted(sorted(members) for members in group.subsets())
 
 
-def compared(
+def body_distance(
     dataset: SignatureDataset,
     descriptor: str | Descriptor = "pretrained",
     *,
     calibration: Calibration | None = None,
     progress: bool = False,
-) -> Comparison:
+) -> BodyDistance:
     """How far the two meshes of a dataset are from each other, and what that means.
 
     Args:
@@ -252,139 +237,12 @@ def compared(
         raise ValueError(f"dataset: expected two meshes to compare, got {len(dataset)}.")
     calibration, chosen = calibration or Calibration.load(), descriptor_of(descriptor)
     calibration.check(descriptor, chosen, dataset.config)
-    descriptions, _ = describe_usable(dataset, chosen, n_workers=1, strict=True, progress=progress)
+    descriptions = describe(dataset, chosen, n_workers=1, progress=progress)
     with torch.inference_mode():
         distance = float(chosen.distances(descriptions[:1], descriptions[1:]))
     surfaces = Surfaces(dataset)
     apart, limit = surface_distance(*map(surfaces.samples, range(2))), surfaces.limit(0, 1, calibration)
-    return Comparison(distance, apart, limit, calibration.words(distance), apart <= limit)
-
-
-def distance_if_alike(one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0) -> float:
-    """`surface_distance`, infinite where the extents of the two tell that they are not the same."""
-    if np.abs(np.log(one.extents / other.extents)).max() > _MOST_STRETCHED:
-        return math.inf
-    return surface_distance(one, other, enough=enough, hopeless=_HOPELESS)
-
-
-class Surfaces:
-    """The samples of surfaces of a dataset, the last used of them in memory.
-
-    Args:
-        dataset: of meshes, whose Signatures give the samples; a mesh itself is read where another is near.
-
-    Attributes:
-        failures: of meshes that could not be read, by index.
-    """
-
-    def __init__(self, dataset: SignatureDataset) -> None:
-        self.failures: dict[int, Failure] = {}
-        self._dataset = dataset
-        self._last = lru_cache(_SURFACES)(self.samples)
-        self._last_triangles = lru_cache(_TRIANGLES)(self._triangles)
-        self._frame = lru_cache(None)(self._origin_and_area)
-        self._known = lru_cache(None)(self._coarseness_and_handles)
-
-    def samples(self, i: int) -> SurfaceSamples:
-        """Those of one.
-
-        Raises:
-            MeshError: the mesh cannot be used; so does their `surface`.
-            ValueError: the Signatures have no directions of the surface.
-        """
-        signature = self._signature(i)
-        found = SurfaceSamples.of(signature.surface.points, signature.surface.attributes[_NORMALS], signature.area)
-        return replace(found, surface=partial(self._last_triangles, i))
-
-    def coarseness(self, i: int) -> float:
-        """How far one is from itself with each vertex in the middle of its neighbours, over √area.
-
-        That is what its level of detail leaves open: how far chords cut round parts off, and other triangles sharp
-        edges. On thin triangles, near neighbours count, see `mean_of_neighbours`.
-
-        Raises:
-            MeshError: the mesh cannot be used.
-            ImportError: libigl is not installed.
-        """
-        return self._known(i)[0]
-
-    def distance(self, i: int, j: int, calibration: Calibration) -> float:
-        """That of two, over √area; infinite where they are not the same, or one cannot be read."""
-        try:
-            one, other = self._last(i), self._last(j)
-            apart = distance_if_alike(one, other, enough=calibration.same.distance)
-            if apart > calibration.same.distance:
-                return math.inf
-            limit = self.limit(i, j, calibration)
-            if apart > limit > 0:
-                # The search has ended at what was near enough: the nearest may be within the limit.
-                apart = distance_if_alike(one, other, enough=limit)
-            return apart if apart <= limit else math.inf
-        except MeshError:
-            return math.inf
-
-    def limit(self, i: int, j: int, calibration: Calibration) -> float:
-        """How far two may be apart and the same, see `Calibration.limit`; raises as `coarseness` does.
-
-        Not at all if one has more handles than the other.
-        """
-        (coarseness, handles), (of_other, handles_of_other) = self._known(i), self._known(j)
-        if None not in (handles, handles_of_other) and handles != handles_of_other:
-            return 0.0
-        return calibration.limit(max(coarseness, of_other))
-
-    def profile(self, i: int) -> NDArray[np.float64] | None:
-        """That of one; None where it cannot be read."""
-        try:
-            return self.samples(i).profile
-        except MeshError:
-            return None
-
-    def _coarseness_and_handles(self, i: int) -> tuple[float, int | None]:
-        """Handles are None where the mesh is open, and where mending may have made some or closed holes."""
-        mesh = self._mesh(i)
-        blurred = TriangleSurface(mean_of_neighbours(self._placed(i, mesh), mesh.faces), mesh.faces)
-        handles = None
-        if not set(mended_by(mesh.notes)) - _KEEP_HANDLES:
-            with contextlib.suppress(MeshError):
-                handles = mesh.genus
-        return offset_in_place(self._last(i), blurred), handles
-
-    def _triangles(self, i: int) -> TriangleSurface:
-        mesh = self._mesh(i)
-        return TriangleSurface(self._placed(i, mesh), mesh.faces)
-
-    def _placed(self, i: int, mesh: Mesh) -> NDArray[np.float64]:
-        """The vertices of one about the origin and in the unit of its samples."""
-        origin, area = self._frame(i)
-        return (mesh.vertices - origin) / math.sqrt(area)
-
-    def _origin_and_area(self, i: int) -> tuple[NDArray[np.float64], float]:
-        signature = self._signature(i)
-        return signature.surface.points.mean(axis=0), signature.area
-
-    def _mesh(self, i: int) -> Mesh:
-        try:
-            return self._dataset.mesh(i)
-        except MeshError as error:
-            self._keep(i, error)
-            raise
-
-    def _signature(self, i: int) -> Signature:
-        try:
-            signature = self._dataset[i].signature
-        except MeshError as error:
-            self._keep(i, error)
-            raise
-        if _NORMALS not in signature.surface.attributes:
-            raise ValueError(
-                f"attributes: expected {_NORMALS!r} among those of the surface samples, got "
-                f"{sorted(signature.surface.attributes)}. Name it in SignatureConfig(attributes=...)."
-            )
-        return signature
-
-    def _keep(self, i: int, error: MeshError) -> None:
-        self.failures[i] = self._dataset.failure(i, Failed(str(error)))
+    return BodyDistance(distance, apart, limit, calibration.words(distance), apart <= limit)
 
 
 def _described(
@@ -392,7 +250,8 @@ def _described(
 ) -> tuple[Tensor, list[Failure]]:
     """Descriptions, or where there is no descriptor the profiles of the surfaces, and what has none."""
     if descriptor is not None:
-        return describe_usable(dataset, descriptor, n_workers=n_workers, progress=progress)
+        failures: list[Failure] = []
+        return describe(dataset, descriptor, failures=failures, n_workers=n_workers, progress=progress), failures
     surfaces = Surfaces(dataset)
     profiled = on_threads(surfaces.profile, range(len(dataset)), n_workers)
     found = list(tqdm(profiled, desc="surfaces", total=len(dataset), disable=not progress))

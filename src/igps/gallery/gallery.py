@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
-import importlib.metadata
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from tqdm import tqdm
 
 from igps.data.dataset import Failure, SignatureDataset
-from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
+from igps.descriptors.fingerprint import fingerprint, name_of
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
-from igps.nn.description import describe_usable
-from igps.nn.descriptor import Descriptor
-from igps.nn.heads.base import distances_of
-from igps.retrieval.distances import cosine
+from igps.nn.description import describe
+from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.retrieval.index import CANDIDATES, Entry, VectorIndex, check_alike, extend_index, merge_indices, write_index
 from igps.retrieval.ranking import SearchResult
 from igps.retrieval.reranking import N_RERANKED, rerank_found
@@ -30,8 +25,6 @@ from igps.signature.signature import SignatureConfig
 
 # So many descriptions are in memory at once.
 _AT_ONCE = 256
-# The packages that descriptions are computed with.
-_COMPUTE_WITH = "torch", "numpy", "scipy", "numba", "libigl"
 
 
 @dataclass(frozen=True)
@@ -113,7 +106,7 @@ class Gallery:
             MeshError: the mesh cannot be used.
         """
         dataset = SignatureDataset([mesh], self.config, cache_dir, reading=self.reading)
-        descriptions, _ = describe_usable(dataset, self.descriptor, n_workers=1, strict=True)
+        descriptions = describe(dataset, self.descriptor, n_workers=1)
         return self.nearest(descriptions, top=top, exact=exact, rerank=rerank)[0]
 
     def nearest(
@@ -142,9 +135,8 @@ class Gallery:
 
     def search(self, descriptions: Tensor, *, top: int, exact: bool = False) -> SearchResult:
         """The entries of the index closest to each of the descriptions (Q, ...), by the descriptor's own distance."""
-        # More are ranked where the cosine of the vectors is not the descriptor's distance, only near it.
-        head = getattr(self.descriptor, "head", None)
-        candidates = CANDIDATES if distances_of(head) is cosine else 4 * CANDIDATES
+        # More are ranked under a head, whose distance may be only near the cosine's.
+        candidates = 4 * CANDIDATES if isinstance(self.descriptor, EmbeddedDescriptor) else CANDIDATES
         with torch.inference_mode():
             return self.index.search(
                 descriptions, self.descriptor.distances, top=min(top, len(self)), exact=exact, candidates=candidates
@@ -155,7 +147,7 @@ class Gallery:
         cls,
         path: str | Path,
         dataset: SignatureDataset,
-        descriptor: str | Descriptor,
+        descriptor: str | Descriptor = "pretrained",
         *,
         n_workers: int | None = None,
         strict: bool = False,
@@ -177,7 +169,7 @@ class Gallery:
         failures: list[Failure] = []
         about = about_of(dataset.config, dataset.reading, descriptor)
         batches = _batches(dataset, chosen, {}, failures, n_workers, strict, progress)
-        write_index(path, about, chosen.comparison, batches, progress=progress)
+        write_index(path, about, chosen.searched_by, batches, progress=progress)
         return cls(path, descriptor), failures
 
     @classmethod
@@ -185,7 +177,7 @@ class Gallery:
         cls,
         path: str | Path,
         dataset: SignatureDataset,
-        descriptor: str | Descriptor,
+        descriptor: str | Descriptor = "pretrained",
         *,
         n_workers: int | None = None,
         strict: bool = False,
@@ -241,62 +233,6 @@ def about_of(config: SignatureConfig, reading: LoadOptions, descriptor: str | De
     }
 
 
-def name_of(descriptor: str | Descriptor) -> str:
-    """The name by which a descriptor was asked for, or its own."""
-    return descriptor if isinstance(descriptor, str) else descriptor.name
-
-
-def fingerprint(descriptor: nn.Module) -> str:
-    """A checksum of all parameters of a descriptor: numbers, learned or given, and classes of all its modules."""
-    found = hashlib.sha256()
-    of_every_module = vars(nn.Module())  # differ between versions of PyTorch
-    for name, module in descriptor.named_modules():
-        plain = {k: v for k, v in sorted(vars(module).items()) if k not in of_every_module and _is_plain(v)}
-        found.update(f"{name} {type(module).__qualname__} {plain!r}\0".encode())
-    for name, tensor in sorted(descriptor.state_dict().items()):
-        values = tensor.detach().cpu().contiguous()
-        found.update(f"{name} {values.dtype} {tuple(values.shape)}\0".encode())
-        found.update(values.numpy().tobytes())
-    return found.hexdigest()[:32]
-
-
-def cache_tag(descriptor: str | Descriptor, module: Descriptor) -> str | None:
-    """All that descriptions depend on beside Signatures, in words, see `igps.nn.description.describe_usable`.
-
-    Name and parameters of the descriptor, the library's code, and the versions of what that computes with.
-
-    Args:
-        descriptor: as it was asked for. None is returned for all that is not one of the library's by its name: what
-            code there is to one of your own is not known.
-        module: the descriptor itself.
-    """
-    return f"{descriptor} {fingerprint(module)} {_code()}" if descriptor in NAMES else None
-
-
-@cache
-def _code() -> str:
-    """A checksum of the library's sources, and versions."""
-    package = Path(__file__).parents[1]
-    found = hashlib.sha256()
-    for source in sorted(package.rglob("*.py")):
-        found.update(f"{source.relative_to(package).as_posix()}\0".encode())
-        found.update(source.read_bytes())
-    return " ".join((found.hexdigest()[:32], *(f"{name} {_version(name)}" for name in _COMPUTE_WITH)))
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "none"
-
-
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, tuple):
-        return all(map(_is_plain, value))
-    return value is None or isinstance(value, bool | int | float | str)
-
-
 def _batches(
     dataset: SignatureDataset,
     descriptor: Descriptor,
@@ -306,40 +242,34 @@ def _batches(
     strict: bool,
     progress: bool,
 ) -> Iterator[tuple[Tensor, list[Entry]]]:
+    """Descriptions and entries of the files that are not known by their marks; the failures are added to the list."""
     with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
         for start in range(0, len(dataset), _AT_ONCE):
             part = dataset.subset(range(start, min(start + _AT_ONCE, len(dataset))))
             keys = [_key(part, i) for i in range(len(part))]
-            new = [i for i, path in enumerate(part.bodies.paths) if keys[i] is None or known.get(_id(path)) != keys[i]]
-            if new:
-                descriptions, failed = _described(part.subset(new), descriptor, n_workers, strict)
-                failures += failed
+            paths, names, labels = part.bodies.paths, part.bodies.names, part.bodies.labels or (None,) * len(part)
+            new = [i for i, path in enumerate(paths) if keys[i] is None or known.get(_id(path)) != keys[i]]
+            descriptions, failed = _described(part.subset(new), descriptor, n_workers, strict)
+            if len(new) > len(failed):
                 lost = {failure.id for failure in failed}
-                labels = part.bodies.labels or (None,) * len(part)
-                entries = [
-                    Entry(_id(part.bodies.paths[i]), part.bodies.names[i], labels[i], keys[i] or "")
-                    for i in new
-                    if part.bodies.names[i] not in lost
-                ]
-                yield descriptions, entries
+                left = [i for i in new if names[i] not in lost]
+                yield descriptions, [Entry(_id(paths[i]), names[i], labels[i], keys[i] or "") for i in left]
+            failures += failed
             bar.update(len(part))
 
 
 def _described(
     dataset: SignatureDataset, descriptor: Descriptor, n_workers: int | None, strict: bool
 ) -> tuple[Tensor, list[Failure]]:
+    """Descriptions of those of the meshes that can be described, which may be none, and the failures of the others."""
+    failed: list[Failure] = []
     try:
-        return describe_usable(dataset, descriptor, n_workers=n_workers, strict=strict)
-    except MeshError as error:
+        if len(dataset):
+            return describe(dataset, descriptor, failures=None if strict else failed, n_workers=n_workers), failed
+    except MeshError:
         if strict:
             raise
-        if len(dataset) == 1:
-            path = dataset.bodies.paths[0]
-            words = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
-            return torch.zeros(0), [Failure(dataset.bodies.names[0], path, words)]
-    # None of them: each tells why, where all at once tell of one alone.
-    each = [_described(dataset.subset([i]), descriptor, 1, strict) for i in range(len(dataset))]
-    return torch.zeros(0), [failure for _, failed in each for failure in failed]
+    return torch.zeros(0), failed
 
 
 def _key(dataset: SignatureDataset, i: int) -> str | None:

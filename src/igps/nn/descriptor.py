@@ -17,10 +17,10 @@ from igps._threads import one_thread
 from igps.data.batch import Body, SignatureBatch
 from igps.data.requirements import Requirements
 from igps.nn.batch_features import Views
-from igps.nn.heads.base import distances_of
+from igps.nn.heads.base import Head
 from igps.nn.histograms.base import SampleHistogram
 from igps.retrieval import chi_square
-from igps.retrieval.vectors import MOST_NUMBERS, Comparison
+from igps.retrieval.vectors import MOST_NUMBERS, SearchDistance
 
 
 class Descriptor(nn.Module, ABC):
@@ -55,16 +55,16 @@ class Descriptor(nn.Module, ABC):
         invariant_to: which of "motion" (rotation, translation, reflection), "scale" and "pose" (isometric bending)
             leave its descriptions as they are, but for discretisation.
         requirements: of a body; all eigenpairs, unless redefined.
-        comparison: "cosine" or "chi_square" where `distances` is that of unit vectors or of histograms, or follows it
-            so closely that what is near by `distances` is among the some hundreds that are nearest by it: an index has
-            short vectors of these. None for all others, which it compares one by one.
+        searched_by: the distance by which an index finds candidates, "cosine" for unit vectors or "chi_square" for
+            histograms; what is near by `distances` must be among the few hundred that are nearest by it. None where
+            neither is: an index compares with all.
     """
 
     name: str = "descriptor"
     source: str = ""
     invariant_to: tuple[str, ...] = ()
     requirements: Requirements = Requirements(whole_spectrum=True)
-    comparison: Comparison | None = None
+    searched_by: SearchDistance | None = None
 
     @abstractmethod
     def describe(self, batch: SignatureBatch) -> Tensor:
@@ -138,7 +138,7 @@ class HistogramDescriptor(Descriptor):
         ValueError: no histogram.
     """
 
-    comparison = "chi_square"
+    searched_by: SearchDistance | None = "chi_square"
 
     def __init__(
         self,
@@ -182,29 +182,28 @@ class HistogramDescriptor(Descriptor):
 
 
 class EmbeddedDescriptor(Descriptor):
-    """A descriptor under a head fitted to its descriptions, compared by the head's own distance or by the cosine.
+    """A descriptor under a head fitted to its descriptions, compared by the head's distance.
 
     Args:
         descriptor: `SignatureBatch` to descriptions.
-        head: descriptions to (N, D) of length 1.
+        head: of these descriptions.
         name, source: see `Descriptor`.
         invariant_to: see `Descriptor`; that of `descriptor` if None, though a head may have learned more.
     """
 
-    comparison = "cosine"
+    searched_by: SearchDistance | None = "cosine"
 
     def __init__(
         self,
         descriptor: Descriptor,
-        head: nn.Module,
+        head: Head,
         *,
         name: str = "embedded",
         source: str = "",
         invariant_to: Sequence[str] | None = None,
     ) -> None:
         super().__init__()
-        self.descriptor = descriptor
-        self.head = head
+        self.descriptor, self.head = descriptor, head
         self.name, self.source = name, source
         self.invariant_to = descriptor.invariant_to if invariant_to is None else tuple(invariant_to)
         self.requirements = descriptor.requirements
@@ -214,22 +213,13 @@ class EmbeddedDescriptor(Descriptor):
         return self.head(self.descriptor(batch))
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
-        """(Q, G) distances of the head's own, such as a `TwoLevelHead` has, or cosine distances."""
-        return distances_of(self.head)(queries, gallery)
+        """(Q, D) and (G, D) embeddings to (Q, G) distances of the head."""
+        return self.head.distances(queries, gallery)
 
     def short(self, embeddings: Tensor) -> Tensor:
         """(N, D) embeddings to (N, ≤ 256) of length 1, for engines that take no more and compare by the cosine.
 
         Raises:
-            ValueError: they have more numbers, and the head has no shorter ones.
+            ValueError: they have more numbers, and the head has no shorter ones, see `Head.short`.
         """
-        if embeddings.shape[1] <= MOST_NUMBERS:
-            return embeddings
-        own = getattr(self.head, "short", None)
-        if own is None:
-            raise ValueError(
-                f"short: expected a head that shortens its vectors, as the TwoLevelHead of pretrained does, got "
-                f"{type(self.head).__name__} and vectors of {embeddings.shape[1]} numbers."
-            )
-        shortened: Tensor = own(embeddings)
-        return shortened
+        return embeddings if embeddings.shape[1] <= MOST_NUMBERS else self.head.short(embeddings)

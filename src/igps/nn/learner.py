@@ -1,4 +1,4 @@
-"""Training a descriptor and a metric end to end, as a LightningModule."""
+"""Training a descriptor and a head end to end, as a LightningModule."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 from igps._threads import one_thread
 from igps.data.batch import SignatureBatch
 from igps.data.datamodule import has_configuration
-from igps.nn.description import evaluation_mode
+from igps.nn._evaluation import evaluation_mode
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.heads.base import Head
 from igps.nn.heads.learned import BlendedDistance
@@ -32,15 +32,15 @@ class RetrievalLearner(LightningModule):
     training shapes before the first step, and one that is fitted in closed form, such as a `WhitenedHead`, again before
     each validation and after each epoch; what is trained then are bins and filters, through it.
 
-    Validation and test log the retrieval scores of the whole distance, each shape against all others of its part. With
-    a distance that has no head there is nothing to train, and `Trainer.test` gives the plain descriptor's scores.
+    Validation and test log the retrieval scores of the distance, each shape against all others of its part. A distance
+    without a head has nothing to train, and `Trainer.test` gives the scores of the plain descriptor.
 
     Example:
         >>> import tempfile
         >>> from pytorch_lightning import Trainer
         >>> from igps import ArticulatedShapes, HistogramDescriptor, PairHistogram, SignatureConfig, SignatureDataModule
-        >>> from igps.nn.heads.learned import BlendedDistance, MetricHead
-        >>> learner = RetrievalLearner(HistogramDescriptor(PairHistogram()), BlendedDistance(MetricHead()))
+        >>> from igps.nn.heads.learned import BlendedDistance, ProjectionHead
+        >>> learner = RetrievalLearner(HistogramDescriptor(PairHistogram()), BlendedDistance(ProjectionHead()))
         >>> trainer = Trainer(
         ...     max_epochs=1, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
         ...     enable_model_summary=False,
@@ -133,16 +133,16 @@ class RetrievalLearner(LightningModule):
         """(Q, G) distances between descriptions (Q, ...) and (G, ...)."""
         return self.distance(queries, gallery)
 
+    @property
+    def _head(self) -> Head:
+        if self.distance.head is None:
+            raise ValueError("distance: expected a head to train, got none. Use Trainer.test for a plain descriptor.")
+        return self.distance.head
+
     def setup(self, stage: str) -> None:
         """Refuse to train without a head, before the optimiser is made."""
-        if stage == "fit" and self.distance.head is None:
-            raise ValueError("distance: expected a head to train, got none. Use Trainer.test for a plain descriptor.")
-
-    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_index: int) -> Any:
-        """Lightning moves tensors and their containers, not batches of ours."""
-        if isinstance(batch, SignatureBatch):
-            return batch.to(device)
-        return super().transfer_batch_to_device(batch, device, dataloader_index)
+        if stage == "fit":
+            _ = self._head
 
     def on_train_start(self) -> None:
         """Fit the head to the training shapes, or centre its inputs on them."""
@@ -160,8 +160,7 @@ class RetrievalLearner(LightningModule):
     @one_thread()
     def training_step(self, batch: SignatureBatch, batch_index: int) -> Tensor:
         """Loss of one P×K batch."""
-        assert self.distance.head is not None  # setup() has made sure
-        embeddings = self.distance.head(self(batch))
+        embeddings = self._head(self(batch))
         chosen = () if self.miner is None else (self.miner(embeddings, batch.labels),)
         loss: Tensor = self.loss(embeddings, batch.labels, *chosen)
         self.log("train_loss", loss, batch_size=len(batch), prog_bar=True)
@@ -219,11 +218,10 @@ class RetrievalLearner(LightningModule):
         """
         if self._fitted_at == self.global_step:
             return
-        head = self.distance.head
+        head = self._head
         with evaluation_mode(self):
             descriptions, labels = self._training_descriptions()
-            has_gradients = head is not None and any(True for _ in head.parameters())
-            if isinstance(head, Head) and not (has_gradients and calibrate):
+            if not (calibrate and any(True for _ in head.parameters())):
                 head.fit(descriptions, labels, self.part_cells)
             if calibrate:
                 self.distance.calibrate(descriptions)

@@ -38,7 +38,7 @@ from igps.retrieval.index_part import (
     sizes,
 )
 from igps.retrieval.ranking import SearchResult, rank
-from igps.retrieval.vectors import Comparison, VectorMap
+from igps.retrieval.vectors import SearchDistance, VectorMap
 
 __all__ = ["CANDIDATES", "Entry", "VectorIndex"]
 
@@ -48,7 +48,7 @@ CANDIDATES = 512
 Batches = Iterable[tuple[Tensor, Sequence[Entry]]]
 """Descriptions (N, ...), some at a time, and what is known of each."""
 
-_FORMAT = "igps-index-1"
+_FORMAT = "igps-index-2"
 _MANIFEST, _LOCK, _STAGED, _PART = "manifest.json", "lock", "staged-", "part-"
 _OURS = (_MANIFEST, _LOCK, _STAGED, _PART, "map-")
 # Fewer are all compared; the map of more is fitted to no more than so many.
@@ -90,7 +90,7 @@ class VectorIndex:
     def _open(self, manifest: dict[str, Any]) -> None:
         self.about: dict[str, Any] = manifest["about"]
         self.shape: tuple[int, ...] = tuple(manifest["shape"])
-        self.comparison: Comparison | None = manifest["comparison"]
+        self.searched_by: SearchDistance | None = manifest["searched_by"]
         self.vector_map = _load_map(self.path, manifest["map"])
         self.manifest = manifest
         self.parts = []
@@ -209,7 +209,7 @@ class VectorIndex:
 def write_index(
     path: str | Path,
     about: Mapping[str, Any],
-    comparison: Comparison | None,
+    searched_by: SearchDistance | None,
     batches: Batches,
     *,
     progress: bool = False,
@@ -219,14 +219,14 @@ def write_index(
     Args:
         path: its folder.
         about: what its users want to know of it, for JSON.
-        comparison: how the descriptions are compared; None where by neither of these: all will be compared.
+        searched_by: the distance by which candidates are found; None where neither serves: all will be compared.
         batches: at least one description.
         progress: show bars of what is done once the descriptions are there.
 
     Raises:
         ValueError: nothing to index.
     """
-    return _changed(Path(path), dict(about), comparison, batches, keep=False, progress=progress)
+    return _changed(Path(path), dict(about), searched_by, batches, keep=False, progress=progress)
 
 
 def extend_index(
@@ -243,7 +243,7 @@ def extend_index(
     """
     before = VectorIndex(path)
     check_alike(before, about)
-    return _changed(before.path, dict(about), before.comparison, batches, keep=True, progress=progress)
+    return _changed(before.path, dict(about), before.searched_by, batches, keep=True, progress=progress)
 
 
 def merge_indices(path: str | Path, others: Sequence[str | Path], *, progress: bool = False) -> VectorIndex:
@@ -273,7 +273,7 @@ def merge_indices(path: str | Path, others: Sequence[str | Path], *, progress: b
                     yield descriptions, one.entries(positions)
                     bar.update(len(positions))
 
-        return _changed(path, first.about, first.comparison, batches(), keep=bool(there), progress=progress)
+        return _changed(path, first.about, first.searched_by, batches(), keep=bool(there), progress=progress)
 
 
 def check_alike(index: VectorIndex, about: Mapping[str, Any]) -> None:
@@ -294,7 +294,7 @@ def _flat(about: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _changed(
-    path: Path, about: dict[str, Any], comparison: Comparison | None, batches: Batches, keep: bool, progress: bool
+    path: Path, about: dict[str, Any], searched_by: SearchDistance | None, batches: Batches, keep: bool, progress: bool
 ) -> VectorIndex:
     path.mkdir(parents=True, exist_ok=True)
     strangers = sorted(found.name for found in path.iterdir() if not found.name.startswith(_OURS))
@@ -307,7 +307,7 @@ def _changed(
             with _locked(path / _LOCK):
                 _remove_abandoned(path)
                 manifest = _manifest(path) if keep else None
-                _commit(path, staged, n, shape, about, comparison, manifest, progress)
+                _commit(path, staged, n, shape, about, searched_by, manifest, progress)
         finally:
             shutil.rmtree(staged, ignore_errors=True)
             staged.with_suffix(".lock").unlink(missing_ok=True)
@@ -339,7 +339,7 @@ def _commit(
     n: int,
     shape: tuple[int, ...] | None,
     about: dict[str, Any],
-    comparison: Comparison | None,
+    searched_by: SearchDistance | None,
     before: dict[str, Any] | None,
     progress: bool,
 ) -> None:
@@ -355,7 +355,7 @@ def _commit(
     old = [] if index is None else index.parts
     added = _without_the_known(added, old)
     parts = [part for part in [*old, added] if len(part) > len(part.removed)]
-    vector_map, fitted_to = _map_for(parts, comparison, index)
+    vector_map, fitted_to = _map_for(parts, searched_by, index)
     if index is not None and vector_map is index.vector_map:
         joined = _joined_sizes([len(part) for part in parts])
     else:
@@ -375,7 +375,7 @@ def _commit(
         "format": _FORMAT,
         "about": about,
         "shape": list(shape),
-        "comparison": comparison,
+        "searched_by": searched_by,
         "map": None if map_name is None else {"file": map_name, "fitted_to": fitted_to},
         "parts": [
             {
@@ -415,11 +415,11 @@ def _without_the_known(added: Part, old: list[Part]) -> Part:
 
 
 def _map_for(
-    parts: list[Part], comparison: Comparison | None, index: VectorIndex | None
+    parts: list[Part], searched_by: SearchDistance | None, index: VectorIndex | None
 ) -> tuple[VectorMap | None, int]:
     """The map of short vectors, and to how many it was fitted; the old one until there are four times as many."""
     total = sum(len(part) - len(part.removed) for part in parts)
-    if comparison is None or total < _FEWEST_FOR_VECTORS:
+    if searched_by is None or total < _FEWEST_FOR_VECTORS:
         return None, 0
     if index is not None and index.vector_map is not None:
         fitted_to = index.manifest["map"]["fitted_to"]
@@ -433,7 +433,7 @@ def _map_for(
         rows.append(part.descriptions(np.sort(generator.choice(here, int(np.ceil(share * len(here))), False))))
         part.forget()
     sample = np.concatenate(rows)
-    return VectorMap.fit(sample, comparison), len(sample)
+    return VectorMap.fit(sample, searched_by), len(sample)
 
 
 def _joined_sizes(counts: Sequence[int]) -> list[int]:

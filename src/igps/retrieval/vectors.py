@@ -1,4 +1,4 @@
-"""Short vectors of descriptions: what engines for nearest neighbours take in place of a distance of one's own."""
+"""Short vectors of descriptions, for engines that find nearest neighbours by Euclidean distances alone."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Comparison = Literal["cosine", "chi_square"]
-"""How descriptions are compared that have short vectors."""
+SearchDistance = Literal["cosine", "chi_square"]
+"""A distance of descriptions that Euclidean distances of short vectors follow."""
 
 MOST_NUMBERS = 256
 """Of a short vector."""
@@ -28,27 +28,27 @@ class VectorMap:
     proportion to χ² (Vedaldi and Zisserman 2012).
 
     Args:
-        comparison: how the descriptions are compared.
+        searched_by: the distance of the descriptions.
         mean: (F,) of the descriptions, or of their features; None where vectors are taken as they are.
         components: (D, F) orthonormal directions.
     """
 
-    comparison: Comparison
+    searched_by: SearchDistance
     mean: NDArray[np.float32] | None = None
     components: NDArray[np.float32] | None = None
 
     @classmethod
-    def fit(cls, descriptions: NDArray[np.float32], comparison: Comparison, seed: int = 0) -> VectorMap:
+    def fit(cls, descriptions: NDArray[np.float32], searched_by: SearchDistance, seed: int = 0) -> VectorMap:
         """The map of descriptions (N, F) such as these; a few thousand are enough."""
-        if comparison == "cosine" and descriptions.shape[1] <= MOST_NUMBERS:
-            return cls(comparison)
+        if searched_by == "cosine" and descriptions.shape[1] <= MOST_NUMBERS:
+            return cls(searched_by)
         from sklearn.decomposition import PCA
 
-        features = _features(descriptions, comparison)
+        features = _features(descriptions, searched_by)
         n_kept = min(MOST_NUMBERS, *features.shape)
         found = PCA(n_kept, svd_solver="randomized" if n_kept < min(features.shape) else "full", random_state=seed)
         found.fit(features)
-        return cls(comparison, found.mean_.astype(np.float32), found.components_.astype(np.float32))
+        return cls(searched_by, found.mean_.astype(np.float32), found.components_.astype(np.float32))
 
     @property
     def changes(self) -> bool:
@@ -60,7 +60,7 @@ class VectorMap:
         if self.components is None or self.mean is None:
             return np.ascontiguousarray(descriptions, dtype=np.float32)
         parts = [
-            (_features(descriptions[i : i + _ROWS_AT_ONCE], self.comparison) - self.mean) @ self.components.T
+            (_features(descriptions[i : i + _ROWS_AT_ONCE], self.searched_by) - self.mean) @ self.components.T
             for i in range(0, len(descriptions), _ROWS_AT_ONCE)
         ]
         return np.concatenate([*parts, np.zeros((0, len(self.components)), dtype=np.float32)])
@@ -68,17 +68,17 @@ class VectorMap:
     def arrays(self) -> dict[str, Any]:
         """What it consists of, for a file of NumPy's."""
         kept = {"mean": self.mean, "components": self.components}
-        return {"comparison": np.array(self.comparison), **{k: v for k, v in kept.items() if v is not None}}
+        return {"searched_by": np.array(self.searched_by), **{k: v for k, v in kept.items() if v is not None}}
 
     @classmethod
     def of_arrays(cls, arrays: Any) -> VectorMap:
         """The map that `arrays` told."""
         names = [name for name in ("mean", "components") if name in arrays]
-        return cls(str(arrays["comparison"]), **{name: arrays[name] for name in names})  # type: ignore[arg-type]
+        return cls(str(arrays["searched_by"]), **{name: arrays[name] for name in names})  # type: ignore[arg-type]
 
 
-def _features(descriptions: NDArray[np.float32], comparison: Comparison) -> NDArray[np.float32]:
-    if comparison == "cosine":
+def _features(descriptions: NDArray[np.float32], searched_by: SearchDistance) -> NDArray[np.float32]:
+    if searched_by == "cosine":
         return descriptions
     from sklearn.kernel_approximation import AdditiveChi2Sampler
 

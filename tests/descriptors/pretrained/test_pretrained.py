@@ -105,9 +105,9 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
             return torch.cat([vectors, (1 - vectors.square().sum(dim=1, keepdim=True)).sqrt()], dim=1)
         return normalize(torch.cat([normalize(one) for one in projected], dim=1))
 
-    classes = level("of_classes", CLASS_PARTS)
-    bodies = [level(f"of_bodies.{k}", (part,)) for k, part in enumerate(BODY_PARTS)]
-    share, reaches = (stored[f"head.{name}"] for name in ("share", "reaches"))
+    classes = level("class_head", CLASS_PARTS)
+    bodies = [level(f"body_heads.{k}", (part,)) for k, part in enumerate(BODY_PARTS)]
+    share, scales = (stored[f"head.{name}"] for name in ("share", "scales"))
     root = (share / len(bodies)).sqrt()
     found = describe(part, module)
     expected = torch.cat([(1 - share).sqrt() * classes, *(root * one for one in bodies)], dim=1)
@@ -116,8 +116,8 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
     from_mean = torch.stack([one.square().sum(dim=1) for one in compared]).mean(dim=0).sqrt()
     shorter = (torch.outer(from_mean, from_mean).sqrt() / (0.5 / 2**0.5)).sqrt()
     apart = torch.zeros(4, 4, dtype=torch.float64)
-    for one, reach in zip(compared, reaches, strict=True):
-        apart += (torch.cdist(one, one, compute_mode="donot_use_mm_for_euclid_dist") * shorter / reach) ** 10
+    for one, scale in zip(compared, scales, strict=True):
+        apart += (torch.cdist(one, one, compute_mode="donot_use_mm_for_euclid_dist") * shorter / scale) ** 10
     distances = (1 - classes @ classes.T) * (1 - torch.exp(-apart))
     torch.testing.assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)
 

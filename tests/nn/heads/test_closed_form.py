@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 from igps.nn.heads.base import Head
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
 from igps.retrieval import cosine, retrieval_scores
-from igps.retrieval.distances import Distance, euclidean
+from igps.retrieval.distances import euclidean
 
 N_CELLS = 60
 
@@ -214,11 +214,10 @@ def prior(collection: tuple[Tensor, Tensor]) -> WhitenedHead:
 
 
 class SquaredPrior(WhitenedHead):
-    """A metric with a distance of its own: of unit vectors the square of the cosine's, of others not."""
+    """A head with a distance of its own: of unit vectors the square of the cosine's, of others not."""
 
-    @property
-    def distances(self) -> Distance:
-        return lambda queries, gallery: euclidean(queries, gallery) ** 4 / 4
+    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        return euclidean(queries, gallery) ** 4 / 4
 
 
 @pytest.fixture
@@ -301,13 +300,12 @@ def test_beside_a_prior_parts_count_by_fishers_discriminant(
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(48))
 
 
-class Stretched(torch.nn.Module):
+class Stretched(Head):
     """A prior that looks at the first cells alone."""
 
     def __init__(self, head: WhitenedHead, n_cells: int) -> None:
         super().__init__()
         self.head, self.n_cells = head, n_cells
-        self.distances = head.distances
 
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Stretched:
         raise AssertionError("a prior stays as it is")
@@ -315,6 +313,9 @@ class Stretched(torch.nn.Module):
     def forward(self, descriptions: Tensor) -> Tensor:
         vectors: Tensor = self.head(descriptions[:, : self.n_cells])
         return vectors
+
+    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        return self.head.distances(queries, gallery)
 
 
 def test_where_no_pair_tells_anything_all_parts_count_alike(

@@ -1,10 +1,16 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 
+from igps.descriptors.d2 import D2
+from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.base import Head
-from igps.nn.heads.learned import BlendedDistance, MetricHead
+from igps.nn.heads.closed_form import KernelHead, WhitenedHead
+from igps.nn.heads.learned import BlendedDistance, ProjectionHead
+from igps.nn.heads.two_level import TwoLevelHead, WCCNHead
 from igps.retrieval import chi_square, hellinger
 from igps.retrieval.distances import euclidean
 
@@ -18,7 +24,7 @@ def histograms() -> torch.Tensor:
 
 def test_head_gives_unit_vectors_and_finite_gradients_at_empty_cells(histograms: torch.Tensor) -> None:
     torch.manual_seed(0)
-    head = MetricHead(width=5, n_hidden=16)
+    head = ProjectionHead(width=5, n_hidden=16)
     histograms.requires_grad_()
     embedding = head(histograms)
     torch.testing.assert_close(embedding.norm(dim=1), torch.ones(12))
@@ -29,7 +35,7 @@ def test_head_gives_unit_vectors_and_finite_gradients_at_empty_cells(histograms:
 
 
 def test_linear_head_with_identity_weights_ranks_like_hellinger(histograms: torch.Tensor) -> None:
-    head = MetricHead(width=24, n_hidden=0).eval()
+    head = ProjectionHead(width=24, n_hidden=0).eval()
     head(histograms)  # which tells its size
     with torch.no_grad():
         head.layers[1].weight.copy_(torch.eye(24))  # type: ignore[union-attr]
@@ -41,7 +47,7 @@ def test_linear_head_with_identity_weights_ranks_like_hellinger(histograms: torc
 
 
 def test_fit_centres_and_scales(histograms: torch.Tensor) -> None:
-    head = MetricHead(width=3, n_hidden=0).eval()
+    head = ProjectionHead(width=3, n_hidden=0).eval()
     assert head.fit(histograms, torch.zeros(12), part_cells=(4, 20)) is head
     inputs = (histograms.flatten(1).sqrt() - head.mean) / head.scale
     torch.testing.assert_close(inputs.mean(dim=0), torch.zeros(24), atol=1e-5, rtol=0)
@@ -52,7 +58,7 @@ def test_fit_centres_and_scales(histograms: torch.Tensor) -> None:
 
 
 def test_sizes_come_from_the_data(histograms: torch.Tensor) -> None:
-    head = MetricHead(width=5, n_hidden=7)
+    head = ProjectionHead(width=5, n_hidden=7)
     assert isinstance(head, Head)
     assert isinstance(head.layers[1].weight, torch.nn.UninitializedParameter)  # type: ignore[union-attr]
     assert head(histograms).shape == (12, 5)
@@ -60,23 +66,23 @@ def test_sizes_come_from_the_data(histograms: torch.Tensor) -> None:
 
 
 def test_wrong_number_of_cells_is_named(histograms: torch.Tensor) -> None:
-    head = MetricHead().fit(histograms, torch.zeros(12))
+    head = ProjectionHead().fit(histograms, torch.zeros(12))
     with pytest.raises(ValueError, match="descriptions: expected 24 cells as in training, got 16"):
         head(histograms[:, :2])
 
 
 def test_impossible_inputs_are_refused(histograms: torch.Tensor) -> None:
     with pytest.raises(ValueError, match="width: expected at least 1, got 0"):
-        MetricHead(width=0)
+        ProjectionHead(width=0)
     with pytest.raises(ValueError, match="at least two training shapes, got 1"):
-        MetricHead().fit(histograms[:1], torch.zeros(1))
+        ProjectionHead().fit(histograms[:1], torch.zeros(1))
     with pytest.raises(ValueError, match="descriptions: expected histograms, entries ≥ 0, got a negative one"):
-        MetricHead()(histograms - 0.5)
+        ProjectionHead()(histograms - 0.5)
 
 
 def test_share_goes_from_plain_to_learned(histograms: torch.Tensor) -> None:
     torch.manual_seed(1)
-    head = MetricHead(width=4).eval()
+    head = ProjectionHead(width=4).eval()
     embedding = head(histograms)
     learned = 1 - embedding @ embedding.T
     for share, expected in ((0.0, chi_square(histograms, histograms)), (1.0, learned)):
@@ -85,6 +91,40 @@ def test_share_goes_from_plain_to_learned(histograms: torch.Tensor) -> None:
         pairs = torch.triu_indices(12, 12, 1).unbind()
         result = distance(histograms, histograms)
         torch.testing.assert_close(result, expected / expected[pairs].median(), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        ProjectionHead,
+        WhitenedHead,
+        KernelHead,
+        WCCNHead,
+        TwoLevelHead,
+        lambda: WhitenedHead(prior=TwoLevelHead()),
+        lambda: KernelHead(TwoLevelHead()),
+    ],
+)
+def test_the_head_alone_is_what_a_descriptor_under_it_deploys(
+    histograms: torch.Tensor, make: Callable[[], Head]
+) -> None:
+    """Its distance and no other, but for the unit that calibration gives it."""
+    torch.manual_seed(1)
+    labels = torch.arange(4).repeat_interleave(3)
+    head = make().eval()
+    if isinstance(prior := getattr(head, "prior", None), Head):
+        prior.fit(histograms, labels)
+    head.fit(histograms, labels)
+    deployed = EmbeddedDescriptor(D2(), head)
+    vectors = head(histograms)
+    expected = deployed.distances(vectors[:5], vectors)
+    distance = BlendedDistance(head, share=1.0)
+    torch.testing.assert_close(distance(histograms[:5], histograms), expected, atol=1e-6, rtol=1e-4)
+    distance.calibrate(histograms)
+    pairs = torch.triu_indices(12, 12, 1).unbind()
+    unit = deployed.distances(vectors, vectors)[pairs].median()
+    assert unit > 0
+    torch.testing.assert_close(distance(histograms[:5], histograms), expected / unit, atol=1e-5, rtol=1e-4)
 
 
 def test_without_head_it_is_the_paper(histograms: torch.Tensor) -> None:
@@ -96,7 +136,7 @@ def test_without_head_it_is_the_paper(histograms: torch.Tensor) -> None:
 def test_plain_distance_may_be_another(histograms: torch.Tensor) -> None:
     flat = histograms.flatten(1)
     torch.testing.assert_close(BlendedDistance(plain=euclidean)(flat, flat), euclidean(flat, flat), atol=0, rtol=0)
-    head = MetricHead(width=4).eval()
+    head = ProjectionHead(width=4).eval()
     head(flat)
     distance = BlendedDistance(head, euclidean, share=0.0)
     distance.calibrate(flat)
@@ -106,12 +146,12 @@ def test_plain_distance_may_be_another(histograms: torch.Tensor) -> None:
 
 def test_state_round_trips_into_one_without_sizes(histograms: torch.Tensor) -> None:
     torch.manual_seed(2)
-    one = BlendedDistance(MetricHead().eval())
+    one = BlendedDistance(ProjectionHead().eval())
     one.head.fit(histograms, torch.zeros(12))  # type: ignore[union-attr, operator]
     one.calibrate(histograms)
     state = {name: value.clone() for name, value in one.state_dict().items()}
-    other_size = BlendedDistance(MetricHead().fit(histograms[:, :1], torch.zeros(12)).eval())
-    for two in (BlendedDistance(MetricHead().eval()), other_size):
+    other_size = BlendedDistance(ProjectionHead().fit(histograms[:, :1], torch.zeros(12)).eval())
+    for two in (BlendedDistance(ProjectionHead().eval()), other_size):
         two.load_state_dict(state)
         torch.testing.assert_close(two(histograms, histograms), one(histograms, histograms), atol=0, rtol=0)
         for name, value in two.state_dict().items():

@@ -100,17 +100,17 @@ def test_what_is_far_beyond_all_training_shapes_is_a_unit_vector_too(
     torch.testing.assert_close(head(alone).norm(dim=1), torch.ones(N_CELLS), atol=1e-5, rtol=0)
 
 
-def test_the_distance_is_that_of_the_classes_where_any_witness_tells_two_bodies_apart(
+def test_the_distance_is_that_of_the_classes_where_any_body_head_tells_two_bodies_apart(
     collection: tuple[Tensor, Tensor, Tensor],
 ) -> None:
     """Written down from the vectors of the heads, of which the last number, with lengths, is no part of a distance."""
     histograms, classes, bodies = collection
-    of_classes = WCCNHead(n_directions=20)
-    witnesses = WCCNHead((0,), n_directions=6, lengths=True), WCCNHead((1,), n_directions=5, lengths=True)
-    head = TwoLevelHead(of_classes, witnesses, reaches=(0.7, 0.3), share=0.3)
+    class_head = WCCNHead(n_directions=20)
+    body_heads = WCCNHead((0,), n_directions=6, lengths=True), WCCNHead((1,), n_directions=5, lengths=True)
+    head = TwoLevelHead(class_head, body_heads, scales=(0.7, 0.3), share=0.3)
     vectors = head.fit(histograms, classes, (15, 25), bodies=bodies)(histograms)
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
-    x, y, z = (one(histograms).double() for one in (of_classes, *witnesses))
+    x, y, z = (one(histograms).double() for one in (class_head, *body_heads))
     products = 0.7 * x @ x.T + 0.15 * y @ y.T + 0.15 * z @ z.T
     torch.testing.assert_close((vectors @ vectors.T).double(), products, atol=1e-5, rtol=0)
     y, z = y[:, :-1], z[:, :-1]
@@ -123,7 +123,7 @@ def test_the_distance_is_that_of_the_classes_where_any_witness_tells_two_bodies_
     torch.testing.assert_close(head.distances(vectors[:7], vectors[3:]).double(), found[:7, 3:], atol=1e-5, rtol=0)
     assert same.min() < 0.1  # nor is it 1 throughout
     assert ((same > 0.2) & (same < 0.9)).any()
-    assert ((first < 0.5) & (second > 0.4) & (same < 0.1)).any()  # by the second witness alone
+    assert ((first < 0.5) & (second > 0.4) & (same < 0.1)).any()  # by the second body head alone
     assert ((shorter < 0.95) | (shorter > 1.05)).double().mean() > 0.5
 
 
@@ -158,13 +158,13 @@ def test_both_levels_are_ordered(collection: tuple[Tensor, Tensor, Tensor]) -> N
     found = {
         level: retrieval_scores(distances, labels).mean()["ft"] for level, labels in (("b", of_body), ("c", of_class))
     }
-    assert found["b"] > ft(head.of_classes(rest), of_body) + 0.05
-    assert found["c"] > ft(head.witnesses[0](rest), of_class) + 0.05
+    assert found["b"] > ft(head.class_head(rest), of_body) + 0.05
+    assert found["c"] > ft(head.body_heads[0](rest), of_class) + 0.05
 
 
 def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> None:
     histograms, classes, bodies = collection
-    fitted = TwoLevelHead(WCCNHead((0,), 5), [WCCNHead((1,), 6, lengths=True)], reaches=[0.3], share=0.3)
+    fitted = TwoLevelHead(WCCNHead((0,), 5), [WCCNHead((1,), 6, lengths=True)], scales=[0.3], share=0.3)
     fitted.fit(histograms, classes, (15, 25), bodies=bodies)
     other = TwoLevelHead(WCCNHead((0,)), [WCCNHead((1,), lengths=True)])
     other.load_state_dict(fitted.state_dict())
@@ -174,8 +174,8 @@ def test_it_is_stored_and_loaded(collection: tuple[Tensor, Tensor, Tensor]) -> N
     torch.testing.assert_close(other.distances(vectors, vectors), fitted.distances(vectors, vectors))
     torch.testing.assert_close(other.short(vectors), fitted.short(vectors))
     level = WCCNHead((1,))  # whether lengths count is stored too
-    level.load_state_dict(fitted.witnesses[0].state_dict())
-    torch.testing.assert_close(level(histograms), fitted.witnesses[0](histograms))
+    level.load_state_dict(fitted.body_heads[0].state_dict())
+    torch.testing.assert_close(level(histograms), fitted.body_heads[0](histograms))
 
 
 @pytest.mark.parametrize(
@@ -199,22 +199,22 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
         WCCNHead().fit(histograms, classes, (3, 4))
     with pytest.raises(ValueError, match="labels: expected one for each of 320 descriptions"):
         WCCNHead().fit(histograms, classes[:3])
-    with pytest.raises(ValueError, match="as many labels as shapes"):
+    with pytest.raises(ValueError, match="as many classes as shapes"):
         WCCNHead().fit(histograms, torch.arange(len(histograms)))
     with pytest.raises(RuntimeError, match="expected to be fitted first"):
         WCCNHead()(histograms)
-    with pytest.raises(ValueError, match=r"reaches, share: .* got \(0.0,\) and 0.5"):
-        TwoLevelHead(reaches=[0.0])
-    with pytest.raises(ValueError, match=r"a positive number for each of 1 heads of bodies, .* got \(0.1, 0.2\)"):
-        TwoLevelHead(reaches=[0.1, 0.2])
+    with pytest.raises(ValueError, match=r"scales, share: .* got \(0.0,\) and 0.5"):
+        TwoLevelHead(scales=[0.0])
+    with pytest.raises(ValueError, match=r"a positive number for each of 1 body heads, .* got \(0.1, 0.2\)"):
+        TwoLevelHead(scales=[0.1, 0.2])
     with pytest.raises(ValueError, match=r"one between 0 and 1, got \(0.1,\) and 1"):
         TwoLevelHead(share=1)
-    with pytest.raises(ValueError, match="of_bodies: expected heads with lengths"):
-        TwoLevelHead(of_bodies=[WCCNHead()])
+    with pytest.raises(ValueError, match="body_heads: expected heads with lengths"):
+        TwoLevelHead(body_heads=[WCCNHead()])
     with pytest.raises(RuntimeError, match="TwoLevelHead: expected to be fitted first"):
         TwoLevelHead().short(histograms)
     fitted = TwoLevelHead().fit(histograms, classes)
     with pytest.raises(ValueError, match="expected 40 cells as in training, got 39"):
         fitted(histograms[:, :39])
-    with pytest.raises(ValueError, match=r"vectors: expected \d+ numbers each, got 40"):
+    with pytest.raises(ValueError, match=r"embeddings: expected \d+ numbers each, got 40"):
         fitted.short(histograms)

@@ -1,4 +1,4 @@
-"""Histograms of a body's interior and surface under a metric that was trained on generated shapes."""
+"""Histograms of a body's interior and surface under a head that was fitted to generated shapes."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
 
 # Of `pretrained_parts`: what bending leaves alone tells bodies, all others tell classes
 BODY_PARTS, CLASS_PARTS = (0, 5, 8), (1, 2, 3, 4, 5, 6, 7)
-# Of the bodies: the median distance of training shapes is 0.5
-_REACHES = (0.125, 0.21, 0.125)
+# Of the body heads: the median distance of training shapes is 0.5
+_SCALES = (0.125, 0.21, 0.125)
 
 
 def pretrained_parts() -> HistogramDescriptor:
@@ -63,12 +63,12 @@ def pretrained_parts() -> HistogramDescriptor:
 def two_levels() -> TwoLevelHead:
     """The head of `pretrained`, not fitted."""
     surface, balls, spectrum = BODY_PARTS
-    of_bodies = [
+    body_heads = [
         WCCNHead([surface], n_directions=90, shrinkage=0.3, lengths=True),
         WCCNHead([balls], n_directions=20, shrinkage=0.3, lengths=True),
         WCCNHead([spectrum], n_directions=60, shrinkage=1.0, lengths=True),
     ]
-    return TwoLevelHead(WCCNHead(CLASS_PARTS, n_directions=150, shrinkage=0.1), of_bodies, reaches=_REACHES)
+    return TwoLevelHead(WCCNHead(CLASS_PARTS, n_directions=150, shrinkage=0.1), body_heads, scales=_SCALES)
 
 
 def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:

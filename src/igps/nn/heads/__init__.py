@@ -2,7 +2,7 @@
 
 from igps.nn.heads.base import Head
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
-from igps.nn.heads.learned import BlendedDistance, MetricHead
+from igps.nn.heads.learned import BlendedDistance, ProjectionHead
 from igps.nn.heads.two_level import TwoLevelHead, WCCNHead
 
-__all__ = ["BlendedDistance", "Head", "KernelHead", "MetricHead", "TwoLevelHead", "WCCNHead", "WhitenedHead"]
+__all__ = ["BlendedDistance", "Head", "KernelHead", "ProjectionHead", "TwoLevelHead", "WCCNHead", "WhitenedHead"]

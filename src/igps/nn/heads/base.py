@@ -1,40 +1,56 @@
-"""What all heads share: they turn descriptions into unit vectors, and take their sizes from what they are fitted to."""
+"""What a head is, and the mathematics that several share: class means, principal directions, whitening."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from igps.retrieval.distances import Distance, cosine, square_root
+from igps.retrieval.distances import cosine, square_root
+
+# Of the largest sum of squares: directions along which less is left are rounding
+_NOTHING_LEFT = 1e-10
 
 
-@runtime_checkable
-class Head(Protocol):
-    """Descriptions to unit vectors, whose cosine distance is a metric."""
+class Head(nn.Module, ABC):
+    """Descriptions to embeddings of length 1, and the distance that compares embeddings.
 
+    A head of your own defines `fit` and `forward`, and `distances` where the cosine distance is not its own. Its
+    buffers take their sizes from what it is fitted to, also when it is loaded.
+    """
+
+    @abstractmethod
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Take from the descriptions (N, ...) and classes (N,) of training shapes what is not learned by gradients.
+        """Take from training shapes what is not learned by gradients.
 
-        `part_cells` tells the cells of the parts that a description consists of; None takes all as one part.
+        Args:
+            descriptions: (N, ...), histograms for all heads of the library.
+            labels: (N,) classes, integers.
+            part_cells: cells of each part of a description, see `HistogramDescriptor.part_cells`; None takes all as one
+                part.
         """
-        ...
 
-    def __call__(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) descriptions to (N, D) of length 1."""
-        ...
+    @abstractmethod
+    def forward(self, descriptions: Tensor) -> Tensor:
+        """(N, ...) descriptions to (N, D) embeddings of length 1."""
 
+    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        """(Q, D) and (G, D) embeddings, as `forward` gives them, to (Q, G) distances; the cosine's unless redefined."""
+        return cosine(queries, gallery)
 
-def distances_of(head: object) -> Distance:
-    """The distance of a head's vectors: its own, if it has one, or the cosine's."""
-    own: Distance = getattr(head, "distances", cosine)
-    return own
+    def short(self, embeddings: Tensor) -> Tensor:
+        """(N, D) embeddings to (N, ≤ 256) of length 1 whose cosines are nearly theirs.
 
-
-class SizedByData(nn.Module):
-    """A module whose buffers have the size of the data that it was fitted to, also when it is loaded."""
+        Raises:
+            ValueError: the head has none.
+        """
+        raise ValueError(
+            f"short: expected a head that shortens its embeddings, as the TwoLevelHead of pretrained does, got "
+            f"{type(self).__name__} and embeddings of {embeddings.shape[1]} numbers."
+        )
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *arguments: Any) -> None:
         for name, buffer in self.named_buffers(recurse=False):
@@ -42,6 +58,9 @@ class SizedByData(nn.Module):
             if stored is not None and stored.shape != buffer.shape:
                 setattr(self, name, buffer.new_zeros(stored.shape))
         super()._load_from_state_dict(state_dict, prefix, *arguments)
+
+    def _not_fitted(self) -> RuntimeError:
+        return RuntimeError(f"{type(self).__name__}: expected to be fitted first. Call fit(descriptions, labels).")
 
 
 def square_roots(histograms: Tensor) -> Tensor:
@@ -62,18 +81,20 @@ def check_cells(cells: Tensor, n_expected: int) -> None:
         raise ValueError(f"descriptions: expected {n_expected} cells as in training, got {cells.shape[1]}.")
 
 
-def check_share(prior_share: float) -> None:
-    """Raise a ValueError unless it is between 0 and 1."""
-    if not 0 < prior_share < 1:
-        raise ValueError(f"prior_share: expected a number between 0 and 1, got {prior_share}.")
+def check_directions(n_directions: int, shrinkage: float) -> None:
+    """Raise a ValueError unless there is a direction and the shrinkage is positive."""
+    if n_directions < 1:
+        raise ValueError(f"n_directions: expected at least 1, got {n_directions}.")
+    if shrinkage <= 0:
+        raise ValueError(f"shrinkage: expected a positive number, got {shrinkage}.")
 
 
-def checked_cells(cells: Tensor, part_cells: Sequence[int] | None) -> list[int]:
-    """How many of (N, cells) values each part has, all one part if None; a ValueError where they do not add up."""
+def checked_parts(cells: Tensor, part_cells: Sequence[int] | None) -> Tensor:
+    """(parts,) how many of (N, cells) values each part has, one part if None; a ValueError if they do not add up."""
     found = list(part_cells or (cells.shape[1],))
     if min(found) < 1 or sum(found) != cells.shape[1]:
         raise ValueError(f"part_cells: expected cells that add up to {cells.shape[1]}, got {found}.")
-    return found
+    return torch.tensor(found, device=cells.device)
 
 
 def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
@@ -85,7 +106,59 @@ def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
     return labels.to(descriptions.device)
 
 
-def means_of(rows: Tensor, members: Tensor) -> Tensor:
+def class_members(descriptions: Tensor, labels: Tensor) -> Tensor:
+    """The classes (N,) of descriptions (N, ...), numbered from 0 without a gap.
+
+    Raises:
+        ValueError: labels that are not aligned, or no class of two shapes.
+    """
+    _, members = checked_labels(descriptions, labels).unique(return_inverse=True)
+    if int(members.max()) + 1 == len(members):
+        raise ValueError("labels: expected a class of at least two shapes, got as many classes as shapes.")
+    return members
+
+
+def class_means(rows: Tensor, members: Tensor) -> Tensor:
     """(C, D) means of rows (N, D) by their classes (N,), numbered from 0 without a gap."""
     n_members = torch.bincount(members)
     return rows.new_zeros(len(n_members), rows.shape[1]).index_add_(0, members, rows) / n_members[:, None]
+
+
+def principal_directions(rows: Tensor, n: int) -> tuple[Tensor, Tensor]:
+    """The n orthonormal directions along which rows (N, D) differ most from the origin, and the sums of their squares.
+
+    Returns:
+        (k, D) and (k,), the largest first; k ≤ n, as directions without extent are left out.
+    """
+    n_rows, width = rows.shape
+    wide = width > n_rows
+    squares, axes = torch.linalg.eigh(rows @ rows.T if wide else rows.T @ rows)  # from the smaller matrix
+    n = min(n, int((squares > _NOTHING_LEFT * squares[-1]).sum()))
+    squares, axes = squares.flip(0)[:n], axes.flip(1)[:, :n]
+    return (axes.T @ rows) / squares.sqrt()[:, None] if wide else axes.T, squares
+
+
+def within_class_whitening(residuals: Tensor, rank: int, shrinkage: float, n: int) -> tuple[Tensor, Tensor]:
+    """The directions along which shapes of one class differ most, and what is left of each: see `damped`.
+
+    With W the covariance within classes over its mean eigenvalue, and s the shrinkage, (W + s·I)^(−1/2) is, up to a
+    factor, the identity but for a gain along each eigenvector of W. Source: within-class covariance normalisation,
+    Hatch, Kajarekar and Stolcke 2006.
+
+    Args:
+        residuals: (N, D) rows of the training shapes, less the mean of their class.
+        rank: number of eigenvalues that the mean is taken over.
+        shrinkage: s.
+        n: directions, at most; those of the largest eigenvalues.
+
+    Returns:
+        directions (k, D), orthonormal, and gains (k,) in (0, 1].
+    """
+    directions, squares = principal_directions(residuals, min(n, rank))
+    relative = squares * rank / residuals.square().sum()
+    return directions, (shrinkage / (shrinkage + relative)).sqrt()
+
+
+def damped(rows: Tensor, directions: Tensor, gains: Tensor) -> Tensor:
+    """(N, D) rows with what they have of each direction (k, D), orthonormal, times its gain (k,)."""
+    return rows - ((rows @ directions.T) * (1 - gains)) @ directions

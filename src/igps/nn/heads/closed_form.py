@@ -11,40 +11,40 @@ from torch.nn import functional
 
 from igps.nn.heads.base import (
     Head,
-    SizedByData,
     check_cells,
-    check_share,
-    checked_cells,
+    check_directions,
     checked_labels,
-    distances_of,
-    means_of,
+    checked_parts,
+    class_means,
+    class_members,
+    damped,
     square_roots,
+    within_class_whitening,
 )
-from igps.retrieval.distances import Distance, cosine
+from igps.retrieval.distances import cosine
 
-# So many shapes of a class tell as well as more how far scores can be trusted
+# With so many training shapes of a class, its scores are trusted in full
 _MANY = 6
 # Variances of distances below this are rounding
 _SMALLEST_VARIANCE = 1e-8
 
 
-class WhitenedHead(SizedByData):
-    """Descriptions to unit vectors, with the directions damped along which shapes of one class differ.
+class WhitenedHead(Head):
+    """Histograms to unit vectors, damped along the directions in which shapes of one class differ.
 
-    The square roots of histograms are centred on the training shapes and multiplied by (W + s·I)^(−1/2) up to a factor,
-    W the covariance within classes over its mean eigenvalue, s the shrinkage (within-class covariance normalisation,
-    Hatch, Kajarekar and Stolcke 2006). How poses change a histogram is much the same from class to class, so that this
-    metric, unlike a free one, serves classes that were not trained on. Before it is fitted, it leaves histograms as
-    they are but for the root and the length.
+    The square roots of histograms are centred on the training shapes and whitened within classes, see
+    `within_class_whitening`. How poses change a histogram is much the same from class to class, so that this head,
+    unlike one with free parameters, serves classes that were not trained on. Before it is fitted, it gives the roots of
+    histograms, brought to length 1.
 
     The parts of a `HistogramDescriptor` may be treated one by one: each is whitened and brought to one length, so that
     the cosine distance is the mean of those of the parts.
 
-    Beside a prior, a metric of the same descriptions that was fitted elsewhere, such as that of `pretrained`, the
-    distance is the weighted mean of its own and the prior's. Such a metric has histograms for many kinds of shapes, of
-    which not all serve the classes at hand. So the parts then count by Fisher's discriminant (1936) of pairs: each
-    distance times (m − m′) / (v + v′), m and v its mean and variance between shapes of two training classes, m′ and v′
-    between those of one.
+    A prior is another head of the same descriptions, fitted elsewhere, such as that of `pretrained`. Beside one, the
+    distance is the weighted mean of its own and the prior's. Of the many parts of such descriptions, not all serve the
+    classes at hand. So the parts then count by Fisher's discriminant (1936) of pairs: each distance times
+    (m − m′) / (v + v′), m and v its mean and variance between shapes of two training classes, m′ and v′ between those
+    of one.
 
     Example:
         >>> import torch
@@ -55,8 +55,8 @@ class WhitenedHead(SizedByData):
         [[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 1]]
 
     Args:
-        n_directions: eigenvectors of W that are kept of each part, the largest.
-        shrinkage: s; a large one leaves only the centring.
+        n_directions: directions that are damped in each part, the largest.
+        shrinkage: s of the whitening; a large one leaves only the centring.
         prior: a fitted head, which stays as it is; None for no other.
         prior_share: its weight, between 0 and 1.
     """
@@ -76,14 +76,9 @@ class WhitenedHead(SizedByData):
         prior_share: float = 1 / 3,
     ) -> None:
         super().__init__()
-        if n_directions < 1:
-            raise ValueError(f"n_directions: expected at least 1, got {n_directions}.")
-        if shrinkage <= 0:
-            raise ValueError(f"shrinkage: expected a positive number, got {shrinkage}.")
-        check_share(prior_share)
-        self.n_directions = n_directions
-        self.shrinkage = shrinkage
-        self.prior = prior
+        check_directions(n_directions, shrinkage)
+        _check_share(prior_share)
+        self.n_directions, self.shrinkage, self.prior = n_directions, shrinkage, prior
         self.register_buffer("prior_share", torch.tensor(prior_share))
         self.register_buffer("mean", torch.zeros(0))
         self.register_buffer("directions", torch.zeros(n_directions, 0))
@@ -96,23 +91,21 @@ class WhitenedHead(SizedByData):
         """Take mean and directions from the histograms (N, ...) and classes (N,) of the training shapes.
 
         Args:
-            descriptions: histograms.
-            labels: integers.
-            part_cells: cells of each part, as a `HistogramDescriptor` tells them; None takes all as one part.
+            descriptions, labels, part_cells: see `Head.fit`.
 
         Raises:
             ValueError: shapes that do not match, or no class of two shapes.
         """
         roots = square_roots(descriptions)
-        labels = checked_labels(roots, labels)
-        _, members = labels.unique(return_inverse=True)
-        means = means_of(roots, members)
-        if len(roots) == len(means):
-            raise ValueError("labels: expected a class of at least two shapes, got as many classes as shapes.")
+        members = class_members(roots, labels)
+        means = class_means(roots, members)
         self.centre(descriptions, part_cells)
         residuals = self.parts((roots - means[members]).double())
         for part, directions, gains in zip(residuals, self.parts(self.directions), self.gains, strict=True):
-            self._fit_part(part, len(roots) - len(means), directions, gains)
+            # The mean eigenvalue is that of the N − C that residuals of N shapes of C classes allow.
+            found = within_class_whitening(part, len(roots) - len(means), self.shrinkage, self.n_directions)
+            for all_rows, rows in zip((directions, gains), found, strict=True):
+                all_rows[: len(rows)] = rows
         if self.prior is not None and len(means) > 1:
             discriminants = torch.stack([_discriminant(part, members) for part in self.whitened_parts(roots)])
             if discriminants.sum() > 0:
@@ -123,79 +116,59 @@ class WhitenedHead(SizedByData):
     def centre(self, descriptions: Tensor, part_cells: Sequence[int] | None = None) -> Self:
         """Take the mean alone from histograms (N, ...), and damp nothing: for shapes without labels, or one a class."""
         roots = square_roots(descriptions)
-        cells = checked_cells(roots, part_cells)
-        self.part_cells = torch.tensor(cells, device=roots.device)
+        self.part_cells = checked_parts(roots, part_cells)
+        n_parts = len(self.part_cells)
         self.mean = roots.mean(dim=0)
         self.directions = roots.new_zeros(self.n_directions, roots.shape[1])
-        self.gains = roots.new_ones(len(cells), self.n_directions)
-        self.part_shares = roots.new_full((len(cells),), 1 / len(cells))
+        self.gains = roots.new_ones(n_parts, self.n_directions)
+        self.part_shares = roots.new_full((n_parts,), 1 / n_parts)
         return self
-
-    def _fit_part(self, residuals: Tensor, rank: int, directions: Tensor, gains: Tensor) -> None:
-        # The eigenvectors of the covariance from the smaller Gram matrix: there are fewer shapes than cells.
-        spread, vectors = torch.linalg.eigh(residuals @ residuals.T)
-        spread, vectors = spread.flip(0).clamp_min(0), vectors.flip(1)
-        # What is left of the others is rounding: it has no direction.
-        n_kept = min(len(directions), rank, int((spread > 1e-10 * spread[0]).sum()))
-        relative = spread[:n_kept] * rank / spread.sum()
-        lengths = spread[:n_kept].sqrt()
-        directions[:n_kept] = (vectors[:, :n_kept].T @ residuals) / lengths[:, None]
-        gains[:n_kept] = (self.shrinkage / (self.shrinkage + relative)).sqrt()
 
     def forward(self, descriptions: Tensor) -> Tensor:
         """(N, ...) histograms to (N, D) of length 1."""
-        own = self._whitened(square_roots(descriptions))
+        roots = square_roots(descriptions)
+        if len(self.mean):
+            shares = self.part_shares.sqrt()
+            own = torch.cat([n * part for n, part in zip(shares, self.whitened_parts(roots), strict=True)], dim=1)
+        else:
+            own = functional.normalize(roots, dim=1)
         if self.prior is None:
             return own
         share = self.prior_share
         return torch.cat([(1 - share).sqrt() * own, share.sqrt() * self.prior(descriptions)], dim=1)
 
-    @property
-    def distances(self) -> Distance:
-        """From (Q, D) and (G, D) vectors to (Q, G) distances: the cosine's, or beside a prior a mean with its own."""
-        return cosine if self.prior is None else self._beside_prior
-
-    def _beside_prior(self, queries: Tensor, gallery: Tensor) -> Tensor:
+    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        """(Q, D) and (G, D) embeddings to (Q, G): the cosine distance, or beside a prior a mean with its own."""
+        if self.prior is None:
+            return cosine(queries, gallery)
         if not len(self.mean):
-            raise RuntimeError("WhitenedHead: expected to be fitted first. Call fit(descriptions, labels).")
+            raise self._not_fitted()
         own, priors = zip(*(one.tensor_split([len(self.mean)], dim=1) for one in (queries, gallery)), strict=True)
-        root = self.prior_share.sqrt()
-        of_prior = distances_of(self.prior)(*(one / root for one in priors))
+        of_prior = self.prior.distances(*(one / self.prior_share.sqrt() for one in priors))
         return (1 - self.prior_share) * cosine(*own) + self.prior_share * of_prior
-
-    def _whitened(self, roots: Tensor) -> Tensor:
-        if not len(self.mean):
-            return functional.normalize(roots, dim=1)
-        lengths = self.part_shares.sqrt()
-        return torch.cat([n * part for n, part in zip(lengths, self.whitened_parts(roots), strict=True)], dim=1)
 
     def whitened_parts(self, roots: Tensor) -> list[Tensor]:
         """Unit vectors (N, cells) of each part, of the square roots (N, D) of histograms."""
         check_cells(roots, len(self.mean))
-        whitened = [
-            part - ((part @ directions.T) * (1 - gains)) @ directions
-            for part, directions, gains in zip(
-                self.parts(roots - self.mean), self.parts(self.directions), self.gains, strict=True
-            )
-        ]
-        return [functional.normalize(part, dim=1) for part in whitened]
+        of_parts = zip(self.parts(roots - self.mean), self.parts(self.directions), self.gains, strict=True)
+        return [functional.normalize(damped(*one), dim=1) for one in of_parts]
 
     def parts(self, cells: Tensor) -> tuple[Tensor, ...]:
         """Views of (N, D) values, one of each part."""
         return cells.split(self.part_cells.tolist(), dim=1)
 
 
-class KernelHead(SizedByData):
-    """Descriptions to what they have of each training class, by kernel ridge regression on a `WhitenedHead`.
+class KernelHead(Head):
+    """Histograms to what they have of each training class, by kernel ridge regression on a `WhitenedHead`.
 
     The kernel is exp(−d/m), d the cosine distance of the whitened histograms, m its median between training shapes, and
     the mean of such kernels if there are several parts. It is regressed onto the indicators of the classes. Beside a
-    prior, a metric of the same descriptions that was fitted elsewhere, such as that of `pretrained`, the kernel of the
-    prior's own distance is one more, with a weight of its own. The best there is here for classes that were trained on;
-    for other classes use the `WhitenedHead`.
+    prior, another head of the same descriptions that was fitted elsewhere, such as that of `pretrained`, the kernel of
+    the prior's distance is one more, with a weight of its own. It is the best head here for classes that were trained
+    on; for other classes use the `WhitenedHead`.
 
-    A vector is half the scores about their mean, which say how much of each class a shape has, and half the roots of a
-    softmax of them, which say which class it is of: by the latter alone, shapes of one class would lie in one place.
+    An embedding is half the scores about their mean, which say how much of each class a shape has, and half the roots
+    of a softmax of them, which say which class it is of: by the latter alone, shapes of one class would coincide.
 
     Example:
         >>> import torch
@@ -206,8 +179,8 @@ class KernelHead(SizedByData):
         [0]
 
     Args:
-        prior: a fitted head, which stays as it is; None for no other. With one shape of each class, which tells nothing
-            of how the shapes of a class vary, its kernel is the only one.
+        prior: a fitted head, which stays as it is; None for no other. With one training shape of each class, which
+            tells nothing of how the shapes of a class vary, its kernel is the only one.
         n_directions, shrinkage: of the `WhitenedHead`.
         ridge: added to the kernel's diagonal, which is 1.
         prior_share: weight of the prior's kernel, between 0 and 1.
@@ -231,14 +204,12 @@ class KernelHead(SizedByData):
         temperature: float = 0.05,
     ) -> None:
         super().__init__()
-        if ridge <= 0:
-            raise ValueError(f"ridge: expected a positive number, got {ridge}.")
-        if temperature <= 0:
-            raise ValueError(f"temperature: expected a positive number, got {temperature}.")
-        check_share(prior_share)
+        for name, value in (("ridge", ridge), ("temperature", temperature)):
+            if value <= 0:
+                raise ValueError(f"{name}: expected a positive number, got {value}.")
+        _check_share(prior_share)
         self.whitened = WhitenedHead(n_directions, shrinkage)
-        self.prior = prior
-        self.ridge, self.prior_share = ridge, prior_share
+        self.prior, self.ridge, self.prior_share = prior, ridge, prior_share
         self.register_buffer("temperature", torch.tensor(temperature))
         self.register_buffer("anchors", torch.zeros(0, 0))
         self.register_buffer("medians", torch.ones(0))
@@ -251,28 +222,30 @@ class KernelHead(SizedByData):
         """Fit whitening and regression to the histograms (N, ...) and classes (N,) of the training shapes.
 
         Args:
-            descriptions, labels, part_cells: see `WhitenedHead.fit`.
+            descriptions, labels, part_cells: see `Head.fit`.
 
         Raises:
             ValueError: shapes that do not match, or fewer than two classes.
         """
-        labels = checked_labels(descriptions, labels)
-        classes, members = labels.unique(return_inverse=True)
-        if len(classes) < 2:
-            raise ValueError(f"labels: expected at least two classes, got {len(classes)}.")
-        if len(classes) < len(labels):
+        self.classes, members = checked_labels(descriptions, labels).unique(return_inverse=True)
+        if len(self.classes) < 2:
+            raise ValueError(f"labels: expected at least two classes, got {len(self.classes)}.")
+        several = len(self.classes) < len(members)
+        if several:
             self.whitened.fit(descriptions, labels, part_cells)
         else:
             self.whitened.centre(descriptions, part_cells)
-        self.classes = classes
         self.anchors = self._vectors(descriptions)
-        self.shares = self._shares(learned=len(classes) < len(labels)).to(self.anchors)
+        n_parts = len(self.whitened.part_cells)
+        share = 0.0 if self.prior is None else self.prior_share if several else 1.0
+        shares = [(1 - share) / n_parts] * n_parts + ([] if self.prior is None else [share])
+        self.shares = self.anchors.new_tensor(shares)
         i, j = torch.triu_indices(len(self.anchors), len(self.anchors), 1, device=self.anchors.device)
         distances = self._distances(self.anchors)[:, i, j]
         self.medians = distances.median(dim=1).values.clamp_min(torch.finfo(distances.dtype).tiny)
         kernel = self._kernel(self.anchors).double()
         kernel.diagonal().add_(self.ridge)
-        targets = functional.one_hot(members, len(classes)).double()
+        targets = functional.one_hot(members, len(self.classes)).double()
         # As they lie in memory when loaded, so that products with them round alike
         self.coefficients = torch.linalg.solve(kernel, targets).to(self.anchors.dtype).contiguous()
         return self
@@ -284,7 +257,7 @@ class KernelHead(SizedByData):
             RuntimeError: it has not been fitted.
         """
         if not len(self.anchors):
-            raise RuntimeError("KernelHead: expected to be fitted first. Call fit(descriptions, labels).")
+            raise self._not_fitted()
         return self._kernel(self._vectors(descriptions)) @ self.coefficients
 
     def predict(self, descriptions: Tensor) -> Tensor:
@@ -299,14 +272,6 @@ class KernelHead(SizedByData):
         n_of_each = len(self.anchors) / len(self.classes)
         likely = (scores / (self.temperature * max(1, _MANY / n_of_each))).softmax(dim=1).sqrt()
         return torch.cat([of_each, likely], dim=1) / 2**0.5
-
-    def _shares(self, *, learned: bool) -> Tensor:
-        """Weights of the kernels, of the parts and of the prior, that sum to 1."""
-        n_parts = len(self.whitened.part_cells)
-        if self.prior is None:
-            return torch.full((n_parts,), 1 / n_parts)
-        share = self.prior_share if learned else 1.0
-        return torch.tensor([(1 - share) / n_parts] * n_parts + [share])
 
     def _kernel(self, vectors: Tensor) -> Tensor:
         kernels = (-self._distances(vectors) / self.medians[:, None, None]).exp()
@@ -323,8 +288,13 @@ class KernelHead(SizedByData):
         split = [one.split([*sizes, one.shape[1] - sum(sizes)], dim=1) for one in (vectors, self.anchors)]
         found = [1 - one @ other.T for one, other in list(zip(*split, strict=True))[: len(sizes)]]
         if self.prior is not None:
-            found.append(distances_of(self.prior)(split[0][-1], split[1][-1]))
+            found.append(self.prior.distances(split[0][-1], split[1][-1]))
         return torch.stack(found)
+
+
+def _check_share(prior_share: float) -> None:
+    if not 0 < prior_share < 1:
+        raise ValueError(f"prior_share: expected a number between 0 and 1, got {prior_share}.")
 
 
 def _discriminant(vectors: Tensor, members: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""What gradients learn on top of histograms: an embedding, and a correction of the plain distance by it."""
+"""What gradients learn on top of histograms: an embedding, and a distance blended of the plain one and a head's."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from igps.nn.heads.base import SizedByData, check_cells, square_roots
-from igps.retrieval.distances import Distance, chi_square, cosine
+from igps.nn.heads.base import Head, check_cells, square_roots
+from igps.retrieval.distances import Distance, chi_square
 
 
-class MetricHead(SizedByData):
-    """Descriptions to unit vectors whose cosine distance is learned by gradients.
+class ProjectionHead(Head):
+    """Histograms to unit vectors whose cosine distance is learned by gradients: one layer, or two.
 
     The square root of a histogram is a unit vector too (its distances are Hellinger's), which tames its largest cells.
     The first layer takes its size from the first descriptions that it sees.
@@ -64,21 +64,22 @@ class MetricHead(SizedByData):
 
 
 class BlendedDistance(nn.Module):
-    """A plain distance, corrected by a head: a weighted sum of the two, each in units of its median in training.
+    """A weighted sum of a plain distance and a head's, each in units of its median between training shapes.
 
-    A free metric forgets what it was not trained on; as a correction it may gain on classes never seen as well. Without
-    a head this is the plain distance.
+    A head with free parameters forgets what it was not trained on; beside the plain distance it may gain on classes
+    never seen as well. Without a head this is the plain distance.
 
     Args:
-        head: descriptions to embeddings, or None.
+        head: of the descriptions, or None.
         plain: (Q, ...) and (G, ...) descriptions to (Q, G) distances, such as `Descriptor.distances`; χ² if None.
-        share: of the head's distance in the sum, from 0 (plain) to 1 (the head alone).
+        share: of the head's distance in the sum, from 0 (plain) to 1 (the head alone, as `EmbeddedDescriptor` has it
+            but for the unit).
     """
 
     plain_unit: Tensor
     learned_unit: Tensor
 
-    def __init__(self, head: nn.Module | None = None, plain: Distance | None = None, share: float = 0.5) -> None:
+    def __init__(self, head: Head | None = None, plain: Distance | None = None, share: float = 0.5) -> None:
         super().__init__()
         if not 0 <= share <= 1:
             raise ValueError(f"share: expected a number from 0 to 1, got {share}.")
@@ -97,7 +98,7 @@ class BlendedDistance(nn.Module):
         embedding = self.head(descriptions)
         for unit, distances in (
             (self.plain_unit, self.plain(descriptions, descriptions)),
-            (self.learned_unit, cosine(embedding, embedding)),
+            (self.learned_unit, self.head.distances(embedding, embedding)),
         ):
             unit.copy_(distances[pairs].median().clamp_min(torch.finfo(distances.dtype).tiny))
 
@@ -106,5 +107,5 @@ class BlendedDistance(nn.Module):
         plain = self.plain(queries, gallery)
         if self.head is None:
             return plain
-        learned = cosine(self.head(queries), self.head(gallery))
+        learned = self.head.distances(self.head(queries), self.head(gallery))
         return (1 - self.share) * plain / self.plain_unit + self.share * learned / self.learned_unit

@@ -9,16 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from igps.descriptors import NAMES, descriptor
-from igps.gallery import gallery
-from igps.gallery.gallery import cache_tag
+from igps.descriptors import NAMES, descriptor, fingerprint
+from igps.descriptors.fingerprint import cache_tag
 
 
 @pytest.fixture(autouse=True)
 def _forgotten() -> Iterator[None]:
-    gallery._code.cache_clear()
+    fingerprint._code.cache_clear()
     yield
-    gallery._code.cache_clear()
+    fingerprint._code.cache_clear()
 
 
 def words() -> str:
@@ -48,19 +47,21 @@ def test_parameters_change_the_words() -> None:
 def test_the_code_changes_the_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = words()
     copied = tmp_path / "igps"
-    shutil.copytree(Path(gallery.__file__).parents[1], copied)
-    monkeypatch.setattr(gallery, "__file__", str(copied / "gallery" / "gallery.py"))
-    gallery._code.cache_clear()
+    shutil.copytree(Path(fingerprint.__file__).parents[1], copied)
+    monkeypatch.setattr(fingerprint, "__file__", str(copied / "descriptors" / "fingerprint.py"))
+    fingerprint._code.cache_clear()
     assert words() == before
     with (copied / "nn" / "histogram.py").open("a") as source:
         source.write("# one more line\n")
-    gallery._code.cache_clear()
+    fingerprint._code.cache_clear()
     assert words() != before
 
 
 def test_versions_change_the_words(monkeypatch: pytest.MonkeyPatch) -> None:
     before = words()
-    gallery._code.cache_clear()
-    version = gallery.importlib.metadata.version
-    monkeypatch.setattr(gallery.importlib.metadata, "version", lambda name: version(name) + (name == "torch") * "+1")
+    fingerprint._code.cache_clear()
+    version = fingerprint.importlib.metadata.version
+    monkeypatch.setattr(
+        fingerprint.importlib.metadata, "version", lambda name: version(name) + (name == "torch") * "+1"
+    )
     assert words() != before

@@ -1,0 +1,66 @@
+"""What tells descriptors apart: a checksum of their parameters, and a tag of all that their descriptions depend on."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from igps.descriptors.registry import NAMES
+from igps.nn.descriptor import Descriptor
+
+# The packages that descriptions are computed with.
+_COMPUTE_WITH = "torch", "numpy", "scipy", "numba", "libigl"
+
+
+def name_of(descriptor: str | Descriptor) -> str:
+    """The name by which a descriptor was asked for, or its own."""
+    return descriptor if isinstance(descriptor, str) else descriptor.name
+
+
+def fingerprint(descriptor: nn.Module) -> str:
+    """A checksum of all parameters of a descriptor: numbers, learned or given, and classes of all its modules."""
+    found = hashlib.sha256()
+    of_every_module = vars(nn.Module())  # differ between versions of PyTorch
+    for name, module in descriptor.named_modules():
+        plain = {k: v for k, v in sorted(vars(module).items()) if k not in of_every_module and _is_plain(v)}
+        found.update(f"{name} {type(module).__qualname__} {plain!r}\0".encode())
+    for name, tensor in sorted(descriptor.state_dict().items()):
+        values = tensor.detach().cpu().contiguous()
+        found.update(f"{name} {values.dtype} {tuple(values.shape)}\0".encode())
+        found.update(values.numpy().tobytes())
+    return found.hexdigest()[:32]
+
+
+def cache_tag(descriptor: str | Descriptor, module: Descriptor) -> str | None:
+    """All that descriptions depend on beside Signatures, in words, see `igps.nn.description.describe`.
+
+    Name and parameters of the descriptor, the library's code, and the versions of what that computes with.
+
+    Args:
+        descriptor: as it was asked for. Only a name of the library's has a tag; for all others, whose code is not
+            known, None is returned.
+        module: the descriptor itself.
+    """
+    return f"{descriptor} {fingerprint(module)} {_code()}" if descriptor in NAMES else None
+
+
+@cache
+def _code() -> str:
+    """A checksum of the library's sources, and versions."""
+    package = Path(__file__).parents[1]
+    found = hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        found.update(f"{source.relative_to(package).as_posix()}\0".encode())
+        found.update(source.read_bytes())
+    return " ".join((found.hexdigest()[:32], *(f"{name} {importlib.metadata.version(name)}" for name in _COMPUTE_WITH)))
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, tuple):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, bool | int | float | str)

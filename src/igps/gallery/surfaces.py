@@ -1,0 +1,165 @@
+"""How far apart surfaces of bodies are, but for motion, mirror image and scale; and when they are the same.
+
+A level of detail leaves open how a surface runs between its vertices. So two surfaces may be as far apart as that
+explains: about as far as the coarser of the two is from itself with every vertex in the middle of its neighbours. What
+"about" means is calibrated on generated bodies, see `Calibration`. Bodies with different numbers of handles are not the
+same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import replace
+from functools import lru_cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps._parallel import Failed
+from igps.data.dataset import Failure, SignatureDataset
+from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
+from igps.gallery.calibration import Calibration
+from igps.mesh.mending import Step, mended_by
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.surface import mean_of_neighbours
+from igps.signature.attributes import AttributeName
+from igps.signature.signature import Signature
+
+# Samples of surfaces, and surfaces, in memory at once.
+_SURFACES, _TRIANGLES = 512, 64
+_NORMALS: AttributeName = "surface_direction"
+# Copies differ by up to 0.045 in the logarithms of their extents; what differs by more is not laid onto each other.
+_MOST_STRETCHED = 0.15
+# A tenth of this is much between copies.
+_HOPELESS = 0.03
+
+# What is done to a mesh that leaves its handles as they are.
+_KEEP_HANDLES: set[Step] = {"welded", "smoothed", "subdivided"}
+
+
+def distance_if_alike(one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0) -> float:
+    """`surface_distance`, infinite where the extents of the two tell that they are not the same."""
+    if np.abs(np.log(one.extents / other.extents)).max() > _MOST_STRETCHED:
+        return math.inf
+    return surface_distance(one, other, enough=enough, hopeless=_HOPELESS)
+
+
+class Surfaces:
+    """The samples of surfaces of a dataset, the last used of them in memory.
+
+    Args:
+        dataset: of meshes, whose Signatures give the samples; a mesh itself is read where another is near.
+
+    Attributes:
+        failures: of meshes that could not be read, by index.
+    """
+
+    def __init__(self, dataset: SignatureDataset) -> None:
+        self.failures: dict[int, Failure] = {}
+        self._dataset = dataset
+        self._last = lru_cache(_SURFACES)(self.samples)
+        self._last_triangles = lru_cache(_TRIANGLES)(self._triangles)
+        self._frame = lru_cache(None)(self._origin_and_area)
+        self._known = lru_cache(None)(self._coarseness_and_handles)
+
+    def samples(self, i: int) -> SurfaceSamples:
+        """Those of one.
+
+        Raises:
+            MeshError: the mesh cannot be used; so does their `surface`.
+            ValueError: the Signatures have no directions of the surface.
+        """
+        signature = self._signature(i)
+        found = SurfaceSamples.of(signature.surface.points, signature.surface.attributes[_NORMALS], signature.area)
+        return replace(found, surface=partial(self._last_triangles, i))
+
+    def coarseness(self, i: int) -> float:
+        """How far one is from itself with each vertex in the middle of its neighbours, over √area.
+
+        That is what its level of detail leaves open: how far chords cut round parts off, and other triangles sharp
+        edges. On thin triangles, near neighbours count, see `mean_of_neighbours`.
+
+        Raises:
+            MeshError: the mesh cannot be used.
+            ImportError: libigl is not installed.
+        """
+        return self._known(i)[0]
+
+    def distance(self, i: int, j: int, calibration: Calibration) -> float:
+        """That of two, over √area; infinite where they are not the same, or one cannot be read."""
+        try:
+            one, other = self._last(i), self._last(j)
+            apart = distance_if_alike(one, other, enough=calibration.same.distance)
+            if apart > calibration.same.distance:
+                return math.inf
+            limit = self.limit(i, j, calibration)
+            if apart > limit > 0:
+                # The search has ended at what was near enough: the nearest may be within the limit.
+                apart = distance_if_alike(one, other, enough=limit)
+            return apart if apart <= limit else math.inf
+        except MeshError:
+            return math.inf
+
+    def limit(self, i: int, j: int, calibration: Calibration) -> float:
+        """How far two may be apart and the same, see `Calibration.limit`; raises as `coarseness` does.
+
+        Not at all if one has more handles than the other.
+        """
+        (coarseness, handles), (of_other, handles_of_other) = self._known(i), self._known(j)
+        if None not in (handles, handles_of_other) and handles != handles_of_other:
+            return 0.0
+        return calibration.limit(max(coarseness, of_other))
+
+    def profile(self, i: int) -> NDArray[np.float64] | None:
+        """That of one; None where it cannot be read."""
+        try:
+            return self.samples(i).profile
+        except MeshError:
+            return None
+
+    def _coarseness_and_handles(self, i: int) -> tuple[float, int | None]:
+        """Handles are None where the mesh is open, and where mending may have made some or closed holes."""
+        mesh = self._mesh(i)
+        blurred = TriangleSurface(mean_of_neighbours(self._placed(i, mesh), mesh.faces), mesh.faces)
+        handles = None
+        if not set(mended_by(mesh.notes)) - _KEEP_HANDLES:
+            with contextlib.suppress(MeshError):
+                handles = mesh.genus
+        return offset_in_place(self._last(i), blurred), handles
+
+    def _triangles(self, i: int) -> TriangleSurface:
+        mesh = self._mesh(i)
+        return TriangleSurface(self._placed(i, mesh), mesh.faces)
+
+    def _placed(self, i: int, mesh: Mesh) -> NDArray[np.float64]:
+        """The vertices of one about the origin and in the unit of its samples."""
+        origin, area = self._frame(i)
+        return (mesh.vertices - origin) / math.sqrt(area)
+
+    def _origin_and_area(self, i: int) -> tuple[NDArray[np.float64], float]:
+        signature = self._signature(i)
+        return signature.surface.points.mean(axis=0), signature.area
+
+    def _mesh(self, i: int) -> Mesh:
+        try:
+            return self._dataset.mesh(i)
+        except MeshError as error:
+            self._keep(i, error)
+            raise
+
+    def _signature(self, i: int) -> Signature:
+        try:
+            signature = self._dataset[i].signature
+        except MeshError as error:
+            self._keep(i, error)
+            raise
+        if _NORMALS not in signature.surface.attributes:
+            raise ValueError(
+                f"attributes: expected {_NORMALS!r} among those of the surface samples, got "
+                f"{sorted(signature.surface.attributes)}. Name it in SignatureConfig(attributes=...)."
+            )
+        return signature
+
+    def _keep(self, i: int, error: MeshError) -> None:
+        self.failures[i] = self._dataset.failure(i, Failed(str(error)))
