@@ -87,11 +87,7 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
             "self, parts: Sequence[int] | None = None, width: int = 128, n_directions: int = 59, "
             "shrinkage: float = 0.03",
         ),
-        # Faces in another order, which only costs time; so do points whose classes are not side by side.
-        (
-            "src/igps/geometry/closed_forms.py",
-            "order = spatial_order(surface.vertices[surface.faces].mean( 2), size)",
-        ),
+        # Points whose classes are not side by side only cost time.
         ("src/igps/nn/counted_pairs.py", "key = key ^ memberships.shape[1] + column"),
         # Two columns more, which nothing reads.
         ("src/igps/nn/pair_loops.py", "inverse = np.ones((n_axes, most_centres + 1), centres.dtype)"),
@@ -105,11 +101,6 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         ("src/igps/geometry/subdivision.py", "order = (np.arange(3) + np.reshape(turn, (- 2, 1)) + first) % 3"),
         # By how much one ring of a patch is turned against the next.
         ("src/igps/geometry/hole_filling.py", "disc.append(_circle((np.arange(size) + ring / 3) / size, radius))"),
-        # So much is computed at once.
-        (
-            "src/igps/geometry/far_field.py",
-            "size = tile.hats - max(1, tile.points // max(n_points, 1))  # few points leave room for more hats",
-        ),
         # Below zero there is only rounding.
         (
             "src/igps/retrieval/reranking.py",
