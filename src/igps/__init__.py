@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from igps.data.batch import SignatureBatch, collate
 from igps.data.dataset import SignatureDataset
+from igps.data.requirements import register_descriptors
 from igps.descriptors import descriptor
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh, MeshError
@@ -33,6 +34,10 @@ if TYPE_CHECKING:
 
 # These bring Lightning, which takes seconds to import: on first use.
 _LAZY = {"RetrievalLearner": "igps.nn.learner", "SignatureDataModule": "igps.data.datamodule"}
+
+# The Dataset lies below the descriptors, and still takes their names.
+register_descriptors(descriptor)
+del register_descriptors
 
 __all__ = [
     "ArticulatedShapes",

@@ -38,6 +38,7 @@ __all__ = [
     "Failed",
     "Limits",
     "MachineError",
+    "attempt",
     "is_machines",
     "machines_words",
     "n_cores",
@@ -138,7 +139,7 @@ def run(
         yield from _by_workers(function, jobs, n_workers, limits)
         return
     for number, job in enumerate(jobs):
-        yield number, _attempt(lambda job=job: function(job), limits)  # type: ignore[misc]
+        yield number, attempt(lambda job=job: function(job), limits)  # type: ignore[misc]
 
 
 def on_threads(
@@ -179,8 +180,12 @@ def _alone(function: Callable[[Job], Result], job: Job) -> Result:
         return function(job)
 
 
-def _attempt(result: Callable[[], Result], limits: Limits) -> Result | Failed:
-    """The result; the job's failure in words, where the machine is not at fault."""
+def attempt(result: Callable[[], Result], limits: Limits = Limits()) -> Result | Failed:
+    """The result; the job's failure in words, where the machine is not at fault.
+
+    Raises:
+        MachineError: where it is.
+    """
     try:
         return result()
     except (BrokenExecutor, CancelledError):
@@ -226,7 +231,7 @@ def _by_executor(
             future = done.get()
             number = numbers.pop(future)
             try:
-                yield number, _attempt(future.result, Limits())
+                yield number, attempt(future.result, Limits())
             except CancelledError as error:
                 raise MachineError("the executor gave the work up. Run again: what is done is kept.") from error
             except BrokenExecutor as error:
@@ -316,7 +321,7 @@ def _by_workers(
                 worker = busy[future]
                 worker.future = None
                 try:
-                    yield worker.number, _attempt(future.result, limits)
+                    yield worker.number, attempt(future.result, limits)
                 except BrokenExecutor:
                     worker.end()
                     deaths[worker.number] += 1

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from torch.utils.data import DataLoader, Dataset
 
 from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch, collate
 from igps.mesh.mesh import Mesh
@@ -155,9 +156,120 @@ def test_subset_with_a_seed_depends_on_nothing_but_the_shape(signatures: list[Si
     assert not torch.equal(collate(signatures).interior.subset(6).points, first.points)
 
 
+def equal(one: SignatureBatch, other: SignatureBatch) -> bool:
+    """Whether two batches hold the same shapes, however they are padded."""
+    if one.ids != other.ids or one.labels.tolist() != other.labels.tolist():
+        return False
+    return all(
+        (a.area, a.volume) == (b.area, b.volume)
+        and np.array_equal(a.eigenvalues, b.eigenvalues)
+        and all(
+            np.array_equal(x.points, y.points)
+            and np.array_equal(x.eigenfunctions, y.eigenfunctions)
+            and all(np.array_equal(x.attributes[name], y.attributes[name]) for name in y.attributes)
+            for x, y in ((a.interior, b.interior), (a.surface, b.surface))
+        )
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    ("index", "chosen"),
+    [
+        (slice(1, None), [1, 2]),
+        (slice(None, None, 2), [0, 2]),
+        ([2, 0], [2, 0]),
+        ([-1], [2]),
+        (torch.tensor([1, 1]), [1, 1]),
+        ([True, False, True], [0, 2]),
+        (torch.tensor([False, True, False]), [1]),
+        (np.array([False, False, True]), [2]),
+        (slice(0, 0), []),
+    ],
+)
+def test_some_shapes_of_a_batch_are_the_batch_of_them(
+    signatures: list[Signature], index: slice | list[int] | torch.Tensor, chosen: list[int]
+) -> None:
+    items = [LabelledSignature(signature, 4 - i, f"number {i}") for i, signature in enumerate(signatures)]
+    some = collate(items)[index]
+    assert len(some) == len(chosen)
+    assert not chosen or equal(some, collate([items[i] for i in chosen]))
+
+
+def test_one_shape_of_a_batch_is_a_body(signatures: list[Signature]) -> None:
+    batch = collate(signatures)
+    assert [batch[i].id for i in (0, -1, np.int64(1))] == ["body 0", "body 2", "body 1"]
+    np.testing.assert_array_equal(batch[2].eigenvalues, signatures[2].eigenvalues)
+    assert [body.id for body in batch] == list(batch.ids)
+    with pytest.raises(IndexError):
+        batch[3]
+    with pytest.raises(IndexError, match="mask: expected 3 entries"):
+        batch[[True, False]]
+
+
+def test_batches_are_joined_and_cut_again(signatures: list[Signature]) -> None:
+    first, second = collate(signatures[:1]), collate(signatures[1:])
+    joined = SignatureBatch.concatenate([first, second])
+    assert equal(joined, collate(signatures))
+    assert torch.equal(joined.eigenvalues, collate(signatures).eigenvalues)
+    assert torch.equal(joined.interior.mask, collate(signatures).interior.mask)
+    assert equal(joined[:1], first)
+    assert equal(joined[1:], second)
+
+
+def test_batches_that_do_not_fit_are_not_joined(signatures: list[Signature]) -> None:
+    box = trimesh.creation.box()
+    mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
+    with_mesh, without = collate(signatures[:1], [mesh]), collate(signatures[1:])
+    assert SignatureBatch.concatenate([with_mesh, with_mesh]).meshes == (mesh, mesh)
+    with pytest.raises(ValueError, match="batches: expected all with meshes or none"):
+        SignatureBatch.concatenate([with_mesh, without])
+    with pytest.raises(ValueError, match="batches: expected at least one"):
+        SignatureBatch.concatenate([])
+    bare = replace(signatures[0], interior=replace(signatures[0].interior, attributes={}))
+    with pytest.raises(ValueError, match="batches: all must carry the same sample attributes"):
+        SignatureBatch.concatenate([collate([bare]), without])
+
+
+class Several(Dataset[Signature]):
+    """Signatures in a list, as a Dataset of one's own gives them."""
+
+    def __init__(self, signatures: list[Signature]) -> None:
+        self.signatures = signatures
+
+    def __len__(self) -> int:
+        return len(self.signatures)
+
+    def __getitem__(self, index: int) -> Signature:
+        return self.signatures[index]
+
+
+def test_workers_give_the_batches_of_this_process_in_shared_memory(signatures: list[Signature]) -> None:
+    """Of like shapes, which are written as they are, and of others, which are padded in every dimension."""
+    (batch,) = DataLoader(Several(signatures), batch_size=3, num_workers=1, collate_fn=collate)
+    expected = collate(signatures)
+    assert equal(batch, expected)
+    assert torch.equal(batch.eigenvalues, expected.eigenvalues)
+    for one, other in ((batch.interior, expected.interior), (batch.surface, expected.surface)):
+        assert torch.equal(one.eigenfunctions, other.eigenfunctions)
+        assert torch.equal(one.mask, other.mask)
+    alike = [signatures[0], replace(signatures[0], interior=signatures[0].surface)]
+    (batch,) = DataLoader(Several(alike), batch_size=2, num_workers=1, collate_fn=collate)
+    assert equal(batch, collate(alike))
+    assert torch.equal(batch.interior.eigenfunctions, collate(alike).interior.eigenfunctions)
+    assert batch.interior.eigenfunctions.is_shared()
+    whole = {one.untyped_storage().data_ptr() for one in (batch.interior.points, batch.surface.eigenfunctions)}
+    assert len(whole) == 1
+    batch.interior.points.zero_()  # writable, as any batch is
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_batches_go_to_a_device_and_bodies_come_back(signatures: list[Signature]) -> None:
-    batch: SignatureBatch = collate(signatures).to("cuda")
+    (pinned,) = DataLoader(Several(signatures), batch_size=3, num_workers=1, collate_fn=collate, pin_memory=True)
+    assert pinned.interior.points.is_pinned()
+    batch: SignatureBatch = pinned.to("cuda", non_blocking=True)
+    assert equal(batch[torch.tensor([2, 0], device="cuda")].to("cpu"), collate([signatures[2], signatures[0]]))
+    assert equal(SignatureBatch.concatenate([batch[:1], batch[1:]]).to("cpu"), collate(signatures))
     assert batch.interior.attributes["depth"].is_cuda
     assert batch.labels.is_cuda
     for body, signature in zip(batch.bodies(), signatures, strict=True):

@@ -22,6 +22,7 @@ from igps.cli.precompute import dask_executor, part_of
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import fill_elsewhere
 from igps.data.sources import given_bodies
+from igps.mesh.loading import BodyRef
 from igps.signature.signature import SignatureConfig
 
 distributed = pytest.importorskip("distributed")
@@ -174,7 +175,7 @@ class Elsewhere(ThreadPoolExecutor):
     """Does nothing that is seen here."""
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
-        return super().submit(lambda path: Nowhere(), *arguments)
+        return super().submit(lambda bodies: [Nowhere() for _ in bodies], *arguments)
 
 
 class Nowhere:
@@ -195,5 +196,5 @@ def test_a_cluster_that_fails_is_told(
 def test_a_worker_of_another_version_is_refused(root: Path, tmp_path: Path) -> None:
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     with pytest.raises(MachineError, match=r"has igps .*, signatures \d+, where 9\.9, signatures 9 is asked for"):
-        fill_elsewhere(dataset._pipeline, "9.9, signatures 9", root / "00.off")
+        fill_elsewhere(dataset.pipeline.fill, "9.9, signatures 9", [BodyRef(root / "00.off")])
     assert stored(tmp_path / "cache") == {}

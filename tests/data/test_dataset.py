@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import logging
+import pickle
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
@@ -11,10 +13,13 @@ import torch
 from bodies_on_disk import write_body
 from torch.utils.data import DataLoader
 
+import igps
 import igps.data.pipeline as pipeline_module
 from igps._parallel import Failed, Limits
 from igps.data.batch import LabelledSignature, SignatureBatch, collate
 from igps.data.dataset import Failure, SignatureDataset
+from igps.data.transforms import FewerSamples, Scale
+from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
@@ -60,16 +65,14 @@ def test_items_are_labelled_and_named(dataset: SignatureDataset) -> None:
 
 
 def test_functions_of_position_become_attributes(root: Path, tmp_path: Path) -> None:
-    dataset = SignatureDataset(
-        root, CONFIG, tmp_path / "cache", point_functions={"height": lambda points: points[:, 2]}
-    )
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"height": lambda points: points[:, 2]})
     for part in (dataset, dataset.subset([0, 3])):
-        samples = part[1].signature.interior
-        np.testing.assert_allclose(samples.attributes["height"], samples.points[:, 2], rtol=1e-6)
+        for samples in (part[1].signature.interior, part[1].signature.surface):
+            np.testing.assert_allclose(samples.attributes["height"], samples.points[:, 2], rtol=1e-6)
     assert SignatureDataset(root, CONFIG, tmp_path / "cache")[0].signature.interior.attributes == {}
-    wrong = {"height": lambda points: points}
-    broken = SignatureDataset(root, CONFIG, tmp_path / "cache", point_functions=wrong)
-    with pytest.raises(ValueError, match=r"point_functions: expected 'height' to give \d+ finite numbers.*ball/1.off"):
+    wrong = {"height": lambda points: points[:-1]}
+    broken = SignatureDataset(root, CONFIG, tmp_path / "cache", attributes=wrong)
+    with pytest.raises(ValueError, match=r"attributes: expected 'height' to give \(\d+,\) or .* numbers.*ball/1.off"):
         broken[0]
 
 
@@ -204,6 +207,246 @@ def test_batch_has_the_meshes_on_demand(dataset: SignatureDataset) -> None:
     for mesh, body, i in zip(batch.meshes or (), batch.bodies(), (3, 1), strict=True):
         np.testing.assert_array_equal(mesh.vertices, dataset.mesh(i).vertices)
         assert mesh.area == pytest.approx(body.area)
+
+
+class Named(SignatureDataset):
+    """With something of its own."""
+
+    motto = "mine"
+
+
+def test_parts_of_a_subclass_are_of_it_and_keep_what_it_has(root: Path, tmp_path: Path) -> None:
+    dataset = Named(root, CONFIG, tmp_path / "cache")
+    dataset.motto = "changed"
+    failure = Failure("ball/1.off", root / "ball" / "1.off", "bad")
+    parts = (dataset.subset([1, 2]), dataset.usable([failure]), dataset[1:3], dataset.to_memory())
+    for part in parts:
+        assert isinstance(part, Named)
+        assert part.motto == "changed"
+    parts[0].motto = "another"
+    assert dataset.motto == "changed"
+    dataset.to_file(tmp_path / "all.igps")
+    assert isinstance(Named.from_file(tmp_path / "all.igps"), Named)
+
+
+@pytest.mark.parametrize(
+    ("index", "chosen"),
+    [
+        (slice(1, 3), [1, 2]),
+        (slice(None, None, -1), [3, 2, 1, 0]),
+        ([3, 0], [3, 0]),
+        (["egg/1.off", "ball/2.off"], [2, 1]),
+        ([False, True, False, True], [1, 3]),
+        (torch.tensor([True, False, False, False]), [0]),
+        (np.array([2, -1]), [2, 3]),
+        ([], []),
+    ],
+)
+def test_some_items_are_a_dataset(dataset: SignatureDataset, index: slice | list[int], chosen: list[int]) -> None:
+    part = dataset[index]
+    assert part.bodies.names == tuple(dataset.bodies.names[i] for i in chosen)
+    assert part.labels.tolist() == dataset.labels[chosen].tolist()
+
+
+def test_an_item_is_asked_for_by_number_or_name(dataset: SignatureDataset) -> None:
+    assert [dataset[i].id for i in (-1, np.int64(2), "ball/2.off")] == ["egg/2.off", "egg/1.off", "ball/2.off"]
+    assert [item.id for item in dataset] == list(dataset.bodies.names)
+    with pytest.raises(IndexError):
+        dataset[4]
+    with pytest.raises(IndexError, match="mask: expected 4 entries, got an array of shape"):
+        dataset[[True]]
+    with pytest.raises(KeyError, match="no body is called 'cat'"):
+        dataset["cat"]
+
+
+def test_the_descriptor_says_what_signatures_it_is_for(root: Path, tmp_path: Path) -> None:
+    """By name, itself, or what it requires, as its requirements applied by hand."""
+    rich = igps.descriptor("rich")
+    expected = rich.requirements.apply_to(SignatureConfig()).resolved()
+    for descriptor in ("rich", rich, rich.requirements):
+        assert SignatureDataset(root, descriptor=descriptor).config == expected
+    small = SignatureConfig(n_eigenpairs=20)
+    assert SignatureDataset(root, replace(CONFIG, n_eigenpairs=None), descriptor="shape_dna").config.resolution == 10
+    with pytest.raises(ValueError, match="n_eigenpairs: this descriptor needs"):
+        SignatureDataset(root, small, descriptor="rich")
+    with pytest.raises(ValueError, match="descriptor: expected one of"):
+        SignatureDataset(root, descriptor="no such")
+
+
+def test_after_precompute_the_meshes_are_not_needed(dataset: SignatureDataset, root: Path, counted: list[str]) -> None:
+    before = [dataset[i].signature for i in range(4)]
+    assert dataset.precompute(n_workers=1, progress=False) == []
+    keys, notes = dataset.cached_keys(), dataset.all_notes()
+    counted.clear()
+    shutil.rmtree(root)
+    for part in (dataset, pickle.loads(pickle.dumps(dataset)), dataset.subset(range(4))):
+        for item, expected in zip(part, before, strict=True):
+            np.testing.assert_array_equal(item.signature.interior.eigenfunctions, expected.interior.eigenfunctions)
+        assert (part.cached_keys(), part.all_notes()) == (keys, notes)
+    assert counted == []
+    with pytest.raises(MeshError, match=r"1\.off"):
+        dataset.mesh(0)
+
+
+def test_after_precompute_a_lost_signature_is_computed_again(
+    dataset: SignatureDataset, counted: list[str], tmp_path: Path
+) -> None:
+    dataset.precompute(n_workers=1, progress=False)
+    shutil.rmtree(tmp_path / "cache")
+    assert dataset[1].id == "ball/2.off"
+    assert len(counted) == 5
+
+
+def test_in_memory_nothing_is_read_any_more(dataset: SignatureDataset, root: Path, tmp_path: Path) -> None:
+    before = collate([dataset[i] for i in range(4)])
+    kept = dataset.to_memory()
+    shutil.rmtree(root)
+    shutil.rmtree(tmp_path / "cache")
+    assert torch.equal(kept.batch(range(4)).interior.eigenfunctions, before.interior.eigenfunctions)
+    assert torch.equal(kept[[3, 1]].batch([0, 1]).labels, before.labels[[3, 1]])
+    assert kept.subset([2])[0].id == "egg/1.off"
+    assert len(pickle.dumps(kept.subset([2]))) < len(pickle.dumps(kept)) / 2
+    assert kept.precompute() == []
+
+
+def test_sizes_are_those_of_the_interior_samples(dataset: SignatureDataset) -> None:
+    assert dataset.sizes.tolist() == [len(item.signature.interior) for item in dataset]
+
+
+def test_a_transform_is_applied_at_each_reading_and_not_kept(dataset: SignatureDataset, counted: list[str]) -> None:
+    plain = dataset[0].signature
+    changed = SignatureDataset(
+        dataset.bodies, CONFIG, dataset.pipeline.cache_dir, transform=FewerSamples(n_interior=5, n_surface=5)
+    )
+    torch.manual_seed(0)
+    first, second = changed[0].signature, changed[0].signature
+    assert len(first.interior) == len(second.surface) == 5
+    assert not np.array_equal(first.interior.points, second.interior.points)
+    assert len(counted) == 1
+    assert changed.cached_keys() == [None] * 4
+    assert len(changed.to_memory()._signature(0).interior) == len(plain.interior)
+    assert len(changed.subset([0])[0].signature.interior) == 5
+
+
+def test_a_pre_transform_is_kept_under_a_key_of_its_own(
+    dataset: SignatureDataset, counted: list[str], root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset.precompute(n_workers=1, progress=False)
+    counted.clear()
+    applied: list[str] = []
+    change = Scale._changed
+    monkeypatch.setattr(Scale, "_changed", lambda self, s, g: applied.append(s.name) or change(self, s, g))
+
+    def changed(seed: int) -> SignatureDataset:
+        return SignatureDataset(root, CONFIG, dataset.pipeline.cache_dir, pre_transform=Scale(seed=seed))
+
+    first = changed(0)
+    volume = first[0].signature.volume
+    assert volume != dataset[0].signature.volume
+    assert volume == changed(0)[0].signature.volume
+    assert len(applied) == 1
+    assert changed(1)[0].signature.volume != volume
+    assert len(applied) == 2
+    assert counted == []  # no eigenpairs for any of it
+    assert first.precompute(n_workers=1, progress=False) == []
+    assert len(applied) == 5
+    keys = first.cached_keys()
+    assert len({*keys, *dataset.cached_keys(), *changed(1).cached_keys()}) == 10  # of the last one is, and None
+    assert changed(0).cached_keys() == keys
+    with pytest.raises(ValueError, match="pre_transform: expected a seed"):
+        SignatureDataset(root, CONFIG, dataset.pipeline.cache_dir, pre_transform=Scale())
+
+
+class Image:
+    """A linear function of space, as an image on a grid would be, with a checksum and a count of its readings."""
+
+    def __init__(self, slope: float, n_channels: int | None = None) -> None:
+        self.slope, self.n_channels, self.read = slope, n_channels, 0
+
+    def cache_tag(self, body: BodyRef) -> str:
+        return f"{body.path.parent.name} {self.slope} {self.n_channels}"
+
+    def __call__(self, body: BodyRef, points: np.ndarray) -> np.ndarray:
+        self.read += 1
+        values = self.slope * points[:, 2] + 100 * (body.path.parent.name == "egg")
+        return values if self.n_channels is None else np.stack([values] * self.n_channels, axis=1)
+
+
+def test_an_attribute_is_added_to_cached_signatures_without_new_eigenpairs(
+    dataset: SignatureDataset, counted: list[str], root: Path, tmp_path: Path
+) -> None:
+    dataset.precompute(n_workers=1, progress=False)
+    counted.clear()
+    image = Image(2.0)
+
+    def with_image(source: Image) -> SignatureDataset:
+        return SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"ct": source})
+
+    for again in range(2):
+        one = with_image(image)
+        assert one.precompute(n_workers=1, progress=False) == []
+        assert image.read == 8  # of interior and surface of four bodies, once
+        for i, item in enumerate(one):
+            for samples in (item.signature.interior, item.signature.surface):
+                expected = 2 * samples.points[:, 2] + (100 if i > 1 else 0)
+                np.testing.assert_allclose(samples.attributes["ct"], expected, rtol=1e-6)
+        assert again or one.cached_keys() != dataset.cached_keys()
+    assert counted == []
+    # Another image, and several channels, are other values; what was there stays.
+    assert (
+        with_image(Image(3.0))[0].signature.interior.attributes["ct"][0]
+        != one[0].signature.interior.attributes["ct"][0]
+    )
+    many = with_image(Image(2.0, 4))
+    assert many.batch([0, 3]).interior.attributes["ct"].shape[2] == 4
+    assert dataset[0].signature.interior.attributes == {}
+    assert counted == []
+    shutil.rmtree(root)
+    assert one[3].signature.interior.attributes["ct"].max() > 90
+    one.to_file(tmp_path / "all.igps")
+    travelled = SignatureDataset.from_file(tmp_path / "all.igps")
+    np.testing.assert_array_equal(
+        travelled[3].signature.surface.attributes["ct"], one[3].signature.surface.attributes["ct"]
+    )
+
+
+def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(root: Path, tmp_path: Path) -> None:
+    def changed(slope: float) -> SignatureDataset:
+        return SignatureDataset(
+            root, CONFIG, tmp_path / "cache", attributes={"ct": Image(slope)},
+            pre_transform=FewerSamples(n_interior=6, seed=0),
+        )  # fmt: skip
+
+    for slope in (2.0, 3.0, 2.0):
+        dataset = changed(slope)
+        dataset.precompute(n_workers=1, progress=False)
+        samples = dataset[1].signature.interior
+        assert len(samples) == 6
+        np.testing.assert_allclose(samples.attributes["ct"], slope * samples.points[:, 2], rtol=1e-6)
+    assert changed(2.0).cached_keys() != changed(3.0).cached_keys()
+    with pytest.raises(ValueError, match="pre_transform: expected attributes with a cache_tag"):
+        SignatureDataset(root, attributes={"x": lambda points: points[:, 0]}, pre_transform=Scale(seed=0))
+
+
+@pytest.mark.parametrize(("start", "how"), [("fork", "cache"), ("fork", "file"), ("spawn", "file")])
+def test_workers_give_what_this_process_gives(
+    dataset: SignatureDataset, root: Path, tmp_path: Path, how: str, start: str
+) -> None:
+    dataset.precompute(n_workers=1, progress=False)
+    expected = dataset.batch(range(4))
+    if how == "file":
+        dataset.to_file(tmp_path / "all.igps")
+        dataset = SignatureDataset.from_file(tmp_path / "all.igps")
+    shutil.rmtree(root)
+    loader = DataLoader(
+        dataset, batch_size=2, num_workers=2, persistent_workers=True, collate_fn=collate,
+        multiprocessing_context=start,
+    )  # fmt: skip
+    for _ in range(2):
+        found = SignatureBatch.concatenate(list(loader))
+        assert found.ids == expected.ids
+        assert torch.equal(found.interior.eigenfunctions, expected.interior.eigenfunctions)
+        assert torch.equal(found.labels, expected.labels)
 
 
 def test_slow_meshes_are_listed(dataset: SignatureDataset, tmp_path: Path) -> None:

@@ -35,13 +35,13 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the mesh files that are read for their key."""
     names: list[str] = []
-    content = pipeline_module._content
+    digest = pipeline_module._content_digest
 
     def reading(path: Path) -> bytes:
         names.append(path.name)
-        return content(path)
+        return digest(path)
 
-    monkeypatch.setattr(pipeline_module, "_content", reading)
+    monkeypatch.setattr(pipeline_module, "_content_digest", reading)
     return names
 
 
@@ -112,7 +112,7 @@ def test_without_the_memory_all_goes_on(
         memory.mkdir()
     else:
         with sqlite3.connect(memory) as database:
-            database.execute("CREATE TABLE file (x)")
+            database.execute("CREATE TABLE body (x)")
         database.close()
     read.clear()
     with caplog.at_level(logging.WARNING):

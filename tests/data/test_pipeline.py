@@ -14,6 +14,7 @@ from bodies_on_disk import write_body
 import igps.data.pipeline as pipeline_module
 from igps.data.cache import SignatureCache
 from igps.data.pipeline import SignaturePipeline
+from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.attributes import AttributeName
@@ -36,32 +37,32 @@ def pipeline(tmp_path: Path) -> SignaturePipeline:
 def test_a_signature_is_computed_once_and_is_that_of_the_mesh(
     pipeline: SignaturePipeline, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert not pipeline.is_cached(path)
-    first = pipeline.signature(path)
-    assert pipeline.is_cached(path)
-    expected = compute_signature(pipeline.mesh(path), CONFIG)
+    assert not pipeline.is_cached(BodyRef(path))
+    first = pipeline.signature(BodyRef(path))
+    assert pipeline.is_cached(BodyRef(path))
+    expected = compute_signature(pipeline.mesh(BodyRef(path)), CONFIG)
 
     def no_more(*_: object) -> None:
         pytest.fail("computed again")
 
     monkeypatch.setattr(pipeline_module, "compute_signature", no_more)
-    for found in (first, pipeline.signature(path)):
+    for found in (first, pipeline.signature(BodyRef(path))):
         np.testing.assert_array_equal(found.interior.eigenfunctions, expected.interior.eigenfunctions)
         np.testing.assert_array_equal(found.eigenvalues, expected.eigenvalues)
 
 
 def test_fill_caches_and_returns_only_what_serves(pipeline: SignaturePipeline, path: Path) -> None:
-    filled = pipeline.fill(path)
+    filled = pipeline.fill([BodyRef(path)])
     assert len(pickle.dumps(filled)) < 1000
-    assert pipeline.is_cached(path)
-    assert pipeline.served(path) == filled == pipeline.fill(path)
+    assert pipeline.is_cached(BodyRef(path))
+    assert pipeline.served([BodyRef(path)]) == filled == pipeline.fill([BodyRef(path)])
 
 
 def test_a_worker_gets_a_small_copy(pipeline: SignaturePipeline, path: Path) -> None:
     sent = pickle.dumps(pipeline)
     assert len(sent) < 2000
     assert pickle.loads(sent) == pipeline
-    assert pickle.loads(sent).key(path) == pipeline.key(path)
+    assert pickle.loads(sent).key(BodyRef(path)) == pipeline.key(BodyRef(path))
 
 
 def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
@@ -71,8 +72,8 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
     shutil.copy(path, copy)
     shutil.copy(path, renamed)
     write_body(other, 1.1, 1.6)
-    assert pipeline.key(copy) == pipeline.key(path)
-    assert replace(pipeline, cache_dir=tmp_path).key(path) == pipeline.key(path)
+    assert pipeline.key(BodyRef(copy)) == pipeline.key(BodyRef(path))
+    assert replace(pipeline, cache_dir=tmp_path).key(BodyRef(path)) == pipeline.key(BodyRef(path))
     pipelines = [pipeline, replace(pipeline, config=replace(CONFIG, seed=1))]
     pipelines += [
         replace(pipeline, reading=reading)
@@ -83,7 +84,10 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
             LoadOptions(allow_open=True),
         )
     ]
-    keys = [one.key(path) for one in pipelines] + [pipeline.key(renamed), pipeline.key(other)]
+    keys = [one.key(BodyRef(path)) for one in pipelines] + [
+        pipeline.key(BodyRef(renamed)),
+        pipeline.key(BodyRef(other)),
+    ]
     assert len(set(keys)) == len(keys)
 
 
@@ -91,7 +95,8 @@ def test_keys_are_those_of_the_caches_that_exist(pipeline: SignaturePipeline, tm
     """Frozen: another key leaves all caches useless. It changes with ALGORITHM_VERSION alone."""
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
     assert SignatureConfig.ALGORITHM_VERSION == 4
-    assert pipeline.key(tmp_path / "frozen.off") == "a75ab4e79d95e15f56ca4e5e68e03c5b743a43fc7a5f05b9f19fbd1a5e9140c7"
+    found = pipeline.key(BodyRef(tmp_path / "frozen.off"))
+    assert found == "01ffcd7d418826c9647d90cd45997d2fa453e1c1e5306795a1f8032b24de3419"
 
 
 def test_a_new_version_of_the_mending_leaves_bodies_that_are_read_as_they_are(
@@ -107,14 +112,14 @@ def test_a_new_version_of_the_mending_leaves_bodies_that_are_read_as_they_are(
         """How many had to be computed."""
         before = len(computed)
         for name in ("body.off", "open.off"):
-            pipeline.fill(tmp_path / name)
-            assert pipeline.is_cached(tmp_path / name)
+            pipeline.fill([BodyRef(tmp_path / name)])
+            assert pipeline.is_cached(BodyRef(tmp_path / name))
         return len(computed) - before
 
     assert [fill(), fill()] == [2, 0]
-    assert pipeline.notes(tmp_path / "open.off")
+    assert pipeline.hit(BodyRef(tmp_path / "open.off")).notes
     monkeypatch.setattr(pipeline_module, "MENDING_VERSION", pipeline_module.MENDING_VERSION + 1)
-    assert not pipeline.is_cached(tmp_path / "open.off")
+    assert not pipeline.is_cached(BodyRef(tmp_path / "open.off"))
     assert [fill(), fill()] == [1, 0]
 
 
@@ -124,11 +129,13 @@ def test_a_mended_body_of_before_versions_of_the_mending_is_made_again(tmp_path:
     path = tmp_path / "open.off"
     trimesh.Trimesh(body.vertices, body.faces[1:], process=False).export(path)
     pipeline = SignaturePipeline(CONFIG, LoadOptions(), tmp_path / "cache")
-    SignatureCache(tmp_path / "cache").put(pipeline.key(path), compute_signature(pipeline.mesh(path), CONFIG))
-    assert not pipeline.is_cached(path)
-    pipeline.fill(path)
+    SignatureCache(tmp_path / "cache").put(
+        pipeline.key(BodyRef(path)), compute_signature(pipeline.mesh(BodyRef(path)), CONFIG)
+    )
+    assert not pipeline.is_cached(BodyRef(path))
+    pipeline.fill([BodyRef(path)])
     assert computed == [CONFIG.n_kept]
-    assert pipeline.is_cached(path)
+    assert pipeline.is_cached(BodyRef(path))
 
 
 USUAL = replace(CONFIG, n_eigenpairs=None)
@@ -159,14 +166,14 @@ def test_a_larger_signature_serves(tmp_path: Path, computed: list[int], subdivis
     path = tmp_path / "egg.off"
     body.export(path)
     full = SignaturePipeline(replace(USUAL, attributes=get_args(AttributeName)), LoadOptions(), tmp_path / "cache")
-    full.signature(path)
+    full.signature(BodyRef(path))
     needed = replace(full, config=replace(NEEDED, attributes=("surface_direction",)))
-    assert needed.is_cached(path)
-    found = needed.signature(path)
+    assert needed.is_cached(BodyRef(path))
+    found = needed.signature(BodyRef(path))
     assert computed == [250]
-    assert needed.notes(path) == full.notes(path)
-    assert bool(full.notes(path)) == (subdivisions == 2)
-    expected = compute_signature(needed.mesh(path), needed.config)
+    assert needed.hit(BodyRef(path)).notes == full.hit(BodyRef(path)).notes
+    assert bool(full.hit(BodyRef(path)).notes) == (subdivisions == 2)
+    expected = compute_signature(needed.mesh(BodyRef(path)), needed.config)
     assert found.config == expected.config
     np.testing.assert_allclose(found.eigenvalues, expected.eigenvalues, rtol=1e-9)
     for one, other in ((found.interior, expected.interior), (found.surface, expected.surface)):
@@ -174,8 +181,8 @@ def test_a_larger_signature_serves(tmp_path: Path, computed: list[int], subdivis
         np.testing.assert_allclose(np.abs(one.eigenfunctions), np.abs(other.eigenfunctions), atol=1e-3)
         assert set(one.attributes) == set(other.attributes) == {"surface_direction"}
     # And never the other way round.
-    replace(needed, cache_dir=tmp_path / "other").signature(path)
-    assert not replace(full, cache_dir=tmp_path / "other").is_cached(path)
+    replace(needed, cache_dir=tmp_path / "other").signature(BodyRef(path))
+    assert not replace(full, cache_dir=tmp_path / "other").is_cached(BodyRef(path))
     assert computed == [250, 64]
 
 
@@ -183,31 +190,31 @@ def test_a_signature_of_another_mesh_or_with_other_samples_does_not_serve(
     pipeline: SignaturePipeline, path: Path, computed: list[int]
 ) -> None:
     """The file has 162 vertices: enough for 64 eigenpairs, and subdivided for 250."""
-    replace(pipeline, config=USUAL).signature(path)
-    replace(pipeline, config=NEEDED).signature(path)
+    replace(pipeline, config=USUAL).signature(BodyRef(path))
+    replace(pipeline, config=NEEDED).signature(BodyRef(path))
     assert computed == [250]
-    replace(pipeline, config=replace(CONFIG, n_eigenpairs=64)).signature(path)
-    replace(pipeline, config=replace(CONFIG, n_eigenpairs=20)).signature(path)
-    replace(pipeline, config=replace(NEEDED, seed=1)).signature(path)
+    replace(pipeline, config=replace(CONFIG, n_eigenpairs=64)).signature(BodyRef(path))
+    replace(pipeline, config=replace(CONFIG, n_eigenpairs=20)).signature(BodyRef(path))
+    replace(pipeline, config=replace(NEEDED, seed=1)).signature(BodyRef(path))
     assert computed == [250, 64, 20, 64]
 
 
 def test_a_damaged_larger_signature_is_passed_over(path: Path, tmp_path: Path, computed: list[int]) -> None:
     pipeline = SignaturePipeline(USUAL, LoadOptions(), tmp_path / "cache")
-    pipeline.signature(path)
+    pipeline.signature(BodyRef(path))
     (file,) = (tmp_path / "cache").rglob("*.safetensors")
     content = bytearray(file.read_bytes())
     content[-1] ^= 1  # of an eigenfunction: the header does not tell
     file.write_bytes(content)
     needed = replace(pipeline, config=NEEDED)
-    assert len(needed.signature(path).eigenvalues) == 64
+    assert len(needed.signature(BodyRef(path)).eigenvalues) == 64
     assert computed == [250, 64]
-    assert len(needed.signature(path).eigenvalues) == 64
+    assert len(needed.signature(BodyRef(path)).eigenvalues) == 64
     assert computed == [250, 64]
 
 
 def test_a_missing_file_is_named(pipeline: SignaturePipeline, tmp_path: Path) -> None:
-    gone = tmp_path / "gone.off"
+    gone = BodyRef(tmp_path / "gone.off")
     assert not pipeline.is_cached(gone)
     for function in (pipeline.key, pipeline.signature, pipeline.mesh):
         with pytest.raises(MeshError, match=r"gone\.off"):

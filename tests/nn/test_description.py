@@ -219,9 +219,9 @@ def fresh(tmp_path: Path) -> SignatureDataset:
         body = trimesh.creation.icosphere(subdivisions=2)
         body.vertices *= [1.0, 1.0 + 0.2 * i, 1.5]
         body.export(tmp_path / f"{i}.off")
-    dataset = SignatureDataset(sorted(tmp_path.glob("*.off")), CONFIG, tmp_path / "cache")
-    assert dataset.precompute(n_workers=1, progress=False) == []
-    return dataset
+    paths = sorted(tmp_path.glob("*.off"))
+    assert SignatureDataset(paths, CONFIG, tmp_path / "cache").precompute(n_workers=1, progress=False) == []
+    return SignatureDataset(paths, CONFIG, tmp_path / "cache")  # which looks at the files again
 
 
 def test_what_has_been_described_is_not_described_again(fresh: SignatureDataset) -> None:
@@ -240,7 +240,7 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDatase
     _, values = asked(fresh)
     assert asked(fresh, cache_tag="other words")[0] == ["0", "1", "2"]
     assert asked(fresh, cache_tag=None)[0] == ["0", "1", "2"]
-    # CacheHit by the same Signatures: another descriptor under the same words would get the histograms otherwise.
+    # Made of the same Signatures: another descriptor under the same words would get the histograms otherwise.
     cache = fresh.pipeline.cache_dir.with_name("other")
     more = SignatureDataset(paths, replace(CONFIG, attributes=get_args(AttributeName)), cache)
     more.precompute(n_workers=1, progress=False)
@@ -248,7 +248,7 @@ def test_descriptions_are_kept_by_all_that_they_depend_on(fresh: SignatureDatase
     asked(more)
     assert plain.cached_keys() == more.cached_keys()
     assert describe_usable(plain, Area(), cache_tag="one", n_workers=1)[0].shape == (3, 2)
-    with_own = SignatureDataset(paths, CONFIG, fresh.pipeline.cache_dir, point_functions={"height": lambda x: x[:, 2]})
+    with_own = SignatureDataset(paths, CONFIG, fresh.pipeline.cache_dir, attributes={"height": lambda x: x[:, 2]})
     assert asked(with_own)[0] == asked(with_own)[0] == ["0", "1", "2"]
     body = trimesh.creation.icosphere(subdivisions=2)
     body.vertices *= [2.0, 0.7, 0.5]

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
+from torch.utils.data import get_worker_info
 
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature
+
+_ALIGNED = 64  # bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +37,7 @@ class SampleBatch:
         points: (N, P, 3) float32, length, measured from the centre of each shape's own samples.
         eigenfunctions: (N, P, K) float32, 1/length; zero where padded.
         mask: (N, P) true where a sample is real.
-        attributes: named scalars, each (N, P) float32, and directions, each (N, P, 3) float32.
+        attributes: by name, each (N, P) or (N, P, C) float32; a direction has C = 3.
     """
 
     points: Tensor
@@ -41,10 +45,14 @@ class SampleBatch:
     mask: Tensor
     attributes: Mapping[str, Tensor]
 
-    def to(self, device: torch.device | str) -> SampleBatch:
-        """The same batch on another device."""
-        attributes = {name: values.to(device) for name, values in self.attributes.items()}
-        return SampleBatch(self.points.to(device), self.eigenfunctions.to(device), self.mask.to(device), attributes)
+    def map(self, function: Callable[[Tensor], Tensor]) -> SampleBatch:
+        """The batch of what a function makes of each of its tensors."""
+        attributes = {name: function(values) for name, values in self.attributes.items()}
+        return SampleBatch(function(self.points), function(self.eigenfunctions), function(self.mask), attributes)
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> SampleBatch:
+        """The same batch on another device; see `torch.Tensor.to`."""
+        return self.map(lambda values: values.to(device, non_blocking=non_blocking))
 
     def subset(self, n_samples: int, seed: int | None = None) -> SampleBatch:
         """At most `n_samples` samples of each shape.
@@ -157,36 +165,102 @@ class SignatureBatch:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def to(self, device: torch.device | str) -> SignatureBatch:
-        """The same batch on another device; meshes stay where they are."""
+    def __iter__(self) -> Iterator[Body]:
+        return self.bodies()
+
+    @overload
+    def __getitem__(self, index: int) -> Body: ...
+    @overload
+    def __getitem__(self, index: slice | Sequence[int] | Sequence[bool] | Tensor) -> SignatureBatch: ...
+    def __getitem__(self, index: int | slice | Sequence[int] | Sequence[bool] | Tensor) -> Body | SignatureBatch:
+        """One shape as a `Body` by its number; some as a batch by a slice, numbers, or a mask."""
+        if isinstance(index, int | np.integer):
+            return self._body(range(len(self))[index])
+        rows: slice | Tensor
+        if isinstance(index, slice):
+            chosen, rows = list(range(len(self))[index]), index
+        else:
+            given = torch.as_tensor(index)
+            if given.dtype == torch.bool and given.shape != (len(self),):
+                raise IndexError(f"mask: expected {len(self)} entries, got a tensor of shape {tuple(given.shape)}.")
+            chosen = torch.arange(len(self))[given.cpu() if given.numel() else given.long()].tolist()
+            rows = torch.tensor(chosen, dtype=torch.int64, device=self.labels.device)
+        return replace(
+            self.map(lambda values: values[rows]),
+            ids=tuple(self.ids[i] for i in chosen),
+            meshes=None if self.meshes is None else tuple(self.meshes[i] for i in chosen),
+        )
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> SignatureBatch:
+        """The batch of what a function makes of each of its tensors."""
         return replace(
             self,
-            eigenvalues=self.eigenvalues.to(device),
-            interior=self.interior.to(device),
-            surface=self.surface.to(device),
-            area=self.area.to(device),
-            volume=self.volume.to(device),
-            labels=self.labels.to(device),
+            eigenvalues=function(self.eigenvalues),
+            interior=self.interior.map(function),
+            surface=self.surface.map(function),
+            area=function(self.area),
+            volume=function(self.volume),
+            labels=function(self.labels),
+        )
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> SignatureBatch:
+        """The same batch on another device; meshes stay where they are.
+
+        Args:
+            device: to move to.
+            non_blocking: return before all is there, for a batch in pinned memory; see `torch.Tensor.to`.
+        """
+        return self.map(lambda values: values.to(device, non_blocking=non_blocking))
+
+    def pin_memory(self) -> SignatureBatch:
+        """The same batch in pinned memory: what `DataLoader(pin_memory=True)` calls."""
+        return self.map(Tensor.pin_memory)
+
+    @staticmethod
+    def concatenate(batches: Sequence[SignatureBatch]) -> SignatureBatch:
+        """The shapes of several batches in one, padded to the longest.
+
+        Args:
+            batches: at least one, on one device, whose samples carry the same attributes; all with meshes, or none.
+        """
+        if not batches:
+            raise ValueError("batches: expected at least one, got none.")
+        meshes = [batch.meshes for batch in batches if batch.meshes is not None]
+        if meshes and len(meshes) < len(batches):
+            raise ValueError("batches: expected all with meshes or none, got some of each.")
+        return SignatureBatch(
+            eigenvalues=_joined([batch.eigenvalues for batch in batches], math.inf),
+            interior=_joined_samples([batch.interior for batch in batches]),
+            surface=_joined_samples([batch.surface for batch in batches]),
+            area=torch.cat([batch.area for batch in batches]),
+            volume=torch.cat([batch.volume for batch in batches]),
+            labels=torch.cat([batch.labels for batch in batches]),
+            ids=tuple(name for batch in batches for name in batch.ids),
+            meshes=tuple(mesh for several in meshes for mesh in several) if meshes else None,
         )
 
     def bodies(self) -> Iterator[Body]:
         """The shapes one by one."""
-        for i, name in enumerate(self.ids):
-            eigenvalues = self.eigenvalues[i]
-            real = torch.isfinite(eigenvalues)
-            yield Body(
-                eigenvalues=eigenvalues[real].cpu().numpy(),
-                interior=_samples_of(self.interior, i, int(real.sum())),
-                surface=_samples_of(self.surface, i, int(real.sum())),
-                area=float(self.area[i]),
-                volume=float(self.volume[i]),
-                id=name,
-                surface_mesh=None if self.meshes is None else self.meshes[i],
-            )
+        return map(self._body, range(len(self)))
+
+    def _body(self, i: int) -> Body:
+        eigenvalues = self.eigenvalues[i]
+        real = torch.isfinite(eigenvalues)
+        return Body(
+            eigenvalues=eigenvalues[real].cpu().numpy(),
+            interior=_samples_of(self.interior, i, int(real.sum())),
+            surface=_samples_of(self.surface, i, int(real.sum())),
+            area=float(self.area[i]),
+            volume=float(self.volume[i]),
+            id=self.ids[i],
+            surface_mesh=None if self.meshes is None else self.meshes[i],
+        )
 
 
 def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mesh] | None = None) -> SignatureBatch:
     """Pad Signatures to a batch: the `collate_fn` of a `DataLoader` over a `SignatureDataset`.
+
+    In a worker process of a DataLoader the batch lies in shared memory, from which its consumer reads it.
 
     Example:
         Bodies differ in the number of their samples, of which the shorter are padded.
@@ -214,44 +288,132 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
         item if isinstance(item, LabelledSignature) else LabelledSignature(item, -1, item.name) for item in items
     ]
     signatures = [item.signature for item in labelled]
-    eigenvalues = [torch.from_numpy(np.asarray(s.eigenvalues, dtype=np.float64)) for s in signatures]
+    eigenvalues, area, volume, labels = _padded(
+        [
+            [np.asarray(s.eigenvalues, dtype=np.float64) for s in signatures],
+            [np.float64(s.area) for s in signatures],
+            [np.float64(s.volume) for s in signatures],
+            [np.int64(item.label) for item in labelled],
+        ],
+        padding=math.inf,
+    )
+    interior, surface = _pad_samples([[s.interior for s in signatures], [s.surface for s in signatures]])
     return SignatureBatch(
-        eigenvalues=pad_sequence(eigenvalues, batch_first=True, padding_value=float("inf")),
-        interior=_pad_samples([s.interior for s in signatures]),
-        surface=_pad_samples([s.surface for s in signatures]),
-        area=torch.tensor([s.area for s in signatures], dtype=torch.float64),
-        volume=torch.tensor([s.volume for s in signatures], dtype=torch.float64),
-        labels=torch.tensor([item.label for item in labelled], dtype=torch.int64),
+        eigenvalues=eigenvalues,
+        interior=interior,
+        surface=surface,
+        area=area,
+        volume=volume,
+        labels=labels,
         ids=tuple(item.id for item in labelled),
         meshes=None if meshes is None else tuple(meshes),
     )
 
 
-def _pad_samples(samples: Sequence[Samples]) -> SampleBatch:
-    names = set(samples[0].attributes)
-    for s in samples:
-        if set(s.attributes) != names:
+def _pad_samples(rooms: Sequence[Sequence[Samples]]) -> list[SampleBatch]:
+    wanted: list[list[NDArray[Any]]] = []
+    for samples in rooms:
+        names = sorted(samples[0].attributes)
+        for s in samples:
+            if sorted(s.attributes) != names:
+                raise ValueError(
+                    f"items: all must carry the same sample attributes, got {names} and {sorted(s.attributes)}."
+                )
+        # Centred before the cast, or a shape far from the origin would lose its digits.
+        wanted.append([(s.points - s.points.mean(axis=0)).astype(np.float32) for s in samples])
+        wanted.append([np.asarray(s.eigenfunctions, dtype=np.float32) for s in samples])
+        wanted.append([np.ones(len(s), dtype=bool) for s in samples])
+        wanted += [[np.asarray(s.attributes[name], dtype=np.float32) for s in samples] for name in names]
+    padded = iter(_padded(wanted))
+    return [
+        SampleBatch(
+            points=next(padded),
+            eigenfunctions=next(padded),
+            mask=next(padded),
+            attributes={name: next(padded) for name in sorted(samples[0].attributes)},
+        )
+        for samples in rooms
+    ]
+
+
+def _padded(wanted: Sequence[Sequence[Any]], padding: float = 0) -> list[Tensor]:
+    """Of each list of N arrays an (N, ...) tensor, padded up to the largest size along each dimension."""
+    shapes = [(len(some), *map(max, zip(*(one.shape for one in some), strict=True))) for some in wanted]
+    if get_worker_info() is not None and hasattr(os, "memfd_create"):
+        return _shared(wanted, shapes, padding)
+    return [torch.from_numpy(_filled(some, shape, padding)) for some, shape in zip(wanted, shapes, strict=True)]
+
+
+def _filled(arrays: Sequence[Any], shape: tuple[int, ...], padding: float) -> NDArray[Any]:
+    filled = np.empty(shape, arrays[0].dtype)  # for which NumPy asks for large pages: they come many times faster
+    for i, one in enumerate(arrays):
+        if one.shape[1:] != shape[2:]:
+            filled[i] = padding
+        where: tuple[Any, ...] = (i, *map(slice, one.shape))
+        filled[where] = one
+        if len(shape) > 1:
+            filled[i, len(one) :] = padding
+    return filled
+
+
+def _shared(wanted: Sequence[Sequence[Any]], shapes: Sequence[tuple[int, ...]], padding: float) -> list[Tensor]:
+    """`_padded` in a worker process: all in one piece of shared memory, which goes to the parent by its handle.
+
+    What is written to it as to a file, rather than to its pages, costs half the time.
+    """
+    kinds = [some[0].dtype for some in wanted]
+    sizes = [math.prod(shape) * kind.itemsize for shape, kind in zip(shapes, kinds, strict=True)]
+    *starts, end = np.cumsum([0, *(-(-size // _ALIGNED) * _ALIGNED for size in sizes)]).tolist()
+    handle = os.memfd_create("batch")
+    try:
+        os.ftruncate(handle, max(end, _ALIGNED))  # zeros
+        for some, shape, start in zip(wanted, shapes, starts, strict=True):
+            as_it_is = padding == 0 and all(one.shape[1:] == shape[2:] for one in some)
+            pieces = some if as_it_is else [_filled(some, shape, padding)]
+            stride = math.prod(shape[1:]) * some[0].itemsize
+            for i, piece in enumerate(pieces):
+                _write(handle, np.ascontiguousarray(piece), start + i * stride)
+        storage = torch.UntypedStorage._new_shared_fd_cpu(handle, max(end, _ALIGNED))  # type: ignore[attr-defined]
+    finally:
+        os.close(handle)
+    block = torch.empty(0, dtype=torch.uint8).set_(storage)
+    return [
+        block[start : start + size].view(torch.from_numpy(np.empty(0, kind)).dtype).view(shape)
+        for start, size, shape, kind in zip(starts, sizes, shapes, kinds, strict=True)
+    ]
+
+
+def _write(handle: int, array: NDArray[Any], start: int) -> None:
+    content = array.reshape(-1).view(np.uint8).data
+    while len(content):
+        n_written = os.pwrite(handle, content, start)
+        content, start = content[n_written:], start + n_written
+
+
+def _joined(parts: Sequence[Tensor], padding: float = 0) -> Tensor:
+    """(N₁ + N₂ + …, ...), padded up to the largest size along each further dimension."""
+    shape = [max(sizes) for sizes in zip(*(part.shape[1:] for part in parts), strict=True)]
+    joined = parts[0].new_full((sum(map(len, parts)), *shape), padding)
+    start = 0
+    for part in parts:
+        joined[(slice(start, start + len(part)), *map(slice, part.shape[1:]))] = part
+        start += len(part)
+    return joined
+
+
+def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:
+    names = sorted(parts[0].attributes)
+    for part in parts:
+        if sorted(part.attributes) != names:
             raise ValueError(
-                f"items: all must carry the same sample attributes, got {sorted(names)} and {sorted(s.attributes)}."
+                f"batches: all must carry the same sample attributes, got {names} and {sorted(part.attributes)}."
             )
     return SampleBatch(
-        # Centred before the cast, or a shape far from the origin would lose its digits.
-        points=_padded([s.points - s.points.mean(axis=0) for s in samples]),
-        eigenfunctions=_padded([s.eigenfunctions for s in samples]),
-        mask=pad_sequence([torch.ones(len(s), dtype=torch.bool) for s in samples], batch_first=True),
-        attributes={name: _padded([s.attributes[name] for s in samples]) for name in sorted(names)},
+        points=_joined([part.points for part in parts]),
+        eigenfunctions=_joined([part.eigenfunctions for part in parts]),
+        mask=_joined([part.mask for part in parts]),
+        attributes={name: _joined([part.attributes[name] for part in parts]) for name in names},
     )
-
-
-def _padded(arrays: Sequence[NDArray[Any]]) -> Tensor:
-    """(N, ...) float32 copies of N arrays, with zeros up to the largest size along each dimension."""
-    shape = [max(sizes) for sizes in zip(*(array.shape for array in arrays), strict=True)]
-    same = all(list(array.shape) == shape for array in arrays)
-    # Zeros that nobody will see would take as long as the copy.
-    padded = (torch.empty if same else torch.zeros)(len(arrays), *shape)
-    for into, array in zip(padded, arrays, strict=True):
-        into[tuple(slice(n) for n in array.shape)] = torch.from_numpy(array)
-    return padded
 
 
 def _samples_of(batch: SampleBatch, i: int, n_eigenpairs: int) -> Samples:

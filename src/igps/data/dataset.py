@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any, Self, overload
 
 import numpy as np
 import torch
@@ -18,15 +20,28 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from tqdm import tqdm
 
-from igps._parallel import Failed, Limits, MachineError, run
+from igps._parallel import Failed, Limits, MachineError, n_cores, run
 from igps.data.batch import LabelledSignature, SignatureBatch, collate
 from igps.data.cache import SignatureCache, default_cache_dir
+from igps.data.collection import About, CollectionFile, write_collection
 from igps.data.file_stat_cache import FileStatCache
-from igps.data.pipeline import CacheHit, SignaturePipeline, fill_elsewhere, version
-from igps.data.sources import Bodies, find_bodies, given_bodies
+from igps.data.pipeline import (
+    ROOMS,
+    AttributeSource,
+    CacheHit,
+    PreTransform,
+    SignaturePipeline,
+    checked_values,
+    fill_elsewhere,
+    version,
+    with_attribute,
+)
+from igps.data.requirements import Requirements, Requiring, requirements_of
+from igps.data.sources import Bodies, ClassRule, find_bodies, given_bodies
+from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
-from igps.signature.signature import Samples, SignatureConfig
+from igps.signature.signature import Samples, Signature, SignatureConfig
 
 logger = logging.getLogger(__name__)
 
@@ -34,12 +49,13 @@ logger = logging.getLogger(__name__)
 _SHARED_WITHIN = 60.0
 _REMEMBERED_AT_ONCE = 1000
 
-PointFunction = Callable[[NDArray[np.float64]], NDArray[np.floating]]
+PointFunction = Callable[[NDArray[np.float64]], NDArray[np.floating[Any]]]
+Index = int | str | slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A mesh that could not be used, and why."""
+    """A body that could not be used, and why."""
 
     id: str
     path: Path
@@ -47,7 +63,7 @@ class Failure:
 
 
 class SignatureDataset(Dataset[LabelledSignature]):
-    """Signatures of mesh files, computed on first touch and cached on disk.
+    """Signatures of bodies in files, computed on first touch and cached on disk.
 
     Example:
         >>> import tempfile, trimesh
@@ -55,24 +71,37 @@ class SignatureDataset(Dataset[LabelledSignature]):
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = ball.export(f"{folder}/ball.off")
         ...     dataset = SignatureDataset(folder, SignatureConfig(n_eigenpairs=20), f"{folder}/cache")
-        ...     item = dataset[0]
+        ...     item = dataset["ball.off"]
         >>> len(dataset), item.id, item.signature.eigenvalues.shape
         (1, 'ball.off', (20,))
 
     Args:
-        root_or_paths: a folder (see `find_bodies`), mesh files, or a `Bodies`.
-        config: parameters of the Signatures; `SignatureConfig()` if None, with 250 eigenpairs. For one descriptor
-            alone, `descriptor.requirements.apply_to(SignatureConfig())` has as many as it needs.
-        cache_dir: where Signatures are kept; the user's cache directory if None. The key of a file covers the mesh
-            file's content, how it is read, every parameter, and the algorithm's version. A Signature with more
-            eigenpairs or attributes serves too.
+        root_or_paths: a folder (see `find_bodies`), files, or `Bodies`.
+        config: parameters of the Signatures; `SignatureConfig()` if None, with 250 eigenpairs where no descriptor asks
+            for another number.
+        cache_dir: where Signatures are kept; the user's cache directory if None. The key of a body covers the content
+            of its file, how it is read, every parameter, and the algorithm's version. A Signature with more eigenpairs
+            or attributes serves too.
+        descriptor: what the Signatures are for, by name or itself: they get the eigenpairs and attributes that it
+            requires.
         labels: classes of the given paths, by name.
-        reading: how mesh files are read.
-        point_functions: attributes of your own of the interior samples, by name: functions of their points, (P, 3) in
-            the mesh file's coordinates, to (P,). They are evaluated at each reading, not cached.
+        classes: what the class of a body is, see `ClassRule`; as the folder tells it if None.
+        reading: how files are read.
+        attributes: further attributes of the samples, by name: an `AttributeSource`, whose values are kept beside the
+            Signatures, which stay; or a function of points, (P, 3) in the file's coordinates, to (P,) or (P, C), which
+            is called at each reading.
+        pre_transform: a change of every Signature, which is kept changed; its `cache_tag` is part of the key.
+        transform: a change of a Signature at each reading; see `igps.data.transforms`.
+
+    Attributes:
+        bodies: files, names and classes.
+        pipeline: how a body becomes a Signature.
+        classes: all names of classes, in the order of their numbers.
+        transform: see above; may be set.
 
     Raises:
-        FileNotFoundError: no such folder, or no mesh in it.
+        FileNotFoundError: no such folder, or no body in it.
+        ValueError: the configuration has less than the descriptor requires.
     """
 
     def __init__(
@@ -81,56 +110,113 @@ class SignatureDataset(Dataset[LabelledSignature]):
         config: SignatureConfig | None = None,
         cache_dir: str | Path | None = None,
         *,
+        descriptor: str | Requiring | Requirements | None = None,
         labels: Sequence[str] | None = None,
+        classes: ClassRule | None = None,
         reading: LoadOptions | None = None,
-        point_functions: Mapping[str, PointFunction] | None = None,
+        attributes: Mapping[str, AttributeSource | PointFunction] | None = None,
+        pre_transform: PreTransform | None = None,
+        transform: Callable[[Signature], Signature] | None = None,
     ) -> None:
-        if isinstance(root_or_paths, Bodies):
-            self.bodies = root_or_paths
-        elif isinstance(root_or_paths, str | Path) and Path(root_or_paths).is_dir():
-            self.bodies = find_bodies(root_or_paths)
-        elif isinstance(root_or_paths, str | Path):
-            self.bodies = given_bodies([root_or_paths], labels)
-        else:
-            self.bodies = given_bodies(root_or_paths, labels)
-        self._pipeline = SignaturePipeline(
-            (config or SignatureConfig()).resolved(), reading or LoadOptions(), Path(cache_dir or default_cache_dir())
-        )
-        self._point_functions = dict(point_functions or {})
+        config, reading = config or SignatureConfig(), reading or LoadOptions()
+        if descriptor is not None:
+            config = requirements_of(descriptor).apply_to(config)
+        self.bodies = _bodies(root_or_paths, labels, reading).classed(classes or "folder")
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
+        given = dict(attributes or {})
+        sources = {name: one for name, one in given.items() if isinstance(one, AttributeSource)}
+        self._functions: dict[str, PointFunction] = {
+            name: one for name, one in given.items() if not isinstance(one, AttributeSource)
+        }
+        if pre_transform is not None and pre_transform.cache_tag and self._functions:
+            raise ValueError("pre_transform: expected attributes with a cache_tag beside it, got a function of points.")
+        self.pipeline = SignaturePipeline(
+            config.resolved(), reading, Path(cache_dir or default_cache_dir()), sources, pre_transform
+        )
+        self.transform = transform
+        # What serves each body, once `precompute` has seen to it. And Signatures that need no cache, with the number of
+        # each body among them.
+        self._hits: tuple[CacheHit | None, ...] = (None,) * len(self.bodies)
+        self._at_hand: CollectionFile | list[Signature] | None = None
+        self._numbers: tuple[int, ...] = tuple(range(len(self.bodies)))
 
     @property
     def config(self) -> SignatureConfig:
         """Parameters of the Signatures."""
-        return self._pipeline.config
-
-    @property
-    def pipeline(self) -> SignaturePipeline:
-        """How a file becomes a Signature."""
-        return self._pipeline
+        return self.pipeline.config
 
     @property
     def reading(self) -> LoadOptions:
-        """How the mesh files are read."""
-        return self._pipeline.reading
+        """How the files are read."""
+        return self.pipeline.reading
 
     @property
     def labels(self) -> Tensor:
-        """(N,) int64 index of each mesh's class in `classes`, −1 where unknown."""
+        """(N,) int64 index of each body's class in `classes`, −1 where unknown."""
         index = {name: i for i, name in enumerate(self.classes)}
         names: Sequence[str | None] = self.bodies.labels or [None] * len(self.bodies)
         return torch.tensor([-1 if name is None else index[name] for name in names], dtype=torch.int64)
 
+    @property
+    def sizes(self) -> Tensor:
+        """(N,) int64 interior samples of each body, for `BucketBatchSampler`. Each Signature is looked at for it."""
+        return torch.tensor([len(self._signature(i).interior) for i in range(len(self))], dtype=torch.int64)
+
     def __len__(self) -> int:
         return len(self.bodies)
 
-    def __getitem__(self, index: int) -> LabelledSignature:
-        path, name = self.bodies.paths[index], self.bodies.names[index]
-        label = -1 if self.bodies.labels is None else self.classes.index(self.bodies.labels[index])
-        signature = replace(self._pipeline.signature(path), name=name)
-        if self._point_functions:
-            signature = replace(signature, interior=_with_attributes(signature.interior, self._point_functions, name))
+    def __iter__(self) -> Iterator[LabelledSignature]:
+        return map(self._item, range(len(self)))
+
+    @overload
+    def __getitem__(self, index: int | str) -> LabelledSignature: ...  # type: ignore[overload-overlap]
+    @overload
+    def __getitem__(
+        self, index: slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
+    ) -> Self: ...
+    def __getitem__(self, index: Index) -> LabelledSignature | Self:
+        """An item by number or name; the dataset of some of the bodies by slice, numbers, names, or mask."""
+        if isinstance(index, str):
+            return self._item(self._number(index))
+        if isinstance(index, int | np.integer):
+            return self._item(range(len(self))[index])
+        if isinstance(index, slice):
+            return self.subset(range(len(self))[index])
+        found = list(index)
+        if found and all(isinstance(one, str) for one in found):
+            return self.subset([self._number(str(one)) for one in found])
+        numbers = torch.as_tensor(np.asarray(index))
+        if numbers.dtype == torch.bool and numbers.shape != (len(self),):
+            raise IndexError(f"mask: expected {len(self)} entries, got an array of shape {tuple(numbers.shape)}.")
+        return self.subset(torch.arange(len(self))[numbers if found else numbers.long()].tolist())
+
+    def _number(self, name: str) -> int:
+        try:
+            return self.bodies.names.index(name)
+        except ValueError:
+            raise KeyError(f"no body is called {name!r}; the first is called {self.bodies.names[:1]}") from None
+
+    def _item(self, i: int) -> LabelledSignature:
+        name = self.bodies.names[i]
+        label = -1 if self.bodies.labels is None else self.classes.index(self.bodies.labels[i])
+        signature = self._signature(i)
+        if self.transform is not None:
+            signature = self.transform(signature)
         return LabelledSignature(signature, label, name)
+
+    def _signature(self, i: int) -> Signature:
+        """Without the transform."""
+        name = self.bodies.names[i]
+        if self._at_hand is not None:
+            return replace(self._at_hand[self._numbers[i]], name=name)
+        hit = self._hits[i]
+        found = None if hit is None else self.pipeline.read(hit)
+        signature = replace(found or self.pipeline.signature(self.bodies[i]), name=name)
+        for attribute, function in self._functions.items():
+            points = {room: getattr(signature, room).points for room in ROOMS}
+            values = {room: checked_values(function(some), len(some), attribute, name) for room, some in points.items()}
+            signature = with_attribute(signature, attribute, values)
+        return signature
 
     def mesh(self, index: int) -> Mesh:
         """The mesh itself, read and checked as for its Signature.
@@ -138,7 +224,12 @@ class SignatureDataset(Dataset[LabelledSignature]):
         Raises:
             MeshError: it cannot be used.
         """
-        return self._pipeline.mesh(self.bodies.paths[index])
+        if isinstance(self._at_hand, CollectionFile):
+            raise MeshError(
+                f"{self.bodies.names[index]}: {self._at_hand.path} holds signatures and no meshes. Make the dataset of "
+                "the folder of meshes."
+            )
+        return self.pipeline.mesh(self.bodies[index])
 
     def key(self, index: int) -> str:
         """The name of a Signature in the cache, by the content of its file and everything that it depends on.
@@ -146,40 +237,126 @@ class SignatureDataset(Dataset[LabelledSignature]):
         Raises:
             MeshError: the file cannot be read.
         """
-        return self._pipeline.key(self.bodies.paths[index])
+        hit = self._hits[index] if isinstance(self._at_hand, CollectionFile) else None
+        return self.pipeline.key(self.bodies[index]) if hit is None else hit.key
 
     def cached_keys(self) -> list[str | None]:
-        """What in the cache serves each mesh, None where nothing does; of files that are known, without reading them.
+        """What in the cache serves each body, None where nothing does; of files that are known, without reading them.
 
-        None as well of those with point functions, which no key covers.
+        None as well of those that change at each reading, which no key covers.
         """
-        if self._point_functions:
+        if self._functions or self.transform is not None:
             return [None] * len(self)
-        ready = FileStatCache(self._pipeline).ready(self.bodies.paths)
-        served = (self._served(i) if path not in ready else ready[path] for i, path in enumerate(self.bodies.paths))
-        return [None if one is None else one.key for one in served]
+        return [None if hit is None else hit.whole_key for hit in self._found()]
 
     def notes(self, index: int) -> tuple[str, ...]:
         """What was done to a mesh on its way to its cached Signature, in words."""
-        return self._pipeline.notes(self.bodies.paths[index])
+        return self.subset([index]).all_notes()[0]
 
     def all_notes(self) -> list[tuple[str, ...]]:
         """The notes of all meshes; of files that are known from `precompute` without reading them again."""
-        ready = FileStatCache(self._pipeline).ready(self.bodies.paths)
-        return [ready[path].notes if path in ready else self.notes(i) for i, path in enumerate(self.bodies.paths)]
+        return [() if hit is None else hit.notes for hit in self._found()]
 
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
         """Some of the items as a batch, with or without their meshes."""
         return collate([self[i] for i in indices], [self.mesh(i) for i in indices] if meshes else None)
 
-    def subset(self, indices: Sequence[int]) -> SignatureDataset:
-        """The dataset of some of the meshes; `classes` keeps all names, so that labels keep their numbers."""
-        chosen = object.__new__(SignatureDataset)
+    def subset(self, indices: Sequence[int]) -> Self:
+        """The dataset of some of the bodies; `classes` keeps all names, so that labels keep their numbers."""
+        chosen = copy.copy(self)
         chosen.bodies = self.bodies.subset(indices)
-        chosen._pipeline = self._pipeline
-        chosen._point_functions = self._point_functions
-        chosen.classes = self.classes
+        chosen._hits = tuple(self._hits[i] for i in indices)
+        chosen._numbers = tuple(self._numbers[i] for i in indices)
+        if isinstance(self._at_hand, list):  # no more goes to a worker than it needs
+            chosen._at_hand = [self._at_hand[number] for number in chosen._numbers]
+            chosen._numbers = tuple(range(len(chosen)))
         return chosen
+
+    def usable(self, failures: Sequence[Failure]) -> Self:
+        """The dataset without the bodies that failed."""
+        failed = {failure.id for failure in failures}
+        return self.subset([i for i, name in enumerate(self.bodies.names) if name not in failed])
+
+    def to_memory(self) -> Self:
+        """The same with all Signatures in memory, as they are before `transform`; those not cached are computed."""
+        chosen = copy.copy(self)
+        chosen._at_hand = [_owned(self._signature(i)) for i in range(len(self))]
+        chosen._numbers = tuple(range(len(self)))
+        return chosen
+
+    def to_file(self, path: str | Path) -> None:
+        """Write all Signatures, as they are before `transform`, to one file that `from_file` reads without the meshes.
+
+        Names, classes and parameters go with them; paths do not. Those not cached are computed.
+
+        Args:
+            path: such as ``signatures.igps``; a file that is there is replaced.
+
+        Raises:
+            MeshError: a body that cannot be used; see `usable`.
+        """
+        hits = [hit if hit is not None else self.pipeline.hit(self.bodies[i]) for i, hit in enumerate(self._hits)]
+        about = About(
+            names=self.bodies.names,
+            parts=self.bodies.parts,
+            labels=self.bodies.labels,
+            classes=self.classes,
+            keys=tuple(hit.whole_key for hit in hits),
+            reading=asdict(self.reading),
+            config=asdict(self.config),
+        )
+        whole = copy.copy(self)
+        whole._hits = tuple(hits)
+        write_collection(Path(path), about, whole._signature)
+
+    @classmethod
+    def from_file(
+        cls,
+        path: str | Path,
+        *,
+        descriptor: str | Requiring | Requirements | None = None,
+        cache_dir: str | Path | None = None,
+        transform: Callable[[Signature], Signature] | None = None,
+    ) -> Self:
+        """The Signatures of a file that `to_file` wrote; it is read by memory map, and runs no code.
+
+        Example:
+            >>> import tempfile, trimesh
+            >>> ball = trimesh.creation.icosphere(subdivisions=2)
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     _ = ball.export(f"{folder}/ball.off")
+            ...     dataset = SignatureDataset(folder, SignatureConfig(n_eigenpairs=20), f"{folder}/cache")
+            ...     dataset.to_file(f"{folder}/signatures.igps")
+            ...     len(SignatureDataset.from_file(f"{folder}/signatures.igps")["ball.off"].signature.eigenvalues)
+            20
+
+        Args:
+            path: the file.
+            descriptor: what the Signatures are for, by name or itself.
+            cache_dir: where descriptions are kept; the user's cache directory if None.
+            transform: a change of a Signature at each reading.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: it is no such file, or has less than the descriptor requires.
+        """
+        file = CollectionFile(path)
+        about = file.about
+        try:
+            config = SignatureConfig(**{**about.config, "attributes": tuple(about.config["attributes"])})
+            reading = LoadOptions(**about.reading)
+        except (TypeError, KeyError, ValueError) as error:
+            raise ValueError(f"{path}: parameters of another version ({error}). Export it again.") from error
+        if descriptor is not None:
+            requirements_of(descriptor).check_config(config)
+        paths = tuple(Path(name.removesuffix(f"#{part}")) for name, part in zip(about.names, about.parts, strict=True))
+        bodies = Bodies(paths, about.names, about.labels, about.parts)
+        dataset = cls.__new__(cls)
+        SignatureDataset.__init__(dataset, bodies, config, cache_dir, reading=reading, transform=transform)
+        dataset.classes = about.classes
+        dataset._at_hand = file
+        dataset._hits = tuple(CacheHit(key, 0, file.notes(i), (0, 0, 0)) for i, key in enumerate(about.keys))
+        return dataset
 
     def precompute(
         self,
@@ -190,98 +367,156 @@ class SignatureDataset(Dataset[LabelledSignature]):
         progress: bool = True,
         limits: Limits | None = None,
     ) -> list[Failure]:
-        """Fill the cache, skipping what is there, and list the meshes that cannot be used.
+        """Fill the cache, skipping what is there, and list the bodies that cannot be used.
+
+        From then on this dataset, and those that are made from it, read Signatures from the cache alone, and the files
+        no more: call it again where files have changed.
 
         Args:
             executor: any `concurrent.futures.Executor`, such as that of a cluster, whose workers must see the files and
                 the cache by the same paths; processes of ours with one BLAS thread each if None.
             n_workers: of those processes; all cores if None.
-            strict: raise at the first bad mesh instead of listing it.
+            strict: raise at the first bad body instead of listing it.
             progress: show a bar.
-            limits: time and memory of one mesh; one that needs more is bad.
+            limits: time and memory of one body; one that needs more is bad.
 
         Raises:
-            MeshError: a bad mesh, if `strict`.
+            MeshError: a bad body, if `strict`.
             MachineError: the disk is full, or the like; what is done is kept.
         """
-        SignatureCache(self._pipeline.cache_dir).remove_abandoned()
-        known = FileStatCache(self._pipeline)
-        ready = known.ready(self.bodies.paths)
-        missing = [i for i, path in enumerate(self.bodies.paths) if path not in ready]
-        fill: Callable[[Path], CacheHit] = self._pipeline.fill
+        if self._at_hand is not None:
+            return []
+        SignatureCache(self.pipeline.cache_dir).remove_abandoned()
+        known = FileStatCache(self.pipeline)
+        found: list[CacheHit | None] = [*map(known.ready(self.bodies).get, self.bodies)]
         if executor is None:
-            served = {i: self._served(i) for i in missing}
-            known.remember({self.bodies.paths[i]: one for i, one in served.items() if one is not None})
-            missing = [i for i, one in served.items() if one is None]
-            paths = [self.bodies.paths[i] for i in missing]
-        else:
-            # Elsewhere, and from another folder: the workers look for themselves what there is.
-            pipeline = replace(self._pipeline, cache_dir=self._pipeline.cache_dir.absolute())
-            fill = partial(fill_elsewhere, pipeline, version())
-            paths = [self.bodies.paths[i].absolute() for i in missing]
+            served = {i: hit for group in _groups(self.bodies, found, None) for i, hit in self._served(group)}
+            known.remember({self.bodies[i]: hit for i, hit in served.items()})
+            for i, hit in served.items():
+                found[i] = hit
+        # A chunk of the bodies of one file is one job, so that the file is read once for it.
+        most = 1 if limits is not None and limits != Limits() else -(-len(self) // (n_workers or n_cores()))
+        jobs = list(_groups(self.bodies, found, most))
+        n_there = len(self) - sum(map(len, jobs))
         failures: dict[int, Failure] = {}
-        new: dict[Path, CacheHit] = {}
-        results = run(fill, paths, n_workers=n_workers, executor=executor, limits=limits)
+        new: dict[BodyRef, CacheHit] = {}
+        outcomes = self._outcomes(jobs, executor, n_workers, limits)
         with (
-            tqdm(total=len(self), initial=len(self) - len(missing), desc="signatures", disable=not progress) as bar,
-            contextlib.closing(results),
+            tqdm(total=len(self), initial=n_there, desc="signatures", disable=not progress) as bar,
+            contextlib.closing(outcomes),
             contextlib.ExitStack() as at_the_end,
         ):
             at_the_end.callback(lambda: known.remember(new))
-            for number, outcome in results:
+            for i, outcome in outcomes:
                 bar.update()
                 if not isinstance(outcome, Failed):
                     self._check_visible(outcome, first=not new)
-                    new[self.bodies.paths[missing[number]]] = outcome
+                    new[self.bodies[i]] = found[i] = outcome
                     if len(new) >= _REMEMBERED_AT_ONCE:
                         known.remember(new)
                         new.clear()
                     continue
-                failure = self.failure(missing[number], outcome)
+                failures[i] = self.failure(i, outcome)
                 if strict:
-                    raise MeshError(failure.error)
-                failures[missing[number]] = failure
-                logger.warning("skipped: %s", failure.error)
+                    raise MeshError(failures[i].error)
+                logger.warning("skipped: %s", failures[i].error)
+        self._hits = tuple(found)
         return [failures[i] for i in sorted(failures)]
 
-    def _served(self, index: int) -> CacheHit | None:
-        try:
-            return self._pipeline.served(self.bodies.paths[index])
-        except MeshError:  # computing it will say why
-            return None
+    def _outcomes(
+        self, jobs: Sequence[Sequence[int]], executor: Executor | None, n_workers: int | None, limits: Limits | None
+    ) -> Generator[tuple[int, CacheHit | Failed], None, None]:
+        """What becomes of each body of the jobs. Where one loses its process, the others of its job are tried again."""
+        fill: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = self.pipeline.fill
+        bodies = [[self.bodies[i] for i in job] for job in jobs]
+        if executor is not None:  # elsewhere, and from another folder
+            pipeline = replace(self.pipeline, cache_dir=self.pipeline.cache_dir.absolute())
+            fill = partial(fill_elsewhere, pipeline.fill, version())
+            bodies = [[replace(body, path=body.path.absolute()) for body in job] for job in bodies]
+        again: list[list[int]] = []
+        results = run(fill, bodies, n_workers=n_workers, executor=executor, limits=limits)
+        with contextlib.closing(results):
+            for number, outcome in results:
+                job = jobs[number]
+                if not isinstance(outcome, Failed):
+                    yield from zip(job, outcome, strict=True)
+                elif len(job) > 1:
+                    again += [[i] for i in job]
+                else:
+                    yield job[0], outcome
+        if again:
+            yield from self._outcomes(again, executor, n_workers, limits)
 
-    def _check_visible(self, served: CacheHit, first: bool) -> None:
+    def _found(self) -> list[CacheHit | None]:
+        """What serves each body, as far as something does."""
+        found = list(self._hits)
+        unknown = self.bodies.subset([i for i, hit in enumerate(found) if hit is None])
+        ready = FileStatCache(self.pipeline).ready(unknown) if self._at_hand is None else {}
+        found = [hit or ready.get(body) for hit, body in zip(found, self.bodies, strict=True)]
+        if self._at_hand is None:
+            for group in _groups(self.bodies, found, None):
+                for i, hit in self._served(group):
+                    found[i] = hit
+        return found
+
+    def _served(self, group: Sequence[int]) -> list[tuple[int, CacheHit]]:
+        """What serves bodies of one file, where something does."""
+        try:
+            hits = self.pipeline.served([self.bodies[i] for i in group])
+        except MeshError:  # computing it will say why
+            return []
+        return [(i, hit) for i, hit in zip(group, hits, strict=True) if hit is not None]
+
+    def _check_visible(self, hit: CacheHit, first: bool) -> None:
         """Raise a MachineError if what a worker put into its cache does not come to this one, asked at the first."""
-        path = SignatureCache(self._pipeline.cache_dir).path(served.key)
+        path = SignatureCache(self.pipeline.cache_dir).path(hit.key)
         deadline = time.monotonic() + _SHARED_WITHIN
         while first and not path.exists():
             if time.monotonic() > deadline:
                 raise MachineError(
-                    f"{self._pipeline.cache_dir}: the workers' signatures do not appear there. Choose a cache_dir that "
+                    f"{self.pipeline.cache_dir}: the workers' signatures do not appear there. Choose a cache_dir that "
                     "this machine and all workers share, by the same path."
                 )
             time.sleep(0.1)
 
     def failure(self, index: int, failed: Failed) -> Failure:
-        """What failed of a mesh, in a sentence that names its file."""
+        """What failed of a body, in a sentence that names its file."""
         path, reason = self.bodies.paths[index], failed.reason
-        named = reason if reason.startswith(str(path)) else f"{path}: {reason}"
+        named = reason if reason.startswith(str(path)) else f"{self.bodies[index]}: {reason}"
         return Failure(self.bodies.names[index], path, named)
 
-    def usable(self, failures: Sequence[Failure]) -> SignatureDataset:
-        """The dataset without the meshes that failed."""
-        failed = {failure.id for failure in failures}
-        return self.subset([i for i, name in enumerate(self.bodies.names) if name not in failed])
+
+def _bodies(
+    given: str | Path | Sequence[str | Path] | Bodies, labels: Sequence[str] | None, reading: LoadOptions
+) -> Bodies:
+    if isinstance(given, Bodies):
+        return given
+    if isinstance(given, str | Path):
+        return find_bodies(given, reading) if Path(given).is_dir() else given_bodies([given], labels, reading)
+    return given_bodies(given, labels, reading)
 
 
-def _with_attributes(samples: Samples, functions: Mapping[str, PointFunction], name: str) -> Samples:
-    found = dict(samples.attributes)
-    for attribute, function in functions.items():
-        values = np.asarray(function(samples.points), dtype=np.float32)
-        if values.shape != (len(samples),) or not np.isfinite(values).all():
-            raise ValueError(
-                f"point_functions: expected {attribute!r} to give {len(samples)} finite numbers for the points of "
-                f"{name}, got an array of shape {values.shape} with {int((~np.isfinite(values)).sum())} not finite."
-            )
-        found[attribute] = values
-    return replace(samples, attributes=found)
+def _groups(bodies: Bodies, found: Sequence[CacheHit | None], most: int | None) -> Iterator[list[int]]:
+    """Numbers of the bodies that nothing serves, those of one file together, at most so many."""
+    by_file: dict[Path, list[int]] = {}
+    for i, (path, hit) in enumerate(zip(bodies.paths, found, strict=True)):
+        if hit is None:
+            by_file.setdefault(path, []).append(i)
+    for group in by_file.values():
+        size = most or len(group)
+        yield from (group[start : start + size] for start in range(0, len(group), size))
+
+
+def _owned(signature: Signature) -> Signature:
+    """The same with arrays of its own."""
+
+    def owned(samples: Samples) -> Samples:
+        attributes = {name: values.copy() for name, values in samples.attributes.items()}
+        return Samples(samples.points.copy(), samples.eigenfunctions.copy(), attributes)
+
+    return replace(
+        signature,
+        eigenvalues=signature.eigenvalues.copy(),
+        interior=owned(signature.interior),
+        surface=owned(signature.surface),
+    )

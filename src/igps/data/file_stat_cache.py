@@ -1,4 +1,4 @@
-"""Which Signature in a cache serves a file, remembered, so that files that did not change are not read again."""
+"""Which Signature in a cache serves a body, remembered, so that files that did not change are not read again."""
 
 from __future__ import annotations
 
@@ -9,42 +9,28 @@ import logging
 import os
 import sqlite3
 import time
-from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Generator, Iterable, Mapping
 
 from igps.data.cache import SignatureCache
 from igps.data.pipeline import CacheHit, SignaturePipeline
+from igps.mesh.loading import BodyRef
 from igps.mesh.mending import MENDING_VERSION
 
 logger = logging.getLogger(__name__)
 
 _FILE = "known_files.sqlite"
-# Who writes holds it for milliseconds.
+# A writer holds it for milliseconds.
 _PATIENCE = 30.0
-# A file may change again within the grain of its clock: what is so young is not remembered.
+# A file may change again within the grain of its clock: a younger one is not remembered.
 _YOUNG = 2 * 10**9
 _TABLE = (
-    "CREATE TABLE IF NOT EXISTS file (pipeline TEXT, path TEXT, size INTEGER, mtime INTEGER, ctime INTEGER, key TEXT, "
-    "bytes INTEGER, notes TEXT, PRIMARY KEY (pipeline, path)) WITHOUT ROWID"
+    "CREATE TABLE IF NOT EXISTS body (pipeline TEXT, path TEXT, part TEXT, size INTEGER, mtime INTEGER, ctime INTEGER, "
+    "key TEXT, bytes INTEGER, notes TEXT, PRIMARY KEY (pipeline, path, part)) WITHOUT ROWID"
 )
 
 
-@dataclass(frozen=True)
-class Known:
-    """A Signature that is there.
-
-    Args:
-        key: its name in the cache.
-        notes: what was done to its mesh.
-    """
-
-    key: str
-    notes: tuple[str, ...]
-
-
 class FileStatCache:
-    """The files of one pipeline, by path, size and times of change, in a small database beside its cache.
+    """The bodies of one pipeline, by path, part, size and times of change, in a small database beside its cache.
 
     It may be removed at any time, and where it cannot be read or written, it is done without.
     """
@@ -52,40 +38,47 @@ class FileStatCache:
     def __init__(self, pipeline: SignaturePipeline) -> None:
         self._pipeline = pipeline
         self._path = pipeline.cache_dir / _FILE
-        told = json.dumps([pipeline.reading.as_dict(), pipeline.config.as_dict(), MENDING_VERSION], sort_keys=True)
-        self._name = hashlib.sha256(told.encode()).hexdigest()[:32]
+        changed = pipeline.pre_transform.cache_tag if pipeline.pre_transform else None
+        words = [pipeline.reading.as_dict(), pipeline.config.as_dict(), MENDING_VERSION, changed]
+        self._name = hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()[:32]
+        # What attributes depend on may change while the file does not, and a transform may depend on them.
+        self._is_useful = not (pipeline.attributes and pipeline.pre_transform)
 
-    def ready(self, paths: Sequence[Path]) -> dict[Path, Known]:
-        """Those of the files that have not changed since, and whose Signature is there in full."""
-        found: dict[Path, Known] = {}
-        if not self._path.exists():
+    def ready(self, bodies: Iterable[BodyRef]) -> dict[BodyRef, CacheHit]:
+        """Those of the bodies whose files have not changed since, and whose Signature is there in full."""
+        found: dict[BodyRef, CacheHit] = {}
+        if not self._path.exists() or not self._is_useful:
             return found
         cache = SignatureCache(self._pipeline.cache_dir)
         with self._dispensable(), contextlib.closing(self._database()) as database:
-            for path in paths:
+            for body in bodies:
                 row = database.execute(
-                    "SELECT size, mtime, ctime, key, bytes, notes FROM file WHERE pipeline = ? AND path = ?",
-                    (self._name, os.path.abspath(path)),
+                    "SELECT size, mtime, ctime, key, bytes, notes FROM body "
+                    "WHERE pipeline = ? AND path = ? AND part = ?",
+                    (self._name, *_address(body)),
                 ).fetchone()
                 if row is None:
                     continue
+                *stamp, key, n_bytes, notes = row
                 with contextlib.suppress(OSError):
-                    same = CacheHit.stamp_of(path) == tuple(row[:3])
-                    if same and os.stat(cache.path(row[3])).st_size == row[4]:
-                        found[path] = Known(row[3], tuple(json.loads(row[5])))
+                    same = CacheHit.stamp_of(body.path) == tuple(stamp)
+                    if same and os.stat(cache.path(key)).st_size == n_bytes:
+                        hit = CacheHit(key, n_bytes, tuple(json.loads(notes)), tuple(stamp))
+                        if (whole := self._pipeline.with_attributes(body, hit)) is not None:
+                            found[body] = whole
         return found
 
-    def remember(self, served: Mapping[Path, CacheHit]) -> None:
-        """Keep what serves these files, but for those that changed just now."""
+    def remember(self, hits: Mapping[BodyRef, CacheHit]) -> None:
+        """Keep what serves these bodies, but for files that changed just now."""
         now = time.time_ns()
         rows = [
-            (self._name, os.path.abspath(path), *one.stamp, one.key, one.n_bytes, json.dumps(one.notes))
-            for path, one in served.items()
-            if now - max(one.stamp[1:]) > _YOUNG
+            (self._name, *_address(body), *hit.stamp, hit.key, hit.n_bytes, json.dumps(hit.notes))
+            for body, hit in hits.items()
+            if now - max(hit.stamp[1:]) > _YOUNG
         ]
-        if rows:
+        if rows and self._is_useful:
             with self._dispensable(), contextlib.closing(self._database()) as database, database:
-                database.executemany("INSERT OR REPLACE INTO file VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
+                database.executemany("INSERT OR REPLACE INTO body VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
 
     def _database(self) -> sqlite3.Connection:
         self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -95,7 +88,7 @@ class FileStatCache:
 
     @contextlib.contextmanager
     def _dispensable(self) -> Generator[None, None, None]:
-        """What fails of the database is told, and costs no more than what it would have saved."""
+        """A fault of the database is logged, and costs no more than the database would have saved."""
         try:
             yield
         except (sqlite3.Error, OSError) as error:
@@ -103,3 +96,7 @@ class FileStatCache:
             if isinstance(error, sqlite3.DatabaseError) and not isinstance(error, sqlite3.OperationalError):
                 with contextlib.suppress(OSError):  # no database any more: the next run makes another
                     self._path.unlink()
+
+
+def _address(body: BodyRef) -> tuple[str, str]:
+    return os.path.abspath(body.path), body.part or ""

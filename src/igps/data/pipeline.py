@@ -1,4 +1,4 @@
-"""How a mesh file becomes a Signature: read, computed and cached, in this process or in a worker."""
+"""How a body in a file becomes a Signature: read, computed and cached, in this process or in a worker."""
 
 from __future__ import annotations
 
@@ -7,35 +7,70 @@ import importlib.metadata
 import json
 import os
 import socket
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
-from igps._parallel import MachineError
-from igps.data.cache import SignatureCache
-from igps.mesh.loading import load_mesh
+import numpy as np
+from numpy.typing import NDArray
+
+from igps._parallel import Failed, MachineError, attempt
+from igps.data.cache import AttributeCache, SignatureCache
+from igps.mesh.loading import BodyRef, each_body, load_mesh
 from igps.mesh.mending import MENDING_VERSION, mended_by
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
-from igps.signature.signature import Signature, SignatureConfig, compute_signature
+from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
+
+ROOMS = ("interior", "surface")
+
+
+@runtime_checkable
+class AttributeSource(Protocol):
+    """What gives the samples of a body an attribute that is kept in the cache, such as an image; picklable."""
+
+    def cache_tag(self, body: BodyRef) -> str:
+        """All that the values depend on beside the points, such as a checksum of the image."""
+
+    def __call__(self, body: BodyRef, points: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
+        """Values (P,) or (P, C) at points (P, 3) in the coordinates of the body's file."""
+
+
+class PreTransform(Protocol):
+    """What changes every Signature before it is cached; picklable."""
+
+    @property
+    def cache_tag(self) -> str:
+        """All that the change depends on, in words."""
+
+    def __call__(self, signature: Signature) -> Signature:
+        """The changed Signature."""
 
 
 @dataclass(frozen=True)
 class CacheHit:
-    """The Signature in the cache that serves a file.
+    """The Signature in the cache that serves a body.
 
     Args:
         key: its name in the cache; that of a larger one, if that is there.
         n_bytes: size of its file.
         notes: what was done to the mesh, in words.
-        stamp: of the mesh file when it was read, see `stamp_of`.
+        stamp: of the body's file when it was read, see `stamp_of`.
+        attributes: the names in the cache of what was added to it, by attribute.
     """
 
     key: str
     n_bytes: int
     notes: tuple[str, ...]
     stamp: tuple[int, int, int]
+    attributes: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def whole_key(self) -> str:
+        """A name for the Signature with its attributes."""
+        return _digest([self.key, sorted(self.attributes.items())]) if self.attributes else self.key
 
     @staticmethod
     def stamp_of(path: Path) -> tuple[int, int, int]:
@@ -46,95 +81,185 @@ class CacheHit:
 
 @dataclass(frozen=True)
 class SignaturePipeline:
-    """All that the Signature of a file depends on, and where it is kept; small, so that workers get no more than this.
+    """All that the Signature of a body depends on, and where it is kept; small, so that workers get no more than this.
 
     Args:
         config: parameters of the Signature.
         reading: how the file is read.
         cache_dir: where Signatures are kept.
+        attributes: what is added to the samples, by name.
+        pre_transform: what is done to the Signature with its attributes before it is kept; None for nothing.
     """
 
     config: SignatureConfig
     reading: LoadOptions
     cache_dir: Path
+    attributes: Mapping[str, AttributeSource] = field(default_factory=dict)
+    pre_transform: PreTransform | None = None
 
-    def mesh(self, path: Path) -> Mesh:
-        """The checked mesh of a file.
+    def mesh(self, body: BodyRef) -> Mesh:
+        """The checked mesh of a body.
 
         Raises:
             MeshError: it cannot be used.
         """
-        return load_mesh(path, self.reading, least_vertices=self.config.n_vertices_read)
+        return load_mesh(body.path, self.reading, part=body.part, least_vertices=self.config.n_vertices_read)
 
-    def signature(self, path: Path) -> Signature:
-        """The Signature of a file, from the cache where it or a larger one is there, and there afterwards."""
-        cache = SignatureCache(self.cache_dir)
-        for key in self._cached(path):
-            signature = cache.get(key)
-            if signature is not None:
-                return signature.beginning(self.config)
-        return self._put(path)[1]
+    def signature(self, body: BodyRef) -> Signature:
+        """The Signature of a body, from the cache where it or a larger one is there, and there afterwards."""
+        return self._made(body, _File.of(body.path))[1]
 
-    def fill(self, path: Path) -> CacheHit:
-        """Put the Signature of a file into the cache; it is not returned, so that it need not travel to the caller."""
-        stamp = _stamp(path)
-        served = self.served(path)
-        if served is not None:
-            return served
-        key, signature = self._put(path)
-        return CacheHit(key, SignatureCache(self.cache_dir).path(key).stat().st_size, tuple(signature.notes), stamp)
+    def fill(self, bodies: Sequence[BodyRef]) -> list[CacheHit | Failed]:
+        """Put the Signatures of bodies of one file into the cache; they are not returned, to spare the way back.
 
-    def served(self, path: Path) -> CacheHit | None:
-        """What in the cache serves a file, None if nothing does.
+        Returns:
+            What serves each; of a body that cannot be used, why, if there are several.
+
+        Raises:
+            MeshError: the only one cannot be used.
+            MachineError: the disk is full, or the like.
+        """
+        if len(bodies) == 1:
+            return [self.hit(bodies[0])]
+        file = _File.of(bodies[0].path)
+        done: dict[BodyRef, CacheHit | Failed] = {}
+        for body in bodies:
+            if (hit := self._served(body, file)) is not None:
+                done[body] = hit
+        missing = {body.part: body for body in bodies if body not in done}
+        try:
+            least = self.config.n_vertices_read
+            for ref, mesh in each_body(bodies[0].path, self.reading, parts=[*missing], least_vertices=least):
+                if isinstance(mesh, MeshError):
+                    done[missing[ref.part]] = Failed(str(mesh))
+                else:
+                    done[missing[ref.part]] = attempt(partial(self._hit, missing[ref.part], file, mesh))
+        except MeshError as error:  # of the file: so of each
+            for body in missing.values():
+                done.setdefault(body, Failed(str(error)))
+        # Those that the file does not have are told so one by one.
+        return [done[body] if body in done else attempt(partial(self._hit, body, file)) for body in bodies]
+
+    def hit(self, body: BodyRef) -> CacheHit:
+        """What serves a body, which is in the cache then.
+
+        Raises:
+            MeshError: it cannot be used.
+        """
+        return self._hit(body, _File.of(body.path))
+
+    def served(self, bodies: Sequence[BodyRef]) -> list[CacheHit | None]:
+        """What in the cache serves each of the bodies of one file, None where nothing does.
 
         Raises:
             MeshError: the file cannot be read.
         """
-        stamp = _stamp(path)
-        key = next(self._cached(path), None)
-        if key is None:
+        file = _File.of(bodies[0].path)
+        return [self._served(body, file) for body in bodies]
+
+    def with_attributes(self, body: BodyRef, hit: CacheHit) -> CacheHit | None:
+        """What serves a body whose Signature in the cache is known, with its attributes; None if one is missing."""
+        if not self.attributes or self.pre_transform is not None:
+            return hit
+        keys = {name: self._attribute_key(body, hit.key, name) for name in self.attributes}
+        cache = AttributeCache(self.cache_dir)
+        return replace(hit, attributes=keys) if all(key in cache for key in keys.values()) else None
+
+    def read(self, hit: CacheHit) -> Signature | None:
+        """The Signature that was found in the cache; None if it is there no more."""
+        signature = SignatureCache(self.cache_dir).get(hit.key)
+        if signature is None:
             return None
-        cache = SignatureCache(self.cache_dir)
-        return CacheHit(key, cache.path(key).stat().st_size, cache.notes(key), stamp)
+        signature = signature.beginning(self.config) if self.pre_transform is None else signature
+        for name, key in hit.attributes.items():
+            values = AttributeCache(self.cache_dir).get(key)
+            if values is None:
+                return None
+            signature = with_attribute(signature, name, values)
+        return signature
 
-    def notes(self, path: Path) -> tuple[str, ...]:
-        """What was done to the mesh of a cached Signature, in words."""
-        key = next(self._cached(path), None)
-        return () if key is None else SignatureCache(self.cache_dir).notes(key)
-
-    def is_cached(self, path: Path) -> bool:
-        """Whether the Signature of a file can be read; false for a file that cannot."""
+    def is_cached(self, body: BodyRef) -> bool:
+        """Whether the Signature of a body can be read; false for a file that cannot."""
         try:
-            return self.served(path) is not None
+            return self.served([body]) != [None]
         except MeshError:
             return False
 
-    def key(self, path: Path, *, mended: bool = False) -> str:
+    def key(self, body: BodyRef, *, mended: bool = False) -> str:
         """A Signature's name in the cache: content of the file, how it is read, every parameter and version.
 
         Args:
-            path: the file.
+            body: the file, and which body of it.
             mended: whether anything was done to its mesh. Only then does the version of the mending count, so that a
                 new one leaves the Signatures of bodies that are read as they are.
 
         Raises:
             MeshError: the file cannot be read.
         """
-        return self._key(path, _content(path), self.config, mended)
+        return self._key(body, _File.of(body.path), self.config, mended)
 
-    def _put(self, path: Path) -> tuple[str, Signature]:
-        """The Signature of a file, computed, and its key in the cache where it is then."""
-        signature = compute_signature(self.mesh(path), self.config)
-        key = self.key(path, mended=bool(mended_by(signature.notes)))
-        SignatureCache(self.cache_dir).put(key, signature)
+    def _hit(self, body: BodyRef, file: _File, mesh: Mesh | None = None) -> CacheHit:
+        return self._served(body, file) or self._made(body, file, mesh)[0]
+
+    def _served(self, body: BodyRef, file: _File) -> CacheHit | None:
+        cache = SignatureCache(self.cache_dir)
+        if self.pre_transform is None:
+            key = next(self._cached(body, file), None)
+        else:
+            keys = (self._changed_key(body, self._key(body, file, self.config, mended)) for mended in (False, True))
+            key = next((key for key in keys if key in cache), None)
+        if key is None:
+            return None
+        hit = CacheHit(key, cache.path(key).stat().st_size, cache.notes(key), file.stamp)
+        return self.with_attributes(body, hit)
+
+    def _made(self, body: BodyRef, file: _File, mesh: Mesh | None = None) -> tuple[CacheHit, Signature]:
+        """The Signature of a body with what serves it, which is in the cache then; computed where it is not."""
+        cache = SignatureCache(self.cache_dir)
+        hit = self._served(body, file)
+        found = None if hit is None else self.read(hit)
+        if hit is not None and found is not None:
+            return hit, found
+        key, signature = self._plain(body, file, mesh)
+        keys = {}
+        for name in self.attributes:
+            keys[name] = self._attribute_key(body, key, name)
+            signature = with_attribute(signature, name, self._attribute(body, signature, name, keys[name]))
+        if self.pre_transform is not None:
+            signature = self.pre_transform(signature)
+            mended = bool(mended_by(signature.notes))
+            key, keys = self._changed_key(body, self._key(body, file, self.config, mended)), {}
+            cache.put(key, signature)
+        return CacheHit(key, cache.path(key).stat().st_size, tuple(signature.notes), file.stamp, keys), signature
+
+    def _plain(self, body: BodyRef, file: _File, mesh: Mesh | None) -> tuple[str, Signature]:
+        """The Signature as it is computed, and its key in the cache, where it is then."""
+        cache = SignatureCache(self.cache_dir)
+        for key in self._cached(body, file):
+            signature = cache.get(key)
+            if signature is not None:
+                return key, signature.beginning(self.config)
+        signature = compute_signature(self.mesh(body) if mesh is None else mesh, self.config)
+        key = self._key(body, file, self.config, bool(mended_by(signature.notes)))
+        cache.put(key, signature)
         return key, signature
 
-    def _cached(self, path: Path) -> Iterator[str]:
-        """The keys that the cache has of the Signature of a file and of larger ones, which begin with it."""
-        cache, content = SignatureCache(self.cache_dir), _content(path)
+    def _attribute(self, body: BodyRef, signature: Signature, name: str, key: str) -> dict[str, NDArray[np.float32]]:
+        cache = AttributeCache(self.cache_dir)
+        values = cache.get(key)
+        if values is None:
+            points = {room: getattr(signature, room).points for room in ROOMS}
+            found = {room: self.attributes[name](body, some) for room, some in points.items()}
+            values = {room: checked_values(found[room], len(points[room]), name, str(body)) for room in ROOMS}
+            cache.put(key, values)
+        return values
+
+    def _cached(self, body: BodyRef, file: _File) -> Iterator[str]:
+        """The keys that the cache has of the Signature of a body and of larger ones, which begin with it."""
+        cache = SignatureCache(self.cache_dir)
         for config in (self.config, *self.config.larger()):
             for mended in (False, True):
-                key = self._key(path, content, config, mended)
+                key = self._key(body, file, config, mended)
                 if key not in cache:
                     continue
                 steps = mended_by(cache.notes(key))
@@ -145,23 +270,85 @@ class SignaturePipeline:
                 if of_this_version and (read_alike or "subdivided" not in steps):
                     yield key
 
-    def _key(self, path: Path, content: bytes, config: SignatureConfig, mended: bool) -> str:
+    def _key(self, body: BodyRef, file: _File, config: SignatureConfig, mended: bool) -> str:
         # The suffix chooses the reader, so the same bytes under another suffix are another mesh.
         versions = config.ALGORITHM_VERSION, MENDING_VERSION if mended else None
-        parameters = _parameters(path.suffix.lower(), self.reading, config, versions)
-        key = hashlib.sha256(parameters + b"\0")
-        key.update(content)  # not joined with them: the file may be large
-        return key.hexdigest()
+        parameters = _parameters(body.path.suffix.lower(), body.part, self.reading, config, versions)
+        return hashlib.sha256(parameters + file.digest).hexdigest()
+
+    def _attribute_key(self, body: BodyRef, key: str, name: str) -> str:
+        return _digest(["attribute", key, name, self.attributes[name].cache_tag(body)])
+
+    def _changed_key(self, body: BodyRef, key: str) -> str:
+        """Of the Signature with its attributes, changed: by all that these depend on."""
+        assert self.pre_transform is not None
+        attributes = [self._attribute_key(body, key, name) for name in sorted(self.attributes)]
+        return _digest(["changed", key, self.pre_transform.cache_tag, attributes])
+
+
+@dataclass(frozen=True)
+class _File:
+    """What a key needs to know of a file.
+
+    Args:
+        stamp: see `CacheHit.stamp_of`.
+        digest: of its content.
+    """
+
+    stamp: tuple[int, int, int]
+    digest: bytes
+
+    @staticmethod
+    def of(path: Path) -> _File:
+        """
+        Raises:
+            MeshError: the file cannot be read.
+        """
+        try:
+            return _File(CacheHit.stamp_of(path), _content_digest(path))
+        except OSError as error:
+            raise MeshError(f"{path}: cannot be read ({error.strerror}). Check the path.") from error
+
+
+def _content_digest(path: Path) -> bytes:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
+
+
+def _digest(words: Sequence[object]) -> str:
+    return hashlib.sha256(json.dumps(words).encode()).hexdigest()
 
 
 @lru_cache
-def _parameters(suffix: str, reading: LoadOptions, config: SignatureConfig, versions: tuple[int, int | None]) -> bytes:
+def _parameters(
+    suffix: str, part: str | None, reading: LoadOptions, config: SignatureConfig, versions: tuple[int, int | None]
+) -> bytes:
     """What a key depends on beside the content of the file, the same for thousands of files."""
     algorithm, mending = versions
-    how: list[object] = [suffix, reading.as_dict()]
-    if mending is not None:
-        how.append({"mending_version": mending})
+    how = {"suffix": suffix, "part": part, "reading": reading.as_dict(), "mending_version": mending}
     return json.dumps([how, {**config.as_dict(), "algorithm_version": algorithm}], sort_keys=True).encode()
+
+
+def checked_values(values: NDArray[Any], n_points: int, name: str, body: str) -> NDArray[np.float32]:
+    """Values of an attribute as they are kept.
+
+    Raises:
+        ValueError: not one finite row for each point.
+    """
+    found = np.asarray(values, dtype=np.float32)
+    if found.ndim not in (1, 2) or len(found) != n_points or not np.isfinite(found).all():
+        raise ValueError(
+            f"attributes: expected {name!r} to give ({n_points},) or ({n_points}, C) finite numbers for the points of "
+            f"{body}, got an array of shape {found.shape} with {int((~np.isfinite(found)).sum())} not finite."
+        )
+    return found
+
+
+def with_attribute(signature: Signature, name: str, values: Mapping[str, NDArray[np.float32]]) -> Signature:
+    def more(samples: Samples, room: str) -> Samples:
+        return replace(samples, attributes={**samples.attributes, name: values[room]})
+
+    return replace(signature, interior=more(signature.interior, "interior"), surface=more(signature.surface, "surface"))
 
 
 def version() -> str:
@@ -169,7 +356,9 @@ def version() -> str:
     return f"{importlib.metadata.version('interior-gps')}, signatures {SignatureConfig.ALGORITHM_VERSION}"
 
 
-def fill_elsewhere(pipeline: SignaturePipeline, expected: str, path: Path) -> CacheHit:
+def fill_elsewhere(
+    fill: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]], expected: str, bodies: Sequence[BodyRef]
+) -> list[CacheHit | Failed]:
     """`SignaturePipeline.fill` by a worker of a cluster.
 
     Raises:
@@ -181,18 +370,4 @@ def fill_elsewhere(pipeline: SignaturePipeline, expected: str, path: Path) -> Ca
             f"the worker on {socket.gethostname()} has igps {here}, where {expected} is asked for. Install one version "
             "everywhere and run again: what is done is kept."
         )
-    return pipeline.fill(path)
-
-
-def _stamp(path: Path) -> tuple[int, int, int]:
-    try:
-        return CacheHit.stamp_of(path)
-    except OSError as error:
-        raise MeshError(f"{path}: cannot be read ({error.strerror}). Check the path.") from error
-
-
-def _content(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise MeshError(f"{path}: cannot be read ({error.strerror}). Check the path.") from error
+    return fill(bodies)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import nn
@@ -71,7 +72,7 @@ class Requirements:
         if missing := [name for name in self.attributes if name not in found]:
             raise ValueError(
                 f"attributes: this descriptor needs signatures with {', '.join(missing)}, got {sorted(found)}. Compute "
-                "them with SignatureConfig(attributes=...), or with descriptor.requirements.apply_to(config)."
+                "them with SignatureDataset(..., descriptor=...), or with SignatureConfig(attributes=...)."
             )
 
     def _check_eigenpairs(self, found: int) -> None:
@@ -86,3 +87,30 @@ def embedding_requirements(embedding: nn.Module) -> Requirements:
     """What an embedding needs: the eigenpairs that it says it uses, or all."""
     n_eigenpairs = getattr(embedding, "n_eigenpairs", None)
     return Requirements(n_eigenpairs) if isinstance(n_eigenpairs, int) else Requirements(whole_spectrum=True)
+
+
+class Requiring(Protocol):
+    """A descriptor, as far as a Dataset knows it."""
+
+    @property
+    def requirements(self) -> Requirements:
+        """What it needs of a body."""
+
+
+_by_name: list[Callable[[str], Requiring]] = []
+
+
+def register_descriptors(by_name: Callable[[str], Requiring]) -> None:
+    """Tell how a descriptor is found by its name: the package does so when it is imported, for the rooms below it."""
+    _by_name[:] = [by_name]
+
+
+def requirements_of(descriptor: str | Requiring | Requirements) -> Requirements:
+    """What a descriptor needs of a body.
+
+    Args:
+        descriptor: its name, itself, or its requirements.
+    """
+    if isinstance(descriptor, Requirements):
+        return descriptor
+    return (_by_name[0](descriptor) if isinstance(descriptor, str) else descriptor).requirements

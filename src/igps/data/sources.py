@@ -1,87 +1,145 @@
-"""Where meshes and their classes come from."""
+"""Where bodies and their classes come from."""
 
 from __future__ import annotations
 
 import csv
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 from igps.mesh.formats import is_searched, searched_suffixes
+from igps.mesh.loading import BodyRef, list_bodies
+from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
 
 LABELS_FILE = "labels.csv"
+
+ClassRule = Literal["folder", "body", "file"]
+"""What the class of a body is: what its folder or `labels.csv` says, the name of its part, or its file."""
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """Mesh files and what is known of them.
+    """Bodies in files, and what is known of them.
 
     Args:
-        paths: the files.
-        names: a distinct name for each, its path relative to the folder it was found in.
+        paths: the file of each.
+        names: a distinct name for each: the path of its file relative to the folder it was found in, and `#part`.
         labels: the class of each, or None where no classes are known.
+        parts: which body of its file each is; None in a file that is one body. All of them if nothing is given.
     """
 
     paths: tuple[Path, ...]
     names: tuple[str, ...]
-    labels: tuple[str, ...] | None
+    labels: tuple[str, ...] | None = None
+    parts: tuple[str | None, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.parts:
+            object.__setattr__(self, "parts", (None,) * len(self.paths))
+        for name in ("names", "labels", "parts"):
+            values = getattr(self, name)
+            if values is not None and len(values) != len(self.paths):
+                raise ValueError(f"{name}: expected one for each of {len(self.paths)} files, got {len(values)}.")
 
     def __len__(self) -> int:
         return len(self.paths)
 
+    def __getitem__(self, index: int) -> BodyRef:
+        return BodyRef(self.paths[index], self.parts[index])
+
+    def __iter__(self) -> Iterator[BodyRef]:
+        return map(BodyRef, self.paths, self.parts)
+
     def subset(self, indices: Sequence[int]) -> Bodies:
-        """Some of the files, in the given order."""
+        """Some of the bodies, in the given order."""
         return Bodies(
             tuple(self.paths[i] for i in indices),
             tuple(self.names[i] for i in indices),
             None if self.labels is None else tuple(self.labels[i] for i in indices),
+            tuple(self.parts[i] for i in indices),
         )
 
+    def classed(self, rule: ClassRule) -> Bodies:
+        """The same bodies with the classes that a rule gives them; "folder" leaves them as they are.
 
-def find_bodies(root: str | Path) -> Bodies:
-    """The meshes below a folder, with their classes if it tells them.
+        Raises:
+            ValueError: an unknown rule, or bodies without parts to be named by.
+        """
+        if rule not in get_args(ClassRule):
+            raise ValueError(f"classes: expected 'folder', 'body' or 'file', got {rule!r}.")
+        if rule == "folder":
+            return self
+        if rule == "body":
+            unnamed = [name for name, part in zip(self.names, self.parts, strict=True) if part is None]
+            if unnamed:
+                raise ValueError(
+                    f"classes: expected files of several bodies with 'body', but {unnamed[0]} is one body."
+                )
+            return Bodies(self.paths, self.names, tuple(str(part) for part in self.parts), self.parts)
+        files = (
+            name if part is None else name.removesuffix(f"#{part}")
+            for name, part in zip(self.names, self.parts, strict=True)
+        )
+        return Bodies(self.paths, self.names, tuple(files), self.parts)
 
-    Three layouts are known: meshes and a `labels.csv` with the columns `file,label` (paths relative to the folder); one
-    folder per class; meshes alone, without classes. The first that fits is taken.
+
+def find_bodies(root: str | Path, options: LoadOptions | None = None, *, classes: ClassRule = "folder") -> Bodies:
+    """The bodies below a folder, with their classes if it tells them.
+
+    Three layouts are known: files and a `labels.csv` with the columns `file,label` (paths relative to the folder), or
+    `file,body,label`, where an empty `body` stands for every body of the file; one folder per class; files alone,
+    without classes. The first that fits is taken. Further columns of `labels.csv` are passed over.
+
+    Args:
+        root: the folder.
+        options: how files are read, which says what bodies there are in one.
+        classes: what the class of a body is, see `ClassRule`.
 
     Raises:
-        FileNotFoundError: the folder does not exist, or holds no mesh.
-        ValueError: `labels.csv` cannot be understood.
+        FileNotFoundError: the folder does not exist, or holds no file that may be a body.
+        ValueError: `labels.csv` cannot be understood, or tells no classes where they are asked of it.
     """
-    root = Path(root)
+    root, options = Path(root), options or LoadOptions()
     if not root.is_dir():
         raise FileNotFoundError(f"{root}: no such folder.")
     if (root / LABELS_FILE).is_file():
-        return _from_labels_file(root)
+        return _from_labels_file(root, options).classed(classes)
     folders = sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
-    in_classes = [(path, folder.name) for folder in folders for path in _meshes_in(folder)]
-    if in_classes:
-        paths, labels = zip(*in_classes, strict=True)
-        return Bodies(paths, _names(paths, root), labels)
-    paths = tuple(_meshes_in(root))
-    if not paths:
+    in_classes = [(path, folder.name) for folder in folders for path in _files_in(folder)]
+    rows = in_classes or [(path, "") for path in _files_in(root)]
+    if not rows:
         raise FileNotFoundError(
             f"{root}: no mesh found. Expected a folder per class, or mesh files with a {LABELS_FILE} (file,label), "
             f"in one of the formats {', '.join(searched_suffixes())}."
         )
-    return Bodies(paths, _names(paths, root), None)
+    found = [
+        (path, _with_part(path.relative_to(root).as_posix(), part), label, part)
+        for path, label in rows
+        for part in _parts(path, options)
+    ]
+    paths, names, labels, parts = zip(*found, strict=True)
+    return Bodies(paths, names, labels if in_classes else None, parts).classed(classes)
 
 
-def labelled_bodies(root: str | Path) -> Bodies:
+def labelled_bodies(root: str | Path, options: LoadOptions | None = None, *, classes: ClassRule = "folder") -> Bodies:
     """`find_bodies` of a folder that tells classes.
 
     Raises:
         ValueError: it tells none.
     """
-    files = find_bodies(root)
-    if files.labels is None:
+    bodies = find_bodies(root, options, classes=classes)
+    if bodies.labels is None:
         raise ValueError(f"{root}: no classes found. Expected one folder per class, or a {LABELS_FILE} (file,label).")
-    return files
+    return bodies
 
 
-def given_bodies(paths: Sequence[str | Path], labels: Sequence[str] | None = None) -> Bodies:
-    """The given files, in the given order, with the given classes.
+def given_bodies(
+    paths: Sequence[str | Path], labels: Sequence[str] | None = None, options: LoadOptions | None = None
+) -> Bodies:
+    """The bodies of the given files, in the given order, with the classes given to the files.
 
     Raises:
         ValueError: no file, or not one label for each.
@@ -91,32 +149,54 @@ def given_bodies(paths: Sequence[str | Path], labels: Sequence[str] | None = Non
         raise ValueError("paths: expected at least one mesh file, got none.")
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
-    return Bodies(files, tuple(str(path) for path in files), None if labels is None else tuple(labels))
+    found = [(i, part) for i, path in enumerate(files) for part in _parts(path, options or LoadOptions())]
+    return Bodies(
+        tuple(files[i] for i, _ in found),
+        tuple(_with_part(str(files[i]), part) for i, part in found),
+        None if labels is None else tuple(labels[i] for i, _ in found),
+        tuple(part for _, part in found),
+    )
 
 
-def _from_labels_file(root: Path) -> Bodies:
+def _parts(path: Path, options: LoadOptions) -> Sequence[str | None]:
+    """The bodies that a file holds, by name. None where the file is one, or cannot be read: computing it says why."""
+    try:
+        return [body.part for body in list_bodies(path, options)] or [None]
+    except MeshError:
+        return [None]
+
+
+def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
     file = root / LABELS_FILE
     with file.open(newline="", encoding="utf-8-sig") as stream:
         reader = csv.DictReader(stream)
         if not reader.fieldnames or not {"file", "label"} <= set(reader.fieldnames):
             raise ValueError(f"{file}: expected the columns file,label in the first line, got {reader.fieldnames}.")
-        rows = [(row["file"], row["label"]) for row in reader]
-    incomplete = [i for i, (name, label) in enumerate(rows, start=2) if not name or not label]
+        rows = [(row["file"], row.get("body") or "", row["label"]) for row in reader]
+    incomplete = [i for i, (name, _, label) in enumerate(rows, start=2) if not name or not label]
     if not rows or incomplete:
         where = f"line {incomplete[0]} lacks a file or a label" if incomplete else "no rows"
         raise ValueError(f"{file}: {where}. Each line names a mesh file and its class.")
-    names = [name for name, _ in rows]
+    named = [
+        (name, part, label) for name, body, label in rows for part in ([body] if body else _parts(root / name, options))
+    ]
+    names = tuple(_with_part(name, part) for name, part, _ in named)
     twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
-        raise ValueError(f"{file}: {twice[0]} is listed twice. List each mesh once.")
-    return Bodies(tuple(root / name for name in names), tuple(names), tuple(label for _, label in rows))
+        raise ValueError(f"{file}: {twice[0]} is listed twice. List each body once.")
+    return Bodies(
+        tuple(root / name for name, _, _ in named),
+        names,
+        tuple(label for _, _, label in named),
+        tuple(part for _, part, _ in named),
+    )
 
 
-def _meshes_in(folder: Path) -> list[Path]:
+def _files_in(folder: Path) -> list[Path]:
     return sorted(
         path for path in folder.rglob("*") if is_searched(path) and not path.name.startswith(".") and path.is_file()
     )
 
 
-def _names(paths: Sequence[Path], root: Path) -> tuple[str, ...]:
-    return tuple(path.relative_to(root).as_posix() for path in paths)
+def _with_part(name: str, part: str | None) -> str:
+    return name if part is None else f"{name}#{part}"

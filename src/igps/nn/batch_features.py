@@ -63,7 +63,7 @@ class View:
             raise ValueError(
                 f"attributes: expected {name!r} among those of the {self.kind} samples, got "
                 f"{sorted(self.samples.attributes)}. Name it in SignatureConfig(attributes=...), or give its function "
-                "to SignatureDataset(point_functions=...)."
+                "to SignatureDataset(attributes=...)."
             )
         return self.samples.attributes[name]
 

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from igps._parallel import Failed, run
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
+from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import compact, longest_side
@@ -82,11 +83,11 @@ def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | Non
         By name; a mesh that cannot be read, and was not kept, is left out and logged.
     """
     kept = read_surfaces(path)
-    names, files = dataset.bodies.names, dataset.bodies.paths
-    missing = [i for i, name in enumerate(names) if not _is_current(dataset.pipeline, files[i], kept.get(name))]
+    names, bodies = dataset.bodies.names, dataset.bodies
+    missing = [i for i, name in enumerate(names) if not _is_current(dataset.pipeline, bodies[i], kept.get(name))]
     if missing:
-        make = partial(surface_of_file, dataset.pipeline, n_vertices=fitting_vertices(len(names)))
-        outcomes = run(make, [files[i] for i in missing], n_workers=n_workers)
+        make = partial(surface_of_body, dataset.pipeline, n_vertices=fitting_vertices(len(names)))
+        outcomes = run(make, [bodies[i] for i in missing], n_workers=n_workers)
         for number, outcome in tqdm(outcomes, total=len(missing), desc="pictures"):
             if isinstance(outcome, Failed):
                 logger.warning("%s: no picture: %s", names[missing[number]], outcome.reason)
@@ -98,13 +99,13 @@ def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | Non
     return found
 
 
-def surface_of_file(pipeline: SignaturePipeline, path: Path, n_vertices: int) -> Surface:
-    """The surface of a mesh file.
+def surface_of_body(pipeline: SignaturePipeline, body: BodyRef, n_vertices: int) -> Surface:
+    """The surface of a body in a file.
 
     Raises:
         MeshError: it cannot be used.
     """
-    return surface_of(pipeline.mesh(path), pipeline.signature(path), n_vertices, pipeline.key(path))
+    return surface_of(pipeline.mesh(body), pipeline.signature(body), n_vertices, pipeline.key(body))
 
 
 def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "") -> Surface:
@@ -198,12 +199,12 @@ def _read(path: Path) -> Iterator[tuple[str, Surface]]:
         start_v, start_f = start_v + n_vertices, start_f + n_faces
 
 
-def _is_current(pipeline: SignaturePipeline, path: Path, kept: Surface | None) -> bool:
+def _is_current(pipeline: SignaturePipeline, body: BodyRef, kept: Surface | None) -> bool:
     """Whether the file is gone, or the one that the surface was made from."""
     if kept is None:
         return False
     try:
-        return pipeline.key(path) == kept.key
+        return pipeline.key(body) == kept.key
     except MeshError:
         return True
 

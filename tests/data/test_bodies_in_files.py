@@ -1,0 +1,162 @@
+"""Files that hold several bodies: found by name, computed together, and one fault costs no other body its Signature."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import igps.data.pipeline as pipeline_module
+from igps.data.dataset import SignatureDataset
+from igps.data.sources import Bodies, find_bodies, given_bodies
+from igps.mesh.loading import BodyRef
+from igps.mesh.mesh import Mesh
+from igps.mesh.options import LoadOptions
+from igps.signature.signature import SignatureConfig, compute_signature
+
+CONFIG = SignatureConfig(n_eigenpairs=10, resolution=8, min_samples=0, n_surface_samples=20)
+OBJECTS = LoadOptions(mend="never", bodies="objects")
+PARTS = {"liver": (1.0, 1.2, 1.5), "spleen": (1.0, 1.0, 2.0)}
+
+
+def egg(part: str, subject: float) -> trimesh.Trimesh:
+    body = trimesh.creation.icosphere(subdivisions=2)
+    body.vertices *= np.array(PARTS[part]) * subject
+    return body
+
+
+def write_subject(path: Path, subject: float, *broken: str) -> None:
+    """The organs of a subject as objects of one file; the broken ones are single triangles."""
+    lines, first = [], 1
+    for part in PARTS:
+        body = egg(part, subject)
+        lines.append(f"o {part}")
+        lines += ["v " + " ".join(map(repr, map(float, vertex))) for vertex in body.vertices]
+        faces = body.faces[:1] if part in broken else body.faces
+        lines += ["f " + " ".join(map(str, face + first)) for face in faces]
+        first += len(body.vertices)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    for i in (1, 2):
+        write_subject(tmp_path / "subjects" / f"{i}.obj", 1.0 + 0.1 * i)
+    return tmp_path / "subjects"
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the files that are read for their bodies."""
+    names: list[str] = []
+    for name in ("each_body", "load_mesh"):
+        function = getattr(pipeline_module, name)
+
+        def reading(path, *arguments, function=function, **options):  # type: ignore[no-untyped-def]
+            names.append(path.name)
+            return function(path, *arguments, **options)
+
+        monkeypatch.setattr(pipeline_module, name, reading)
+    return names
+
+
+def test_bodies_are_found_by_file_and_part(root: Path) -> None:
+    bodies = find_bodies(root, OBJECTS)
+    assert bodies.names == ("1.obj#liver", "1.obj#spleen", "2.obj#liver", "2.obj#spleen")
+    assert list(bodies)[1] == bodies[1] == BodyRef(root / "1.obj", "spleen")
+    assert bodies.labels is None
+    assert bodies.subset([3]).parts == ("spleen",)
+    assert find_bodies(root).names == ("1.obj", "2.obj")
+    given = given_bodies([root / "2.obj"], ["second"], OBJECTS)
+    assert given.names == (f"{root / '2.obj'}#liver", f"{root / '2.obj'}#spleen")
+    assert given.labels == ("second", "second")
+
+
+def test_the_class_is_the_folder_the_part_or_the_file(root: Path) -> None:
+    assert find_bodies(root, OBJECTS, classes="body").labels == ("liver", "spleen", "liver", "spleen")
+    assert find_bodies(root, OBJECTS, classes="file").labels == ("1.obj", "1.obj", "2.obj", "2.obj")
+    assert find_bodies(root.parent, OBJECTS).labels == ("subjects",) * 4
+    assert SignatureDataset(root, CONFIG, reading=OBJECTS, classes="body").labels.tolist() == [0, 1, 0, 1]
+    with pytest.raises(ValueError, match=r"classes: expected files of several bodies with 'body', but 1\.obj is one"):
+        find_bodies(root, classes="body")
+    with pytest.raises(ValueError, match="classes: expected 'folder', 'body' or 'file', got 'organ'"):
+        find_bodies(root, classes="organ")  # type: ignore[arg-type]
+
+
+def test_a_table_names_bodies_and_may_tell_more(root: Path) -> None:
+    (root / "labels.csv").write_text("file,age,body,label\n2.obj,30,spleen,ill\n1.obj,40,,well\n")
+    bodies = find_bodies(root, OBJECTS)
+    assert bodies.names == ("2.obj#spleen", "1.obj#liver", "1.obj#spleen")
+    assert bodies.labels == ("ill", "well", "well")
+    assert find_bodies(root, OBJECTS, classes="body").labels == ("spleen", "liver", "spleen")
+    (root / "labels.csv").write_text("file,body,label\n1.obj,spleen,ill\n1.obj,,well\n")
+    with pytest.raises(ValueError, match=r"1\.obj#spleen is listed twice"):
+        find_bodies(root, OBJECTS)
+
+
+def test_counts_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ValueError, match="names: expected one for each of 1 files, got 2"):
+        Bodies((Path("a"),), ("a", "b"))
+
+
+@pytest.mark.parametrize("how", ["at once", "on first touch"])
+def test_each_has_the_signature_of_its_own_surface(root: Path, tmp_path: Path, reads: list[str], how: str) -> None:
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache", reading=OBJECTS)
+    if how == "at once":
+        assert dataset.precompute(n_workers=1, progress=False) == []
+        assert reads == ["1.obj", "2.obj"]  # once for both of its bodies
+        reads.clear()
+    for i, name in enumerate(dataset.bodies.names):
+        part, subject = name.split("#")[1], 1.0 + 0.1 * int(name[0])
+        body = egg(part, subject)
+        expected = compute_signature(Mesh(body.vertices, body.faces), CONFIG)
+        assert dataset[name].id == dataset[name].signature.name == name
+        np.testing.assert_allclose(dataset[i].signature.eigenvalues, expected.eigenvalues, rtol=1e-9)
+        assert dataset.mesh(i).volume == pytest.approx(body.volume)
+    assert len({dataset.key(i) for i in range(4)}) == 4
+    if how == "at once":
+        assert reads == [f"{1 + i // 2}.obj" for i in range(4)]  # for the meshes alone
+
+
+@pytest.mark.parametrize("how", ["here", "by two workers"])
+def test_a_bad_body_costs_no_other_of_its_file(root: Path, tmp_path: Path, how: str) -> None:
+    write_subject(root / "1.obj", 1.1, "liver")
+    (root / "3.obj").write_text("nothing")
+    table = "file,body,label\n1.obj,liver,a\n1.obj,spleen,a\n2.obj,liver,b\n2.obj,heart,b\n2.obj,spleen,b\n3.obj,x,c\n"
+    (root / "labels.csv").write_text(table)
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache", reading=OBJECTS)
+    with ThreadPoolExecutor(2) as pool:
+        workers = {"n_workers": 1} if how == "here" else {"executor": pool, "n_workers": 2}
+        failures = dataset.precompute(**workers, progress=False)  # type: ignore[arg-type]
+    assert [failure.id for failure in failures] == ["1.obj#liver", "2.obj#heart", "3.obj#x"]
+    assert [failure.path.name for failure in failures] == ["1.obj", "2.obj", "3.obj"]
+    for failure, words in zip(
+        failures, ("#liver: open surface with 3 boundary edges", "has no body 'heart'", "3.obj"), strict=True
+    ):
+        assert failure.error.startswith(str(failure.path))
+        assert words in failure.error
+    usable = dataset.usable(failures)
+    assert [item.id for item in usable] == ["1.obj#spleen", "2.obj#liver", "2.obj#spleen"]
+
+
+class Fragile(ThreadPoolExecutor):
+    """Loses every job of several bodies, as a cluster does when one of them kills its worker."""
+
+    def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
+        if len(arguments[0]) == 1:
+            return super().submit(function, *arguments, **options)
+        lost: Future[Any] = Future()
+        lost.set_exception(RuntimeError("the worker is gone"))
+        return lost
+
+
+def test_where_a_job_of_several_bodies_is_lost_each_is_tried_alone(root: Path, tmp_path: Path) -> None:
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache", reading=OBJECTS)
+    with Fragile(1) as executor:
+        assert dataset.precompute(executor, n_workers=1, progress=False) == []
+    assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 4

@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from igps.data.samplers import BucketBatchSampler
+
+SIZES = torch.randint(1000, 4000, (403,), generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("drop_last", [False, True])
+def test_every_shape_comes_once_in_batches_of_the_size_asked(drop_last: bool) -> None:
+    sampler = BucketBatchSampler(SIZES, 8, drop_last=drop_last, generator=torch.Generator().manual_seed(0))
+    batches = list(sampler)
+    assert len(batches) == len(sampler) == (50 if drop_last else 51)
+    assert sorted(map(len, batches))[0] == (8 if drop_last else 3)
+    drawn = [i for batch in batches for i in batch]
+    assert len(set(drawn)) == len(drawn) == (400 if drop_last else 403)
+
+
+def padding(batches: list[list[int]]) -> float:
+    """Rows that a batch of the longest has more than its shapes, over those of the shapes."""
+    return sum(len(one) * int(SIZES[one].max()) for one in batches) / sum(int(SIZES[one].sum()) for one in batches) - 1
+
+
+def test_padding_is_a_small_part_of_that_of_random_batches() -> None:
+    sampler = BucketBatchSampler(SIZES.tolist(), 8, generator=torch.Generator().manual_seed(0))
+    random = torch.randperm(403, generator=torch.Generator().manual_seed(0)).split(8)
+    assert padding([one.tolist() for one in random]) > 0.3
+    assert padding(list(sampler)) < 0.1
+
+
+def test_epochs_differ_and_seeds_say_all() -> None:
+    def epochs(seed: int) -> list[list[list[int]]]:
+        sampler = BucketBatchSampler(SIZES, 8, generator=torch.Generator().manual_seed(seed))
+        return [list(sampler), list(sampler)]
+
+    first = epochs(0)
+    assert first == epochs(0)
+    assert first[0] != first[1]
+    assert {frozenset(one) for one in first[0]} != {frozenset(one) for one in first[1]}
+    with pytest.raises(ValueError, match="batch_size: expected at least 1"):
+        BucketBatchSampler(SIZES, 0)
