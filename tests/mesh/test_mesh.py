@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import nibabel
 import numpy as np
 import pytest
 import trimesh
@@ -110,6 +113,32 @@ def test_a_trimesh_becomes_a_mesh_and_a_mesh_stays_itself() -> None:
 @pytest.mark.parametrize("body", [None, "box.ply", np.zeros((3, 3)), trimesh.Scene()])
 def test_what_is_no_mesh_is_named(body: object) -> None:
     with pytest.raises(
-        TypeError, match=rf"mesh: expected a Mesh or a trimesh.Trimesh, got .*{type(body).__name__}\. Read"
+        TypeError, match=rf"mesh: expected a Mesh, a trimesh.Trimesh, .* got .*{type(body).__name__}\. Read"
     ):
         Mesh.of(body)  # type: ignore[arg-type]
+
+
+def test_meshes_of_other_libraries(blob: Mesh) -> None:
+    """PyVista's polygons stand in one row, each behind its number of corners; only what it is asked for is needed."""
+    of_trimesh = trimesh.Trimesh(blob.vertices, blob.faces, process=False)
+    of_trimesh.units = "inch"
+    points = nibabel.gifti.GiftiDataArray(blob.vertices.astype("f4"), "NIFTI_INTENT_POINTSET")
+    faces = nibabel.gifti.GiftiDataArray(blob.faces.astype("i4"), "NIFTI_INTENT_TRIANGLE")
+    row = np.column_stack([np.full(len(blob.faces), 3), blob.faces]).ravel()
+    for thing, unit in (
+        (of_trimesh, "inch"),
+        (nibabel.gifti.GiftiImage(darrays=[points, faces]), "mm"),
+        (SimpleNamespace(points=blob.vertices, faces=row), None),
+    ):
+        mesh = Mesh.of(thing)
+        np.testing.assert_allclose(mesh.vertices, blob.vertices, atol=1e-6)
+        np.testing.assert_array_equal(mesh.faces, blob.faces)
+        assert (mesh.name, mesh.unit) == ("mesh", unit)
+    quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]]
+    corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float32)
+    assert Mesh.of(SimpleNamespace(points=corners, faces=np.ravel([[4, *quad] for quad in quads]))).volume == 1
+
+
+def test_an_image_without_a_surface_is_none() -> None:
+    with pytest.raises(TypeError, match="holds no surface"):
+        Mesh.of(nibabel.gifti.GiftiImage())

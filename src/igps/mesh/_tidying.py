@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import compact, diagonal, face_areas, face_parts, undirected_edges
@@ -63,42 +61,14 @@ def are_specks(areas: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def oriented(faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.int64]:
-    """The faces turned so that neighbours agree, as far as the surface can be oriented.
-
-    From the first face of each part in the order of a breadth-first search; the smaller side is turned.
-    """
+    """The faces turned so that neighbours agree, as far as the surface can be oriented; the smaller side is turned."""
     if not len(faces):
         return faces
-    n = len(faces)
-    _, edge_of_side = undirected_edges(faces, int(faces.max()) + 1)
-    by_edge = np.argsort(edge_of_side, kind="stable")
-    count = np.bincount(edge_of_side)
-    at = (np.cumsum(count) - count)[count == 2]
-    one, two = by_edge[at], by_edge[at + 1]
-    start = faces.ravel()
-    differ = start[one] == start[two]  # both run along the edge in the same direction
-    one, two = one // 3, two // 3
-    # One edge of two is enough where faces share two: of the matrix entries for a pair, 1 agrees and 2 differs.
-    pair, where = np.unique(np.minimum(one, two) * n + np.maximum(one, two), return_index=True)
-    graph = sparse.csr_array((np.where(differ[where], 2, 1), (pair // n, pair % n)), shape=(n, n))
-    graph = (graph + graph.T).tocsr()
-    n_parts, part = connected_components(graph, directed=False)
-    # One search through all parts: a root is joined to the first face of each.
-    _, first = np.unique(part, return_index=True)
-    root = sparse.csr_array((np.ones(n_parts, dtype=int), (np.zeros(n_parts, dtype=int), first)), shape=(1, n))
-    whole = sparse.vstack([sparse.hstack([graph, sparse.csr_array((n, 1), dtype=int)]), sparse.hstack([root, [[0]]])])
-    _, before = breadth_first_order(whole.tocsr(), n, directed=True)
-    before[n] = n
-    flip = np.zeros(n + 1, dtype=bool)
-    child = np.nonzero(before[:n] != n)[0]
-    if len(child):  # of none SciPy makes a matrix
-        flip[child] = np.asarray(graph[child, before[child]]).ravel() == 2
-    # Parity along the way to the root, by doubling.
-    while (before != n).any():
-        flip ^= flip[before]
-        before = before[before]
-    turn = flip[:n]
-    mostly = np.bincount(part, weights=turn, minlength=n_parts) > np.bincount(part, minlength=n_parts) / 2
+    import igl
+
+    agreeing, part = igl.bfs_orient(faces)
+    turn = (agreeing != faces).any(axis=1)
+    mostly = np.bincount(part, weights=turn) > np.bincount(part) / 2
     turn ^= mostly[part]
     if turn.any():
         notes.append(f"turned {int(turn.sum())} faces to orient the surface")

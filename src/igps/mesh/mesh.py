@@ -6,7 +6,7 @@ import copy
 import logging
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,9 +20,6 @@ from igps.mesh.surface import (
     signed_volume,
     undirected_edges,
 )
-
-if TYPE_CHECKING:
-    import trimesh
 
 logger = logging.getLogger(__name__)
 
@@ -104,6 +101,30 @@ class Mesh:
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
 
+    @classmethod
+    def of(cls, body: Any) -> Mesh:
+        """The Mesh of a body as another library keeps it; a Mesh is given back as it is.
+
+        Example:
+            >>> import trimesh
+            >>> Mesh.of(trimesh.creation.box((1, 2, 3)))
+            Mesh('mesh', 8 vertices, 12 faces)
+
+        Args:
+            body: a Mesh, or a closed surface as a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage. Polygons
+                are cut into triangles. Its file, if it knows one, becomes the name.
+
+        Raises:
+            TypeError: it is something else.
+            MeshError: it is not one closed surface, see `Mesh`.
+        """
+        if isinstance(body, cls):
+            return body
+        from igps.mesh.objects import raw_of
+
+        name, raw = raw_of(body)
+        return cls(raw.vertices, raw.faces, name=name, unit=raw.unit)
+
     def told(self, *, notes: tuple[str, ...] = (), unit: str | None = None) -> Mesh:
         """The same mesh with more notes, before its own, and with a unit if one is given; nothing is checked again."""
         other = copy.copy(self)
@@ -121,34 +142,6 @@ class Mesh:
         object.__setattr__(other, "vertices", self.vertices[order])
         object.__setattr__(other, "faces", rank[self.faces])
         return other
-
-    @classmethod
-    def of(cls, body: Mesh | trimesh.Trimesh) -> Mesh:
-        """The Mesh of a body as another library keeps it; a Mesh is given back as it is.
-
-        Example:
-            >>> import trimesh
-            >>> Mesh.of(trimesh.creation.box((1, 2, 3)))
-            Mesh('mesh', 8 vertices, 12 faces)
-
-        Args:
-            body: a Mesh or a `trimesh.Trimesh`. Its file, if it knows one, becomes the name.
-
-        Raises:
-            TypeError: it is something else.
-            MeshError: it is not one closed surface, see `Mesh`.
-        """
-        if isinstance(body, cls):
-            return body
-        import trimesh
-
-        if isinstance(body, trimesh.Trimesh):
-            name = body.metadata.get("file_name") or "mesh"
-            return cls(np.asarray(body.vertices), np.asarray(body.faces), name=str(name))
-        raise TypeError(
-            f"mesh: expected a Mesh or a trimesh.Trimesh, got {type(body).__module__}.{type(body).__qualname__}. "
-            "Read a file with igps.load_mesh, or pass Mesh(vertices, faces)."
-        )
 
     @cached_property
     def area(self) -> float:

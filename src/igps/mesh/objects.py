@@ -1,0 +1,41 @@
+"""Surfaces of other libraries, in memory: told by what they have, so that none of the libraries is needed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from igps.mesh.formats._format import RawBody, triangles
+
+
+def raw_of(thing: Any) -> tuple[str, RawBody]:
+    """Name and surface of a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage, unchecked.
+
+    Raises:
+        TypeError: it is none of them.
+    """
+    metadata = getattr(thing, "metadata", None)
+    name = str((metadata.get("file_name") if isinstance(metadata, dict) else None) or "mesh")
+    if hasattr(thing, "get_arrays_from_intent"):
+        points, faces = (thing.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE"))
+        if not points or not faces:
+            raise TypeError("the GIFTI image holds no surface: it lacks points or triangles. Give one of a surface.")
+        return name, RawBody(np.asarray(points[0].data, np.float64), np.asarray(faces[0].data, np.int64), unit="mm")
+    if hasattr(thing, "points") and hasattr(thing, "faces"):
+        row = np.asarray(thing.faces, dtype=np.int64)
+        starts, at = [], 0
+        while at < len(row):  # each polygon behind its number of corners
+            starts.append(at)
+            at += row[at] + 1
+        is_corner = np.ones(len(row), dtype=bool)
+        is_corner[starts] = False
+        return name, RawBody(np.asarray(thing.points, np.float64), triangles(row[is_corner], row[starts]))
+    if hasattr(thing, "vertices") and hasattr(thing, "faces"):
+        unit = getattr(thing, "units", None)
+        return name, RawBody(np.asarray(thing.vertices, np.float64), np.asarray(thing.faces, np.int64), unit=unit)
+    kinds = "a Mesh, a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage"
+    raise TypeError(
+        f"mesh: expected {kinds}, got {type(thing).__module__}.{type(thing).__qualname__}. Read a file with "
+        "igps.load_mesh, or pass Mesh(vertices, faces)."
+    )
