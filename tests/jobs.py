@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 
@@ -60,6 +62,15 @@ def fail_with(number: int) -> int:
     if number == 0:
         raise MemoryError
     raise OSError(number, errno.errorcode[number])
+
+
+def call(job: Callable[[], object]) -> object:
+    return job()
+
+
+def need_library(name: str) -> None:
+    """Import what is not installed."""
+    importlib.import_module(name)
 
 
 def process(_: int) -> tuple[int, str | None]:

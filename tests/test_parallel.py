@@ -11,12 +11,13 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 import jobs
-from igps._parallel import Failed, Limits, MachineError, n_cores, run
+from igps._parallel import Failed, Limits, MachineError, run
 
 GIB = 2**30
 needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc to see whether a process lives")
@@ -104,14 +105,21 @@ def test_a_job_that_needs_too_much_memory_is_named() -> None:
 
 @pytest.mark.parametrize("where", ["here", "workers", "executor"])
 @pytest.mark.parametrize(
-    ("number", "message"), [(errno.ENOSPC, "ENOSPC.*Make room.*run again"), (0, "out of memory. Use fewer workers")]
+    ("job", "message"),
+    [
+        (partial(jobs.fail_with, errno.ENOSPC), "ENOSPC.*Make room.*run again"),
+        (partial(jobs.fail_with, 0), "out of memory. Use fewer workers"),
+        (partial(jobs.need_library, "no_such_library"), "No module named 'no_such_library'.*Install it and run again"),
+    ],
+    ids=["disk", "memory", "library"],
 )
-def test_the_machine_is_not_the_jobs_fault(where: str, number: int, message: str) -> None:
+def test_the_machine_is_not_the_jobs_fault(where: str, job: Callable[[], None], message: str) -> None:
+    """It is told once, and not of every job."""
     with ThreadPoolExecutor(1) as pool, pytest.raises(MachineError, match=message):
         list(
             run(
-                jobs.fail_with,
-                [number] * 3,
+                jobs.call,
+                [job] * 3,
                 n_workers=2 if where == "workers" else 1,
                 executor=pool if where == "executor" else None,
             )
@@ -188,7 +196,3 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     if not ended(worker):
         os.kill(worker, signal.SIGKILL)
         pytest.fail("the worker outlived its parent")
-
-
-def test_cores_are_those_that_this_process_may_use() -> None:
-    assert 1 <= n_cores() <= (os.cpu_count() or 1)

@@ -79,7 +79,7 @@ _MOST_STARTS = 2
 
 
 class MachineError(RuntimeError):
-    """The machine, not a job, is at fault: a full disk, no memory, no process. What is done so far is kept."""
+    """The machine, not a job, is at fault: a full disk, no memory, a library that is missing. What is done is kept."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,8 @@ def run(
         limits: of each job, in processes of ours.
 
     Raises:
-        MachineError: the disk is full, memory runs out without a limit, or no process can be started.
+        MachineError: the disk is full, memory runs out without a limit, a library is missing, or no process can be
+            started.
     """
     limits = limits or Limits()
     limited = limits != Limits()
@@ -196,6 +197,8 @@ def attempt(result: Callable[[], Result], limits: Limits = Limits()) -> Result |
         if limits.memory is not None:
             return Failed(f"it needs more than the memory_limit of {limits.memory / 2**20:.0f} MiB.")
         raise MachineError("out of memory. Use fewer workers or set a memory limit; what is done is kept.") from error
+    except ImportError as error:
+        raise MachineError(f"{str(error).rstrip('.')}. Install it and run again: what is done is kept.") from error
     except OSError as error:
         if is_machines(error):
             raise MachineError(machines_words(error)) from error

@@ -10,35 +10,28 @@ each and sleep while they wait (`igps._parallel.on_threads`), at most `n_threads
 from __future__ import annotations
 
 import contextlib
-import math
 import os
-import re
 import sys
 import threading
 from _thread import start_new_thread
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
+import joblib
 import threadpoolctl
 import torch
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-_PROC = Path("/proc/self")
-
 
 def n_cores() -> int:
     """Cores that this process may keep busy: by its affinity and by the quota of its container, at least 1."""
-    seen = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    quota = cpu_quota()
-    return seen if quota is None else max(1, min(seen, math.ceil(quota)))
+    return joblib.cpu_count()
 
 
 def n_threads() -> int:
@@ -46,7 +39,7 @@ def n_threads() -> int:
     if _present.most is not None:
         return _present.most
     most = _get_torch_threads()
-    return min(n_cores(), most) if most > 1 else most  # how many cores there are is asked of files
+    return min(n_cores(), most) if most > 1 else most  # files tell how many cores there are
 
 
 @contextlib.contextmanager
@@ -54,7 +47,7 @@ def one_thread() -> Iterator[None]:
     """Torch, NumPy and SciPy on one thread in this thread, and afterwards on as many as before.
 
     Other threads of the process keep their torch threads, and those started meanwhile get what they would have got.
-    NumPy and SciPy have one setting for all threads: it is restored by whoever is the last to leave.
+    NumPy and SciPy have one setting for all threads: the last thread to leave restores it.
     """
     outside = _present.most
     _present.most = n_threads()
@@ -77,11 +70,11 @@ def stay_on_one_thread() -> None:
 class Team:
     """Threads that stay for a computation of many short steps, each of a few jobs.
 
-    To start threads for every step would take longer than the step. Who asks works too, and waits only for jobs that
-    another has begun: beside a busy process, whose core it is, a thread that is not let run delays nobody.
+    To start threads for every step would take longer than the step. The thread that calls `each` takes jobs as well,
+    and waits only for jobs that another thread has begun. So a thread that gets no core delays nothing.
 
     Args:
-        most: with the one that asks; as many as `n_threads` if None.
+        most: number of threads, the calling one included; `n_threads` if None.
     """
 
     def __init__(self, most: int | None = None) -> None:
@@ -127,37 +120,8 @@ def _in_mode(inference: bool, function: Callable[[], None]) -> None:
         function()
 
 
-# One thread, for whoever needs no other
+# Does all jobs on the calling thread
 ALONE = Team(1)
-
-
-def cpu_quota(proc: Path = _PROC) -> float | None:
-    """Cores that the control groups of this process grant it, cgroup v1 or v2; None without a limit.
-
-    A group has at most what the groups around it have. What cannot be read is no limit.
-
-    Args:
-        proc: the folder of the process, with its `cgroup` and `mountinfo`.
-    """
-    try:
-        memberships = (proc / "cgroup").read_text().splitlines()
-        mounts = [mount for line in (proc / "mountinfo").read_text().splitlines() if (mount := _mount(line))]
-    except (OSError, UnicodeDecodeError):
-        return None
-    quotas = []
-    for membership in memberships:
-        number, _, rest = membership.partition(":")
-        controllers, _, group = rest.partition(":")
-        if number == "0" and not controllers:
-            kind, controller, read = "cgroup2", "", _unified_quota
-        elif "cpu" in controllers.split(","):
-            kind, controller, read = "cgroup", "cpu", _legacy_quota
-        else:
-            continue
-        for mount in mounts:
-            if mount.kind == kind and (not controller or controller in mount.options):
-                quotas += [read(folder) for folder in _groups(mount, group)]
-    return min((quota for quota in quotas if quota is not None), default=None)
 
 
 class _Present(threading.local):
@@ -171,7 +135,63 @@ class _Present(threading.local):
 
 
 _present = _Present()
-_torch_threads = threading.Lock()
+
+
+def _at_fork(**hooks: Callable[[], object]) -> None:
+    """`os.register_at_fork`, where a process can fork."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(**hooks)
+
+
+def _fork_safe_lock() -> threading.Lock:
+    """A lock that no thread holds while the process forks, else it would stay closed in the child: a fork waits."""
+    lock = threading.Lock()
+    _at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release)
+    return lock
+
+
+class ProcessSetting:
+    """A context in which a setting of the whole process is changed, for any number of threads at once.
+
+    The first that enters changes it, the last that leaves restores it. In a forked child only the thread that forked
+    lives on: the others no longer count.
+
+    Args:
+        change: changes the setting, and returns what restores it.
+    """
+
+    def __init__(self, change: Callable[[], Callable[[], None]]) -> None:
+        self._change = change
+        self._lock = _fork_safe_lock()
+        self._users: list[int] = []
+        self._restore: Callable[[], None] | None = None
+        _at_fork(after_in_child=lambda: self._keep_only(threading.get_ident()))
+
+    @contextlib.contextmanager
+    def __call__(self) -> Iterator[None]:
+        user = threading.get_ident()
+        with self._lock:
+            if not self._users:
+                self._restore = self._change()
+            self._users.append(user)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._users.remove(user)
+                self._restore_if_unused()
+
+    def _keep_only(self, user: int) -> None:
+        self._users = [one for one in self._users if one == user]
+        self._restore_if_unused()
+
+    def _restore_if_unused(self) -> None:
+        if not self._users and self._restore is not None:
+            self._restore()
+            self._restore = None
+
+
+_torch_threads = _fork_safe_lock()
 
 
 def _get_torch_threads() -> int:
@@ -208,8 +228,7 @@ class _NewThreads:
 
     def __init__(self) -> None:
         self._asleep: deque[tuple[_Questions, _Answers]] = deque()
-        if hasattr(os, "register_at_fork"):
-            os.register_at_fork(after_in_child=self._asleep.clear)  # of the threads, only the one that forks lives on
+        _at_fork(after_in_child=self._asleep.clear)  # of the threads, only the one that forks lives on
 
     @contextlib.contextmanager
     def one(self) -> Iterator[Callable[[Callable[[], Any]], Any]]:
@@ -252,33 +271,19 @@ def _libraries(n_modules: int) -> threadpoolctl.ThreadpoolController:
     return threadpoolctl.ThreadpoolController()
 
 
-class _Blas:
-    """The threads of NumPy's and SciPy's products: a setting of the process, so that those who need it are counted.
+def _blas_to_one_thread() -> Callable[[], None]:
+    """For NumPy's and SciPy's products; returns what restores their threads.
 
     As long as a thread is alive that has set a limit, threadpoolctl lets no other lift it; so who has set one lets go.
     """
+    limits = _libraries(len(sys.modules)).limit(limits=1, user_api="blas")
+    _let_go()
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._users = 0
-        self._restore: Callable[[], None] | None = None
+    def restore() -> None:
+        limits.restore_original_limits()
+        _let_go()
 
-    @contextlib.contextmanager
-    def on_one_thread(self) -> Iterator[None]:
-        with self._lock:
-            if self._users == 0:
-                limits = _libraries(len(sys.modules)).limit(limits=1, user_api="blas")
-                self._restore = limits.restore_original_limits
-                _let_go()
-            self._users += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._users -= 1
-                if self._users == 0 and self._restore is not None:
-                    self._restore()
-                    _let_go()
+    return restore
 
 
 def _let_go() -> None:
@@ -288,64 +293,4 @@ def _let_go() -> None:
         clear()
 
 
-_blas_on_one_thread = _Blas().on_one_thread
-
-
-@dataclass(frozen=True)
-class _Mount:
-    """A mounted file system.
-
-    Args:
-        kind: of file system.
-        options: of its superblock; of cgroup v1 with its controllers.
-        root: the folder of it that is mounted; of a control group file system, which group.
-        folder: where.
-    """
-
-    kind: str
-    options: tuple[str, ...]
-    root: str
-    folder: Path
-
-
-def _mount(line: str) -> _Mount | None:
-    """A line of mountinfo, see proc_pid_mountinfo(5); None where it cannot be understood."""
-    before, _, after = line.partition(" - ")
-    fields, described = before.split(" "), after.split(" ")
-    if len(fields) < 5 or len(described) < 3:
-        return None
-    root, folder = (re.sub(r"\\([0-7]{3})", lambda match: chr(int(match[1], 8)), name) for name in fields[3:5])
-    return _Mount(described[0], tuple(described[2].split(",")), root, Path(folder))
-
-
-def _groups(mount: _Mount, group: str) -> list[Path]:
-    """The folders of a group and of those around it, as far as they are mounted: in a container often one."""
-    inside = os.path.relpath(group, mount.root)
-    if inside.startswith(".."):  # as another namespace sees it: what is mounted is ours
-        inside = "."
-    innermost = mount.folder / inside
-    return [one for one in (innermost, *innermost.parents) if one == mount.folder or mount.folder in one.parents]
-
-
-def _unified_quota(folder: Path) -> float | None:
-    quota, _, period = _read(folder / "cpu.max").partition(" ")
-    return _ratio(quota, period)
-
-
-def _legacy_quota(folder: Path) -> float | None:
-    return _ratio(_read(folder / "cpu.cfs_quota_us"), _read(folder / "cpu.cfs_period_us"))
-
-
-def _read(file: Path) -> str:
-    try:
-        return file.read_text().strip()
-    except (OSError, UnicodeDecodeError):
-        return ""
-
-
-def _ratio(quota: str, period: str) -> float | None:
-    try:
-        granted = int(quota) / int(period)
-    except (ValueError, ZeroDivisionError):
-        return None  # "max", or nothing
-    return granted if granted > 0 else None
+_blas_on_one_thread = ProcessSetting(_blas_to_one_thread)

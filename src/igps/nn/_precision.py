@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import torch
+
+from igps._threads import ProcessSetting
 
 
 class _Settings:
@@ -67,34 +67,15 @@ def _own_precision(backend: Any) -> str:
     return "none" if precision == getattr(backend, "fp32_precision", _common_precision()) else precision
 
 
-class _Holder:
-    """Counts who needs full precision: the settings are the process's, so that the last one restores them."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._n_users = 0
-        self._before: _Settings | None = None
-
-    @contextmanager
-    def __call__(self) -> Iterator[None]:
-        with self._lock:
-            self._n_users += 1
-            if self._n_users == 1:
-                settings = _Settings()
-                if not settings.is_full:
-                    settings.make_full()
-                    self._before = settings
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._n_users -= 1
-                if self._n_users == 0 and self._before is not None:
-                    self._before.restore()
-                    self._before = None
+def _change() -> Callable[[], None]:
+    settings = _Settings()
+    if settings.is_full:
+        return lambda: None
+    settings.make_full()
+    return settings.restore
 
 
-full_precision = _Holder()
+full_precision = ProcessSetting(_change)
 """A context in which float32 matrix products are computed in float32.
 
 `torch.set_float32_matmul_precision("medium")`, and the settings of `torch.backends` like it, allow TF32 or bfloat16: a
