@@ -20,6 +20,9 @@ import jobs
 from igps._parallel import Failed, Limits, MachineError, run
 
 GIB = 2**30
+LINUX = sys.platform == "linux"
+# Bytes of a body that a worker keeps for the next
+PAGES = 40 * 2**20
 needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc to see whether a process lives")
 
 
@@ -39,13 +42,61 @@ def ended(pid: int) -> bool:
     return False
 
 
-@pytest.mark.parametrize("n_workers", [1, 2, 3])
-def test_every_job_has_its_result_whatever_the_number_of_workers(n_workers: int) -> None:
-    numbers = [3, -1, 5, 13, 0, 8, 2, 9]
-    expected: dict[int, object] = {i: x * x for i, x in enumerate(numbers)}
-    expected[1] = Failed("x: expected a natural number, got -1.")
-    expected[3] = Failed("KeyError: 'thirteen'")
-    assert all_of(jobs.square, numbers, n_workers=n_workers) == expected
+SQUARES = [partial(jobs.square, x) for x in (3, -1, 5, 13, 0, 8)]
+OF_SQUARES = {
+    0: 9,
+    1: Failed("x: expected a natural number, got -1."),
+    2: 25,
+    3: Failed("KeyError: 'thirteen'"),
+    4: 0,
+    5: 64,
+}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict:  # type: ignore[type-arg]
+    """Of two workers, whose parent has other settings: squares, two that die, two that tell of themselves."""
+    others = [
+        partial(jobs.die_at_zero, 0),
+        partial(jobs.die_once, tmp_path_factory.mktemp("marked") / "marker"),
+        *2 * [partial(jobs.process, 0)],
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "3")
+        patch.delenv("MKL_NUM_THREADS", raising=False)
+        found = all_of(jobs.call, [*SQUARES, *others], n_workers=2)
+        assert os.environ["OMP_NUM_THREADS"] == "3"
+        assert "MKL_NUM_THREADS" not in os.environ
+    return found
+
+
+@pytest.fixture(scope="module")
+def limited() -> dict:  # type: ignore[type-arg]
+    """Of one worker with limits: two that tell of themselves, large and small, three of one size, slow and quick."""
+    found = [partial(jobs.process, 0)] * 2
+    found += [partial(jobs.allocate, size) for size in (1000, 2 * GIB, 2000)]
+    found += [partial(jobs.pages_cleared, PAGES)] * 3
+    found += [partial(jobs.sleep, seconds) for seconds in (0.1, 1000.0, 0.2)]
+    return all_of(jobs.call, found, n_workers=1, limits=Limits(seconds=5, memory=GIB if LINUX else None))
+
+
+def test_every_job_has_its_result_in_this_process_and_in_others(results: dict[int, object]) -> None:
+    assert all_of(jobs.call, SQUARES, n_workers=1) == OF_SQUARES
+    assert {number: results[number] for number in OF_SQUARES} == OF_SQUARES
+
+
+def test_a_job_that_kills_its_process_is_named(results: dict[int, object]) -> None:
+    killed = results[6]
+    assert isinstance(killed, Failed)
+    assert killed.reason.startswith("the process that worked on it was killed, twice. It may need more memory")
+
+
+def test_a_job_that_is_killed_once_is_tried_again(results: dict[int, object]) -> None:
+    assert results[7] == "marker"
+
+
+def test_workers_have_one_thread(results: dict[int, tuple[int, str]]) -> None:
+    assert {results[number][1] for number in (8, 9)} == {"1"}
 
 
 def test_nothing_to_do() -> None:
@@ -53,54 +104,28 @@ def test_nothing_to_do() -> None:
     assert all_of(jobs.square, [], n_workers=4, limits=Limits(seconds=1)) == {}
 
 
-def test_one_worker_is_this_process_unless_there_are_limits() -> None:
+def test_one_worker_is_this_process_unless_there_are_limits(limited: dict[int, tuple[int, str]]) -> None:
     assert all_of(jobs.process, [0, 0], n_workers=1)[1][0] == os.getpid()
-    limited = all_of(jobs.process, [0, 0], n_workers=1, limits=Limits(seconds=100))
     assert limited[0][0] == limited[1][0] != os.getpid()
 
 
-def test_workers_have_one_thread_and_the_environment_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
-    results = all_of(jobs.process, [0] * 4, n_workers=2)
-    assert {threads for _, threads in results.values()} == {"1"}
-    assert os.environ["OMP_NUM_THREADS"] == "3"
-    assert "MKL_NUM_THREADS" not in os.environ
+@pytest.mark.skipif(not LINUX, reason="Linux alone enforces a memory limit")
+def test_a_job_that_needs_too_much_memory_is_named(limited: dict[int, object]) -> None:
+    expected = [1000, Failed("it needs more than the memory_limit of 1024 MiB."), 2000]
+    assert [limited[number] for number in (2, 3, 4)] == expected
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left as they are")
 @pytest.mark.skipif("[always]" in jobs.huge_pages(), reason="the system hands out huge pages, of which there are few")
-def test_a_worker_keeps_the_memory_of_one_body_for_the_next() -> None:
-    size = 40 * 2**20
-    first, second, third = all_of(jobs.pages_cleared, [size] * 3, n_workers=1, limits=Limits(seconds=100)).values()
-    assert first > 0.9 * size / mmap.PAGESIZE
+def test_a_worker_keeps_the_memory_of_one_body_for_the_next(limited: dict[int, int]) -> None:
+    first, second, third = (limited[number] for number in (5, 6, 7))
+    assert first > 0.9 * PAGES / mmap.PAGESIZE
     assert max(second, third) < first / 10
 
 
-def test_a_job_that_kills_its_process_is_named_and_costs_no_other_its_result() -> None:
-    results = all_of(jobs.die_at_zero, [1, 0, 2, 3, 4, 5], n_workers=2)
-    killed = results.pop(1)
-    assert isinstance(killed, Failed)
-    assert killed.reason.startswith("the process that worked on it was killed, twice. It may need more memory")
-    assert results == {0: 1, 2: 2, 3: 3, 4: 4, 5: 5}
-
-
-def test_a_job_that_is_killed_once_is_tried_again(tmp_path: Path) -> None:
-    markers = [tmp_path / name for name in ("a", "b", "c")]
-    assert all_of(jobs.die_once, markers, n_workers=2) == {0: "a", 1: "b", 2: "c"}
-
-
-def test_a_job_that_takes_too_long_is_ended() -> None:
-    start = time.monotonic()
-    results = all_of(jobs.sleep, [0.0, 1000.0, 0.1, 0.2], n_workers=2, limits=Limits(seconds=3))
-    assert time.monotonic() - start < 300
-    assert results == {0: 0.0, 1: Failed("it took longer than the time_limit of 3 s."), 2: 0.1, 3: 0.2}
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="Linux alone enforces a memory limit")
-def test_a_job_that_needs_too_much_memory_is_named() -> None:
-    results = all_of(jobs.allocate, [1000, 2 * GIB, 2000], n_workers=1, limits=Limits(memory=GIB))
-    assert results == {0: 1000, 1: Failed("it needs more than the memory_limit of 1024 MiB."), 2: 2000}
+def test_a_job_that_takes_too_long_is_ended(limited: dict[int, object]) -> None:
+    expected = [0.1, Failed("it took longer than the time_limit of 5 s."), 0.2]
+    assert [limited[number] for number in (8, 9, 10)] == expected
 
 
 @pytest.mark.parametrize("where", ["here", "workers", "executor"])
@@ -120,8 +145,9 @@ def test_the_machine_is_not_the_jobs_fault(where: str, job: Callable[[], None], 
             run(
                 jobs.call,
                 [job] * 3,
-                n_workers=2 if where == "workers" else 1,
+                n_workers=1,
                 executor=pool if where == "executor" else None,
+                limits=Limits(seconds=100) if where == "workers" else None,
             )
         )
 
@@ -161,7 +187,7 @@ def test_impossible_limits_are_refused(name: str, options: dict[str, int]) -> No
 
 def test_a_script_without_a_main_guard_is_told(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
-    script.write_text("from igps._parallel import run\nlist(run(abs, [1, 2, 3], n_workers=2))\n")
+    script.write_text("from igps._parallel import Limits, run\nlist(run(abs, [1], limits=Limits(seconds=9)))\n")
     told = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=300, check=False)
     assert told.returncode != 0
     assert "MachineError: no worker process could be started" in told.stderr
@@ -184,9 +210,9 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
         "import os, signal, sys\n"
         f"sys.path.append({str(Path(jobs.__file__).parent)!r})\n"
         "import jobs\n"
-        "from igps._parallel import run\n"
+        "from igps._parallel import Limits, run\n"
         "if __name__ == '__main__':\n"
-        "    for _, (worker, _) in run(jobs.process, [0, 0], n_workers=2):\n"
+        "    for _, (worker, _) in run(jobs.process, [0], limits=Limits(seconds=100)):\n"
         "        print(worker, flush=True)\n"
         "        os.kill(os.getpid(), signal.SIGKILL)\n"
     )

@@ -16,6 +16,8 @@ from igps._threads import Team
 from igps.spectra import _multifrontal as multifrontal
 from igps.spectra._multifrontal import Factors, SingularMatrixError, analyse
 
+# A single block of all unknowns is not cut, with places or without
+SPLITS = [(4, True), (4, False), (32, True), (32, False), (10_000, True)]
 EPSILON = float(np.finfo(float).eps)
 
 
@@ -76,8 +78,7 @@ def elimination_growth(factors: Factors) -> float:
 
 
 @pytest.mark.parametrize("shift", [-20.0, 0.37, 3.0])
-@pytest.mark.parametrize("leaf_size", [4, 32, 10_000])
-@pytest.mark.parametrize("with_places", [True, False])
+@pytest.mark.parametrize(("leaf_size", "with_places"), SPLITS)
 def test_solve_and_inertia_on_a_grid(shift: float, leaf_size: int, with_places: bool) -> None:
     matrix, places = grid_matrix(23)
     dense = matrix.toarray() - shift * np.eye(matrix.shape[0])
@@ -93,8 +94,7 @@ def test_solve_and_inertia_on_a_grid(shift: float, leaf_size: int, with_places: 
 
 
 @pytest.mark.parametrize("shift", [-1.0, 300.0, 700.0, 1e4])
-@pytest.mark.parametrize("leaf_size", [4, 32, 10_000])
-@pytest.mark.parametrize("with_places", [True, False])
+@pytest.mark.parametrize(("leaf_size", "with_places"), SPLITS)
 def test_slivers_and_shifts_among_the_eigenvalues_cost_no_digits(
     shift: float, leaf_size: int, with_places: bool
 ) -> None:
