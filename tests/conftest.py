@@ -11,10 +11,8 @@ import pytest
 import torch
 import trimesh
 
-from igps._compiled import is_available
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
-from igps.nn._kernels import counted_pairs
 from igps.signature import mean_value as coordinates
 from igps.spectra import _products as products
 
@@ -26,16 +24,6 @@ SHARED = Path(__file__).parents[2] / "shared"
 
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-
-
-@pytest.fixture(params=["compiled", "plain"])
-def both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The test runs with loops compiled, where they can be, and without."""
-    if request.param == "plain":
-        for module in (counted_pairs,):
-            monkeypatch.setattr(module, "is_available", lambda: False)
-    elif not is_available():
-        pytest.skip("needs numba, the extra [fast]")
 
 
 @pytest.fixture(params=["loops", "BLAS"])

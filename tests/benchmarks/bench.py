@@ -34,11 +34,10 @@ from igps._threads import n_cores
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.winding import winding_number
-from igps.nn._kernels.hard_pairs import pair_histogram
+from igps.nn import axes
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.axes.centres import middles
-from igps.nn.axes.pairs import Distances, OrientedPoints
-from igps.nn.histograms.pairs import joint_histogram
+from igps.nn.histograms import joint_histogram, pair_histogram
 from igps.retrieval import chi_square, euclidean
 from igps.signature.laplacian import laplacian
 from igps.signature.mean_value import extend
@@ -281,7 +280,7 @@ def histogram_backward(data: Path | None) -> Figure:
     small = embedding[:1024]
 
     def ours() -> None:
-        distances = Distances(embedding, bins.centres(), equal=False)
+        distances = axes.euclidean_distances(embedding, bins.centres())
         (joint_histogram(classes.memberships(potential), [distances]) * upstream).sum().backward()
 
     def by_autograd() -> None:
@@ -326,9 +325,9 @@ def oriented_pairs(data: Path | None) -> Figure:
     points = torch.rand(1000, 3, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(1000, 3, generator=generator), dim=1)
     one_class = torch.ones(1000, 1)
-    distances = Distances(points, middles(6, 1.0, "bins"), equal=True)
+    distances = axes.euclidean_distances(points, middles(6, 1.0, "bins"))
     cosines = middles(5, 2.0, "bins") - 1
-    oriented = OrientedPoints(points, directions, cosines, cosines)
+    oriented = axes.oriented_pairs(points, directions, cosines, cosines)
     x, n = points.double().numpy(), directions.double().numpy()
     i, j = np.triu_indices(1000, 1)
 

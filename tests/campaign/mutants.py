@@ -65,12 +65,7 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         # `is` in place of `==`: both sides are truth values.
         ("src/igps/retrieval/metric.py", "if self.labels and (ids is None) is bool(self.ids):"),
         # Centres at equal distances are taken for unequal ones, which only costs time.
-        ("src/igps/nn/pair_loops.py", "gap = (last - first) + (n - 1)"),
-        # One point more, which is no member of the class: its weight is zero.
-        (
-            "src/igps/nn/soft_pairs.py",
-            "member = slice(first, last + 2) if last - first < len(index) else index",
-        ),
+        ("src/igps/nn/_kernels/pair_loops.py", "mean = (last - first) + (n - 1)"),
         # The sum over the other dimension: the matrix is symmetric.
         ("src/igps/retrieval/reranking.py", "joins = (2 / 3 * half.sum(dim= 0) <= inside.T) & members"),
         # Exact principal components in place of approximate ones, which are only faster; of all, either is exact.
@@ -88,11 +83,12 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
             "shrinkage: float = 0.03",
         ),
         # Points whose classes are not side by side only cost time.
-        ("src/igps/nn/counted_pairs.py", "key = key ^ memberships.shape[1] + column"),
+        (
+            "src/igps/nn/_kernels/pairs.py",
+            "key = key * layout.n_classes - torch.where(own[:, k] > 0, classes[:, k], 0)",
+        ),
         # Two columns more, which nothing reads.
-        ("src/igps/nn/pair_loops.py", "inverse = np.ones((n_axes, most_centres + 1), centres.dtype)"),
-        # A product into an array that is given is never cast.
-        ("src/igps/nn/counted_pairs.py", 'with torch.autocast("cpu", enabled=True):'),
+        ("src/igps/nn/_kernels/pair_loops.py", "inverse = np.ones((n_axes, most_centres + 1), centres.dtype)"),
         # No resolution is larger than the finest: one that is asked for is refused before, one that grows is cut.
         ("src/igps/geometry/voxels.py", "if min_samples == 0 or resolution == finest:"),
         # Nothing compares two of them.

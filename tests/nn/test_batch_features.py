@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from batches import N_POINTS, alone, embedded, scaled, two_bodies
-from igps.nn.batch_features import View, Views, check_kind, nearest_directions
+from igps.nn.batch_features import BatchFeatures, SampleFeatures, check_kind, nearest_directions, nearest_neighbours
 from igps.nn.embedding import SpectralEmbedding
 
 
@@ -27,32 +27,37 @@ def test_nearest_directions_are_those_of_a_loop() -> None:
     generator = torch.Generator().manual_seed(1)
     points = torch.randn(9, 3, generator=generator, dtype=torch.float64)
     targets = torch.randn(20, 3, generator=generator, dtype=torch.float64)
-    found = nearest_directions(points, targets, n_nearest=3)
+    mask = torch.ones(20, dtype=torch.bool)
+    found = nearest_directions(points, targets, mask, n_nearest=3)
     for point, direction in zip(points, found, strict=True):
         nearest = sorted(targets, key=lambda target, point=point: float((target - point).norm()))[:3]  # type: ignore[misc]
         torch.testing.assert_close(direction, normalize(torch.stack(nearest).mean(dim=0) - point, dim=0))
-    whole = nearest_directions(points, targets, n_nearest=50)
+    whole = nearest_directions(points, targets, mask, n_nearest=50)
     torch.testing.assert_close(whole, normalize(targets.mean(dim=0) - points, dim=1))
+    few = nearest_directions(
+        points, targets.masked_fill(torch.arange(20)[:, None] > 4, torch.nan), torch.arange(20) < 5
+    )
+    torch.testing.assert_close(few, normalize(targets[:5].mean(dim=0) - points, dim=1))
 
 
 def test_an_embedding_is_computed_once() -> None:
     batch = two_bodies()
-    views, embedding, other = Views(batch, training=False), Counting(), Counting()
+    features, embedding, other = BatchFeatures(batch, training=False), Counting(), Counting()
     for _ in range(3):
-        view = views.of("interior", None, None)
-        assert view.embedded(embedding) is view.embedded(embedding)
-        view.embedded(other)
+        samples = features.of("interior", None, None)
+        assert samples.embedded(embedding) is samples.embedded(embedding)
+        samples.embedded(other)
     assert embedding.calls == other.calls == 1
-    views.of("surface", None, None).embedded(embedding)
-    views.of("interior", 20, None).embedded(embedding)
-    views.of("interior", 20, 10).embedded(embedding)
+    features.of("surface", None, None).embedded(embedding)
+    features.of("interior", 20, None).embedded(embedding)
+    features.of("interior", 20, 10).embedded(embedding)
     assert embedding.calls == 3
 
 
 def test_positions_do_not_change_with_scale() -> None:
     batch, large = two_bodies(), scaled(two_bodies(), 8.0)
-    expected = View(batch, "interior", batch.interior).positions()
-    torch.testing.assert_close(View(large, "interior", large.interior).positions(), expected)
+    expected = SampleFeatures(batch, "interior", batch.interior).positions()
+    torch.testing.assert_close(SampleFeatures(large, "interior", large.interior).positions(), expected)
     by_hand = batch.interior.points.numpy() / np.sqrt([2.0, 3.0])[:, None, None]
     np.testing.assert_allclose(expected, by_hand, rtol=1e-6)
 
@@ -60,7 +65,7 @@ def test_positions_do_not_change_with_scale() -> None:
 @pytest.mark.parametrize("kind", ["interior", "surface"])
 def test_directions_in_the_embedding_lead_outwards_whatever_the_padding(kind: str) -> None:
     batch, embedding = two_bodies(), SpectralEmbedding(n_eigenpairs=4)
-    directions = View(batch, kind, getattr(batch, kind)).embedded_directions(embedding)  # type: ignore[arg-type]
+    directions = SampleFeatures(batch, kind, getattr(batch, kind)).embedded_directions(embedding)  # type: ignore[arg-type]
     for i, n in enumerate(N_POINTS):
         inside, surface = (embedded(batch, i, where, 4) for where in ("interior", "surface"))
         own, other, sign = (inside, surface, 1) if kind == "interior" else (surface, inside, -1)
@@ -68,15 +73,15 @@ def test_directions_in_the_embedding_lead_outwards_whatever_the_padding(kind: st
         expected = sign * normalize(other[nearest].mean(dim=1) - own, dim=1)
         np.testing.assert_allclose(directions[i, :n], expected, atol=1e-4)
         single = alone(batch, i)
-        unpadded = View(single, kind, getattr(single, kind)).embedded_directions(embedding)  # type: ignore[arg-type]
+        unpadded = SampleFeatures(single, kind, getattr(single, kind)).embedded_directions(embedding)  # type: ignore[arg-type]
         torch.testing.assert_close(unpadded[0], directions[i, :n])
 
 
 def test_neighbours_in_the_embedding_are_found_once_whatever_the_padding() -> None:
     batch, embedding = two_bodies(), SpectralEmbedding(n_eigenpairs=4)
-    view = View(batch, "surface", batch.surface)
-    found = view.neighbours(embedding)
-    assert view.neighbours(embedding) is found
+    samples = SampleFeatures(batch, "surface", batch.surface)
+    found = samples.neighbours(embedding)
+    assert samples.neighbours(embedding) is found
     for i, n in enumerate(N_POINTS):
         points = embedded(batch, i, "surface", 4)
         apart = (points[:, None] - points).norm(dim=2).fill_diagonal_(torch.inf)
@@ -86,20 +91,30 @@ def test_neighbours_in_the_embedding_are_found_once_whatever_the_padding() -> No
 
 def test_subsets() -> None:
     batch = two_bodies()
-    assert Views(batch, training=False).of("interior", None, 5).samples is batch.interior
+    assert BatchFeatures(batch, training=False).of("interior", None, 5).samples is batch.interior
     fixed, again, drawn, other = (
-        Views(batch, training).of("interior", 9, 5).samples for training in (False, False, True, True)
+        BatchFeatures(batch, training).of("interior", 9, 5).samples for training in (False, False, True, True)
     )
     assert fixed.mask.sum(dim=1).tolist() == [9, 9]
     assert torch.equal(fixed.points, again.points)
     assert drawn.mask.sum(dim=1).tolist() == [5, 5]
     assert not torch.equal(drawn.points, other.points)
-    views = Views(batch, training=True)
-    assert views.of("interior", 9, 5) is views.of("interior", None, 5)
-    assert views.of("interior", 5, None) is not views.of("interior", 5, 5)
+    features = BatchFeatures(batch, training=True)
+    assert features.of("interior", 9, 5) is features.of("interior", None, 5)
+    assert features.of("interior", 5, None) is not features.of("interior", 5, 5)
 
 
 def test_a_wrong_kind_says_which_there_are() -> None:
     check_kind("surface")
     with pytest.raises(ValueError, match="samples: expected 'interior' or 'surface', got 'volume'"):
         check_kind("volume")
+
+
+def test_nearest_points_are_those_of_a_loop() -> None:
+    points = torch.randn(30, 4, generator=torch.Generator().manual_seed(3))
+    for i, found in enumerate(nearest_neighbours(points, 5).tolist()):
+        others = sorted((j for j in range(30) if j != i), key=lambda j, i=i: float((points[j] - points[i]).norm()))  # type: ignore[misc]
+        assert found == others[:5]
+    assert nearest_neighbours(points[:3], 5).shape == (3, 2)
+    with pytest.raises(ValueError, match="samples: expected at least one of each body, got none"):
+        nearest_neighbours(torch.zeros(0, 3), 4)

@@ -9,11 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from igps.nn._kernels.hard_pairs import pair_histogram
-from igps.nn._kernels.oriented_pairs import oriented_pair_histogram
-from igps.nn._kernels.soft_pairs import soft_pair_histogram
 from igps.nn._precision import full_precision
+from igps.nn.axes import euclidean_distances, oriented_pairs
 from igps.nn.batch_features import nearest_directions
+from igps.nn.histograms import joint_histogram, pair_histogram
 
 
 def by_backend(name: str, precision: str) -> Callable[[], None]:
@@ -72,10 +71,13 @@ def kernels() -> list[Tensor]:
     memberships = torch.rand(300, 2, generator=generator).softmax(dim=1)
     centres = torch.linspace(0.1, 2.5, 30)
     leaf = embedding.clone().requires_grad_()
-    joint = soft_pair_histogram(memberships, [(leaf, centres), (points, centres[:10])])
+    joint = joint_histogram(
+        memberships, [euclidean_distances(leaf, centres), euclidean_distances(points, centres[:10])]
+    )
     cosines = torch.linspace(-0.8, 0.8, 5)
-    oriented = oriented_pair_histogram(
-        torch.ones(300, 1), [(embedding, centres[::5])], [(points, directions, cosines, cosines)]
+    oriented = joint_histogram(
+        torch.ones(300, 1),
+        [euclidean_distances(embedding, centres[::5]), oriented_pairs(points, directions, cosines, cosines)],
     )
     (gradient,) = torch.autograd.grad(joint.square().sum(), leaf)  # counts all pairs once more
     return [
@@ -83,7 +85,7 @@ def kernels() -> list[Tensor]:
         joint.detach(),
         oriented,
         gradient,
-        nearest_directions(embedding, embedding.flip(0) * 1.1, 3),
+        nearest_directions(embedding, embedding.flip(0) * 1.1, torch.ones(300, dtype=torch.bool), 3),
     ]
 
 

@@ -7,7 +7,8 @@ from torch import Tensor, nn
 
 from igps.data.batch import SignatureBatch
 from igps.nn.axes import Attribute, InteriorDistance, PointAxis
-from igps.nn.batch_features import View
+from igps.nn.axes.points import largest_members
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
@@ -48,13 +49,13 @@ class Shares(PointAxis):
         """C."""
         return self._n_classes
 
-    def values(self, view: View, embedding: nn.Module) -> Tensor:
+    def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """(N, P, C) of the samples.
 
         Raises:
             ValueError: the samples have no such attribute, or one of another number of classes.
         """
-        values = view.attribute(self.name)
+        values = features.attribute(self.name)
         if values.ndim != 3 or values.shape[2] != self.n_classes:
             raise ValueError(
                 f"attributes: expected {self.n_classes} shares of each sample as {self.name!r}, got an attribute of "
@@ -71,6 +72,11 @@ class Shares(PointAxis):
         if not torch.isfinite(values).all():
             raise ValueError(f"{self.name}: expected finite shares, got NaN or infinity.")
         return values
+
+    def members(self, values: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Those of the classes that samples have a share in, see `PointAxis`."""
+        self.memberships(values[mask])
+        return largest_members(values, mask)
 
     def extra_repr(self) -> str:
         return f"{self.name!r}, {self.n_classes}"

@@ -1,4 +1,4 @@
-"""What histograms look at in a batch, each thing computed once however many of them ask for it."""
+"""Features of a batch that histograms share: embeddings, positions, attributes, each computed once."""
 
 from __future__ import annotations
 
@@ -10,13 +10,17 @@ from torch.nn import functional
 
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.nn._kernels.balls import ball_radii
-from igps.nn._kernels.merge_tree import nearest
 from igps.nn._precision import full_precision
 from igps.nn.embedding import barycentroid_potential
 
 SampleKind = Literal["interior", "surface"]
 
+# Where padded targets are put: farther than any, and its square can be told.
+_FAR = 1e18
+# For the direction to the surface in the embedding.
 _N_NEAREST = 8
+# For graphs of samples: with 12 or more it makes no difference, with 8 limbs fall apart where samples are sparse.
+N_NEIGHBOURS = 16
 
 
 def check_kind(samples: str) -> None:
@@ -25,8 +29,8 @@ def check_kind(samples: str) -> None:
         raise ValueError(f"samples: expected 'interior' or 'surface', got {samples!r}.")
 
 
-class View:
-    """Some samples of the shapes of a batch, and what derives from them.
+class SampleFeatures:
+    """Some samples of each shape of a batch, and what is computed from them, once for all who ask.
 
     Args:
         batch: N shapes.
@@ -74,10 +78,7 @@ class View:
             ValueError: they have no directions.
         """
         if self._ball_radii is None:
-            points, directions = self.positions(), self.attribute("surface_direction")
-            self._ball_radii = torch.ones_like(points[..., :2])
-            for i, real in enumerate(self.samples.mask):
-                self._ball_radii[i, real] = ball_radii(points[i, real], directions[i, real])
+            self._ball_radii = ball_radii(self.positions(), self.attribute("surface_direction"), self.samples.mask)
         return self._ball_radii
 
     def log_potential(self, embedding: nn.Module) -> Tensor:
@@ -89,7 +90,9 @@ class View:
         """Of each shape, (P, k) the other samples that are nearest to each in the embedding, padding left out."""
         if embedding not in self._neighbours:
             coordinates = self.embedded(embedding)
-            self._neighbours[embedding] = [nearest(coordinates[i, real]) for i, real in enumerate(self.samples.mask)]
+            self._neighbours[embedding] = [
+                nearest_neighbours(coordinates[i, real]) for i, real in enumerate(self.samples.mask)
+            ]
         return self._neighbours[embedding]
 
     def embedded_directions(self, embedding: nn.Module) -> Tensor:
@@ -98,48 +101,65 @@ class View:
         targets = embedding(other.eigenfunctions, self.batch.eigenvalues, self.batch.area)
         coordinates = self.embedded(embedding)
         return torch.stack(
-            [outward * nearest_directions(coordinates[i], targets[i, real]) for i, real in enumerate(other.mask)]
+            [outward * nearest_directions(coordinates[i], targets[i], real) for i, real in enumerate(other.mask)]
         )
 
 
-class Views:
-    """The views of a batch by kind and number of samples, so that histograms of one descriptor share theirs.
+class BatchFeatures:
+    """A batch with the `SampleFeatures` of each kind and number of samples, shared by the parts of a descriptor.
 
     Args:
         batch: N shapes.
-        training: draw subsets of samples anew; otherwise a subset is always the same.
+        training: whether subsets of samples are drawn anew; otherwise a subset is always the same.
     """
 
     def __init__(self, batch: SignatureBatch, training: bool) -> None:
-        self._batch = batch
+        self.batch = batch
         self._training = training
-        self._views: dict[tuple[SampleKind, int | None, bool], View] = {}
+        self._features: dict[tuple[SampleKind, int | None, bool], SampleFeatures] = {}
 
-    def of(self, kind: SampleKind, n_samples: int | None, n_training_samples: int | None) -> View:
-        """The view of at most `n_samples`, in training of `n_training_samples` drawn at random; None takes all."""
+    def of(self, kind: SampleKind, n_samples: int | None, n_training_samples: int | None) -> SampleFeatures:
+        """Those of at most `n_samples`, in training of `n_training_samples` drawn at random; None takes all."""
         drawn = self._training and n_training_samples is not None
         n_wanted = n_training_samples if drawn else n_samples
         key = (kind, n_wanted, drawn)
-        if key not in self._views:
-            samples = self._batch.interior if kind == "interior" else self._batch.surface
+        if key not in self._features:
+            samples = self.batch.interior if kind == "interior" else self.batch.surface
             if n_wanted is not None:
                 samples = samples.subset(n_wanted, seed=None if drawn else 0)
-            self._views[key] = View(self._batch, kind, samples)
-        return self._views[key]
+            self._features[key] = SampleFeatures(self.batch, kind, samples)
+        return self._features[key]
 
 
-def nearest_directions(points: Tensor, targets: Tensor, n_nearest: int = _N_NEAREST) -> Tensor:
+def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest: int = _N_NEAREST) -> Tensor:
     """Unit vectors from points to the mean of the targets nearest to them.
 
     Args:
         points: (P, D).
         targets: (T, D).
+        mask: (T,) true where a target is real.
         n_nearest: how many of the targets; all if there are fewer.
 
     Returns:
         (P, D); zero where the mean is the point itself.
     """
     with full_precision():
-        distances = torch.cdist(points.detach(), targets.detach())
-    nearest = distances.topk(min(n_nearest, len(targets)), largest=False).indices
-    return functional.normalize(targets[nearest].mean(dim=1) - points, dim=1)
+        distances = torch.cdist(points.detach(), targets.detach().masked_fill(~mask[:, None], _FAR))
+    nearest = distances.topk(min(n_nearest, len(targets)), largest=False)
+    found = (nearest.values < _FAR).unsqueeze(2)
+    mean = torch.where(found, targets[nearest.indices], 0).sum(dim=1) / found.sum(dim=1)
+    return functional.normalize(mean - points, dim=1)
+
+
+def nearest_neighbours(points: Tensor, n_nearest: int = N_NEIGHBOURS) -> Tensor:
+    """(P, k) the others that are nearest to each of points (P, D), the nearest first; all where there are no more.
+
+    Raises:
+        ValueError: no point.
+    """
+    if not len(points):
+        raise ValueError("samples: expected at least one of each body, got none.")
+    with full_precision():
+        squares = torch.cdist(points.detach(), points.detach(), compute_mode="use_mm_for_euclid_dist")
+    squares.fill_diagonal_(torch.inf)
+    return squares.topk(min(n_nearest, len(points) - 1), dim=1, largest=False).indices

@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from igps._threads import one_thread
 from igps.data.batch import Body, SignatureBatch
 from igps.data.requirements import Requirements
-from igps.nn.batch_features import Views
+from igps.nn.batch_features import BatchFeatures
 from igps.nn.heads.base import Head
-from igps.nn.histograms.base import SampleHistogram
+from igps.nn.histograms.base import DescriptionPart
 from igps.retrieval import chi_square
 from igps.retrieval.vectors import MOST_NUMBERS, SearchDistance
 
@@ -131,7 +131,7 @@ class HistogramDescriptor(Descriptor):
         ((640, 64), [[0.0, 1.0, 1.0]])
 
     Args:
-        histograms: one `SampleHistogram`, such as a `PairHistogram`; or the parts, each one or several of them.
+        histograms: one `DescriptionPart`, such as a `PairHistogram`; or the parts, each one or several of them.
         name, source, invariant_to: see `Descriptor`.
 
     Raises:
@@ -142,26 +142,26 @@ class HistogramDescriptor(Descriptor):
 
     def __init__(
         self,
-        histograms: SampleHistogram | Sequence[SampleHistogram | Sequence[SampleHistogram]],
+        histograms: DescriptionPart | Sequence[DescriptionPart | Sequence[DescriptionPart]],
         *,
         name: str = "histogram",
         source: str = "",
         invariant_to: Sequence[str] = (),
     ) -> None:
         super().__init__()
-        parts = [histograms] if isinstance(histograms, SampleHistogram) else list(histograms)
-        groups = [[part] if isinstance(part, SampleHistogram) else list(part) for part in parts]
+        parts = [histograms] if isinstance(histograms, DescriptionPart) else list(histograms)
+        groups = [[part] if isinstance(part, DescriptionPart) else list(part) for part in parts]
         if not groups or not all(groups):
             raise ValueError("histograms: expected at least one in each part, got none.")
         self.histograms = nn.ModuleList(histogram for group in groups for histogram in group)
-        self._sizes = None if isinstance(histograms, SampleHistogram) else tuple(len(group) for group in groups)
+        self._sizes = None if isinstance(histograms, DescriptionPart) else tuple(len(group) for group in groups)
         self.name, self.source, self.invariant_to = name, source, tuple(invariant_to)
         self.requirements = reduce(or_, (histogram.requirements for group in groups for histogram in group))
 
     @property
-    def parts(self) -> tuple[tuple[SampleHistogram, ...], ...]:
+    def parts(self) -> tuple[tuple[DescriptionPart, ...], ...]:
         """The histograms of each part."""
-        histograms = iter([one for one in self.histograms if isinstance(one, SampleHistogram)])
+        histograms = iter([one for one in self.histograms if isinstance(one, DescriptionPart)])
         return tuple(tuple(islice(histograms, size)) for size in self._sizes or (1,))
 
     @property
@@ -171,13 +171,13 @@ class HistogramDescriptor(Descriptor):
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, C(C+1)/2, B, ...) histograms of a single one, (N, cells) of several; each body's of sum 1."""
-        views = Views(batch, self.training)
+        features = BatchFeatures(batch, self.training)
         if self._sizes is None:
-            return self.parts[0][0].of_views(views)
+            return self.parts[0][0](features)
         cells = []
         for part in self.parts:
             share = 1 / (len(self.parts) * len(part))
-            cells += [share * histogram.of_views(views).flatten(1) for histogram in part]
+            cells += [share * histogram(features).flatten(1) for histogram in part]
         return torch.cat(cells, dim=1)
 
 

@@ -16,7 +16,7 @@ from igps.data.batch import SignatureBatch
 from igps.data.requirements import Requirements
 from igps.descriptors.pretrained.branch_histogram import BranchHistogram
 from igps.descriptors.pretrained.piece_histogram import PieceHistogram
-from igps.nn._kernels.merge_tree import N_NEIGHBOURS
+from igps.nn.batch_features import N_NEIGHBOURS
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram
 from loops import hat

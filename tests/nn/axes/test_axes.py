@@ -21,14 +21,14 @@ from igps.nn.axes import (
     axis_of,
 )
 from igps.nn.axes.points import soft_memberships
-from igps.nn.batch_features import View
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from loops import hat, soft_classes
 
 
-def view(kind: str = "interior") -> View:
+def view(kind: str = "interior") -> SampleFeatures:
     batch = two_bodies()
-    return View(batch, kind, getattr(batch, kind))  # type: ignore[arg-type]
+    return SampleFeatures(batch, kind, getattr(batch, kind))  # type: ignore[arg-type]
 
 
 def test_hats_are_the_linear_kernel() -> None:
@@ -54,6 +54,19 @@ def test_hard_classes_are_those_of_the_nearest_centre(axis: PointAxis) -> None:
     expected = [0, 0, 1, 1, 2, 3, 3, 3]
     assert axis.memberships(values).tolist() == np.eye(4)[expected].tolist()
     assert axis.n_classes == 4
+
+
+@pytest.mark.parametrize("options", [{}, {"soft": True}, {"learnable": True}])
+@pytest.mark.parametrize("depths", [[0.1, 0.35, 0.4, 0.95], [0.2, 0.3], [0.4]])
+def test_members_are_memberships_without_their_zeros(options: dict[str, bool], depths: list[float]) -> None:
+    axis = Attribute("depth", depths, **options)  # type: ignore[arg-type]
+    values = torch.tensor([[0.0, 0.1, 0.3, 0.35], [0.5, 0.9, 1.0, torch.nan]])
+    mask = values.isfinite()
+    classes, weights = axis.members(values, mask)
+    found = torch.zeros(2, 4, len(depths)).scatter_add(2, classes, weights.detach())
+    torch.testing.assert_close(found[mask], axis.memberships(values[mask]).detach())
+    with pytest.raises(ValueError, match="Attribute: expected finite values, got NaN or infinity"):
+        axis.members(values, torch.ones_like(mask))
 
 
 @pytest.mark.parametrize("options", [{"soft": True}, {"learnable": True}])
@@ -87,7 +100,7 @@ def test_a_missing_attribute_lists_what_there_is() -> None:
         Attribute("charge", [0.1, 0.2]).values(view("surface"), nn.Identity())
     bare = batch_of(torch.rand(1, 5, 3))
     with pytest.raises(ValueError, match="expected 'surface_direction' among those of the interior samples"):
-        PairCosines().pairs(View(bare, "interior", bare.interior), SpectralEmbedding())
+        PairCosines().pairs(SampleFeatures(bare, "interior", bare.interior), SpectralEmbedding())
 
 
 def test_directions_are_no_classes() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from igps.nn.axes.centres import OrderedCentres, middles, position
+from igps.nn.axes.centres import OrderedCentres, middles
 
 
 def test_middles_are_those_of_equal_intervals() -> None:
@@ -16,13 +16,6 @@ def test_middles_are_those_of_equal_intervals() -> None:
 def test_impossible_intervals_are_refused(n: int, largest: float) -> None:
     with pytest.raises(ValueError, match=f"at least one of bins and a positive range, got n_bins={n}"):
         middles(n, largest, "bins")
-
-
-def test_position_interpolates_the_numbers_of_the_centres() -> None:
-    centres = torch.tensor([-0.5, 0.25, 0.3, 2.0], dtype=torch.float64)
-    values = torch.linspace(-1, 3, 77, dtype=torch.float64).view(7, 11)
-    np.testing.assert_allclose(position(values, centres), np.interp(values, centres, np.arange(4)), atol=1e-14)
-    np.testing.assert_allclose(position(centres, centres), np.arange(4), atol=1e-14)
 
 
 @pytest.mark.parametrize("start", [[0.1, 0.2, 0.5, 0.6], [-3.0, -1.0, 0.0, 7.0], [0.4]])

@@ -13,7 +13,7 @@ from batches import alone, embedded, scaled, two_bodies
 from igps.data.requirements import Requirements
 from igps.nn._kernels.balls import ball_radii
 from igps.nn.axes import BallRadius, EuclideanDistance, Potential
-from igps.nn.batch_features import View
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.points import PointHistogram
 from loops import product, soft_classes
@@ -37,7 +37,8 @@ def test_it_is_the_share_of_samples_in_each_cell() -> None:
     for i in range(2):
         real = batch.surface.mask[i]
         points = batch.surface.points[i, real] / batch.area[i].sqrt().float()
-        radii = ball_radii(points, batch.surface.attributes["surface_direction"][i, real]).log()
+        directions = batch.surface.attributes["surface_direction"][i, real]
+        radii = ball_radii(points[None], directions[None], real[real][None])[0].log()
         inside, outside = ([math.log(a) + k * math.log(b / a) / (n - 1) for k in range(n)] for a, b, n in
                            ((0.05, 0.6, 3), (0.05, 0.9, 2)))  # fmt: skip
         memberships = product(
@@ -77,7 +78,7 @@ def test_what_it_cannot_count_is_named() -> None:
         PointHistogram([])
     batch = two_bodies()
     with pytest.raises(ValueError, match="samples: expected surface samples, which balls touch, got interior ones"):
-        BallRadius().values(View(batch, "interior", batch.interior), SpectralEmbedding())
+        BallRadius().values(SampleFeatures(batch, "interior", batch.interior), SpectralEmbedding())
     with pytest.raises(ValueError, match="side: expected 'inside' or 'outside', got 'left'"):
         BallRadius("left")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="expected 0 < smallest < largest"):

@@ -14,6 +14,8 @@ from torch.nn.functional import normalize
 
 from igps.nn._kernels import balls
 
+Radii = Callable[[Tensor, Tensor], Tensor]
+
 
 def on(mesh: trimesh.Trimesh, n: int) -> tuple[Tensor, Tensor]:
     points, faces = trimesh.sample.sample_surface(mesh, n, seed=0)
@@ -34,17 +36,18 @@ def by_definition(points: Tensor, directions: Tensor, side: int) -> list[float]:
     return radii
 
 
-@pytest.fixture(params=["compiled", "tensors"])
-def ball_radii(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Callable[[Tensor, Tensor], Tensor]:
-    """By the compiled loop, and by products of tensors where nothing can be compiled or a gradient is asked for."""
-    if request.param == "tensors":
-        monkeypatch.setattr("igps.nn._kernels.balls.can_count", lambda *_: False)
-    else:
-        pytest.importorskip("numba")
-    return balls.ball_radii
+@pytest.fixture(params=["compiled", "torch"])
+def ball_radii(request: pytest.FixtureRequest) -> Radii:
+    """Of one shape, by the compiled loop, and by operations of PyTorch where a gradient is asked for."""
+    compiled = request.param == "compiled"
 
+    def radii(points: Tensor, directions: Tensor) -> Tensor:
+        leaf = points[None].clone().requires_grad_(not compiled)
+        found = balls.ball_radii(leaf, directions[None], torch.ones(1, len(points), dtype=torch.bool))[0]
+        assert found.requires_grad is not compiled
+        return found.detach()
 
-Radii = Callable[[Tensor, Tensor], Tensor]
+    return radii
 
 
 def test_radii_are_those_of_the_definition(ball_radii: Radii) -> None:
@@ -107,3 +110,19 @@ def test_what_is_not_finite_is_refused(ball_radii: Radii) -> None:
     points[1, 1] = torch.nan
     with pytest.raises(ValueError, match="expected finite points and directions, got NaN or infinity"):
         ball_radii(points, torch.eye(3))
+
+
+def test_padding_takes_part_in_no_ball(ball_radii: Radii) -> None:
+    generator = torch.Generator().manual_seed(3)
+    points = torch.rand(2, 30, 3, generator=generator)
+    directions = normalize(torch.randn(2, 30, 3, generator=generator), dim=2)
+    mask = torch.arange(30) < torch.tensor([[30], [11]])
+    for fill in (0.0, torch.nan):
+        padded = points.masked_fill(~mask[:, :, None], fill)
+        for gradient in (False, True):
+            found = balls.ball_radii(padded.clone().requires_grad_(gradient), directions, mask).detach()
+            assert (found[1, 11:] == 1).all()
+            for i, n in enumerate((30, 11)):
+                torch.testing.assert_close(
+                    found[i, :n], ball_radii(points[i, :n], directions[i, :n]), rtol=1e-3, atol=0
+                )

@@ -8,7 +8,7 @@ from torch.nn.functional import normalize
 
 from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn.axes.points import soft_memberships
-from igps.nn.batch_features import SampleKind, View
+from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential
 from igps.nn.histograms.base import SampleHistogram, counted, joint, present
 
@@ -72,14 +72,14 @@ class AxialHistogram(SampleHistogram):
         """Those of the embedding, and the directions."""
         return embedding_requirements(self.embedding) | Requirements(attributes=("surface_direction",))
 
-    def of_view(self, view: View) -> Tensor:
-        """(N, 3, ...) histograms of the samples in a view."""
-        potential = barycentroid_potential(view.embedded(self.embedding))
-        positions, directions = view.positions(), view.attribute("surface_direction")
+    def of_samples(self, features: SampleFeatures) -> Tensor:
+        """(N, 3, ...) histograms of some samples of N shapes."""
+        potential = barycentroid_potential(features.embedded(self.embedding))
+        positions, directions = features.positions(), features.attribute("surface_direction")
         return torch.stack(
             [
                 self._of_shape(positions[i, real], directions[i, real], potential[i, real])
-                for i, real in enumerate(present(view))
+                for i, real in enumerate(present(features))
             ]
         )
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from igps.data.requirements import Requirements, embedding_requirements
-from igps.nn._kernels.merge_tree import merge_tree
-from igps.nn.batch_features import SampleKind, View
+from igps.descriptors.pretrained._merge_tree import merge_tree
+from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram, present
 
@@ -58,10 +58,12 @@ class BranchHistogram(SampleHistogram):
         """Those of the embedding."""
         return embedding_requirements(self.embedding)
 
-    def of_view(self, view: View) -> Tensor:
-        """(N, B) histograms of the samples in a view."""
-        heights, neighbours = view.log_potential(self.embedding), view.neighbours(self.embedding)
-        return torch.stack([self._of_shape(heights[i, real], neighbours[i]) for i, real in enumerate(present(view))])
+    def of_samples(self, features: SampleFeatures) -> Tensor:
+        """(N, B) histograms of some samples of N shapes."""
+        heights, neighbours = features.log_potential(self.embedding), features.neighbours(self.embedding)
+        return torch.stack(
+            [self._of_shape(heights[i, real], neighbours[i]) for i, real in enumerate(present(features))]
+        )
 
     def _of_shape(self, heights: Tensor, neighbours: Tensor) -> Tensor:
         tree = merge_tree(heights, neighbours)

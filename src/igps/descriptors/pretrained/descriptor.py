@@ -10,7 +10,7 @@ from igps.descriptors.multiscale import N_ORIENTED_SAMPLES
 from igps.descriptors.pretrained.axial_histogram import AxialHistogram
 from igps.descriptors.pretrained.branch_histogram import BranchHistogram
 from igps.descriptors.pretrained.piece_histogram import PieceHistogram
-from igps.descriptors.pretrained.spectrum_histogram import SpectrumHistogram
+from igps.descriptors.pretrained.spectrum_shares import SpectrumShares
 from igps.nn.axes import BallRadius, EmbeddedPairCosines, EuclideanDistance, InteriorDistance, PairCosines, Potential
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
@@ -51,7 +51,7 @@ def pretrained_parts() -> HistogramDescriptor:
             PointHistogram([*balls, *potentials], embeddings[16]),
             BranchHistogram(embeddings[16], n_samples=n),
             PieceHistogram(embedding=embeddings[16], n_samples=n),
-            SpectrumHistogram(64),
+            SpectrumShares(64),
         ],
         name="pretrained_parts",
         source="Rustamov 2007 and 2010; Wahl, Hillenbrand and Hirzinger 2003; Reuter, Wolter and Peinecke 2006; Ma, "

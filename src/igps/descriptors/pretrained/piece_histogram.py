@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from igps.data.requirements import Requirements, embedding_requirements
-from igps.nn._kernels.merge_tree import merge_tree
+from igps.descriptors.pretrained._merge_tree import merge_tree
 from igps.nn.axes.points import soft_memberships
-from igps.nn.batch_features import SampleKind, View
+from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram, present
 
@@ -77,14 +77,14 @@ class PieceHistogram(SampleHistogram):
         """Those of the embedding."""
         return embedding_requirements(self.embedding)
 
-    def of_view(self, view: View) -> Tensor:
-        """(N, L, ...) histograms of the samples in a view."""
-        heights, positions = view.log_potential(self.embedding), view.positions()
-        neighbours = view.neighbours(self.embedding)
+    def of_samples(self, features: SampleFeatures) -> Tensor:
+        """(N, L, ...) histograms of some samples of N shapes."""
+        heights, positions = features.log_potential(self.embedding), features.positions()
+        neighbours = features.neighbours(self.embedding)
         return torch.stack(
             [
                 self._of_shape(heights[i, real], positions[i, real], neighbours[i])
-                for i, real in enumerate(present(view))
+                for i, real in enumerate(present(features))
             ]
         )
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from igps.nn._kernels.ball_loops import bends
-from igps.nn._kernels.counted_pairs import can_count
 from igps.nn._precision import full_precision
 
 # Points that lie so nearly in the tangent plane, by the sine, tell of the sampled normal's error and not of a ball
@@ -19,7 +20,7 @@ _RANK = 3
 _SMALLEST, _LARGEST = 1e-3, 10.0
 
 
-def ball_radii(points: Tensor, directions: Tensor) -> Tensor:
+def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
     """Radii of the largest balls without a sample inside that touch the surface at each sample.
 
     A ball that touches at x with centre x − r n passes through another point y where r = |x − y|² / (2 n·(x − y)); the
@@ -27,34 +28,49 @@ def ball_radii(points: Tensor, directions: Tensor) -> Tensor:
     Choi 2012), and so tell the local thickness.
 
     Args:
-        points: (P, 3), in units of the body's size.
-        directions: (P, 3) of length 1, outward.
+        points: (N, P, 3), in units of the body's size.
+        directions: (N, P, 3) of length 1, outward.
+        mask: (N, P) true where a sample is real.
 
     Returns:
-        (P, 2) radii inside and outside, from 0.001 to 10; the latter where no sample is on that side.
+        (N, P, 2) radii inside and outside, from 0.001 to 10; the latter where no sample is on that side. 1 where
+        padded.
 
     Raises:
-        ValueError: fewer than three points, or values that are not finite.
+        ValueError: fewer than three points of a shape, or values that are not finite.
     """
-    if len(points) < _RANK:
-        raise ValueError(f"samples: expected at least {_RANK} of each body, which tell its balls, got {len(points)}.")
-    if not (torch.isfinite(points).all() and torch.isfinite(directions).all()):
-        raise ValueError("samples: expected finite points and directions, got NaN or infinity.")
-    if can_count(points, directions):
-        places = _array(points)
-        bent = np.zeros((len(points), 2), dtype=places.dtype)
-        bends(places, _array(directions.to(points.dtype)), _TANGENTIAL, bent)
-        return (1 / torch.from_numpy(bent)).clamp(_SMALLEST, _LARGEST)
-    with full_precision():
-        squares = torch.cdist(points, points, compute_mode="use_mm_for_euclid_dist").square().fill_diagonal_(torch.inf)
+    if not torch.compiler.is_compiling():
+        if (fewest := int(mask.sum(dim=1).min())) < _RANK:
+            raise ValueError(f"samples: expected at least {_RANK} of each body, which tell its balls, got {fewest}.")
+        if not (torch.isfinite(points[mask]).all() and torch.isfinite(directions[mask]).all()):
+            raise ValueError("samples: expected finite points and directions, got NaN or infinity.")
+    differentiable = torch.is_grad_enabled() and (points.requires_grad or directions.requires_grad)
+    if points.device.type != "cpu" or differentiable or torch.compiler.is_compiling():
+        found = torch.stack([_radii(*one) for one in zip(points, directions, mask, strict=True)])
+    else:
+        found = torch.ones_like(points[..., :2])
+        for into, places, ways, real in zip(found, points, directions.to(points.dtype), mask, strict=True):
+            bent = np.zeros((int(real.sum()), 2), into.numpy().dtype)
+            bends(_array(places[real]), _array(ways[real]), _TANGENTIAL, bent)
+            into[real] = 1 / torch.from_numpy(bent)
+    return torch.where(mask[:, :, None], found.clamp(_SMALLEST, _LARGEST), 1)
+
+
+def _radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
+    """(P, 2) radii of one shape by operations of PyTorch, differentiable."""
+    points, directions = (one.masked_fill(~mask[:, None], 0) for one in (points, directions))
+    with full_precision() if not torch.compiler.is_compiling() else contextlib.nullcontext():
+        squares = torch.cdist(points, points, compute_mode="use_mm_for_euclid_dist").square()
         # n·(x − y): how deep each point lies below the tangent plane of every other one
         depth = (directions * points).sum(dim=1, keepdim=True) - directions @ points.T
+    none = ~mask | torch.eye(len(points), dtype=torch.bool, device=points.device)
     flat = squares.sqrt() * _TANGENTIAL
     sides = []
     for height in (depth, -depth):
-        radii = torch.where(height > flat, squares / (2 * height), torch.inf)
+        counts = (height > flat) & ~none
+        radii = torch.where(counts, squares / torch.where(counts, 2 * height, 1), torch.inf)
         sides.append(radii.topk(_RANK, dim=1, largest=False).values[:, -1])
-    return torch.stack(sides, dim=1).clamp(_SMALLEST, _LARGEST)
+    return torch.stack(sides, dim=1)
 
 
 def _array(vectors: Tensor) -> NDArray[np.float32]:

@@ -1,23 +1,28 @@
-"""Loops over pairs of points that Numba compiles: what `igps.nn._kernels.counted_pairs` counts with.
+"""Loops over pairs of points that Numba compiles: the counts of `igps.nn._kernels.pairs`, and their gradient.
 
 A block of pairs has rows and columns: row i is point ``row + i``, column j point ``column + j`` with row ≤ column, and
-counted are the pairs whose second point comes after the first, each unordered pair once. A pair is sorted into the cell
-of the centres below its values, and shared out between the corners of that cell, two an axis: what belongs to the next
-cell is kept beside the cell's own, where one store reaches both.
+the pairs whose second point comes after the first are counted, each unordered pair once. A pair falls into the cell
+below its values, and is shared out between the 2^K corners of that cell: what belongs to the next bins is kept beside
+the cell's own count, where one store reaches both.
+
+Of a row, the cells of all its pairs and their shares along each axis are found first, axis by axis, in loops that the
+compiler turns into vectors (`locate_row`). Then each pair is added to its corners, or, for the gradient, reads them.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from igps._compiled import compiled
 
-# Entries for each centre in the table from a value to its interval.
-_TABLE_PER_CENTRE = 16
-_FEW_CENTRES = 12
+# How the loops get the values of axes: as they are; distances from inner products; three cosines at once from points.
+VALUES, DISTANCES, COSINES = 0, 1, 2
+# Rows of the room for cosines: the larger and the smaller to the line, that between the directions, one over the
+# length of the line, and the first point's own cosine to the line.
+N_FEATURES = 5
 # Numbers that a compiled loop takes at once, at most.
 _VECTOR = 32
 # A whole pair and its share in one integer: the shares of so many pairs do not reach the count, nor is a digit lost of
@@ -29,14 +34,30 @@ _LANES = 4
 _CONTRACTED: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 
 
+class Axes(NamedTuple):
+    """K axes, of which R have values and 3 S are cosines.
+
+    Args:
+        kinds: in order, `VALUES`, `DISTANCES`, or `COSINES`, which are three axes.
+        norms: (R, P) squared lengths of the points of axes of distances.
+        oriented: (S, 2, D, P) for each three axes of cosines the points, and their directions of length 1.
+        n_dimensions: (S,) how many of the D they have.
+        centres: (K, B) ascending, of each axis its own number of them.
+        n_centres: (K,).
+    """
+
+    kinds: NDArray[np.int64]
+    norms: NDArray[Any]
+    oriented: NDArray[Any]
+    n_dimensions: NDArray[np.int64]
+    centres: NDArray[Any]
+    n_centres: NDArray[np.int64]
+
+
 @compiled(error_model="numpy")
-def add_pairs(
+def count_block(
     values: NDArray[Any],
-    norms: NDArray[Any],
-    oriented: NDArray[Any],
-    n_dimensions: NDArray[np.int64],
-    centres: NDArray[Any],
-    n_centres: NDArray[np.int64],
+    axes: Axes,
     row: int,
     column: int,
     classes: NDArray[np.int32],
@@ -46,32 +67,28 @@ def add_pairs(
     """Count a block of pairs.
 
     Args:
-        values: (K', I, J) inner products of the points of each axis of distances, which come first; overwritten.
-        norms: (K', P) squared lengths of these points.
-        oriented: (S, 2, D, P) points, and their directions, whose `line_features` are three axes each.
-        n_dimensions: (S,) how many of the D they have.
-        centres: (K, B) ascending, of each axis its own number of them.
-        n_centres: (K,).
+        values: (R, I, J) of the axes that are not cosines, in order; of distances the inner products, overwritten.
+        axes: see above.
         row, column: see above.
         classes: (M, P) that each point belongs to.
-        weights: (M, P) of them, descending; 0 where a point belongs to fewer.
+        weights: (M, P) in them.
         total: (C(C+1)/2, cells·2^K) to add to; of the corners the last axis alternates fastest.
     """
-    n_distances, n_rows, n_columns = values.shape
-    n_axes = len(n_centres)
+    n_rows, n_columns = values.shape[1:]
+    n_axes, n_members = len(axes.n_centres), len(classes)
     n_corners = 1 << n_axes
     n_cells = total.shape[1] // n_corners
     n_classes = int(np.sqrt(2.0 * len(total)))
-    n_members = len(classes)
-    inverse, below, per_length, most = tables(centres, n_centres)
+    inverse, equal = gaps(axes.centres, axes.n_centres)
     # Of the row, or of rows in the same classes: by the class of the other end, whose first cell is its home.
     sums = np.zeros((n_classes * n_cells, n_corners))
     by_class = sums.reshape((n_classes, n_cells * n_corners))
     home = (classes[:, column : column + n_columns] * n_cells).astype(np.int32)
+    features = np.empty((len(axes.oriented), N_FEATURES, n_columns), values.dtype)
     shares = np.empty((n_axes, n_columns), values.dtype)
-    features = np.empty((4, n_columns), values.dtype)
     cells, interval = np.empty(n_columns, np.int32), np.empty(n_columns, np.int32)
-    packs = n_axes == 1 and values.itemsize == 4 and n_rows * n_columns <= _MOST_PACKED and are_whole(weights)
+    packs = n_axes == 1 and values.itemsize == 4 and n_rows * n_columns <= _MOST_PACKED
+    packs = packs and n_members == 1 and weights.min() == 1
     packed = np.zeros((n_classes * n_cells if packs else 0) * _LANES, np.int64)
     lowest, highest = no_cells(n_cells, n_members)
     for i in range(n_rows):
@@ -84,41 +101,9 @@ def add_pairs(
                 same &= classes[m, point] == classes[m, point - 1] and weights[m, point] == weights[m, point - 1]
             if not same:
                 unpack(packed, sums)
-                flush(
-                    by_class,
-                    lowest * n_corners,
-                    (highest + 1) * n_corners,
-                    classes[:, point - 1],
-                    weights[:, point - 1],
-                    total,
-                )
+                flush(by_class, lowest * n_corners, (highest + 1) * n_corners, classes, weights, point - 1, total)
                 lowest, highest = no_cells(n_cells, n_members)
-        cells[start:] = 0
-        for k in range(n_axes):
-            n, cell, share = n_centres[k], cells[start:], shares[k, start:]
-            if k < n_distances:
-                value = values[k, i, start:]
-                distances(value, norms[k, point], norms[k, column + start :])
-            else:
-                s, feature = divmod(k - n_distances, 3)
-                if feature == 0:
-                    # Slices of rows, one by one: of a slice of them all it would not be known that they have no gaps.
-                    line_features(
-                        oriented[s, 0],
-                        oriented[s, 1],
-                        n_dimensions[s],
-                        point,
-                        column + start,
-                        features[0, start:],
-                        features[1, start:],
-                        features[2, start:],
-                        features[3, start:],
-                    )
-                value = features[1 + feature, start:]
-            if most[k] == 0:
-                locate_equal(value, centres[k, 0], inverse[k, 0], n, cell, share)
-            else:
-                locate(value, centres[k, :n], inverse[k], below[k], per_length[k], most[k], interval, cell, share)
+        locate_row(values, i, axes, inverse, equal, point, column, start, features, interval, cells, shares)
         cell = cells[first:]
         if n_members > 1:
             for j in range(len(cell)):
@@ -126,25 +111,122 @@ def add_pairs(
         for m in range(n_members):
             begin, weight = home[m, first:], weights[m, column + first :]
             if packs:
-                place_whole_pairs(cells[start:], home[m, start:], shares[0, start:], interval[start:])
-                share_whole_pairs(cell, interval[first:], packed)
+                pack_pairs(cells[start:], home[0, start:], shares[0, start:], interval[start:])
+                add_whole_pairs(cell, interval[first:], packed)
             elif n_axes == 1:
-                share_one_axis(cell, begin, shares[0, first:], weight, sums)
+                add_one_axis(cell, begin, shares[0, first:], weight, sums)
             elif n_axes == 2:
-                share_two_axes(cell, begin, shares[0, first:], shares[1, first:], weight, sums, 0)
+                add_two_axes(cell, begin, shares[0, first:], shares[1, first:], weight, sums, np.int64(0))
             elif n_axes == 4:
-                share_four_axes(cell, begin, shares, first, weight, sums)
+                add_four_axes(cell, begin, shares, first, weight, sums)
             else:
-                share_axes(cell, begin, shares, first, weight, sums)
+                add_axes(cell, begin, shares, first, weight, sums)
     unpack(packed, sums)
-    flush(
-        by_class,
-        lowest * n_corners,
-        (highest + 1) * n_corners,
-        classes[:, row + n_rows - 1],
-        weights[:, row + n_rows - 1],
-        total,
-    )
+    flush(by_class, lowest * n_corners, (highest + 1) * n_corners, classes, weights, row + n_rows - 1, total)
+
+
+@compiled(error_model="numpy")
+def gradient_block(
+    values: NDArray[Any],
+    axes: Axes,
+    row: int,
+    column: int,
+    classes: NDArray[np.int32],
+    weights: NDArray[np.float64],
+    upstream: NDArray[Any],
+    turns: NDArray[Any],
+    by_weights: NDArray[np.float64],
+    by_centres: NDArray[np.float64],
+) -> None:
+    """The gradient of `count_block`, whose first arguments are the same.
+
+    Args:
+        values: overwritten with the derivatives by them, of distances by their squares; 0 where there is no pair.
+        upstream: (C(C+1)/2, cells·2^K) derivatives by the counts.
+        turns: (S, 4, I, J) to fill, for each three axes of cosines, with the derivatives by u·(y − x), v·(x − y), u·v
+            and |y − x|², of points x and y with directions u and v, x being that of the row.
+        by_weights: (M, P) to add to.
+        by_centres: (K, B) to add to.
+    """
+    n_rows, n_columns = values.shape[1:]
+    n_axes, n_members = len(axes.n_centres), len(classes)
+    n_corners = 1 << n_axes
+    n_classes = int(np.sqrt(2.0 * len(upstream)))
+    inverse, equal = gaps(axes.centres, axes.n_centres)
+    features = np.empty((len(axes.oriented), N_FEATURES, n_columns), values.dtype)
+    shares = np.empty((n_axes, n_columns), values.dtype)
+    cells, interval = np.empty(n_columns, np.int32), np.empty(n_columns, np.int32)
+    # Numbered as the nodes of a binary tree, whose level k splits along axis k, and whose leaves are the corners: the
+    # share that a node has of the pair, and the mean of what is upstream of its leaves.
+    axis_of = np.empty(n_corners, np.int64)
+    for node in range(1, n_corners):
+        axis_of[node] = 0 if node == 1 else axis_of[node >> 1] + 1
+    share_of, mean_of = np.ones(2 * n_corners), np.empty(2 * n_corners)
+    slopes = np.empty(n_axes)
+    none = values.dtype.type(0)
+    for i in range(n_rows):
+        point = row + i
+        first = max(point + 1 - column, 0)
+        start = whole_vectors(first, n_columns)
+        locate_row(values, i, axes, inverse, equal, point, column, start, features, interval, cells, shares)
+        values[:, i, : min(first, n_columns)] = none
+        turns[:, :, i, : min(first, n_columns)] = none
+        for j in range(first, n_columns):
+            other = column + j
+            for node in range(1, n_corners):
+                beyond = share_of[node] * shares[axis_of[node], j]
+                share_of[2 * node], share_of[2 * node + 1] = share_of[node] - beyond, beyond
+            mean_of[n_corners:] = 0
+            begin = cells[j] * n_corners
+            for m in range(n_members):
+                of_row = weights[m, point]
+                for n in range(n_members):
+                    of_column = weights[n, other]
+                    if of_row == 0 and of_column == 0:
+                        continue
+                    a, b = min(classes[m, point], classes[n, other]), max(classes[m, point], classes[n, other])
+                    pair = np.uint32(a * n_classes - a * (a - 1) // 2 + b - a)
+                    both, mean = of_row * of_column, 0.0
+                    for corner in range(n_corners):
+                        above = np.float64(upstream[pair, np.uint32(begin + corner)])
+                        mean_of[n_corners + corner] += both * above
+                        mean += share_of[n_corners + corner] * above
+                    by_weights[m, point] += of_column * mean
+                    by_weights[n, other] += of_row * mean
+            slopes[:] = 0
+            for node in range(n_corners - 1, 0, -1):
+                k = axis_of[node]
+                difference = mean_of[2 * node + 1] - mean_of[2 * node]
+                slopes[k] += share_of[node] * difference
+                mean_of[node] = mean_of[2 * node] + shares[k, j] * difference
+            within: Any = cells[j]
+            for k in range(n_axes - 1, -1, -1):
+                share, width = np.float64(shares[k, j]), np.uint32(axes.n_centres[k])
+                q, within = np.uint32(within % width), np.uint32(within // width)
+                inside = share < 1 and (share > 0 or q > 0)  # on a centre, the slope is that beyond it
+                slope = slopes[k] * inverse[k, np.uint32(0) if equal[k] else q] if inside else 0.0
+                by_centres[k, q] -= slope * (1 - share)
+                by_centres[k, q + np.uint32(1)] -= slope * share
+                slopes[k] = slope
+            k = r = s = 0
+            for kind in axes.kinds:
+                if kind == COSINES:
+                    to_line, length = features[s, 4, j], features[s, 3, j]
+                    own, others = slopes[k] * length, slopes[k + 1] * length
+                    along = -(slopes[k] * features[s, 0, j] + slopes[k + 1] * features[s, 1, j]) * length * length / 2
+                    if to_line != features[s, 0, j]:
+                        own, others = others, own
+                    turns[s, 0, i, j], turns[s, 1, i, j], turns[s, 2, i, j] = own, others, slopes[k + 2]
+                    turns[s, 3, i, j] = along
+                    k += 3
+                    s += 1
+                    continue
+                if kind == DISTANCES:  # points that coincide have no direction to move apart in
+                    values[r, i, j] = slopes[k] / (2 * values[r, i, j]) if values[r, i, j] > 0 else 0.0
+                else:
+                    values[r, i, j] = slopes[k]
+                k += 1
+                r += 1
 
 
 @compiled(error_model="numpy")
@@ -164,62 +246,72 @@ def whole_vectors(first: int, n_columns: int) -> int:
 
 
 @compiled(error_model="numpy")
-def line_features(
-    points: NDArray[Any],
-    directions: NDArray[Any],
-    n_dimensions: int,
-    at: int,
-    others: int,
-    length: NDArray[Any],
-    here: NDArray[Any],
-    there: NDArray[Any],
-    between: NDArray[Any],
+def gaps(centres: NDArray[Any], n_centres: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """(K, B − 1) one over the gaps between centres (K, B), and (K,) whether those of an axis are all equal.
+
+    Where they are, the first is one over their mean.
+    """
+    n_axes, most_centres = centres.shape
+    inverse = np.ones((n_axes, most_centres - 1), centres.dtype)
+    equal = np.ones(n_axes, np.bool_)
+    for k in range(n_axes):
+        n = n_centres[k]
+        first, last = centres[k, 0], centres[k, n - 1]
+        mean = (last - first) / (n - 1)
+        rounding = 8 * np.finfo(centres.dtype).eps * max(abs(first), abs(last))
+        for q in range(n - 1):
+            gap = centres[k, q + 1] - centres[k, q]
+            inverse[k, q] = 1 / gap
+            equal[k] &= abs(gap - mean) <= rounding
+        if equal[k]:
+            inverse[k, 0] = 1 / mean
+    return inverse, equal
+
+
+@compiled(error_model="numpy", inline="always")
+def locate_row(
+    values: NDArray[Any],
+    i: int,
+    axes: Axes,
+    inverse: NDArray[Any],
+    equal: NDArray[np.bool_],
+    point: int,
+    column: int,
+    start: int,
+    features: NDArray[Any],
+    interval: NDArray[np.int32],
+    cells: NDArray[np.int32],
+    shares: NDArray[Any],
 ) -> None:
-    """The `point_pair_features` of a point with n others that follow each other.
+    """Find the cells (J,) of the pairs of one row, and their shares (K, J) along each axis.
 
     Args:
-        points: (D, P).
-        directions: (D, P) of length 1.
-        n_dimensions: how many of the D they have.
-        at: number of the point.
-        others: of the first of the others.
-        length: (n,) room, for the squared lengths of the lines from it to them.
-        here, there: (n,) to fill: the larger and the smaller cosine to the line.
-        between: (n,) to fill: the cosine between the directions.
+        values, axes, column: see `count_block`.
+        i: the row, and `point` its point.
+        inverse, equal: see `gaps`.
+        start: the first column.
+        features: (S, N_FEATURES, J) to fill, see `cosines`.
+        interval: (J,) room.
+        cells, shares: to fill.
     """
-    least, none, most = here.dtype.type(-1), here.dtype.type(0), here.dtype.type(1)
-    n = len(length)
-    if n_dimensions == 3:  # all three coordinates at once, but few arrays in a loop: of many it makes no vectors
-        x, y, z = points[0, at], points[1, at], points[2, at]
-        u, v, w = directions[0, at], directions[1, at], directions[2, at]
-        xs, ys, zs = points[0, others:], points[1, others:], points[2, others:]
-        us, vs, ws = directions[0, others:], directions[1, others:], directions[2, others:]
-        for j in range(n):
-            a, b, c = xs[j] - x, ys[j] - y, zs[j] - z
-            length[j] = a * a + b * b + c * c
-            here[j] = u * a + v * b + w * c
-        for j in range(n):
-            there[j] = us[j] * (x - xs[j]) + vs[j] * (y - ys[j]) + ws[j] * (z - zs[j])
-        for j in range(n):
-            between[j] = u * us[j] + v * vs[j] + w * ws[j]
-    else:
-        length[:] = 0
-        here[:] = 0
-        there[:] = 0
-        between[:] = 0
-        for d in range(n_dimensions):
-            x, u = points[d, at], directions[d, at]
-            xs, us = points[d, others:], directions[d, others:]
-            for j in range(n):
-                line = xs[j] - x
-                length[j] += line * line
-                here[j] += u * line
-                there[j] -= us[j] * line
-                between[j] += u * us[j]
-    for j in range(n):
-        inverse = most / np.sqrt(length[j]) if length[j] > none else none
-        a, b = min(max(here[j] * inverse, least), most), min(max(there[j] * inverse, least), most)
-        here[j], there[j] = max(a, b), min(a, b)
+    cells[start:] = 0
+    k = r = s = 0
+    for kind in axes.kinds:
+        if kind == COSINES:
+            cosines(axes.oriented[s, 0], axes.oriented[s, 1], axes.n_dimensions[s], point, column, start, features[s])
+            for f in range(3):
+                locate(features[s, f, start:], axes.centres[k, : axes.n_centres[k]], inverse[k], equal[k],
+                       interval[start:], cells[start:], shares[k, start:])  # fmt: skip
+                k += 1
+            s += 1
+            continue
+        value = values[r, i, start:]
+        if kind == DISTANCES:
+            distances(value, axes.norms[r, point], axes.norms[r, column + start :])
+        locate(value, axes.centres[k, : axes.n_centres[k]], inverse[k], equal[k], interval[start:], cells[start:],
+               shares[k, start:])  # fmt: skip
+        k += 1
+        r += 1
 
 
 @compiled(error_model="numpy")
@@ -231,57 +323,49 @@ def distances(products: NDArray[Any], norm: Any, norms: NDArray[Any]) -> None:
 
 
 @compiled(error_model="numpy")
-def tables(
-    centres: NDArray[Any], n_centres: NDArray[np.int64]
-) -> tuple[NDArray[Any], NDArray[np.int32], NDArray[Any], NDArray[np.int64]]:
-    """What finds the interval of a value, for each axis.
-
-    Returns:
-        (K, B − 1) one over the gaps between centres (K, B); (K, T) how many of the centres that are neither first nor
-        last lie in the steps below each of T equal steps; (K,) steps per length; (K,) most of them in one step, 0 where
-        all gaps are equal and no table is needed.
-    """
-    n_axes, most_centres = centres.shape
-    n_steps = _TABLE_PER_CENTRE * most_centres
-    inverse = np.ones((n_axes, most_centres - 1), centres.dtype)
-    below = np.zeros((n_axes, n_steps + 1), np.int32)
-    per_length = np.empty(n_axes, centres.dtype)
-    most = np.zeros(n_axes, np.int64)
-    for k in range(n_axes):
-        n = n_centres[k]
-        first, last = centres[k, 0], centres[k, n - 1]
-        gap = (last - first) / (n - 1)
-        rounding = 8 * np.finfo(centres.dtype).eps * max(abs(first), abs(last))
-        equal = True
-        for q in range(n - 1):
-            inverse[k, q] = 1 / (centres[k, q + 1] - centres[k, q])
-            equal &= abs(centres[k, q + 1] - centres[k, q] - gap) <= rounding
-        per_length[k] = n_steps / (last - first)
-        if equal:
-            inverse[k, 0] = 1 / gap
-            continue
-        for q in range(1, n - 1):
-            below[k, np.int64((centres[k, q] - first) * per_length[k]) + 1] += 1
-        for step in range(n_steps):
-            most[k] = max(most[k], below[k, step + 1])
-            below[k, step + 1] += below[k, step]
-    return inverse, below, per_length, most
-
-
-@compiled(error_model="numpy")
-def locate_equal(
-    values: NDArray[Any], origin: Any, inverse: Any, n: int, cell: NDArray[np.int32], share: NDArray[Any]
+def cosines(
+    points: NDArray[Any],
+    directions: NDArray[Any],
+    n_dimensions: int,
+    point: int,
+    column: int,
+    start: int,
+    features: NDArray[Any],
 ) -> None:
-    """`locate` where the centres are n ones at equal distances from an origin on."""
-    none, end = values.dtype.type(0), values.dtype.type(n - 1)
-    width, last = np.int32(n), np.int32(n - 2)
-    for j in range(len(values)):
-        along = (values[j] - origin) * inverse
-        along = along if along > none else none
-        along = along if along < end else end
-        interval = min(np.int32(along), last)
-        share[j] = along - values.dtype.type(interval)
-        cell[j] = cell[j] * width + interval
+    """The `point_pair_features` of a point with those of the columns from a start on.
+
+    Args:
+        points: (D, P), and their directions (D, P) of length 1, of which the first `n_dimensions` count.
+        point: number of the point.
+        column, start: number of the point of the first column, and the first column.
+        features: (N_FEATURES, J) to fill.
+    """
+    least, none, most = features.dtype.type(-1), features.dtype.type(0), features.dtype.type(1)
+    # Slices of rows, one by one: of a slice of them all it would not be known that they have no gaps.
+    here, there, between = features[0, start:], features[1, start:], features[2, start:]
+    length, own = features[3, start:], features[4, start:]
+    n = len(length)
+    length[:] = none
+    here[:] = none
+    there[:] = none
+    between[:] = none
+    for d in range(n_dimensions):
+        x, u = points[d, point], directions[d, point]
+        xs, us = points[d, column + start :], directions[d, column + start :]
+        for j in range(n):  # few arrays in a loop: of many the compiler makes no vectors
+            line = xs[j] - x
+            length[j] += line * line
+            here[j] += u * line
+        for j in range(n):
+            there[j] += us[j] * (x - xs[j])
+        for j in range(n):
+            between[j] += u * us[j]
+    for j in range(n):
+        inverse = most / np.sqrt(length[j]) if length[j] > none else none
+        own[j], length[j] = min(max(here[j] * inverse, least), most), inverse
+    for j in range(n):
+        other = min(max(there[j] * length[j], least), most)
+        here[j], there[j] = max(own[j], other), min(own[j], other)
 
 
 @compiled(error_model="numpy")
@@ -289,9 +373,7 @@ def locate(
     values: NDArray[Any],
     centres: NDArray[Any],
     inverse: NDArray[Any],
-    below: NDArray[np.int32],
-    per_length: Any,
-    most: int,
+    equal: bool,
     interval: NDArray[np.int32],
     cell: NDArray[np.int32],
     share: NDArray[Any],
@@ -300,49 +382,43 @@ def locate(
 
     Args:
         values: of one row.
-        centres, inverse, below, per_length, most: of the axis, see `tables`.
-        interval: room for n numbers.
+        centres: (B,) ascending.
+        inverse, equal: of the axis, see `gaps`.
+        interval: (n,) room.
         cell: (n,) by the axes before, to be refined.
         share: (n,) to fill: how far each value is on the way from the centre below to that above.
     """
-    none, one, end = values.dtype.type(0), values.dtype.type(1), values.dtype.type(len(below) - 1)
+    none, one, end = values.dtype.type(0), values.dtype.type(1), values.dtype.type(len(centres) - 1)
     width, last = np.int32(len(centres)), np.int32(len(centres) - 2)
-    if width <= _FEW_CENTRES:
-        # How far past each centre on the way to the next, 0 to 1, in sum: a search takes longer.
-        share[: len(values)] = none
-        for q in range(width - 1):
-            for j in range(len(values)):
-                share[j] += min(max((values[j] - centres[q]) * inverse[q], none), one)
+    if equal:
+        origin, scale = centres[0], inverse[0]
         for j in range(len(values)):
-            k = min(np.int32(share[j]), last)
-            share[j] = min(share[j] - values.dtype.type(k), one)
-            cell[j] = cell[j] * width + k
+            along = (values[j] - origin) * scale
+            along = along if along > none else none
+            along = along if along < end else end
+            q = min(np.int32(along), last)
+            share[j] = along - values.dtype.type(q)
+            cell[j] = cell[j] * width + q
         return
-    # An unsigned index is one that need not be counted from the end.
-    for j in range(len(values)):
-        interval[j] = below[np.uint32(min(max((values[j] - centres[0]) * per_length, none), end))]
-    for _ in range(most):
+    half = 1
+    while 2 * half <= last:
+        half *= 2
+    interval[:] = 0
+    while half > 0:  # a search by halves, of all values at once
+        step = np.int32(half)
         for j in range(len(values)):
-            q = min(interval[j], last)
-            interval[j] += values[j] >= centres[np.uint32(q + 1)]
+            # An unsigned index is one that need not be counted from the end.
+            q = min(np.int32(interval[j] + step), last)
+            interval[j] = q if values[j] >= centres[np.uint32(q)] else interval[j]
+        half //= 2
     for j in range(len(values)):
-        k = min(interval[j], last)
-        share[j] = (values[j] - centres[np.uint32(k)]) * inverse[np.uint32(k)]
-        cell[j] = cell[j] * width + k
-    for j in range(len(values)):
-        share[j] = min(max(share[j], none), one)
+        below = np.uint32(interval[j])
+        share[j] = min(max((values[j] - centres[below]) * inverse[below], none), one)
+        cell[j] = cell[j] * width + interval[j]
 
 
 @compiled(error_model="numpy")
-def are_whole(weights: NDArray[np.float64]) -> bool:
-    """Whether all points belong to one class each."""
-    return len(weights) == 1 and weights.min() == 1
-
-
-@compiled(error_model="numpy")
-def place_whole_pairs(
-    cell: NDArray[np.int32], home: NDArray[np.int32], share: NDArray[Any], parts: NDArray[np.int32]
-) -> None:
+def pack_pairs(cell: NDArray[np.int32], home: NDArray[np.int32], share: NDArray[Any], parts: NDArray[np.int32]) -> None:
     """Add its home to the cell of each pair (n,), and fill in its share (n,) as an integer."""
     for j in range(len(cell)):
         cell[j] = (cell[j] + home[j]) * np.int32(_LANES) + np.int32(j % _LANES)
@@ -350,8 +426,8 @@ def place_whole_pairs(
 
 
 @compiled(error_model="numpy")
-def share_whole_pairs(cell: NDArray[np.int32], parts: NDArray[np.int32], packed: NDArray[np.int64]) -> None:
-    """`share_one_axis` of pairs that weigh 1, into integers (cells,): one store for both corners, and no rounding."""
+def add_whole_pairs(cell: NDArray[np.int32], parts: NDArray[np.int32], packed: NDArray[np.int64]) -> None:
+    """`add_one_axis` of pairs that weigh 1, into integers (cells·_LANES,): one store for both corners, no rounding."""
     for j in range(len(cell)):
         packed[np.uint32(cell[j])] += _PAIR + np.int64(parts[j])
 
@@ -369,7 +445,7 @@ def unpack(packed: NDArray[np.int64], sums: NDArray[np.float64]) -> None:
 
 
 @compiled(**_CONTRACTED)
-def share_one_axis(
+def add_one_axis(
     cell: NDArray[np.int32],
     home: NDArray[np.int32],
     share: NDArray[Any],
@@ -388,7 +464,6 @@ def share_one_axis(
         sums: see above.
     """
     for j in range(len(cell)):
-        # An unsigned index is one that need not be counted from the end.
         into = np.uint32(cell[j] + home[j])
         beyond = weights[j] * share[j]
         sums[into, 0] += weights[j] - beyond
@@ -396,27 +471,36 @@ def share_one_axis(
 
 
 @compiled(**_CONTRACTED)
-def share_two_axes(
+def add_two_axes(
     cell: NDArray[np.int32],
     home: NDArray[np.int32],
     first: NDArray[Any],
     second: NDArray[Any],
     weights: NDArray[np.float64],
     sums: NDArray[np.float64],
-    at: int,
+    at: Any,
 ) -> None:
-    """`share_one_axis` of the shares along two axes, into four corners from one on."""
+    """`add_one_axis` of the shares along two axes, into four corners from one on."""
     for j in range(len(cell)):
         into = np.uint32(cell[j] + home[j])
-        before, side, beyond, corner = quarters(weights[j], np.float64(first[j]), np.float64(second[j]))
-        sums[into, at] += before
-        sums[into, at + 1] += side
-        sums[into, at + 2] += beyond
-        sums[into, at + 3] += corner
+        a, b, c, d = quarters(weights[j], first[j], second[j])
+        sums[into, at] += a
+        sums[into, at + 1] += b
+        sums[into, at + 2] += c
+        sums[into, at + 3] += d
 
 
 @compiled(**_CONTRACTED)
-def share_four_axes(
+def quarters(weight: float, first: float, second: float) -> tuple[float, float, float, float]:
+    """A weight shared out between the four corners of two axes, none of them less than 0."""
+    beyond = weight * first
+    before = weight - beyond
+    corner, side = beyond * second, before * second
+    return before - side, side, beyond - corner, corner
+
+
+@compiled(**_CONTRACTED)
+def add_four_axes(
     cell: NDArray[np.int32],
     home: NDArray[np.int32],
     shares: NDArray[Any],
@@ -424,20 +508,32 @@ def share_four_axes(
     weights: NDArray[np.float64],
     sums: NDArray[np.float64],
 ) -> None:
-    """`share_one_axis` of the shares along four axes, (4, n) from the first on: a distance and three cosines."""
+    """`add_axes` along four, a distance and three cosines, which takes half of the time in one pass."""
     one, two, three, four = shares[0, first:], shares[1, first:], shares[2, first:], shares[3, first:]
     for j in range(len(cell)):
         into = np.uint32(cell[j] + home[j])
         inner = quarters(1.0, np.float64(three[j]), np.float64(four[j]))
-        a, b, c, d = quarters(weights[j], np.float64(one[j]), np.float64(two[j]))
-        add_corners(sums, into, 0, a, inner)
-        add_corners(sums, into, 4, b, inner)
-        add_corners(sums, into, 8, c, inner)
-        add_corners(sums, into, 12, d, inner)
+        outer = quarters(weights[j], np.float64(one[j]), np.float64(two[j]))
+        # A plain number would make a function of its own of each.
+        add_corners(sums, into, np.int64(0), outer[0], inner)
+        add_corners(sums, into, np.int64(4), outer[1], inner)
+        add_corners(sums, into, np.int64(8), outer[2], inner)
+        add_corners(sums, into, np.int64(12), outer[3], inner)
+
+
+@compiled(**_CONTRACTED)
+def add_corners(
+    sums: NDArray[np.float64], cell: Any, at: Any, weight: float, parts: tuple[float, float, float, float]
+) -> None:
+    """Add a weight to a cell's four corners from one on, in parts."""
+    sums[cell, at] += weight * parts[0]
+    sums[cell, at + 1] += weight * parts[1]
+    sums[cell, at + 2] += weight * parts[2]
+    sums[cell, at + 3] += weight * parts[3]
 
 
 @compiled(error_model="numpy")
-def share_axes(
+def add_axes(
     cell: NDArray[np.int32],
     home: NDArray[np.int32],
     shares: NDArray[Any],
@@ -445,7 +541,7 @@ def share_axes(
     weights: NDArray[np.float64],
     sums: NDArray[np.float64],
 ) -> None:
-    """`share_one_axis` of the shares along any number of axes from two on, (K, n) from the first on."""
+    """`add_one_axis` of the shares along any number of axes from two on, (K, n) from the first on."""
     n_outer = len(shares) - 2
     rest = np.empty(len(cell))
     for corner in range(1 << n_outer):
@@ -458,28 +554,7 @@ def share_axes(
             else:
                 for j in range(len(cell)):
                     rest[j] -= rest[j] * shares[k, first + j]
-        share_two_axes(cell, home, shares[n_outer, first:], shares[n_outer + 1, first:], rest, sums, 4 * corner)
-
-
-@compiled(**_CONTRACTED)
-def quarters(weight: float, first: float, second: float) -> tuple[float, float, float, float]:
-    """A weight shared out between the four corners of two axes, none of them less than 0."""
-    beyond = weight * first
-    before = weight - beyond
-    corner = beyond * second
-    side = before * second
-    return before - side, side, beyond - corner, corner
-
-
-@compiled(**_CONTRACTED)
-def add_corners(
-    sums: NDArray[np.float64], cell: Any, at: int, weight: float, parts: tuple[float, float, float, float]
-) -> None:
-    """Add a weight to a cell's four corners from one on, in parts."""
-    sums[cell, at] += weight * parts[0]
-    sums[cell, at + 1] += weight * parts[1]
-    sums[cell, at + 2] += weight * parts[2]
-    sums[cell, at + 3] += weight * parts[3]
+        add_two_axes(cell, home, shares[n_outer, first:], shares[n_outer + 1, first:], rest, sums, np.int64(4 * corner))
 
 
 @compiled(error_model="numpy")
@@ -489,18 +564,19 @@ def flush(
     highest: int,
     classes: NDArray[np.int32],
     weights: NDArray[np.float64],
+    point: int,
     total: NDArray[np.float64],
 ) -> None:
-    """Add the sums (C, cells·corners) of rows in the classes (M,) by weights (M,) to the total, and clear them.
+    """Add the sums (C, cells·corners) of rows like a point, by its weights (M, P) in its classes, and clear them.
 
     All that was counted is from the lowest place to before the highest.
     """
     n_classes = len(sums)
     for other in range(n_classes):
         for m in range(len(classes)):
-            a, b = min(classes[m], other), max(classes[m], other)
-            row = a * n_classes - a * (a - 1) // 2 + b - a
+            a, b = min(classes[m, point], other), max(classes[m, point], other)
+            pair = a * n_classes - a * (a - 1) // 2 + b - a
             for c in range(lowest, highest):
-                total[row, c] += weights[m] * sums[other, c]
+                total[pair, c] += weights[m, point] * sums[other, c]
         for c in range(lowest, highest):
             sums[other, c] = 0

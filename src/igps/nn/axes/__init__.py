@@ -1,7 +1,13 @@
-"""The axes of pair histograms, of points and of pairs, and those that have a layout of their own by name."""
+"""The axes of histograms: of points, such as `Potential`, and of pairs of points, such as `InteriorDistance`.
+
+An axis of your own is a subclass of `PointAxis` or `PairAxis`. One that belongs to the library is a class in this
+folder, exported here, and entered in `AXES` by its name if it has a default layout.
+"""
 
 from __future__ import annotations
 
+from igps.nn._kernels.pair_values import PairValues, euclidean_distances, oriented_pairs, point_pair_features
+from igps.nn.axes.centres import OrderedCentres
 from igps.nn.axes.pairs import EmbeddedPairCosines, EuclideanDistance, InteriorDistance, PairAxis, PairCosines
 from igps.nn.axes.points import Attribute, BallRadius, PointAxis, Potential
 
@@ -12,11 +18,16 @@ __all__ = [
     "EmbeddedPairCosines",
     "EuclideanDistance",
     "InteriorDistance",
+    "OrderedCentres",
     "PairAxis",
     "PairCosines",
+    "PairValues",
     "PointAxis",
     "Potential",
     "axis_of",
+    "euclidean_distances",
+    "oriented_pairs",
+    "point_pair_features",
 ]
 
 AXES: dict[str, type[PointAxis | PairAxis]] = {

@@ -24,15 +24,6 @@ def middles(n: int, largest: float, name: str) -> Tensor:
     return (torch.arange(n) + 0.5) * (largest / n)
 
 
-def position(values: Tensor, centres: Tensor) -> Tensor:
-    """Where values lie on the axis of the centres: k at centre k, linear between, 0 below the first, B − 1 beyond."""
-    # A search among so few centres takes longer, and is not differentiable.
-    along = torch.zeros_like(values)
-    for centre, width in zip(centres[:-1], centres.diff(), strict=True):
-        along = along + ((values - centre) / width).clamp(0, 1)
-    return along
-
-
 class OrderedCentres(nn.Module):
     """Ascending centres of bins or classes, fixed or learned.
 

@@ -7,57 +7,47 @@ surface next to them.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 
 from torch import Tensor, nn
 
 from igps.data.requirements import Requirements, embedding_requirements
+from igps.nn._kernels.pair_values import PairValues, euclidean_distances, oriented_pairs
 from igps.nn.axes.centres import OrderedCentres, middles
-from igps.nn.batch_features import View
-
-
-@dataclass(frozen=True)
-class Distances:
-    """Points whose Euclidean distances are counted between centres.
-
-    Args:
-        points: (P, D); or (N, P, D) of N shapes.
-        centres: (B,) ascending.
-        equal: whether the centres are known to be the middles of equal intervals from 0 on.
-    """
-
-    points: Tensor
-    centres: Tensor
-    equal: bool
-
-    def of_shape(self, i: int, real: Tensor | slice) -> Distances:
-        """Those of one shape."""
-        return Distances(self.points[i, real], self.centres, self.equal)
-
-
-@dataclass(frozen=True)
-class OrientedPoints:
-    """Points and directions, the three `point_pair_features` of whose pairs are counted between centres.
-
-    Args:
-        points: (P, D); or (N, P, D) of N shapes.
-        directions: the same, of length 1.
-        towards: (A,) centres of the cosines that tell how directions lie to the line between two points.
-        between: (A,) centres of the cosine between two directions.
-    """
-
-    points: Tensor
-    directions: Tensor
-    towards: Tensor
-    between: Tensor
-
-    def of_shape(self, i: int, real: Tensor | slice) -> OrientedPoints:
-        """Those of one shape."""
-        return OrientedPoints(self.points[i, real], self.directions[i, real], self.towards, self.between)
+from igps.nn.batch_features import SampleFeatures
 
 
 class PairAxis(nn.Module, ABC):
-    """Bins of pairs, shared out linearly: a pair counts in the two bins whose centres surround its value."""
+    """Bins of pairs, shared out linearly: a pair counts in the two bins whose centres surround its value.
+
+    An axis of your own defines `shape`, `pairs`, and where the samples alone do not suffice `requirements`. `pairs`
+    says from what of the samples the values of pairs follow, and how; `euclidean_distances` does it for points.
+
+    Example:
+        How much deeper inside the body one sample lies than the other.
+
+        >>> import torch
+        >>> from igps.nn.axes import OrderedCentres, PairValues
+        >>> class DepthDifference(PairAxis):
+        ...     def __init__(self):
+        ...         super().__init__()
+        ...         self.centres = OrderedCentres([0.0, 0.02, 0.05, 0.1], learnable=True)
+        ...
+        ...     @property
+        ...     def shape(self):
+        ...         return (4,)
+        ...
+        ...     def requirements(self, embedding):
+        ...         return Requirements(attributes=("depth",))
+        ...
+        ...     def pairs(self, features, embedding):
+        ...         def between(rows, columns):  # (N, I) and (N, J) depths to (N, 1, I, J)
+        ...             return (rows[0][:, None, :, None] - columns[0][:, None, None, :]).abs()
+        ...
+        ...         return PairValues((features.attribute("depth"),), (self.centres(),), between)
+        >>> from igps.nn.histograms import PairHistogram
+        >>> PairHistogram([DepthDifference()]).shape
+        (1, 4)
+    """
 
     @property
     @abstractmethod
@@ -69,8 +59,8 @@ class PairAxis(nn.Module, ABC):
         return Requirements()
 
     @abstractmethod
-    def pairs(self, view: View, embedding: nn.Module) -> Distances | OrientedPoints:
-        """What is counted, of N shapes."""
+    def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
+        """The values of the pairs of N shapes, and the centres of their bins."""
 
 
 class DistanceAxis(PairAxis):
@@ -88,8 +78,8 @@ class DistanceAxis(PairAxis):
         """(B,)."""
         return (len(self.centres.start),)
 
-    def _distances(self, points: Tensor) -> Distances:
-        return Distances(points, self.centres(), self.centres.log_gap is None)
+    def _distances(self, points: Tensor) -> PairValues:
+        return euclidean_distances(points, self.centres())
 
 
 class InteriorDistance(DistanceAxis):
@@ -112,9 +102,9 @@ class InteriorDistance(DistanceAxis):
         """Those of the embedding, its own or the histogram's."""
         return embedding_requirements(self.embedding or embedding)
 
-    def pairs(self, view: View, embedding: nn.Module) -> Distances:
+    def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Embedded samples."""
-        return self._distances(view.embedded(self.embedding or embedding))
+        return self._distances(features.embedded(self.embedding or embedding))
 
 
 class EuclideanDistance(DistanceAxis):
@@ -129,9 +119,9 @@ class EuclideanDistance(DistanceAxis):
     def __init__(self, n_bins: int = 16, reach: float = 1.0, *, learnable: bool = False) -> None:
         super().__init__(n_bins, reach, learnable)
 
-    def pairs(self, view: View, embedding: nn.Module) -> Distances:
+    def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Samples over √area."""
-        return self._distances(view.positions())
+        return self._distances(features.positions())
 
 
 class _CosineAxes(PairAxis):
@@ -148,8 +138,8 @@ class _CosineAxes(PairAxis):
         """(A, A, A)."""
         return (len(self.between_centres.start),) * 3
 
-    def _oriented(self, points: Tensor, directions: Tensor) -> OrientedPoints:
-        return OrientedPoints(points, directions, self.towards_centres(), self.between_centres())
+    def _oriented(self, points: Tensor, directions: Tensor) -> PairValues:
+        return oriented_pairs(points, directions, self.towards_centres(), self.between_centres())
 
 
 class PairCosines(_CosineAxes):
@@ -170,9 +160,9 @@ class PairCosines(_CosineAxes):
         """The directions."""
         return Requirements(attributes=("surface_direction",))
 
-    def pairs(self, view: View, embedding: nn.Module) -> OrientedPoints:
+    def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Samples over √area, and the directions to the surface."""
-        return self._oriented(view.positions(), view.attribute("surface_direction"))
+        return self._oriented(features.positions(), features.attribute("surface_direction"))
 
 
 class EmbeddedPairCosines(_CosineAxes):
@@ -193,6 +183,6 @@ class EmbeddedPairCosines(_CosineAxes):
         """Those of the embedding."""
         return embedding_requirements(embedding)
 
-    def pairs(self, view: View, embedding: nn.Module) -> OrientedPoints:
+    def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Embedded samples, and the directions between them and the embedded samples of the other kind."""
-        return self._oriented(view.embedded(embedding), view.embedded_directions(embedding))
+        return self._oriented(features.embedded(embedding), features.embedded_directions(embedding))

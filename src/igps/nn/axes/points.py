@@ -13,7 +13,7 @@ from torch.nn.functional import one_hot
 
 from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn.axes.centres import OrderedCentres, middles
-from igps.nn.batch_features import View
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import barycentroid_potential
 from igps.signature.attributes import AttributeName
 
@@ -43,7 +43,7 @@ class PointAxis(nn.Module, ABC):
         return Requirements()
 
     @abstractmethod
-    def values(self, view: View, embedding: nn.Module) -> Tensor:
+    def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """(N, P) of the samples."""
 
     def memberships(self, values: Tensor) -> Tensor:
@@ -55,6 +55,29 @@ class PointAxis(nn.Module, ABC):
         if not torch.isfinite(values).all():
             raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
         return soft_memberships(values, self.centres()) if self.soft else _nearest(values, self.centres())
+
+    def members(self, values: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """The classes that points belong to, and how much: `memberships` without its zeros.
+
+        Args:
+            values: (N, P).
+            mask: (N, P) true where a point is real.
+
+        Returns:
+            (N, P, M) integers and weights of sum 1, M = 2 for soft classes and 1 for hard ones.
+
+        Raises:
+            ValueError: values that are not finite.
+        """
+        if not torch.compiler.is_compiling() and not torch.isfinite(values[mask]).all():
+            raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
+        centres = self.centres().to(values.dtype)
+        if not self.soft or len(centres) == 1:
+            classes = torch.bucketize(values.detach(), _boundaries(centres), right=True).unsqueeze(2)
+            return classes, torch.ones_like(classes, dtype=values.dtype)
+        below = torch.bucketize(values.detach(), centres.detach()[1:-1], right=True)
+        share = ((values - centres[below]) / centres.diff()[below]).clamp(0, 1)
+        return torch.stack([below, below + 1], dim=2), torch.stack([1 - share, share], dim=2)
 
 
 class Potential(PointAxis):
@@ -83,9 +106,9 @@ class Potential(PointAxis):
         """Those of the embedding, its own or the histogram's."""
         return embedding_requirements(self.embedding or embedding)
 
-    def values(self, view: View, embedding: nn.Module) -> Tensor:
+    def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """(N, P) potential."""
-        return barycentroid_potential(view.embedded(self.embedding or embedding))
+        return barycentroid_potential(features.embedded(self.embedding or embedding))
 
 
 class BallRadius(PointAxis):
@@ -120,15 +143,15 @@ class BallRadius(PointAxis):
         """The directions."""
         return Requirements(attributes=("surface_direction",))
 
-    def values(self, view: View, embedding: nn.Module) -> Tensor:
+    def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """(N, P) logarithms of the radii over √area.
 
         Raises:
             ValueError: interior samples.
         """
-        if view.kind != "surface":
+        if features.kind != "surface":
             raise ValueError("samples: expected surface samples, which balls touch, got interior ones.")
-        return view.ball_radii()[..., ("inside", "outside").index(self.side)].log()
+        return features.ball_radii()[..., ("inside", "outside").index(self.side)].log()
 
     def extra_repr(self) -> str:
         return repr(self.side)
@@ -151,13 +174,13 @@ class Attribute(PointAxis):
         """The attribute, if it is one that Signatures are computed with."""
         return Requirements(attributes=tuple(name for name in get_args(AttributeName) if name == self.name))
 
-    def values(self, view: View, embedding: nn.Module) -> Tensor:
+    def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """(N, P) of the attribute.
 
         Raises:
             ValueError: the samples have no such attribute, or it is a direction.
         """
-        values = view.attribute(self.name)
+        values = features.attribute(self.name)
         if values.ndim != 2:
             raise ValueError(f"attributes: expected a scalar to split by, but {self.name!r} is a direction.")
         return values
@@ -182,7 +205,23 @@ def soft_memberships(values: Tensor, centres: Tensor) -> Tensor:
     return torch.cat([one, passed], dim=-1) - torch.cat([passed, none], dim=-1)
 
 
+def largest_members(memberships: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Classes and weights (N, P, M) from memberships (N, P, C) in all classes, M as many as any point belongs to.
+
+    With a gradient M is C, so that memberships that are 0 have theirs too.
+    """
+    n_members = memberships.shape[2]
+    if not (memberships.requires_grad or torch.compiler.is_compiling()):
+        n_members = int((memberships > 0).sum(dim=2).masked_fill(~mask, 1).max())
+    weights, classes = memberships.topk(n_members, dim=2)
+    return classes, weights
+
+
+def _boundaries(centres: Tensor) -> Tensor:
+    """(C − 1,) values that are as near to one class as to the next."""
+    return (centres.detach()[1:] + centres.detach()[:-1]) / 2
+
+
 def _nearest(values: Tensor, centres: Tensor) -> Tensor:
     """(P, C) memberships, 1 in the class whose centre is nearest."""
-    between = (centres[1:] + centres[:-1]) / 2
-    return one_hot(torch.bucketize(values.detach(), between, right=True), len(centres)).to(values.dtype)
+    return one_hot(torch.bucketize(values.detach(), _boundaries(centres), right=True), len(centres)).to(values.dtype)

@@ -1,7 +1,7 @@
 """Joint histograms over the samples of a body, and over their pairs, as products of axes."""
 
-from igps.nn.histograms.base import SampleHistogram
-from igps.nn.histograms.pairs import PairHistogram, joint_histogram
+from igps.nn.histograms.base import DescriptionPart, SampleHistogram
+from igps.nn.histograms.pairs import PairHistogram, joint_histogram, pair_histogram
 from igps.nn.histograms.points import PointHistogram
 
-__all__ = ["PairHistogram", "PointHistogram", "SampleHistogram", "joint_histogram"]
+__all__ = ["DescriptionPart", "PairHistogram", "PointHistogram", "SampleHistogram", "joint_histogram", "pair_histogram"]

@@ -1,19 +1,54 @@
-"""What all histograms of the samples of a body share, whether they count samples or pairs of them."""
+"""What the parts of a description share, and the histograms of samples among them."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from functools import reduce
 
 import torch
 from torch import Tensor, nn
 
 from igps.data.batch import SignatureBatch
 from igps.data.requirements import Requirements
-from igps.nn.batch_features import SampleKind, View, Views, check_kind
+from igps.nn.batch_features import BatchFeatures, SampleFeatures, SampleKind, check_kind
 
 
-class SampleHistogram(nn.Module, ABC):
+class DescriptionPart(nn.Module, ABC):
+    """A module that makes one part of a description: non-negative numbers of sum 1 for each body.
+
+    A part of your own defines `shape`, `requirements` and `of_features`.
+    """
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Of a body's part."""
+
+    @property
+    @abstractmethod
+    def requirements(self) -> Requirements:
+        """What it needs of a body."""
+
+    @abstractmethod
+    def of_features(self, features: BatchFeatures) -> Tensor:
+        """(N, ...) parts of N shapes."""
+
+    @property
+    def n_cells(self) -> int:
+        """Numbers of a body's part."""
+        return math.prod(self.shape)
+
+    def forward(self, batch: SignatureBatch | BatchFeatures) -> Tensor:
+        """(N, ...) parts of N shapes, of a batch or of features that several parts share.
+
+        Raises:
+            ValueError: a body without two samples, attributes that are missing, or values that are not finite.
+        """
+        return self.of_features(batch if isinstance(batch, BatchFeatures) else BatchFeatures(batch, self.training))
+
+
+class SampleHistogram(DescriptionPart):
     """A histogram of some samples of each body, whose cells sum to 1.
 
     Args:
@@ -38,44 +73,18 @@ class SampleHistogram(nn.Module, ABC):
         self.n_samples = n_samples
         self.n_training_samples = n_training_samples
 
-    @property
     @abstractmethod
-    def shape(self) -> tuple[int, ...]:
-        """Of a body's histogram."""
+    def of_samples(self, features: SampleFeatures) -> Tensor:
+        """(N, ...) histograms of some samples of N shapes."""
 
-    @property
-    @abstractmethod
-    def requirements(self) -> Requirements:
-        """What it needs of a body."""
-
-    @abstractmethod
-    def of_view(self, view: View) -> Tensor:
-        """(N, ...) histograms of the samples in a view."""
-
-    @property
-    def n_cells(self) -> int:
-        """Cells of a body's histogram."""
-        return math.prod(self.shape)
-
-    def forward(self, batch: SignatureBatch) -> Tensor:
-        """(N, ...) histograms, each body's of sum 1.
-
-        Raises:
-            ValueError: a body without two samples, attributes that are missing, or values that are not finite.
-        """
-        return self.of_views(Views(batch, self.training))
-
-    def of_views(self, views: Views) -> Tensor:
-        """`forward` of a batch whose views are shared with other histograms."""
-        return self.of_view(views.of(self.samples, self.n_samples, self.n_training_samples))
+    def of_features(self, features: BatchFeatures) -> Tensor:
+        """(N, ...) histograms of N shapes."""
+        return self.of_samples(features.of(self.samples, self.n_samples, self.n_training_samples))
 
 
 def joint(memberships: list[Tensor]) -> Tensor:
-    """(P, C) memberships of points in all combinations of classes, from those in classes of several kinds."""
-    found = memberships[0]
-    for one in memberships[1:]:
-        found = (found[:, :, None] * one[:, None, :]).flatten(1)
-    return found
+    """(..., P, C) memberships of points in all combinations of classes, from those in classes of several kinds."""
+    return reduce(lambda one, other: (one[..., :, None] * other[..., None, :]).flatten(-2), memberships)
 
 
 def counted(one: Tensor, other: Tensor) -> Tensor:
@@ -89,6 +98,6 @@ def counted(one: Tensor, other: Tensor) -> Tensor:
     return one.T @ other / len(one)
 
 
-def present(view: View) -> list[Tensor | slice]:
+def present(features: SampleFeatures) -> list[Tensor | slice]:
     """Which samples of each body are real; where nothing is padding, nothing need be copied."""
-    return [slice(None) if bool(torch.all(real)) else real for real in view.samples.mask]
+    return [slice(None) if bool(torch.all(real)) else real for real in features.samples.mask]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import reduce
 from operator import or_
 
@@ -11,14 +12,14 @@ import torch
 from torch import Tensor, nn
 
 from igps.data.requirements import Requirements
-from igps.nn._kernels.hard_pairs import class_pairs, hard_pair_histogram
-from igps.nn._kernels.oriented_pairs import oriented_pair_histogram
-from igps.nn._kernels.soft_pairs import soft_pair_histogram
+from igps.nn._kernels.pair_values import PairValues, euclidean_distances
+from igps.nn._kernels.pairs import check_pairs, class_pairs, count_pairs
 from igps.nn.axes import PairAxis, PointAxis, axis_of
-from igps.nn.axes.pairs import DistanceAxis, Distances, OrientedPoints
-from igps.nn.batch_features import SampleKind, View
+from igps.nn.axes.pairs import DistanceAxis
+from igps.nn.axes.points import largest_members
+from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histograms.base import SampleHistogram, joint, present
+from igps.nn.histograms.base import SampleHistogram
 
 
 class PairHistogram(SampleHistogram):
@@ -91,54 +92,101 @@ class PairHistogram(SampleHistogram):
         axes: list[PointAxis | PairAxis] = [*self.point_axes, *self.pair_axes]
         return reduce(or_, (axis.requirements(self.embedding) for axis in axes))
 
-    def of_view(self, view: View) -> Tensor:
-        """(N, C(C+1)/2, B, ...) histograms of the samples in a view."""
-        values = [one.values(view, self.embedding) for one in self.point_axes]
-        pairs = [one.pairs(view, self.embedding) for one in self.pair_axes]
-        return torch.stack(
-            [
-                self._of_shape([value[i, real] for value in values], [one.of_shape(i, real) for one in pairs])
-                for i, real in enumerate(present(view))
-            ]
-        )
-
-    def _of_shape(self, values: list[Tensor], pairs: list[Distances | OrientedPoints]) -> Tensor:
-        everything = torch.ones(len(pairs[0].points), 1, device=pairs[0].points.device)
-        classes = [one.memberships(value) for one, value in zip(self.point_axes, values, strict=True)]
-        return joint_histogram(joint([everything, *classes]), pairs)
-
-
-# Its loops over data gain nothing by torch.compile, which is to leave it alone. This mark says so as
-# torch.compiler.disable does, but that imports the compiler: a second and a half for everybody.
-PairHistogram._of_shape._torchdynamo_disable = True  # type: ignore[attr-defined]
+    def of_samples(self, features: SampleFeatures) -> Tensor:
+        """(N, C(C+1)/2, B, ...) histograms of some samples of N shapes."""
+        mask = features.samples.mask
+        pairs = [one.pairs(features, self.embedding) for one in self.pair_axes]
+        check_pairs(pairs, mask)
+        classes = torch.zeros(*mask.shape, 1, dtype=torch.long, device=mask.device)
+        weights = torch.ones_like(classes, dtype=pairs[0].inputs[0].dtype)
+        n_classes = 1
+        for axis in self.point_axes:
+            own, shares = axis.members(axis.values(features, self.embedding), mask)
+            classes = (classes.unsqueeze(3) * axis.n_classes + own.unsqueeze(2)).flatten(2)
+            weights = (weights.unsqueeze(3) * shares.unsqueeze(2)).flatten(2)
+            n_classes *= axis.n_classes
+        return count_pairs(classes, weights, n_classes, pairs, mask)
 
 
-def joint_histogram(memberships: Tensor, pairs: Sequence[Distances | OrientedPoints]) -> Tensor:
-    """The joint histogram of one body, by the fastest of the algorithms that count the same.
-
-    Where no gradient is asked for, points in one class each and a single distance in equal bins take the shortest way.
+def joint_histogram(memberships: Tensor, pairs: Sequence[PairValues], mask: Tensor | None = None) -> Tensor:
+    """The joint histogram of all pairs of points, by the classes of their ends and the bins of their values.
 
     Args:
-        memberships: (P, C) of the points in classes, rows of sum 1.
-        pairs: what is counted of their pairs.
+        memberships: (P, C) of the points in classes, rows of sum 1; or (N, P, C) of N shapes.
+        pairs: the values of their pairs, such as `euclidean_distances` or `oriented_pairs`.
+        mask: (N, P) true where a point is real; all if None.
 
     Returns:
-        (C(C+1)/2, B, ...) of sum 1; the dimensions of distances come before those of oriented points.
+        (C(C+1)/2, B, ...) of sum 1, or (N, C(C+1)/2, B, ...), in the type of the first inputs, float32 at least.
+
+    Raises:
+        ValueError: fewer than two points, shapes that do not match, values that are not finite, memberships that are
+            negative or do not sum to 1, or centres that do not ascend.
     """
-    distances = [one for one in pairs if isinstance(one, Distances)]
-    oriented = [one for one in pairs if isinstance(one, OrientedPoints)]
-    axes = [(one.points, one.centres) for one in distances]
-    if oriented:
-        return oriented_pair_histogram(
-            memberships, axes, [(one.points, one.directions, one.towards, one.between) for one in oriented]
+    if memberships.ndim == 2:
+        batched = [replace(one, inputs=tuple(x[None] for x in one.inputs)) for one in pairs]
+        return joint_histogram(memberships[None], batched, None if mask is None else mask[None])[0]
+    mask = torch.ones_like(memberships[..., 0], dtype=torch.bool) if mask is None else mask
+    check_pairs(pairs, mask)
+    for centres in (one for pair in pairs for one in pair.centres):
+        if centres.ndim != 1 or len(centres) < 2 or not bool(((centres.diff() > 0) & centres[1:].isfinite()).all()):
+            raise ValueError(
+                f"centres: expected at least two finite values in ascending order, got {centres.tolist()}."
+            )
+    real = memberships[mask]
+    # Both comparisons are false for NaN.
+    if not bool((real >= 0).all() & ((real.sum(dim=1) - 1).abs() < 1e-3).all()):
+        raise ValueError("memberships: expected non-negative rows of sum 1, got others; divide each row by its sum.")
+    n_classes = memberships.shape[2]
+    return count_pairs(*largest_members(memberships, mask), n_classes, pairs, mask)
+
+
+def pair_histogram(
+    embedding: Tensor,
+    potential: Tensor,
+    *,
+    distance_range: float = 4.0,
+    potential_range: float = 1.5,
+    n_classes: int = 4,
+    n_bins: int = 64,
+) -> Tensor:
+    """Histogram of pairwise distances for every unordered pair of potential classes (Rustamov 2010, section 4).
+
+    Each unordered pair of distinct points counts once, in the row of the classes of its ends. Classes are `n_classes`
+    equal intervals of [0, `potential_range`]. Bins have their centres in the middle of `n_bins` equal intervals of
+    [0, `distance_range`]; a distance counts in the two bins whose centres surround it, in linear proportion. What lies
+    beyond a range counts in its last class or bin.
+
+    Args:
+        embedding: (P, D) points; their Euclidean distances are counted.
+        potential: (P,) non-negative.
+        distance_range: end of the last bin.
+        potential_range: end of the last class.
+        n_classes: C.
+        n_bins: B.
+
+    Returns:
+        (C(C+1)/2, B) in the embedding's type, float32 at least, of sum 1; row order (0,0), (0,1), … (0,C−1), (1,1), …
+
+    Raises:
+        ValueError: fewer than two points, shapes that do not match, or values that are not finite.
+    """
+    if embedding.ndim != 2:
+        raise ValueError(f"embedding: expected shape (P, D), got {tuple(embedding.shape)}.")
+    if potential.shape != embedding.shape[:1]:
+        raise ValueError(
+            f"potential: expected shape {tuple(embedding.shape[:1])}, one of each point, got {tuple(potential.shape)}."
         )
-    (first, *others) = distances
-    differentiated = torch.is_grad_enabled() and any(
-        tensor.requires_grad for tensor in (memberships, first.points, first.centres)
-    )
-    hard = bool(((memberships == 0) | (memberships == 1)).all())
-    if first.equal and not others and hard and not differentiated:
-        level = memberships.argmax(dim=1)
-        width = 2 * float(first.centres[0])  # the first centre is the middle of the first bin
-        return hard_pair_histogram(first.points, level, memberships.shape[1], len(first.centres), width)
-    return soft_pair_histogram(memberships, axes)
+    if not bool(((potential >= 0) & torch.isfinite(potential)).all()):
+        raise ValueError("potential: expected non-negative, finite values, got others.")
+    if n_classes < 1 or n_bins < 2 or distance_range <= 0 or potential_range <= 0:
+        raise ValueError(
+            "expected n_classes >= 1, n_bins >= 2 and positive ranges, got "
+            f"{n_classes=}, {n_bins=}, {distance_range=}, {potential_range=}."
+        )
+    classes = (potential * (n_classes / potential_range)).long().clamp_(max=n_classes - 1)[None, :, None]
+    dtype = torch.promote_types(embedding.dtype, torch.float32)
+    centres = (torch.arange(n_bins, dtype=dtype, device=embedding.device) + 0.5) * (distance_range / n_bins)
+    pairs, mask = [euclidean_distances(embedding[None], centres)], torch.ones_like(classes[..., 0], dtype=torch.bool)
+    check_pairs(pairs, mask)
+    return count_pairs(classes, torch.ones_like(classes, dtype=dtype), n_classes, pairs, mask)[0]

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from igps.data.requirements import Requirements
 from igps.nn.axes.points import PointAxis
-from igps.nn.batch_features import SampleKind, View
+from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram, counted, joint, present
 
@@ -66,11 +66,11 @@ class PointHistogram(SampleHistogram):
         """What all axes together need of a body."""
         return reduce(or_, (axis.requirements(self.embedding) for axis in self.point_axes))
 
-    def of_view(self, view: View) -> Tensor:
-        """(N, C, ...) histograms of the samples in a view."""
-        values = [one.values(view, self.embedding) for one in self.point_axes]
+    def of_samples(self, features: SampleFeatures) -> Tensor:
+        """(N, C, ...) histograms of some samples of N shapes."""
+        values = [one.values(features, self.embedding) for one in self.point_axes]
         return torch.stack(
-            [self._of_shape([value[i, real] for value in values]) for i, real in enumerate(present(view))]
+            [self._of_shape([value[i, real] for value in values]) for i, real in enumerate(present(features))]
         )
 
     def _of_shape(self, values: list[Tensor]) -> Tensor:

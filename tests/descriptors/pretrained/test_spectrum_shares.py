@@ -9,13 +9,13 @@ import torch
 
 from batches import N_EIGENPAIRS, alone, scaled, two_bodies
 from igps.data.requirements import Requirements
-from igps.descriptors.pretrained.spectrum_histogram import SpectrumHistogram
+from igps.descriptors.pretrained.spectrum_shares import SpectrumShares
 from igps.nn.descriptor import HistogramDescriptor
 
 
 def test_shares_are_those_of_a_loop() -> None:
     batch = two_bodies()
-    found = SpectrumHistogram(6)(batch)
+    found = SpectrumShares(6)(batch)
     assert found.shape == (2, 5)
     assert found.dtype == torch.float32
     for i in range(2):
@@ -27,12 +27,12 @@ def test_shares_are_those_of_a_loop() -> None:
 def test_a_spectrum_that_follows_weyl_has_equal_shares() -> None:
     batch = two_bodies()
     line = 4 * torch.pi * torch.arange(1, 13, dtype=torch.float64) / batch.area[:, None]
-    found = SpectrumHistogram(12)(replace(batch, eigenvalues=line))
+    found = SpectrumShares(12)(replace(batch, eigenvalues=line))
     torch.testing.assert_close(found, torch.full((2, 11), 1 / 11))
 
 
 def test_padding_scale_and_the_first_eigenvalue_change_nothing() -> None:
-    batch, histogram = two_bodies(), SpectrumHistogram(min(N_EIGENPAIRS))
+    batch, histogram = two_bodies(), SpectrumShares(min(N_EIGENPAIRS))
     found = histogram(batch)
     torch.testing.assert_close(found.sum(dim=1), torch.ones(2))
     for i in range(2):
@@ -44,8 +44,8 @@ def test_padding_scale_and_the_first_eigenvalue_change_nothing() -> None:
 
 
 def test_needs_and_what_is_refused() -> None:
-    assert SpectrumHistogram(20).requirements == Requirements(n_eigenpairs=20)
+    assert SpectrumShares(20).requirements == Requirements(n_eigenpairs=20)
     with pytest.raises(ValueError, match="n_eigenpairs: expected at least 3, got 2"):
-        SpectrumHistogram(2)
+        SpectrumShares(2)
     with pytest.raises(ValueError, match="needs signatures of at least 8, got 7"):
-        HistogramDescriptor(SpectrumHistogram(8))(two_bodies())
+        HistogramDescriptor(SpectrumShares(8))(two_bodies())

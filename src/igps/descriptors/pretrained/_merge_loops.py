@@ -1,4 +1,4 @@
-"""A loop that Numba compiles for `merge_tree`; it is also what runs, slowly, where Numba is not installed."""
+"""The loop of `merge_tree` that Numba compiles."""
 
 from __future__ import annotations
 

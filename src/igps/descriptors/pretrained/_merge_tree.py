@@ -9,12 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from igps._compiled import is_available
-from igps.nn._kernels.merge_loops import merge
-from igps.nn._precision import full_precision
-
-# With 12 or more it makes no difference, with 8 limbs fall apart where samples are sparse
-N_NEIGHBOURS = 16
+from igps.descriptors.pretrained._merge_loops import merge
 
 
 class MergeTree(NamedTuple):
@@ -51,21 +46,6 @@ def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = ()) -
     order = torch.argsort(values.detach(), descending=True, stable=True).cpu().numpy()
     ends = np.empty((len(values), 2), np.int64)
     pieces = np.full((len(counts), len(values)), -1, np.int64)
-    loop = merge if is_available() else merge.plain
-    n = loop(order, neighbours.cpu().numpy(), np.array(counts, np.int64), ends, pieces)
+    n = merge(order, neighbours.cpu().numpy(), np.array(counts, np.int64), ends, pieces)
     found = torch.from_numpy(ends[:n]).to(values.device)
     return MergeTree(found[:, 0], found[:, 1], torch.from_numpy(pieces).to(values.device))
-
-
-def nearest(points: Tensor, n_nearest: int = N_NEIGHBOURS) -> Tensor:
-    """(P, k) the others that are nearest to each of points (P, D), the nearest first; all where there are no more.
-
-    Raises:
-        ValueError: no point.
-    """
-    if not len(points):
-        raise ValueError("samples: expected at least one of each body, got none.")
-    with full_precision():
-        squares = torch.cdist(points.detach(), points.detach(), compute_mode="use_mm_for_euclid_dist")
-    squares.fill_diagonal_(torch.inf)
-    return squares.topk(min(n_nearest, len(points) - 1), dim=1, largest=False).indices

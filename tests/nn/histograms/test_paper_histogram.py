@@ -1,3 +1,5 @@
+"""The paper's histogram as a function, against its definition one pair at a time."""
+
 from __future__ import annotations
 
 import math
@@ -6,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from igps.nn._kernels.hard_pairs import class_pairs, pair_histogram
-
-pytestmark = pytest.mark.usefixtures("both_ways")
+from igps.nn._kernels.pairs import class_pairs
+from igps.nn.histograms import pair_histogram
 
 
 def by_loops(embedding: np.ndarray, potential: np.ndarray, d_max: float, u_max: float, c: int, b: int) -> np.ndarray:
@@ -54,12 +55,6 @@ def test_values_beyond_the_ranges_stay_in_the_last_cells(cloud: tuple[torch.Tens
     assert far[-1, -1] > 0.9
 
 
-def test_blocks_do_not_show(cloud: tuple[torch.Tensor, torch.Tensor], monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = pair_histogram(*cloud)
-    monkeypatch.setattr("igps.nn._kernels.hard_pairs._BLOCK", 7)
-    np.testing.assert_allclose(pair_histogram(*cloud), whole, atol=1e-14)
-
-
 def test_does_not_depend_on_order_or_on_the_basis(cloud: tuple[torch.Tensor, torch.Tensor]) -> None:
     embedding, potential = cloud
     order = torch.randperm(len(embedding), generator=torch.Generator().manual_seed(0))
@@ -73,7 +68,7 @@ def test_does_not_depend_on_order_or_on_the_basis(cloud: tuple[torch.Tensor, tor
     [
         (torch.zeros(1, 3), torch.zeros(1), "two points"),
         (torch.zeros(5, 3), torch.zeros(4), r"potential: expected shape \(5,\), one of each point, got \(4,\)"),
-        (torch.zeros(1, 5, 3), torch.zeros(1), r"points: expected shape \(P, D\), got \(1, 5, 3\)"),
+        (torch.zeros(5), torch.zeros(5), r"embedding: expected shape \(P, D\), got \(5,\)"),
         (torch.full((5, 3), torch.nan), torch.zeros(5), "finite"),
         (torch.zeros(5, 3), -torch.ones(5), "non-negative"),
     ],

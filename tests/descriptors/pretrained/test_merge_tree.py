@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -11,20 +11,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from igps.nn._kernels import merge_tree as module
-from igps.nn._kernels.merge_tree import MergeTree, nearest
-
-Build = Callable[..., MergeTree]
-
-
-@pytest.fixture(params=["compiled", "plain"])
-def merge_tree(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Build:
-    """By the loop as Numba compiles it, and as it is written."""
-    if request.param == "plain":
-        monkeypatch.setattr(module, "is_available", lambda: False)
-    else:
-        pytest.importorskip("numba")
-    return module.merge_tree
+from igps.descriptors.pretrained._merge_tree import merge_tree
+from igps.nn.batch_features import nearest_neighbours
 
 
 def components(neighbours: Tensor, kept: np.ndarray) -> np.ndarray:
@@ -39,11 +27,11 @@ def components(neighbours: Tensor, kept: np.ndarray) -> np.ndarray:
 def random_graph(seed: int, n: int = 80, k: int = 3) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(seed)
     values = torch.randn(n, generator=generator, dtype=torch.float64)
-    return values, nearest(torch.rand(n, 2, generator=generator), k)
+    return values, nearest_neighbours(torch.rand(n, 2, generator=generator), k)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_as_many_branches_live_at_each_level_as_there_are_components(merge_tree: Build, seed: int) -> None:
+def test_as_many_branches_live_at_each_level_as_there_are_components(seed: int) -> None:
     values, neighbours = random_graph(seed)
     tree = merge_tree(values, neighbours)
     peaks, saddles = values[tree.peaks], values[tree.saddles]
@@ -56,7 +44,7 @@ def test_as_many_branches_live_at_each_level_as_there_are_components(merge_tree:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_pieces_are_components_named_by_their_peaks(merge_tree: Build, seed: int) -> None:
+def test_pieces_are_components_named_by_their_peaks(seed: int) -> None:
     values, neighbours = random_graph(seed)
     counts = [1, 8, 8, 30, 80]
     tree = merge_tree(values, neighbours, counts)
@@ -76,7 +64,7 @@ def on_a_path(values: Sequence[float]) -> tuple[Tensor, Tensor]:
     return torch.tensor(values), torch.tensor([[max(k - 1, 0), min(k + 1, last)] for k in range(last + 1)])
 
 
-def test_the_lower_of_two_peaks_ends_where_they_meet(merge_tree: Build) -> None:
+def test_the_lower_of_two_peaks_ends_where_they_meet() -> None:
     """Heights 5, 3 and 4, passes 1 and 2 between them, and 0 at the lower end."""
     values, neighbours = on_a_path([0.0, 5.0, 1.0, 3.0, 2.0, 4.0])
     tree = merge_tree(values, neighbours)
@@ -84,7 +72,7 @@ def test_the_lower_of_two_peaks_ends_where_they_meet(merge_tree: Build) -> None:
     assert found == {5.0: 0.0, 4.0: 1.0, 3.0: 2.0}
 
 
-def test_of_equal_peaks_the_first_lives_on(merge_tree: Build) -> None:
+def test_of_equal_peaks_the_first_lives_on() -> None:
     tree = merge_tree(*on_a_path([2.0, 1.0, 2.0, 0.0]))
     assert sorted(zip(tree.peaks.tolist(), tree.saddles.tolist(), strict=True)) == [(0, 3), (2, 1)]
     many = merge_tree(*on_a_path([2.0, 1.0] * 200 + [0.0]))
@@ -92,27 +80,17 @@ def test_of_equal_peaks_the_first_lives_on(merge_tree: Build) -> None:
     assert (0, 400) in zip(many.peaks.tolist(), many.saddles.tolist(), strict=True)
 
 
-def test_what_is_apart_ends_at_the_bottom(merge_tree: Build) -> None:
+def test_what_is_apart_ends_at_the_bottom() -> None:
     values = torch.tensor([3.0, 1.0, 2.0, 0.5])
     tree = merge_tree(values, torch.tensor([[1], [0], [3], [2]]))
     assert sorted(zip(tree.peaks.tolist(), tree.saddles.tolist(), strict=True)) == [(0, 3), (2, 3)]
 
 
-def test_a_single_point_is_one_branch_of_no_length(merge_tree: Build) -> None:
-    tree = merge_tree(torch.tensor([1.0]), nearest(torch.zeros(1, 3), 4), [1])
+def test_a_single_point_is_one_branch_of_no_length() -> None:
+    tree = merge_tree(torch.tensor([1.0]), nearest_neighbours(torch.zeros(1, 3), 4), [1])
     assert [one.tolist() for one in tree] == [[0], [0], [[0]]]
 
 
-def test_what_cannot_be_ordered_is_refused(merge_tree: Build) -> None:
+def test_what_cannot_be_ordered_is_refused() -> None:
     with pytest.raises(ValueError, match="values: expected finite numbers, got NaN or infinity"):
         merge_tree(torch.tensor([1.0, torch.nan]), torch.tensor([[1], [0]]))
-    with pytest.raises(ValueError, match="samples: expected at least one of each body, got none"):
-        nearest(torch.zeros(0, 3), 4)
-
-
-def test_nearest_points_are_those_of_a_loop() -> None:
-    points = torch.randn(30, 4, generator=torch.Generator().manual_seed(3))
-    for i, found in enumerate(nearest(points, 5).tolist()):
-        others = sorted((j for j in range(30) if j != i), key=lambda j, i=i: float((points[j] - points[i]).norm()))  # type: ignore[misc]
-        assert found == others[:5]
-    assert nearest(points[:3], 5).shape == (3, 2)

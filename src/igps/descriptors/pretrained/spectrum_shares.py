@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from igps.data.requirements import Requirements
-from igps.nn.batch_features import View
-from igps.nn.histograms.base import SampleHistogram
+from igps.nn.batch_features import BatchFeatures
+from igps.nn.histograms.base import DescriptionPart
 
 
-class SpectrumHistogram(SampleHistogram):
+class SpectrumShares(DescriptionPart):
     """The eigenvalues λₖ of a body's surface, each over its number k, as shares of their sum.
 
     By Weyl's law λₖ grows as 4πk over the area, so that all shares are nearly alike, and how they differ is the body's
@@ -27,7 +27,7 @@ class SpectrumHistogram(SampleHistogram):
         >>> from igps.signature.signature import SignatureConfig, compute_signature
         >>> ball = trimesh.creation.icosphere(subdivisions=3)
         >>> signature = compute_signature(Mesh(ball.vertices, ball.faces), SignatureConfig(n_eigenpairs=8))
-        >>> shares = SpectrumHistogram(8)(collate([signature]))[0]
+        >>> shares = SpectrumShares(8)(collate([signature]))[0]
         >>> expected = torch.tensor([2 / 2, 2 / 3, 6 / 4, 6 / 5, 6 / 6, 6 / 7, 6 / 8])
         >>> bool((shares / shares[0] - expected).abs().max() < 0.02)
         True
@@ -37,7 +37,7 @@ class SpectrumHistogram(SampleHistogram):
     """
 
     def __init__(self, n_eigenpairs: int = 64) -> None:
-        super().__init__("surface")
+        super().__init__()
         if n_eigenpairs < 3:
             raise ValueError(f"n_eigenpairs: expected at least 3, got {n_eigenpairs}.")
         self.n_eigenpairs = n_eigenpairs
@@ -52,8 +52,9 @@ class SpectrumHistogram(SampleHistogram):
         """As many eigenpairs."""
         return Requirements(n_eigenpairs=self.n_eigenpairs)
 
-    def of_view(self, view: View) -> Tensor:
-        """(N, K − 1) histograms of the shapes in a view, whatever its samples."""
-        numbers = torch.arange(2, self.n_eigenpairs + 1, device=view.batch.eigenvalues.device)
-        over_number = view.batch.eigenvalues[:, 1 : self.n_eigenpairs] / numbers
-        return (over_number / over_number.sum(dim=1, keepdim=True)).to(view.samples.eigenfunctions.dtype)
+    def of_features(self, features: BatchFeatures) -> Tensor:
+        """(N, K − 1) shares of N shapes."""
+        batch = features.batch
+        numbers = torch.arange(2, self.n_eigenpairs + 1, device=batch.eigenvalues.device)
+        over_number = batch.eigenvalues[:, 1 : self.n_eigenpairs] / numbers
+        return (over_number / over_number.sum(dim=1, keepdim=True)).to(batch.surface.eigenfunctions.dtype)

@@ -1,0 +1,116 @@
+"""What is measured of pairs of points: the values that axes of pairs sort into bins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from igps.nn._kernels.pair_loops import COSINES, DISTANCES, VALUES
+
+Inputs = Sequence[Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class PairValues:
+    """One or several values of every pair of points, and the centres of the bins that each is sorted into.
+
+    A value must be the same whichever point comes first.
+
+    Args:
+        inputs: (N, P, ...) or (P, ...) each, what the values are computed from; finite.
+        centres: (B,) ascending, one of each value.
+        between: the inputs of I points, (N, I, ...) each, and of J others to the values (N, k, I, J); differentiable.
+        kinds: how compiled loops get the values, see `pair_loops`; left out, they are what `between` gives.
+    """
+
+    inputs: tuple[Tensor, ...]
+    centres: tuple[Tensor, ...]
+    between: Callable[[Inputs, Inputs], Tensor]
+    kinds: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.kinds:
+            object.__setattr__(self, "kinds", (VALUES,) * len(self.centres))
+
+
+def euclidean_distances(points: Tensor, centres: Tensor) -> PairValues:
+    """Euclidean distances.
+
+    Args:
+        points: (N, P, D) or (P, D).
+        centres: (B,) ascending.
+    """
+    return PairValues((points,), (centres,), _distances, (DISTANCES,))
+
+
+def oriented_pairs(points: Tensor, directions: Tensor, towards: Tensor, among: Tensor) -> PairValues:
+    """The three `point_pair_features` of points with directions.
+
+    Args:
+        points: (N, P, D) or (P, D).
+        directions: the same, of length 1.
+        towards: (A,) centres of the cosines that tell how directions lie to the line between two points.
+        among: (A,) centres of the cosine between two directions.
+
+    Raises:
+        ValueError: points and directions of different shapes.
+    """
+    if points.shape != directions.shape:
+        raise ValueError(
+            f"directions: expected the shape of the points, {tuple(points.shape)}, got {tuple(directions.shape)}."
+        )
+    return PairValues((points, directions), (towards, towards, among), _cosines, (COSINES,))
+
+
+def cosine_factors(points: Tensor, directions: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Matrices whose products hold u·(y − x), v·(x − y) and u·v of points x and y with directions u and v.
+
+    Each product is of a matrix of the rows, x and u, with one of the columns, y and v, transposed.
+    """
+    own, ones = (directions * points).sum(dim=-1, keepdim=True), torch.ones_like(points[..., :1])
+    extended, turned = torch.cat([points, ones], dim=-1), torch.cat([directions, -own], dim=-1)
+    return [(turned, extended), (extended, turned), (directions, directions)]
+
+
+def point_pair_features(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Cosines that tell how each pair of oriented points lies (Wahl et al. 2003; Drost et al. 2010).
+
+    With u the unit vector from point i to j and n their directions, these are the larger and the smaller of nᵢ·u and
+    −nⱼ·u, which are 1 where a direction points to the other point, and nᵢ·nⱼ: they do not depend on which is i.
+
+    Args:
+        points: (P, D).
+        directions: (P, D) of length 1.
+
+    Returns:
+        Three tensors (P(P−1)/2,), pairs in the order of `torch.triu_indices`; of points that coincide the first two
+        are 0.
+    """
+    i, j = torch.triu_indices(len(points), len(points), 1, device=points.device)
+    first, second, among = _cosines((points, directions), (points, directions))[:, i, j]
+    return first, second, among
+
+
+def _distances(rows: Inputs, columns: Inputs) -> Tensor:
+    centre = rows[0].detach().mean(dim=-2, keepdim=True)  # keeps digits in the squares
+    x, y = rows[0] - centre, columns[0] - centre
+    squares = x.square().sum(dim=-1).unsqueeze(-1) + y.square().sum(dim=-1).unsqueeze(-2) - 2 * x @ y.mT
+    # The root has no derivative at 0, and points that coincide no direction to move apart in.
+    return torch.where(squares > 0, torch.where(squares > 0, squares, 1).sqrt(), 0).unsqueeze(-3)
+
+
+def _cosines(rows: Inputs, columns: Inputs) -> Tensor:
+    factors = zip(cosine_factors(*rows), cosine_factors(*columns), strict=True)
+    here, there, among = (left @ right.mT for (left, _), (_, right) in factors)
+    length = torch.cdist(rows[0], columns[0], compute_mode="donot_use_mm_for_euclid_dist")
+    inverse = torch.where(length > 0, 1 / torch.where(length > 0, length, 1), 0)
+    here, there = (here * inverse).clamp(-1, 1), (there * inverse).clamp(-1, 1)
+    return torch.stack([torch.maximum(here, there), torch.minimum(here, there), among], dim=-3)
+
+
+def centres_of(pairs: Sequence[PairValues]) -> list[Tensor]:
+    """The centres of all values, in order."""
+    return [one for pair in pairs for one in pair.centres]

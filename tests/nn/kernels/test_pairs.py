@@ -1,0 +1,435 @@
+"""The count of pairs by both back ends, against loops over pairs and against the dense definition for its gradients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize, one_hot
+
+from conftest import torch_threads
+from igps import _threads as threads
+from igps.nn._kernels import pairs as pair_module
+from igps.nn._kernels.pairs import class_pairs
+from igps.nn.axes import PairValues, euclidean_distances, oriented_pairs, point_pair_features
+from igps.nn.histograms import joint_histogram
+from loops import Axis, cosines, distances, pair_histogram_by_loops
+
+FEW = [0.3, 0.5, 0.52, 1.9]
+EQUAL = [0.25, 0.75, 1.25, 1.75, 2.25]
+MANY = [0.1, 0.4, 0.401, 0.4012, 0.4013, 0.7, 0.9, 1.0, 1.1, 1.15, 1.3, 1.5, 1.6, 1.9, 2.2, 2.9]
+TOWARDS, AMONG = [-0.7, 0.1, 0.6], [-0.5, 0.3]
+BACK_ENDS = ["compiled", "torch", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(),
+                                                                                reason="no CUDA device"))]  # fmt: skip
+
+
+@pytest.fixture(params=BACK_ENDS)
+def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Where the points are; on the CPU by compiled loops or by operations of PyTorch."""
+    if request.param == "torch":
+        monkeypatch.setattr(pair_module, "_is_compiled", lambda *_: False)
+    return "cuda" if request.param == "cuda" else "cpu"
+
+
+def some(n_points: int = 23, n_classes: int = 3, seed: int = 4) -> dict[str, Tensor]:
+    """Coordinates, points, directions, and memberships of which many are 0."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(width: int) -> Tensor:
+        return torch.randn(n_points, width, generator=generator, dtype=torch.float64)
+
+    memberships = torch.rand(n_points, n_classes, generator=generator, dtype=torch.float64)
+    memberships[::2] = (memberships[::2] > 0.6).double()
+    memberships[memberships.sum(dim=1) == 0, 0] = 1
+    return {
+        "memberships": normalize(memberships, p=1, dim=1),
+        "coordinates": normal(5) * 0.5,
+        "points": normal(3) * 0.4,
+        "directions": normalize(normal(3), dim=1),
+        "heights": normal(1)[:, 0],
+    }
+
+
+def differences(heights: Tensor, centres: Tensor) -> PairValues:
+    """Of a height, as an axis of one's own would count it."""
+
+    def between(rows: Sequence[Tensor], columns: Sequence[Tensor]) -> Tensor:
+        return (rows[0][:, None, :, None] - columns[0][:, None, None, :]).abs()
+
+    return PairValues((heights,), (centres,), between)
+
+
+def centres(values: Sequence[float], like: Tensor) -> Tensor:
+    return torch.tensor(values, dtype=torch.promote_types(like.dtype, torch.float32), device=like.device)
+
+
+# Layouts of axes, each with what is counted and what a loop counts.
+KINDS: dict[str, tuple[Callable[..., PairValues], Callable[..., list[Axis]]]] = {
+    "equal": (
+        lambda s: euclidean_distances(s["coordinates"], centres(EQUAL, s["points"])),
+        lambda s: [(distances(s["coordinates"]), EQUAL)],
+    ),
+    "few": (
+        lambda s: euclidean_distances(s["points"], centres(FEW, s["points"])),
+        lambda s: [(distances(s["points"]), FEW)],
+    ),
+    "many": (
+        lambda s: euclidean_distances(s["coordinates"], centres(MANY, s["points"])),
+        lambda s: [(distances(s["coordinates"]), MANY)],
+    ),
+    "own": (
+        lambda s: differences(s["heights"], centres(FEW, s["points"])),
+        lambda s: [(np.abs(np.subtract.outer(s["heights"].numpy(), s["heights"].numpy())), FEW)],
+    ),
+    "cosines": (
+        lambda s: oriented_pairs(
+            s["points"], s["directions"], centres(TOWARDS, s["points"]), centres(AMONG, s["points"])
+        ),
+        lambda s: list(zip(cosines(s["points"], s["directions"]), (TOWARDS, TOWARDS, AMONG), strict=True)),
+    ),
+    "cosines of five": (
+        lambda s: oriented_pairs(
+            s["coordinates"], normalize(s["coordinates"].roll(1, 0), dim=1), *[centres(AMONG, s["points"])] * 2
+        ),
+        lambda s: [(v, AMONG) for v in cosines(s["coordinates"], normalize(s["coordinates"].roll(1, 0), dim=1))],
+    ),
+}
+LAYOUTS = [
+    ["equal"], ["many"], ["own"], ["few", "many"], ["equal", "own"], ["few", "equal", "many"], ["cosines"],
+    ["few", "cosines"], ["cosines", "equal"], ["own", "cosines", "many"], ["cosines", "cosines of five"],
+]  # fmt: skip
+
+
+def counted(layout: Sequence[str], given: dict[str, Tensor]) -> Tensor:
+    return joint_histogram(given["memberships"], [KINDS[kind][0](given) for kind in layout])
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=" × ".join)
+@pytest.mark.parametrize(("n_classes", "block"), [(1, None), (3, None), (3, (1, 4)), (3, (5, 6))])
+def test_histogram_is_the_sum_of_hats_over_all_pairs(
+    device: str, layout: list[str], n_classes: int, block: tuple[int, int] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = some(n_classes=n_classes)
+    if block is not None:
+        n_rows, n_columns = block
+        n_values = max(1, sum("cosines" not in kind for kind in layout))
+        monkeypatch.setattr(pair_module, "_MOST_COLUMNS", n_columns)
+        monkeypatch.setattr(pair_module, "_BLOCK", n_rows * n_columns * n_values)
+        monkeypatch.setattr(pair_module, "_DEVICE_BLOCK", n_rows * len(given["points"]))
+    result = counted(layout, {name: value.to(device) for name, value in given.items()}).cpu()
+    axes = [axis for kind in layout for axis in KINDS[kind][1](given)]
+    np.testing.assert_allclose(result, pair_histogram_by_loops(given["memberships"], axes), atol=1e-12)
+    assert float(result.sum()) == pytest.approx(1, abs=1e-12)
+    single = counted(layout, {name: value.float().to(device) for name, value in given.items()})
+    assert single.dtype == torch.float32
+    np.testing.assert_allclose(single.cpu(), result, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [[0.5, 0.5 + 1e-9, 0.5 + 2e-9, 0.9, 0.9001, 1.1], [1e-3, 1e4], [-1.0, 0.7, 0.8], [-2.0, -1.0], [0.001, 0.002]],
+)
+def test_any_spacing_of_centres_is_exact(device: str, layout: list[float]) -> None:
+    given = some(40)
+    pairs = [euclidean_distances(given["coordinates"].to(device), centres(layout, given["points"]).to(device))]
+    result = joint_histogram(given["memberships"].to(device), pairs)
+    expected = pair_histogram_by_loops(given["memberships"], [(distances(given["coordinates"]), layout)])
+    np.testing.assert_allclose(result.cpu(), expected, atol=1e-12)
+
+
+def test_distance_on_a_centre_is_exact(device: str) -> None:
+    line = torch.arange(9, dtype=torch.float64, device=device)[:, None]
+    result = joint_histogram(torch.ones_like(line), [euclidean_distances(line, centres([1, 3, 4, 7], line))])
+    n = {d: 9 - d for d in range(1, 9)}
+    expected = [n[1] + n[2] / 2, n[2] / 2 + n[3]]
+    expected += [n[4] + n[5] * 2 / 3 + n[6] / 3, n[5] / 3 + n[6] * 2 / 3 + n[7] + n[8]]
+    np.testing.assert_allclose(result[0].cpu() * 36, expected, atol=1e-12)
+
+
+def test_narrow_ramps_tend_to_a_plain_histogram(device: str) -> None:
+    """Centres in close pairs around the edges: the bins between hold what falls between the edges."""
+    coordinates = some(60)["coordinates"].to(device)
+    edges = torch.tensor([0.5, 1.0, 1.7, 2.0], dtype=torch.float64)
+    layout = torch.stack([edges - 1e-9, edges + 1e-9], dim=1).flatten().to(device)
+    result = joint_histogram(coordinates.new_ones(60, 1), [euclidean_distances(coordinates, layout)])[0].cpu()
+    counts = np.histogram(torch.pdist(coordinates).cpu(), [0, *edges.tolist(), np.inf])[0] / (60 * 59 / 2)
+    # Within an interval between close pairs, the count is shared by its two ends.
+    merged = [result[0], *result[1:-1].view(-1, 2).sum(dim=1), result[-1]]
+    np.testing.assert_allclose(torch.stack(merged), counts, atol=1e-12)
+
+
+def test_single_precision_is_summed_in_double(device: str) -> None:
+    """Half a million pairs whose weights are not whole: in single precision the sum would be off by some 10⁻⁴."""
+    given = {name: value.to(device) for name, value in some(1000).items()}
+    result = counted(["many"], {name: value.float() for name, value in given.items()})
+    assert float(result.sum()) == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(result.cpu(), counted(["many"], given).cpu(), atol=1e-7)
+
+
+@pytest.mark.parametrize("layout", [EQUAL, MANY])
+def test_whole_pairs_of_single_precision_are_as_those_of_double(layout: list[float]) -> None:
+    """Points in one class each are counted in integers, several classes, and many alike side by side."""
+    generator = torch.Generator().manual_seed(6)
+    points = torch.randn(2300, 3, generator=generator).sort(dim=0).values * 0.4
+    memberships = one_hot(torch.randint(3, (2300,), generator=generator), 3).double()
+    result, expected = (
+        joint_histogram(memberships.to(dtype), [euclidean_distances(points.to(dtype), torch.tensor(layout).to(dtype))])
+        for dtype in (torch.float32, torch.float64)
+    )
+    np.testing.assert_allclose(result, expected, atol=1e-7)
+
+
+@pytest.mark.parametrize(("spread", "bin_of_all"), [(0.0, 0), (1e4, 4)])
+def test_a_block_of_pairs_that_all_fall_into_one_bin(spread: float, bin_of_all: int) -> None:
+    """As many as are ever counted at once in one integer, with the largest share and with none."""
+    points = torch.arange(1.0, 2401.0)[:, None] * spread
+    expected = one_hot(torch.tensor([bin_of_all]), 5).float()
+    assert torch.equal(
+        joint_histogram(torch.ones(2400, 1), [euclidean_distances(points, torch.tensor(EQUAL))]), expected
+    )
+
+
+def test_features_are_those_of_a_loop() -> None:
+    given = some(12)
+    i, j = np.triu_indices(12, 1)
+    expected = cosines(given["points"], given["directions"])
+    for feature, one in zip(point_pair_features(given["points"], given["directions"]), expected, strict=True):
+        np.testing.assert_allclose(feature, one[i, j], atol=1e-12)
+
+
+def test_features_of_a_sphere_follow_from_the_distance() -> None:
+    """On a sphere of radius R with outward normals, n·u = −d/2R at either end and nᵢ·nⱼ = 1 − d²/2R²."""
+    normals = some(30)["directions"]
+    points = 2.5 * normals + torch.tensor([3.0, -1.0, 7.0])
+    first, second, between = point_pair_features(points, normals)
+    distance = torch.nn.functional.pdist(points)
+    for towards in (first, second):
+        torch.testing.assert_close(towards, -distance / 5, atol=1e-9, rtol=0)
+    torch.testing.assert_close(between, 1 - distance**2 / 12.5, atol=1e-9, rtol=0)
+
+
+def test_points_that_coincide_have_no_line(device: str) -> None:
+    directions = some(2)["directions"].float().to(device)
+    points = torch.rand(1, 3, device=device).expand(2, -1)
+    first, second, _ = point_pair_features(points, directions)
+    assert first == second == 0
+    angles = torch.tensor([-1.0, 0.0, 1.0], device=device)
+    result = joint_histogram(points.new_ones(2, 1), [oriented_pairs(points, directions, angles, angles)])
+    assert float(result[0, 1, 1].sum()) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("layout", [["cosines"], ["few", "cosines"]])
+def test_turning_moving_and_reordering_change_nothing(device: str, layout: list[str]) -> None:
+    given = some(40)
+    turn = torch.linalg.qr(some(3, seed=5)["points"]).Q
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(2))
+    moved = {name: value[order] for name, value in given.items()}
+    moved |= {"points": moved["points"] @ turn + 4, "directions": moved["directions"] @ turn}
+    expected, found, inwards = (
+        counted(layout, {name: value.to(device) for name, value in one.items()})
+        for one in (given, moved, {**given, "directions": -given["directions"]})
+    )
+    torch.testing.assert_close(found, expected, atol=1e-9, rtol=0)
+    assert (inwards - expected).abs().sum() > 0.1
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_no_cell_is_negative(device: str, joint: bool) -> None:
+    """Isolated pairs just below a centre: what rounding leaves in the cell before it would have no other to hide in."""
+    generator = torch.Generator().manual_seed(0)
+    layout = ((torch.arange(12) + 0.5) / 3).to(device)
+    below = torch.nextafter(layout[1:].cpu(), torch.zeros(())).repeat(20)
+    length = torch.cat([below, below * (1 - 6e-8 * torch.rand(len(below), generator=generator))])
+    ends = torch.zeros(len(length), 2, 3)
+    ends[:, 1] = length[:, None] * normalize(torch.randn(len(length), 3, generator=generator), dim=1)
+    soft = torch.rand(len(length), 2, 1, generator=generator)
+    axes = [ends, ends.roll(1, dims=2)] if joint else [ends]
+    result = joint_histogram(
+        torch.cat([soft, 1 - soft], dim=2).to(device), [euclidean_distances(one.to(device), layout) for one in axes]
+    )
+    assert result.min() >= 0
+    torch.testing.assert_close(result.flatten(1).sum(dim=1), torch.ones(len(length), device=device), atol=1e-6, rtol=0)
+
+
+def test_no_cell_of_cosines_is_negative(device: str) -> None:
+    """χ² refuses a histogram with a cell of −1e−18; a pair close below several centres leaves next to nothing there."""
+    below = torch.logspace(-6, -3, 40)[:, None]
+    angle = torch.linspace(0.1, 3.0, 20).expand(40, -1)
+    both = torch.stack([angle, angle + torch.acos(0.4 - below)], dim=2).flatten(0, 1)
+    directions = torch.stack([both.cos(), both.sin(), torch.zeros_like(both)], dim=2)
+    points = torch.zeros(800, 2, 3)
+    points[:, 1, 0] = (0.75 - below).expand(-1, 20).flatten()
+    angles, bins = (torch.arange(5) * 0.4 - 0.8).to(device), (torch.arange(6) * 0.5 + 0.25).to(device)
+    pairs = [
+        euclidean_distances(points.to(device), bins),
+        oriented_pairs(points.to(device), directions.to(device), angles, angles),
+    ]
+    assert joint_histogram(torch.ones(800, 2, 1, device=device), pairs).min() >= 0
+
+
+def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """700 points, several blocks for each share, and the gradient."""
+    monkeypatch.setattr(threads, "n_cores", lambda: 8)
+    given = {name: value.requires_grad_() for name, value in some(700).items()}
+    upstream, results = None, []
+    for n_threads in (1, 2, 5):
+        with torch_threads(n_threads):
+            histogram = counted(["many", "cosines"], given)
+            if upstream is None:
+                upstream = torch.randn(histogram.shape, generator=torch.Generator().manual_seed(4)).double()
+            leaves = [given[name] for name in ("memberships", "coordinates", "points", "directions")]
+            results.append([histogram.detach(), *torch.autograd.grad(histogram, leaves, upstream)])
+            with ThreadPoolExecutor(1) as pool:  # a new thread inherits what the workers must not have changed
+                assert pool.submit(torch.get_num_threads).result() == torch.get_num_threads() == n_threads
+    for other in results[1:]:
+        assert all(torch.equal(one, same) for one, same in zip(results[0], other, strict=True))
+
+
+def dense(memberships: Tensor, values: Sequence[Tensor], layouts: Sequence[Tensor]) -> Tensor:
+    """The definition over all pairs at once, (pairs,) values of each axis, for its gradients."""
+    i, j = torch.triu_indices(len(memberships), len(memberships), 1, device=memberships.device)
+    shares = None
+    for value, layout in zip(values, layouts, strict=True):
+        passed = ((value[:, None] - layout[:-1]) / layout.diff()).clamp(0, 1)
+        ones = torch.ones_like(passed[:, :1])
+        share = torch.cat([ones, passed], dim=1) - torch.cat([passed, 0 * ones], dim=1)
+        share = share.view(len(i), *[1] * (0 if shares is None else shares.ndim - 1), -1)
+        shares = share if shares is None else shares.unsqueeze(-1) * share
+    rows = []
+    for a, b in class_pairs(memberships.shape[1]):
+        weight = memberships[i, a] * memberships[j, b] + (memberships[i, b] * memberships[j, a] if a != b else 0)
+        rows.append(torch.tensordot(weight, shares, dims=1))
+    return torch.stack(rows) / len(i)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=" × ".join)
+@pytest.mark.parametrize("block", [None, (7, 11)])
+def test_gradients_equal_those_of_the_dense_definition(
+    device: str, layout: list[str], block: tuple[int, int] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also by memberships that are zero, whose gradient is not."""
+    if block is not None:
+        monkeypatch.setattr(pair_module, "_MOST_COLUMNS", block[1])
+        monkeypatch.setattr(pair_module, "_BLOCK", math.prod(block))
+        monkeypatch.setattr(pair_module, "_DEVICE_BLOCK", block[0] * 29)
+    given = {name: value.to(device).requires_grad_() for name, value in some(29).items()}
+    pairs = [KINDS[kind][0](given) for kind in layout]
+    leaves, i, j = [given["memberships"]], *torch.triu_indices(29, 29, 1, device=device)
+    values: list[Tensor] = []
+    for kind, one in zip(layout, pairs, strict=True):
+        leaves += [x for x in one.inputs if x.is_leaf] + [c.requires_grad_() for c in one.centres]
+        if "cosines" in kind:
+            points, directions = one.inputs
+            line = normalize(points[j] - points[i], dim=1)
+            ends = [(directions[i] * line).sum(dim=1), -(directions[j] * line).sum(dim=1)]
+            values += [torch.maximum(*ends), torch.minimum(*ends), (directions[i] * directions[j]).sum(dim=1)]
+        elif kind == "own":
+            values.append((one.inputs[0][i] - one.inputs[0][j]).abs())
+        else:
+            values.append((one.inputs[0][i] - one.inputs[0][j]).norm(dim=1))
+    leaves = list({id(leaf): leaf for leaf in leaves}.values())
+    expected = dense(given["memberships"], values, [c for one in pairs for c in one.centres])
+    result = joint_histogram(given["memberships"], pairs)
+    upstream = torch.randn(result.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64).to(device)
+    for by_hand, by_torch in zip(
+        torch.autograd.grad(result, leaves, upstream, retain_graph=True),
+        torch.autograd.grad(expected, leaves, upstream),
+        strict=True,
+    ):
+        assert (by_torch.abs() > 1e-9).any()
+        torch.testing.assert_close(by_hand, by_torch, rtol=1e-9, atol=1e-13)
+
+
+@pytest.mark.parametrize("layout", [["many"], ["few", "own"], ["few", "cosines"]])
+def test_gradcheck(device: str, layout: list[str]) -> None:
+    given = some(7, n_classes=2, seed=1)
+    names = ["memberships", *dict.fromkeys({"many": "coordinates", "own": "heights"}.get(k, "points") for k in layout)]
+    leaves = [given[name].to(device).requires_grad_() for name in names]
+
+    def histogram(logits: Tensor, *others: Tensor) -> Tensor:
+        moved = dict(zip(names, (logits.softmax(dim=1), *others), strict=True))
+        return counted(layout, {**{name: value.to(device) for name, value in given.items()}, **moved})
+
+    for gradient in torch.autograd.grad(histogram(*leaves).square().sum(), leaves):
+        assert (gradient.abs() > 1e-9).any()
+    assert torch.autograd.gradcheck(histogram, leaves)
+
+
+def test_coincident_points_have_finite_gradients(device: str) -> None:
+    embedding = torch.zeros(6, 3, dtype=torch.float64, device=device)
+    embedding[3:] = 0.5
+    embedding.requires_grad_()
+    layout = centres([-0.1, 0.3, 1.0], embedding)  # a slope at distance 0
+    result = joint_histogram(embedding.new_ones(6, 1), [euclidean_distances(embedding, layout)])
+    near, far = (torch.autograd.grad(result[0, k], embedding, retain_graph=True)[0] for k in (0, 2))
+    assert torch.isfinite(near).all()
+    # 9 of the 15 pairs are at √0.75; pulling one point away along the diagonal stretches 3 of them by 1/√3 each axis.
+    np.testing.assert_allclose(far[3:].cpu(), 3 / 15 / 0.7 / math.sqrt(3), rtol=1e-9)
+
+
+@pytest.mark.parametrize("layout", [["many"], ["few", "cosines"]])
+def test_half_precision_is_counted_in_single(device: str, layout: list[str]) -> None:
+    halves = {name: value.bfloat16().to(device) for name, value in some(30).items()}
+    single = {name: value.float() for name, value in halves.items()}
+    for one in (halves, single):
+        one["memberships"] = torch.ones(30, 1, device=device)
+    with torch.autocast(device, torch.bfloat16):
+        results = counted(layout, halves), counted(layout, single)
+    for result in results:
+        assert result.dtype == torch.float32
+        torch.testing.assert_close(result, counted(layout, single), rtol=0, atol=1e-6)
+
+
+@pytest.fixture
+def good() -> dict[str, Tensor]:
+    return {name: value.float() for name, value in some(5, n_classes=2).items()}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({name: value[:1] for name, value in some(5, 2).items()}, "two points to form a pair, got 1"),
+        ({"points": torch.zeros(4, 3)}, r"expected one of each of the 5 points, got shape \(4, 3\)"),
+        ({"points": torch.full((5, 3), torch.nan)}, "expected finite values, got NaN or infinity"),
+        ({"coordinates": torch.full((5, 3), torch.inf)}, "expected finite values, got NaN or infinity"),
+        ({"points": torch.tensor([[-1e19], [1e19]] * 2 + [[0.0]])}, "expected distances that can be squared"),
+        ({"memberships": torch.full((5, 2), 0.4)}, "memberships: expected non-negative rows of sum 1"),
+        ({"memberships": torch.tensor([[1.5, -0.5]] * 5)}, "non-negative"),
+        ({"memberships": torch.full((5, 2), torch.nan)}, "sum 1"),
+    ],
+)
+@pytest.mark.parametrize("layout", [["few", "many"], ["many", "few"]])
+def test_bad_points_are_refused(
+    good: dict[str, Tensor], change: dict[str, Tensor], message: str, layout: list[str]
+) -> None:
+    counted(layout, good)
+    with pytest.raises(ValueError, match=message):
+        counted(layout, {**good, **change})
+
+
+@pytest.mark.parametrize("layout", [[0.5, 0.5, 1.0], [0.5, torch.inf], [torch.nan, 1.0], [1.0], []])
+def test_bad_centres_are_refused(layout: list[float]) -> None:
+    points, bins = torch.rand(5, 3), torch.tensor(layout)
+    for pairs in ([euclidean_distances(points, bins)], [oriented_pairs(points, points, bins, torch.rand(2).sort()[0])]):
+        with pytest.raises(ValueError, match="centres: expected at least two finite values in ascending order"):
+            joint_histogram(torch.ones(5, 1), pairs)
+
+
+def test_directions_are_of_the_shape_of_the_points() -> None:
+    points, layout = torch.rand(10, 3), torch.tensor([0.0, 1.0])
+    with pytest.raises(ValueError, match=r"directions: expected the shape of the points, \(10, 3\), got \(10, 2\)"):
+        oriented_pairs(points, points[:, :2], layout, layout)
+    for inputs in ((points * torch.inf, points), (points, points * torch.inf)):
+        with pytest.raises(ValueError, match="expected finite values"):
+            joint_histogram(torch.ones(10, 1), [oriented_pairs(*inputs, layout, layout)])
+
+
+def test_far_points_are_counted_as_long_as_their_distances_can_be_squared() -> None:
+    far = torch.tensor([[-1e18, 0.0], [1e18, 0.0]])
+    result = joint_histogram(torch.ones(2, 1), [euclidean_distances(far, torch.tensor([0.5, 1.0]))])
+    assert result.tolist() == [[0, 1]]
