@@ -374,8 +374,9 @@ def _centred(points: Tensor) -> Tensor:
     mean = points.mean(dim=0)
     if not bool(mean[-1:].all()):
         used = (points != 0).any(dim=0).nonzero().flatten()
-        points = points[:, : int(used[-1]) + 1 if len(used) else 0]
-    return points - mean[: points.shape[1]]
+        points = points[:, : int(used[-1]) + 1 if len(used) else 0].contiguous()
+        mean = points.mean(dim=0)
+    return points - mean
 
 
 def _pull(by_squares: Tensor, points: Tensor, rows: slice, columns: slice, into: Tensor) -> None:
