@@ -46,7 +46,7 @@ class SignatureConfig:
     """
 
     # Raise it whenever the same mesh and parameters would give another Signature: it is part of every cache key.
-    ALGORITHM_VERSION: ClassVar[int] = 4
+    ALGORITHM_VERSION: ClassVar[int] = 5
 
     DEFAULT_EIGENPAIRS: ClassVar[int] = 250
     # What the library's descriptors ask for: known to be in caches.
