@@ -12,7 +12,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from igps.data.batch import SignatureBatch, collate
+from igps.data.batch import SignatureBatch
+from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.requirements import register_descriptors
 from igps.descriptors import descriptor

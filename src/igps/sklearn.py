@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.utils.validation import check_is_fitted
 
-from igps.data.batch import collate
+from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
@@ -96,13 +96,13 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
 
     def _features(self, shapes: list[Any]) -> NDArray[np.float32]:
         chosen = descriptor_of(self.descriptor)
-        config = chosen.requirements.apply_to(self.config or SignatureConfig())
         if isinstance(shapes[0], Mesh):
+            config = chosen.requirements.apply_to(self.config or SignatureConfig())
             with torch.inference_mode():
                 parts = [chosen(collate([compute_signature(mesh, config)], [mesh])) for mesh in shapes]
             features = torch.cat(parts)
         else:
-            dataset = SignatureDataset(shapes, config, self.cache_dir, reading=self.reading)
+            dataset = SignatureDataset(shapes, self.config, self.cache_dir, descriptor=chosen, reading=self.reading)
             dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
             tag = cache_tag(self.descriptor, chosen)
             features = describe(dataset, chosen, cache_tag=tag, n_workers=self.n_workers)

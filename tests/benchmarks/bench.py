@@ -531,11 +531,10 @@ def work(data: Path | None) -> None:
     """What a `worker` does."""
     mesh = model(data, 3_600)
     descriptor = igps.descriptor("rich")
-    config = descriptor.requirements.apply_to(igps.SignatureConfig())
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "body.off"
         trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
-        dataset = igps.SignatureDataset([path], config, folder)
+        dataset = igps.SignatureDataset([path], descriptor=descriptor, cache_dir=folder)
         step = training_step(igps.collate([dataset[0]] * 4))
         tasks: dict[str, Callable[[], object]] = {
             "signature": lambda: igps.compute_signature(mesh),

@@ -8,7 +8,8 @@ import torch
 import trimesh
 from torch.utils.data import DataLoader, Dataset
 
-from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch, collate
+from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch
+from igps.data.collation import collate
 from igps.mesh.mesh import Mesh
 from igps.nn.histograms.pairs import PairHistogram
 from igps.signature.signature import Samples, Signature, SignatureConfig

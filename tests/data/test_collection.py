@@ -14,7 +14,7 @@ from bodies_on_disk import write_body
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
-from igps.data.batch import collate
+from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.requirements import Requirements
 from igps.mesh.mesh import MeshError

@@ -9,6 +9,7 @@ import torch
 import trimesh
 from bodies_on_disk import write_body
 
+from igps.data.batch import SignatureBatch
 from igps.data.datamodule import SignatureDataModule
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
@@ -62,6 +63,23 @@ def test_training_shapes_are_kept_in_memory_thinned(root: Path, tmp_path: Path, 
         assert len(list(module.train_dataloader())) == 1  # without the cache
         shutil.rmtree(root)
         assert len(list(module.train_dataloader())) == 1
+
+
+def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(root: Path, tmp_path: Path) -> None:
+    def module(**options: int) -> SignatureDataModule:
+        return SignatureDataModule(
+            root, n_train=2, n_validation=0, config=CONFIG, cache_dir=tmp_path / "cache", n_workers=1, **options
+        )
+
+    one, other = module(), module(n_loading_workers=2, evaluation_batch_size=4)
+    one.prepare_data()
+    other.prepare_data()
+    (whole,), parts = list(one.test_dataloader()), list(other.test_dataloader())
+    assert [len(part) for part in parts] == [4, 2]
+    assert sum((part.ids for part in parts), ()) == whole.ids
+    assert torch.equal(SignatureBatch.concatenate(parts).interior.points, whole.interior.points)
+    with pytest.raises(ValueError, match="evaluation_batch_size: expected at least 1, got 0"):
+        module(evaluation_batch_size=0)
 
 
 def test_a_single_sample_in_memory_is_refused(root: Path) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.data.batch import Body, collate
+from igps.data.batch import Body
+from igps.data.collation import collate
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature
 

@@ -15,7 +15,8 @@ import trimesh
 from numpy.typing import NDArray
 
 import igps
-from igps.data.batch import Body, SignatureBatch, collate
+from igps.data.batch import Body, SignatureBatch
+from igps.data.collation import collate
 from igps.data.requirements import Requirements
 from igps.descriptors import NAMES, descriptor
 from igps.mesh.mesh import Mesh

@@ -10,7 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from igps.data.batch import collate
+from igps.data.collation import collate
 from igps.descriptors import NAMES, descriptor
 from igps.descriptors.molecular import MOLECULAR_ATTRIBUTES, Shares, molecular
 from igps.mesh.formats.molecules import Molecule

@@ -13,7 +13,8 @@ from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_metric_learning.losses import TripletMarginLoss
 from torch.utils.data import DataLoader
 
-from igps.data.batch import LabelledSignature, SignatureBatch, collate
+from igps.data.batch import LabelledSignature, SignatureBatch
+from igps.data.collation import collate
 from igps.data.datamodule import SignatureDataModule
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.description import describe

@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from conftest import as_mesh
-from igps.data.batch import SampleBatch, collate
+from igps.data.batch import SampleBatch
+from igps.data.collation import collate
 from igps.mesh.mesh import Mesh
 from igps.nn.axes import EuclideanDistance, InteriorDistance, Potential
 from igps.nn.histograms.pairs import PairHistogram

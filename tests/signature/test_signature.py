@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from conftest import as_mesh
-from igps.data.batch import collate
+from igps.data.collation import collate
 from igps.mesh.mesh import Mesh, MeshError
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding

@@ -12,7 +12,7 @@ from training.studies.disturbances import DISTURBANCES
 from training.studies.robustness import POSE, Robustness, robustness
 
 from conftest import horseshoe
-from igps.data.batch import collate
+from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies, find_bodies
 from igps.descriptors import descriptor

@@ -47,8 +47,7 @@ def described(root: Path, name: str) -> tuple[Tensor, Tensor, tuple[int, ...]]:
     """Flat histograms, classes, and the cells of the parts, by the library, from the cache that the scripts filled."""
     module = igps.descriptor(name)
     assert isinstance(module, igps.HistogramDescriptor)
-    config = module.requirements.apply_to(igps.SignatureConfig())
-    dataset = igps.SignatureDataset(root / "meshes", config, root / "cache")
+    dataset = igps.SignatureDataset(root / "meshes", descriptor=module, cache_dir=root / "cache")
     return igps.describe(dataset, module).flatten(1), dataset.labels, module.part_cells
 
 
@@ -106,8 +105,7 @@ def test_a_metric_is_the_prior_of_the_heads(root: Path) -> None:
     )  # fmt: skip
     module = igps.descriptor("pretrained")
     assert isinstance(module, EmbeddedDescriptor)
-    config = module.requirements.apply_to(igps.SignatureConfig())
-    dataset = igps.SignatureDataset(root / "meshes", config, root / "cache")
+    dataset = igps.SignatureDataset(root / "meshes", descriptor=module, cache_dir=root / "cache")
     vectors, histograms = igps.describe(dataset, module), igps.describe(dataset, module.descriptor).flatten(1)
     split = split_unseen(dataset.labels, 2, seed=100)
     train, test = torch.tensor(split.train), torch.tensor(split.test)
@@ -194,8 +192,7 @@ def test_ablation_prints_every_head_of_every_layout(root: Path) -> None:
         [Potential(4, soft=True), InteriorDistance(64)], igps.SpectralEmbedding(n_eigenpairs=50), n_samples=1000
     )
     module = igps.HistogramDescriptor(histogram)
-    config = igps.descriptor("rich").requirements.apply_to(igps.SignatureConfig())
-    dataset = igps.SignatureDataset(root / "meshes", config, root / "cache")
+    dataset = igps.SignatureDataset(root / "meshes", descriptor="rich", cache_dir=root / "cache")
     split = split_seen(dataset.labels, 3, seed=100)
     scores = expected(igps.describe(dataset, module).flatten(1), dataset.labels, split, module.part_cells)
     wanted = [scores[head]["ft"] for head in ("none", "whitened", "kernel")]
@@ -210,9 +207,7 @@ def test_pretraining_saves_a_metric_and_measures_it(root: Path, tmp_path: Path) 
         "--out", tmp_path / "metric.safetensors", "--figures", tmp_path / "figures",
     )  # fmt: skip
     vectors = igps.describe(
-        igps.SignatureDataset(
-            root / "meshes", pretrained().requirements.apply_to(igps.SignatureConfig()), root / "cache"
-        ),
+        igps.SignatureDataset(root / "meshes", cache_dir=root / "cache", descriptor=pretrained()),
         pretrained(tmp_path / "metric.safetensors"),
     )
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-4, rtol=0)

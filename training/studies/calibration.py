@@ -144,7 +144,7 @@ def _generated(
         GradedShapes(n_classes, 4, 4, seed).write(root, progress=True, n_workers=n_workers)
     except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
         print(error)
-    shapes = igps.SignatureDataset(root, descriptor.requirements.apply_to(igps.SignatureConfig()), cache_dir)
+    shapes = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=descriptor)
     return shapes.usable(shapes.precompute(n_workers=n_workers))
 
 

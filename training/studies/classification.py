@@ -44,7 +44,7 @@ def classify(
     prior: Head | None = None
     if checkpoint is None:
         module, prior = histograms_and_prior(descriptor)
-        dataset = igps.SignatureDataset(root, module.requirements.apply_to(igps.SignatureConfig()), cache_dir)
+        dataset = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=module)
         dataset.precompute(strict=True)
         histograms, part_cells = describe(dataset, module, progress=True), module.part_cells
         seeds = range(first_seed, first_seed + n_splits)

@@ -52,7 +52,7 @@ def splits(
         out: a JSON file to which the rows are added.
     """
     module, prior = histograms_and_prior(descriptor)
-    dataset = igps.SignatureDataset(root, module.requirements.apply_to(igps.SignatureConfig()), cache_dir)
+    dataset = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=module)
     dataset.precompute(strict=True)
     histograms, labels = describe(dataset, module, progress=True).flatten(1), dataset.labels
     print(f"{descriptor}, {protocol}, n_train={n_train}, {n_splits} splits from seed {first_seed}, percent")

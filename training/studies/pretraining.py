@@ -12,7 +12,6 @@ from torch import Tensor
 
 import igps
 from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained_parts, save_pretrained, two_levels
-from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
@@ -126,8 +125,7 @@ def _usable(
     root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None, some: list[int] | None = None
 ) -> igps.SignatureDataset:
     """The dataset of the meshes, or some of them, whose signatures could be computed; those that could not are told."""
-    config = descriptor.requirements.apply_to(igps.SignatureConfig())
-    data = igps.SignatureDataset(root, config, cache_dir, reading=LoadOptions())
+    data = igps.SignatureDataset(root, descriptor=descriptor, cache_dir=cache_dir)
     if some is not None:
         data = data.subset(some)
     failures = data.precompute(n_workers=n_workers)

@@ -110,9 +110,8 @@ def chosen_dataset(
     if paper and signature != SignatureConfig():
         raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
     config = SignatureConfig.paper() if paper else signature
-    if needs is not None:
-        config = needs.apply_to(config)
-    return SignatureDataset(source, config, cache_dir, reading=LoadOptions(mend, component, allow_open))
+    reading = LoadOptions(mend, component, allow_open)
+    return SignatureDataset(source, config, cache_dir, descriptor=needs, reading=reading)
 
 
 def mending_summary(dataset: SignatureDataset, n_given: int) -> str:

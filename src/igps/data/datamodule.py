@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from pytorch_lightning import LightningDataModule
 from pytorch_lightning.core.mixins.hparams_mixin import _given_hyperparameters
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Sampler
 
-from igps.data.batch import LabelledSignature, SignatureBatch, collate
+from igps.data.batch import LabelledSignature, SignatureBatch
+from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import labelled_bodies
 from igps.data.splits import SplitProtocol, split_seen, split_unseen
+from igps.data.transforms import FewerSamples
 from igps.mesh.options import LoadOptions
-from igps.signature.signature import Samples, SignatureConfig
+from igps.signature.signature import SignatureConfig
 
 
 def has_configuration() -> bool:
@@ -59,6 +59,8 @@ class SignatureDataModule(LightningDataModule):
         reading: how mesh files are read.
         cache_dir: of the signatures; the user's cache directory if None.
         n_workers: processes that compute missing signatures; all cores if None.
+        n_loading_workers: processes that read signatures for the batches; none if 0.
+        evaluation_batch_size: shapes in a batch of validation and test.
     """
 
     def __init__(
@@ -76,6 +78,8 @@ class SignatureDataModule(LightningDataModule):
         reading: LoadOptions | None = None,
         cache_dir: Path | None = None,
         n_workers: int | None = None,
+        n_loading_workers: int = 0,
+        evaluation_batch_size: int = 16,
     ) -> None:
         super().__init__()
         if protocol not in ("seen", "unseen"):
@@ -84,14 +88,18 @@ class SignatureDataModule(LightningDataModule):
             raise ValueError("n_test: expected None with protocol 'seen', which tests all shapes not trained on.")
         if n_samples_in_memory is not None and n_samples_in_memory < 2:
             raise ValueError(f"n_samples_in_memory: expected None or at least 2, got {n_samples_in_memory}.")
+        if evaluation_batch_size < 1:
+            raise ValueError(f"evaluation_batch_size: expected at least 1, got {evaluation_batch_size}.")
         if has_configuration():
             self.save_hyperparameters()
         self.dataset = SignatureDataset(labelled_bodies(root), config, cache_dir, reading=reading)
         self.classes_per_batch = classes_per_batch
         self.shapes_per_class = shapes_per_class
         self.n_samples_in_memory = n_samples_in_memory
-        self._in_memory: list[LabelledSignature] = []
+        self._in_memory: SignatureDataset | None = None
         self.n_workers = n_workers
+        self.n_loading_workers = n_loading_workers
+        self.evaluation_batch_size = evaluation_batch_size
         labels = self.dataset.labels
         if protocol == "seen":
             self.split = split_seen(labels, n_train, n_validation=n_validation, seed=split_seed)
@@ -119,11 +127,11 @@ class SignatureDataModule(LightningDataModule):
             length_before_new_iter=max(len(part), n_batch * n_processes),
         )
         if self.n_samples_in_memory is None:
-            return DataLoader(part, batch_size=n_batch, sampler=sampler, collate_fn=collate)
-        if not self._in_memory:
-            self._in_memory = [_thinned(part[i], self.n_samples_in_memory) for i in range(len(part))]
-        # A list is a map-style dataset to a DataLoader.
-        return DataLoader(self._in_memory, batch_size=n_batch, sampler=sampler, collate_fn=collate)  # type: ignore[arg-type]
+            return self._loader(part, n_batch, sampler, self.n_loading_workers)
+        if self._in_memory is None:
+            n = self.n_samples_in_memory
+            self._in_memory = part.to_memory(FewerSamples(n_interior=n, n_surface=n, seed=0))
+        return self._loader(self._in_memory, n_batch, sampler, 0)  # there is nothing to read
 
     def val_dataloader(self) -> DataLoader[LabelledSignature] | list[DataLoader[LabelledSignature]]:
         """The validation part in order; nothing if it is empty."""
@@ -137,20 +145,20 @@ class SignatureDataModule(LightningDataModule):
         self, batch: SignatureBatch, device: torch.device, dataloader_index: int
     ) -> SignatureBatch:
         """Lightning moves tensors and their containers, not batches of ours."""
-        return batch.to(device)
+        return batch.to(device, non_blocking=True)
 
     def _in_order(self, indices: Sequence[int]) -> DataLoader[LabelledSignature]:
-        return DataLoader(self.dataset.subset(indices), batch_size=16, collate_fn=collate)
+        return self._loader(self.dataset.subset(indices), self.evaluation_batch_size, None, self.n_loading_workers)
 
-
-def _thinned(item: LabelledSignature, n_samples: int) -> LabelledSignature:
-    generator = np.random.default_rng(0)
-
-    def subset(samples: Samples) -> Samples:
-        chosen = np.sort(generator.permutation(len(samples))[:n_samples])
-        attributes = {name: values[chosen] for name, values in samples.attributes.items()}
-        return Samples(samples.points[chosen], samples.eigenfunctions[chosen], attributes)
-
-    signature = item.signature
-    thinned = replace(signature, interior=subset(signature.interior), surface=subset(signature.surface))
-    return replace(item, signature=thinned)
+    def _loader(
+        self, part: SignatureDataset, batch_size: int, sampler: Sampler[int] | None, n_workers: int
+    ) -> DataLoader[LabelledSignature]:
+        return DataLoader(
+            part,
+            batch_size=batch_size,
+            sampler=sampler,
+            num_workers=n_workers,
+            persistent_workers=n_workers > 0,
+            pin_memory=torch.cuda.is_available(),
+            collate_fn=collate,
+        )

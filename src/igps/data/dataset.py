@@ -5,11 +5,9 @@ from __future__ import annotations
 import contextlib
 import copy
 import logging
-import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Self, overload
 
@@ -20,22 +18,15 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from tqdm import tqdm
 
-from igps._parallel import Failed, Limits, MachineError, n_cores, run
-from igps.data.batch import LabelledSignature, SignatureBatch, collate
+from igps._parallel import Failed, Limits
+from igps.data.attributes import ROOMS, AttributeSource, with_attribute
+from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.cache import SignatureCache, default_cache_dir
+from igps.data.collation import collate
 from igps.data.collection import About, CollectionFile, write_collection
 from igps.data.file_stat_cache import FileStatCache
-from igps.data.pipeline import (
-    ROOMS,
-    AttributeSource,
-    CacheHit,
-    PreTransform,
-    SignaturePipeline,
-    checked_values,
-    fill_elsewhere,
-    version,
-    with_attribute,
-)
+from igps.data.filling import check_visible, filled, hits_in_cache
+from igps.data.pipeline import CacheHit, PreTransform, SignaturePipeline
 from igps.data.requirements import Requirements, Requiring, requirements_of
 from igps.data.sources import Bodies, ClassRule, find_bodies, given_bodies
 from igps.mesh.loading import BodyRef
@@ -45,8 +36,6 @@ from igps.signature.signature import Samples, Signature, SignatureConfig
 
 logger = logging.getLogger(__name__)
 
-# Seconds until a file that another machine wrote is seen here, by a file system for many.
-_SHARED_WITHIN = 60.0
 _REMEMBERED_AT_ONCE = 1000
 
 PointFunction = Callable[[NDArray[np.float64]], NDArray[np.floating[Any]]]
@@ -213,8 +202,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         found = None if hit is None else self.pipeline.read(hit)
         signature = replace(found or self.pipeline.signature(self.bodies[i]), name=name)
         for attribute, function in self._functions.items():
-            points = {room: getattr(signature, room).points for room in ROOMS}
-            values = {room: checked_values(function(some), len(some), attribute, name) for room, some in points.items()}
+            values = {room: function(getattr(signature, room).points) for room in ROOMS}
             signature = with_attribute(signature, attribute, values)
         return signature
 
@@ -277,10 +265,17 @@ class SignatureDataset(Dataset[LabelledSignature]):
         failed = {failure.id for failure in failures}
         return self.subset([i for i, name in enumerate(self.bodies.names) if name not in failed])
 
-    def to_memory(self) -> Self:
-        """The same with all Signatures in memory, as they are before `transform`; those not cached are computed."""
+    def to_memory(self, change: Callable[[Signature], Signature] | None = None) -> Self:
+        """The same with all Signatures in memory, as they are before `transform`; those not cached are computed.
+
+        Args:
+            change: what is done to each before it is kept, such as `FewerSamples`, of which more fit.
+        """
         chosen = copy.copy(self)
-        chosen._at_hand = [_owned(self._signature(i)) for i in range(len(self))]
+        signatures = (self._signature(i) for i in range(len(self)))
+        chosen._at_hand = [_owned(one if change is None else change(one)) for one in signatures]
+        if change is not None:  # no description of what is in the cache
+            chosen._hits = (None,) * len(self)
         chosen._numbers = tuple(range(len(self)))
         return chosen
 
@@ -388,21 +383,15 @@ class SignatureDataset(Dataset[LabelledSignature]):
             return []
         SignatureCache(self.pipeline.cache_dir).remove_abandoned()
         known = FileStatCache(self.pipeline)
-        found: list[CacheHit | None] = [*map(known.ready(self.bodies).get, self.bodies)]
-        if executor is None:
-            served = {i: hit for group in _groups(self.bodies, found, None) for i, hit in self._served(group)}
-            known.remember({self.bodies[i]: hit for i, hit in served.items()})
-            for i, hit in served.items():
-                found[i] = hit
-        # A chunk of the bodies of one file is one job, so that the file is read once for it.
-        most = 1 if limits is not None and limits != Limits() else -(-len(self) // (n_workers or n_cores()))
-        jobs = list(_groups(self.bodies, found, most))
-        n_there = len(self) - sum(map(len, jobs))
+        found = hits_in_cache(self.pipeline, self.bodies, look=executor is None)
         failures: dict[int, Failure] = {}
         new: dict[BodyRef, CacheHit] = {}
-        outcomes = self._outcomes(jobs, executor, n_workers, limits)
+        missing = [i for i, hit in enumerate(found) if hit is None]
+        outcomes = filled(
+            self.pipeline, self.bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits()
+        )
         with (
-            tqdm(total=len(self), initial=n_there, desc="signatures", disable=not progress) as bar,
+            tqdm(total=len(self), initial=len(self) - len(missing), desc="signatures", disable=not progress) as bar,
             contextlib.closing(outcomes),
             contextlib.ExitStack() as at_the_end,
         ):
@@ -410,7 +399,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
             for i, outcome in outcomes:
                 bar.update()
                 if not isinstance(outcome, Failed):
-                    self._check_visible(outcome, first=not new)
+                    if not new:
+                        check_visible(self.pipeline, outcome)
                     new[self.bodies[i]] = found[i] = outcome
                     if len(new) >= _REMEMBERED_AT_ONCE:
                         known.remember(new)
@@ -423,61 +413,12 @@ class SignatureDataset(Dataset[LabelledSignature]):
         self._hits = tuple(found)
         return [failures[i] for i in sorted(failures)]
 
-    def _outcomes(
-        self, jobs: Sequence[Sequence[int]], executor: Executor | None, n_workers: int | None, limits: Limits | None
-    ) -> Generator[tuple[int, CacheHit | Failed], None, None]:
-        """What becomes of each body of the jobs. Where one loses its process, the others of its job are tried again."""
-        fill: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = self.pipeline.fill
-        bodies = [[self.bodies[i] for i in job] for job in jobs]
-        if executor is not None:  # elsewhere, and from another folder
-            pipeline = replace(self.pipeline, cache_dir=self.pipeline.cache_dir.absolute())
-            fill = partial(fill_elsewhere, pipeline.fill, version())
-            bodies = [[replace(body, path=body.path.absolute()) for body in job] for job in bodies]
-        again: list[list[int]] = []
-        results = run(fill, bodies, n_workers=n_workers, executor=executor, limits=limits)
-        with contextlib.closing(results):
-            for number, outcome in results:
-                job = jobs[number]
-                if not isinstance(outcome, Failed):
-                    yield from zip(job, outcome, strict=True)
-                elif len(job) > 1:
-                    again += [[i] for i in job]
-                else:
-                    yield job[0], outcome
-        if again:
-            yield from self._outcomes(again, executor, n_workers, limits)
-
     def _found(self) -> list[CacheHit | None]:
         """What serves each body, as far as something does."""
-        found = list(self._hits)
-        unknown = self.bodies.subset([i for i, hit in enumerate(found) if hit is None])
-        ready = FileStatCache(self.pipeline).ready(unknown) if self._at_hand is None else {}
-        found = [hit or ready.get(body) for hit, body in zip(found, self.bodies, strict=True)]
-        if self._at_hand is None:
-            for group in _groups(self.bodies, found, None):
-                for i, hit in self._served(group):
-                    found[i] = hit
-        return found
-
-    def _served(self, group: Sequence[int]) -> list[tuple[int, CacheHit]]:
-        """What serves bodies of one file, where something does."""
-        try:
-            hits = self.pipeline.served([self.bodies[i] for i in group])
-        except MeshError:  # computing it will say why
-            return []
-        return [(i, hit) for i, hit in zip(group, hits, strict=True) if hit is not None]
-
-    def _check_visible(self, hit: CacheHit, first: bool) -> None:
-        """Raise a MachineError if what a worker put into its cache does not come to this one, asked at the first."""
-        path = SignatureCache(self.pipeline.cache_dir).path(hit.key)
-        deadline = time.monotonic() + _SHARED_WITHIN
-        while first and not path.exists():
-            if time.monotonic() > deadline:
-                raise MachineError(
-                    f"{self.pipeline.cache_dir}: the workers' signatures do not appear there. Choose a cache_dir that "
-                    "this machine and all workers share, by the same path."
-                )
-            time.sleep(0.1)
+        if self._at_hand is not None or None not in self._hits:
+            return list(self._hits)
+        found = hits_in_cache(self.pipeline, self.bodies)
+        return [known or hit for known, hit in zip(self._hits, found, strict=True)]
 
     def failure(self, index: int, failed: Failed) -> Failure:
         """What failed of a body, in a sentence that names its file."""
@@ -494,17 +435,6 @@ def _bodies(
     if isinstance(given, str | Path):
         return find_bodies(given, reading) if Path(given).is_dir() else given_bodies([given], labels, reading)
     return given_bodies(given, labels, reading)
-
-
-def _groups(bodies: Bodies, found: Sequence[CacheHit | None], most: int | None) -> Iterator[list[int]]:
-    """Numbers of the bodies that nothing serves, those of one file together, at most so many."""
-    by_file: dict[Path, list[int]] = {}
-    for i, (path, hit) in enumerate(zip(bodies.paths, found, strict=True)):
-        if hit is None:
-            by_file.setdefault(path, []).append(i)
-    for group in by_file.values():
-        size = most or len(group)
-        yield from (group[start : start + size] for start in range(0, len(group), size))
 
 
 def _owned(signature: Signature) -> Signature:

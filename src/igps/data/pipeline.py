@@ -11,31 +11,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Protocol
 
 from igps._parallel import Failed, MachineError, attempt
+from igps.data.attributes import ROOMS, AttributeSource, with_attribute
 from igps.data.cache import AttributeCache, SignatureCache
 from igps.mesh.loading import BodyRef, each_body, load_mesh
 from igps.mesh.mending import MENDING_VERSION, mended_by
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
-from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
-
-ROOMS = ("interior", "surface")
-
-
-@runtime_checkable
-class AttributeSource(Protocol):
-    """What gives the samples of a body an attribute that is kept in the cache, such as an image; picklable."""
-
-    def cache_tag(self, body: BodyRef) -> str:
-        """All that the values depend on beside the points, such as a checksum of the image."""
-
-    def __call__(self, body: BodyRef, points: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
-        """Values (P,) or (P, C) at points (P, 3) in the coordinates of the body's file."""
+from igps.signature.signature import Signature, SignatureConfig, compute_signature
 
 
 class PreTransform(Protocol):
@@ -224,7 +209,7 @@ class SignaturePipeline:
         keys = {}
         for name in self.attributes:
             keys[name] = self._attribute_key(body, key, name)
-            signature = with_attribute(signature, name, self._attribute(body, signature, name, keys[name]))
+            signature = self._with_attribute(body, signature, name, keys[name])
         if self.pre_transform is not None:
             signature = self.pre_transform(signature)
             mended = bool(mended_by(signature.notes))
@@ -244,15 +229,15 @@ class SignaturePipeline:
         cache.put(key, signature)
         return key, signature
 
-    def _attribute(self, body: BodyRef, signature: Signature, name: str, key: str) -> dict[str, NDArray[np.float32]]:
+    def _with_attribute(self, body: BodyRef, signature: Signature, name: str, key: str) -> Signature:
         cache = AttributeCache(self.cache_dir)
         values = cache.get(key)
-        if values is None:
-            points = {room: getattr(signature, room).points for room in ROOMS}
-            found = {room: self.attributes[name](body, some) for room, some in points.items()}
-            values = {room: checked_values(found[room], len(points[room]), name, str(body)) for room in ROOMS}
-            cache.put(key, values)
-        return values
+        if values is not None:
+            return with_attribute(signature, name, values)
+        found = {room: self.attributes[name](body, getattr(signature, room).points) for room in ROOMS}
+        signature = with_attribute(signature, name, found)
+        cache.put(key, {room: getattr(signature, room).attributes[name] for room in ROOMS})
+        return signature
 
     def _cached(self, body: BodyRef, file: _File) -> Iterator[str]:
         """The keys that the cache has of the Signature of a body and of larger ones, which begin with it."""
@@ -327,28 +312,6 @@ def _parameters(
     algorithm, mending = versions
     how = {"suffix": suffix, "part": part, "reading": reading.as_dict(), "mending_version": mending}
     return json.dumps([how, {**config.as_dict(), "algorithm_version": algorithm}], sort_keys=True).encode()
-
-
-def checked_values(values: NDArray[Any], n_points: int, name: str, body: str) -> NDArray[np.float32]:
-    """Values of an attribute as they are kept.
-
-    Raises:
-        ValueError: not one finite row for each point.
-    """
-    found = np.asarray(values, dtype=np.float32)
-    if found.ndim not in (1, 2) or len(found) != n_points or not np.isfinite(found).all():
-        raise ValueError(
-            f"attributes: expected {name!r} to give ({n_points},) or ({n_points}, C) finite numbers for the points of "
-            f"{body}, got an array of shape {found.shape} with {int((~np.isfinite(found)).sum())} not finite."
-        )
-    return found
-
-
-def with_attribute(signature: Signature, name: str, values: Mapping[str, NDArray[np.float32]]) -> Signature:
-    def more(samples: Samples, room: str) -> Samples:
-        return replace(samples, attributes={**samples.attributes, name: values[room]})
-
-    return replace(signature, interior=more(signature.interior, "interior"), surface=more(signature.surface, "surface"))
 
 
 def version() -> str:

@@ -42,13 +42,13 @@ def describe(
 
     Example:
         >>> import tempfile, trimesh
-        >>> from igps import SignatureConfig, descriptor
+        >>> from igps import descriptor
         >>> interior = descriptor("interior")
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = trimesh.creation.icosphere(subdivisions=2).export(f"{folder}/ball.off")
         ...     _ = trimesh.creation.capsule(height=3.0, radius=0.5).export(f"{folder}/pill.off")
-        ...     config = interior.requirements.apply_to(SignatureConfig())
-        ...     histograms = describe(SignatureDataset(folder, config, f"{folder}/cache"), interior)
+        ...     dataset = SignatureDataset(folder, descriptor=interior, cache_dir=f"{folder}/cache")
+        ...     histograms = describe(dataset, interior)
         >>> len(histograms), interior.distances(histograms, histograms).argmin(dim=1).tolist()
         (2, [0, 1])
 

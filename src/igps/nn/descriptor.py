@@ -31,7 +31,7 @@ class Descriptor(nn.Module, ABC):
 
     Example:
         >>> import trimesh
-        >>> from igps.data.batch import collate
+        >>> from igps.data.collation import collate
         >>> from igps.mesh.mesh import Mesh
         >>> from igps.signature.signature import SignatureConfig, compute_signature
         >>> from igps.retrieval.distances import euclidean
@@ -90,7 +90,7 @@ class BodyDescriptor(Descriptor):
 
     Example:
         >>> import trimesh
-        >>> from igps.data.batch import collate
+        >>> from igps.data.collation import collate
         >>> from igps.mesh.mesh import Mesh
         >>> from igps.signature.signature import SignatureConfig, compute_signature
         >>> class Roundness(BodyDescriptor):

@@ -43,7 +43,7 @@ class Samples:
     Args:
         points: (P, 3) float64, length.
         eigenfunctions: (P, K) float32, 1/length, not scaled by any power of the eigenvalues.
-        attributes: named scalars of the points, each (P,) float32, and directions, each (P, 3) float32.
+        attributes: by name, each (P,) or (P, C) float32; a direction has C = 3.
     """
 
     points: NDArray[np.float64]
@@ -64,8 +64,8 @@ class Samples:
             array([1., 3.], dtype=float32)
 
         Args:
-            values: by name, a number for each of the P points, (P,), or a direction, (P, 3). One of a name that is
-                there already takes its place.
+            values: by name, a number for each of the P points, (P,), or C numbers, (P, C), such as a direction. One of
+                a name that is there already takes its place.
 
         Raises:
             ValueError: values of another shape, or not finite.
@@ -73,9 +73,9 @@ class Samples:
         found = dict(self.attributes)
         for name, given in values.items():
             array = np.asarray(given, dtype=np.float32)
-            if array.shape not in ((len(self),), (len(self), 3)) or not np.isfinite(array).all():
+            if array.ndim not in (1, 2) or len(array) != len(self) or not np.isfinite(array).all():
                 raise ValueError(
-                    f"{name}: expected a finite number or direction for each of {len(self)} points, got an array of "
+                    f"{name}: expected a finite number, or several, for each of {len(self)} points, got an array of "
                     f"shape {array.shape} with {int((~np.isfinite(array)).sum())} values that are not finite."
                 )
             found[name] = array

@@ -22,7 +22,7 @@ class SpectrumShares(DescriptionPart):
         Of a sphere λ = l (l + 1), 2 l + 1 times; what is over is the number k, from 2 on.
 
         >>> import trimesh
-        >>> from igps.data.batch import collate
+        >>> from igps.data.collation import collate
         >>> from igps.mesh.mesh import Mesh
         >>> from igps.signature.signature import SignatureConfig, compute_signature
         >>> ball = trimesh.creation.icosphere(subdivisions=3)

@@ -31,7 +31,7 @@ class PairHistogram(SampleHistogram):
 
     Example:
         >>> import trimesh
-        >>> from igps.data.batch import collate
+        >>> from igps.data.collation import collate
         >>> from igps.mesh.mesh import Mesh
         >>> from igps.signature.signature import SignatureConfig, compute_signature
         >>> ball = trimesh.creation.icosphere(subdivisions=2)

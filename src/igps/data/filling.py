@@ -1,0 +1,108 @@
+"""The cache is filled: what it has of many bodies, and the rest computed by processes here or elsewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from igps._parallel import Failed, Limits, MachineError, n_cores, run
+from igps.data.cache import SignatureCache
+from igps.data.file_stat_cache import FileStatCache
+from igps.data.pipeline import CacheHit, SignaturePipeline, fill_elsewhere, version
+from igps.data.sources import Bodies
+from igps.mesh.loading import BodyRef
+from igps.mesh.mesh import MeshError
+
+# Seconds until a file that another machine wrote is seen here, by a file system for many.
+_SHARED_WITHIN = 60.0
+
+
+def hits_in_cache(pipeline: SignaturePipeline, bodies: Bodies, look: bool = True) -> list[CacheHit | None]:
+    """What in the cache serves each body, None where nothing does.
+
+    Args:
+        pipeline: how a body becomes a Signature.
+        bodies: N bodies.
+        look: read the files that are not known or have changed; otherwise nothing serves these.
+    """
+    known = FileStatCache(pipeline)
+    ready = known.ready(bodies)
+    found = [ready.get(body) for body in bodies]
+    new: dict[BodyRef, CacheHit] = {}
+    for group in _by_file(bodies, (i for i, hit in enumerate(found) if hit is None and look)):
+        with contextlib.suppress(MeshError):  # computing it will say why
+            for i, hit in zip(group, pipeline.served([bodies[i] for i in group]), strict=True):
+                if hit is not None:
+                    found[i] = new[bodies[i]] = hit
+    known.remember(new)
+    return found
+
+
+def filled(
+    pipeline: SignaturePipeline,
+    bodies: Bodies,
+    numbers: Sequence[int],
+    *,
+    n_workers: int | None,
+    executor: Executor | None,
+    limits: Limits,
+    at_once: int | None = None,
+) -> Generator[tuple[int, CacheHit | Failed], None, None]:
+    """Compute Signatures into the cache, and tell of each body by its number what serves it, or why it failed.
+
+    The bodies of one file are computed in chunks, for each of which it is read once. Where one of a chunk loses its
+    process, each of the chunk is tried again alone. With limits, which are of one body, every body is.
+
+    Args:
+        pipeline: how a body becomes a Signature.
+        bodies: N bodies.
+        numbers: of those that are computed.
+        n_workers, executor, limits: see `igps._parallel.run`.
+        at_once: bodies in a chunk; so many that every worker has one if None.
+    """
+    most = 1 if limits != Limits() else at_once or max(1, -(-len(numbers) // (n_workers or n_cores())))
+    jobs = [group[start : start + most] for group in _by_file(bodies, numbers) for start in range(0, len(group), most)]
+    fill: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
+    given = [[bodies[i] for i in job] for job in jobs]
+    if executor is not None:  # elsewhere, and from another folder
+        there = replace(pipeline, cache_dir=pipeline.cache_dir.absolute())
+        fill = partial(fill_elsewhere, there.fill, version())
+        given = [[replace(body, path=body.path.absolute()) for body in job] for job in given]
+    lost: list[int] = []
+    results = run(fill, given, n_workers=n_workers, executor=executor, limits=limits)
+    with contextlib.closing(results):
+        for number, outcome in results:
+            job = jobs[number]
+            if not isinstance(outcome, Failed):
+                yield from zip(job, outcome, strict=True)
+            elif len(job) > 1:
+                lost += job
+            else:
+                yield job[0], outcome
+    if lost:
+        yield from filled(pipeline, bodies, lost, n_workers=n_workers, executor=executor, limits=limits, at_once=1)
+
+
+def check_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
+    """Raise a MachineError if what a worker put into its cache does not come to this one."""
+    path = SignatureCache(pipeline.cache_dir).path(hit.key)
+    deadline = time.monotonic() + _SHARED_WITHIN
+    while not path.exists():
+        if time.monotonic() > deadline:
+            raise MachineError(
+                f"{pipeline.cache_dir}: the workers' signatures do not appear there. Choose a cache_dir that this "
+                "machine and all workers share, by the same path."
+            )
+        time.sleep(0.1)
+
+
+def _by_file(bodies: Bodies, numbers: Iterable[int]) -> Iterator[list[int]]:
+    groups: dict[Path, list[int]] = {}
+    for i in numbers:
+        groups.setdefault(bodies.paths[i], []).append(i)
+    yield from groups.values()
