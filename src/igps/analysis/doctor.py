@@ -7,12 +7,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 from tqdm import tqdm
 
 from igps._parallel import Failed, Limits, run
-from igps.data.sources import Bodies
+from igps.data.sources import Bodies, BodyRef
 from igps.mesh.loading import load_mesh, read_surface
 from igps.mesh.mending import Step, mended_by
 from igps.mesh.mesh import MeshError
@@ -75,12 +74,12 @@ def examine(
         progress: show a bar.
     """
     one = partial(_examine, reading or LoadOptions(), config or SignatureConfig())
-    outcomes = run(one, files.paths, n_workers=n_workers, limits=limits)
+    outcomes = run(one, list(files), n_workers=n_workers, limits=limits)
     found: dict[int, Finding] = {}
     with tqdm(total=len(files), desc="files", disable=not progress) as bar, contextlib.closing(outcomes):
         for i, outcome in outcomes:
             bar.update()
-            found[i] = Finding(files.paths[i].name, error=outcome.reason) if isinstance(outcome, Failed) else outcome
+            found[i] = Finding(files.names[i], error=outcome.reason) if isinstance(outcome, Failed) else outcome
     return [replace(found[i], id=files.names[i]) for i in range(len(files))]
 
 
@@ -91,25 +90,26 @@ def expected_cost(n_vertices: int, n_eigenpairs: int) -> tuple[float, float]:
     return seconds, _BYTES + _BYTES_PER_VERTEX * n_vertices + _BYTES_PER_ENTRY * entries
 
 
-def _examine(reading: LoadOptions, config: SignatureConfig, path: Path) -> Finding:
+def _examine(reading: LoadOptions, config: SignatureConfig, body: BodyRef) -> Finding:
     start = time.process_time()
+    path, part, name = body.path, body.part, str(body)
     try:
-        vertices = read_surface(path, reading).vertices
+        vertices = read_surface(path, reading, part=part).vertices
     except MeshError as error:
-        return Finding(path.name, fault=str(error), error=str(error))
+        return Finding(name, fault=str(error), error=str(error))
     fault = None
     try:
-        load_mesh(path, replace(reading, mend="never"))
+        load_mesh(path, replace(reading, mend="never"), part=part)
     except MeshError as error:
         fault = str(error)
     try:
-        mesh = load_mesh(path, reading, least_vertices=config.n_vertices_read)
+        mesh = load_mesh(path, reading, part=part, least_vertices=config.n_vertices_read)
     except MeshError as error:
-        return Finding(path.name, fault=fault, n_vertices=len(vertices), error=str(error))
+        return Finding(name, fault=fault, n_vertices=len(vertices), error=str(error))
     n_after = min(len(mesh.vertices), config.max_vertices or len(mesh.vertices))
     seconds, memory = expected_cost(n_after, config.n_kept)
     return Finding(
-        id=path.name,
+        id=name,
         fault=fault,
         steps=mended_by(mesh.notes),
         notes=mesh.notes,

@@ -11,11 +11,10 @@ import numpy as np
 
 from igps.analysis.comparison import Result
 from igps.analysis.comparison import compare as compare_descriptors
-from igps.cli.reading import signatures, write_notes, write_rows
+from igps.cli.reading import Folder, signatures, write_notes, write_rows
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure
-from igps.data.sources import labelled_bodies
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
 from igps.report.sources import write_sources
@@ -48,7 +47,7 @@ def compare(
     """
     check_report(report, out)
     chosen = [descriptor_of(name) for name in descriptors or NAMES]
-    dataset, failures = signatures(labelled_bodies(root), chosen, n_workers=n_workers, strict=strict, **reading)
+    dataset, failures = signatures(Folder(root, labelled=True), chosen, n_workers=n_workers, strict=strict, **reading)
     results: list[Result] = []
     for result in compare_descriptors(dataset, chosen, n_workers=n_workers, strict=strict):
         results.append(result)

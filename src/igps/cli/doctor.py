@@ -10,7 +10,7 @@ from igps.analysis.doctor import Finding, examine, usable
 from igps.cli.reading import Verdict, write_rows
 from igps.data.sources import find_bodies
 from igps.mesh.mending import Mending
-from igps.mesh.options import Component, LoadOptions
+from igps.mesh.options import MAX_UNPACKED, BodyKind, Component, LoadOptions
 from igps.report.tables import findings_table
 from igps.signature.signature import SignatureConfig
 
@@ -26,6 +26,10 @@ def doctor(
     mend: Mending = "auto",
     component: Component | None = None,
     allow_open: bool = False,
+    bodies: BodyKind | None = None,
+    names: str | None = None,
+    threshold: float = 0.5,
+    max_unpacked: int = MAX_UNPACKED,
     n_workers: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
@@ -42,13 +46,18 @@ def doctor(
             watertight all that does not bound one body without crossing itself.
         component: largest keeps only the largest connected component of each mesh.
         allow_open: accept surfaces with holes
+        bodies: what of a file is a body: whole, labels, objects, pieces, chains, models or assembly; the labels of a
+            volume, the chains of a molecule and the whole of anything else if not given.
+        names: a table of the names of labels; those of the volume, or beside it, if not given.
+        threshold: a voxel of at least this probability belongs to the body, in volumes of probabilities.
+        max_unpacked: bytes that a compressed file may unpack to.
         n_workers: processes; all cores if not given.
         time_limit: seconds that one file may take; no limit if not given.
         memory_limit: gigabytes of memory that one file may take; no limit if not given.
     """
-    reading = LoadOptions(mend, component, allow_open)
+    reading = LoadOptions(mend, component, allow_open, bodies, max_unpacked, names, threshold)
     limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
-    found = examine(find_bodies(root), reading, signature, n_workers=n_workers, limits=limits)
+    found = examine(find_bodies(root, reading), reading, signature, n_workers=n_workers, limits=limits)
     print(findings_table(found))
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

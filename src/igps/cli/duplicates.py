@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from igps.cli.index import as_indexed
-from igps.cli.reading import signatures, write_rows
-from igps.data.sources import find_bodies
+from igps.cli.reading import Folder, signatures, write_rows
 from igps.descriptors import descriptor as descriptor_of
 from igps.gallery.calibration import Calibration
 from igps.gallery.duplicates import Duplicates, body_distance
@@ -49,8 +48,8 @@ def duplicates(
         as_indexed(source, reading)
     else:
         assert root is not None
-        chosen, files = descriptor_of(DESCRIPTOR), find_bodies(root)
-        source, unread = signatures(files, [chosen], cache_dir, n_workers=n_workers, strict=strict, **reading)
+        chosen, files = descriptor_of(DESCRIPTOR), Folder(root)
+        source, unread = signatures(files, [chosen], n_workers=n_workers, strict=strict, cache_dir=cache_dir, **reading)
         n_skipped = len(unread)
     found = find_duplicates(source, DESCRIPTOR, poses=poses, cache_dir=cache_dir, n_workers=n_workers, progress=True)
     _print_groups(found, calibration, poses)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from igps.cli.reading import signatures
+from igps.cli.reading import Folder, signatures
 from igps.data.dataset import Failure
-from igps.data.sources import find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.gallery.gallery import Gallery, about_of
 from igps.mesh.options import LoadOptions
@@ -36,7 +36,7 @@ def index_build(
         strict: stop at the first mesh that cannot be used instead of skipping it
     """
     chosen = descriptor_of(descriptor)
-    dataset, unread = signatures(find_bodies(root), [chosen], n_workers=n_workers, strict=strict, **reading)
+    dataset, unread = signatures(Folder(root), [chosen], n_workers=n_workers, strict=strict, **reading)
     gallery, undescribed = Gallery.build(out, dataset, descriptor, n_workers=n_workers, strict=strict, progress=True)
     _print_state(gallery, [*unread, *undescribed])
 
@@ -58,7 +58,7 @@ def index_add(
     """
     gallery = Gallery(index)
     reading = as_indexed(gallery, reading)
-    dataset, unread = signatures(find_bodies(root), [gallery.descriptor], n_workers=n_workers, strict=strict, **reading)
+    dataset, unread = signatures(Folder(root), [gallery.descriptor], n_workers=n_workers, strict=strict, **reading)
     name = gallery.index.about["descriptor"]
     gallery, undescribed = Gallery.add(index, dataset, name, n_workers=n_workers, strict=strict, progress=True)
     _print_state(gallery, [*unread, *undescribed])
@@ -80,24 +80,17 @@ def as_indexed(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: others are asked for.
     """
-    given, ours = dict(reading), {"mend": "auto", "component": None, "allow_open": False}
+    given = dict(reading)
     config = given.pop("signature", SignatureConfig())
     if given.pop("paper", False):
         config = SignatureConfig.paper()
-    asked = LoadOptions(**{name: given.pop(name, default) for name, default in ours.items()})
+    asked = LoadOptions(**{one.name: given.pop(one.name, one.default) for one in fields(LoadOptions)})
     if config != SignatureConfig():
         wanted = gallery.descriptor.requirements.apply_to(config).resolved()
         check_alike(gallery.index, {"signature": about_of(wanted, asked, gallery.descriptor)["signature"]})
     if asked != LoadOptions():
         check_alike(gallery.index, {"reading": about_of(gallery.config, asked, gallery.descriptor)["reading"]})
-    told = gallery.reading
-    return {
-        **given,
-        "signature": gallery.config,
-        "mend": told.mend,
-        "component": told.component,
-        "allow_open": told.allow_open,
-    }
+    return {**given, "signature": gallery.config, **asdict(gallery.reading)}
 
 
 def _print_state(gallery: Gallery, failures: Sequence[Failure]) -> None:

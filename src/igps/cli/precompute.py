@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from igps._parallel import Limits, MachineError
-from igps.cli.reading import chosen_dataset, write_rows
+from igps.cli.reading import Folder, chosen_dataset, write_rows
 from igps.data.pipeline import version
 from igps.data.requirements import Requirements
-from igps.data.sources import Bodies, find_bodies
 from igps.descriptors import descriptor as descriptor_of
 
 # Seconds until a scheduler that does not answer is taken for missing.
@@ -51,12 +50,12 @@ def precompute(
         time_limit: seconds that the signature of one mesh may take; no limit if not given.
         memory_limit: gigabytes of memory that the signature of one mesh may take; no limit if not given.
     """
-    files = part_of(find_bodies(root), shard)
-    if not len(files):
+    needs = reduce(or_, (descriptor_of(name).requirements for name in descriptors or ["pretrained"]), Requirements())
+    dataset = chosen_dataset(Folder(root), needs, **reading)
+    dataset = dataset.subset(of_shard(len(dataset), shard))
+    if not len(dataset):
         print(f"{root}: no mesh in shard {shard}")
         return
-    needs = reduce(or_, (descriptor_of(name).requirements for name in descriptors or ["pretrained"]), Requirements())
-    dataset = chosen_dataset(files, needs, **reading)
     limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
     if cluster is None:
         failed = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits)
@@ -69,18 +68,18 @@ def precompute(
     print(f"{len(dataset) - len(failed)} of {len(dataset)} signatures{part} are in the cache; {len(failed)} failed")
 
 
-def part_of(files: Bodies, shard: str | None) -> Bodies:
-    """Every n-th of the files, so that the shards 1/n to n/n have all, each once; all of them if None.
+def of_shard(n_bodies: int, shard: str | None) -> range:
+    """Which bodies a shard has: every n-th, so that the shards 1/n to n/n have all, each once; all of them if None.
 
     Raises:
         ValueError: not two numbers, or the first not one of the second.
     """
     if shard is None:
-        return files
+        return range(n_bodies)
     found = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
     if found is None or int(found[1]) > int(found[2]):
         raise ValueError(f"shard: expected such as 3/64, from 1/64 to 64/64, got {shard!r}.")
-    return files.subset(range(int(found[1]) - 1, len(files), int(found[2])))
+    return range(int(found[1]) - 1, n_bodies, int(found[2]))
 
 
 @contextlib.contextmanager

@@ -14,9 +14,9 @@ from typing import Any
 from igps._parallel import Limits
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
-from igps.data.sources import Bodies
+from igps.data.sources import Bodies, ClassRule, find_bodies, labelled_bodies
 from igps.mesh.mending import Mending, mended_by
-from igps.mesh.options import Component, LoadOptions
+from igps.mesh.options import MAX_UNPACKED, BodyKind, Component, LoadOptions
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig
 
@@ -29,6 +29,19 @@ FLAGS = {
 
 
 @dataclass(frozen=True)
+class Folder:
+    """A folder whose bodies are found as the options say.
+
+    Args:
+        root: the folder.
+        labelled: whether it must tell classes.
+    """
+
+    root: Path
+    labelled: bool = False
+
+
+@dataclass(frozen=True)
 class Verdict:
     """What a command tells, and whether its exit status is 0."""
 
@@ -37,41 +50,31 @@ class Verdict:
 
 
 def signatures(
-    source: Path | Sequence[Path] | Bodies,
+    source: Folder | Sequence[Path] | Bodies,
     descriptors: Sequence[Descriptor] = (),
-    cache_dir: Path | None = None,
-    signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
-    paper: bool = False,
-    mend: Mending = "auto",
-    component: Component | None = None,
-    allow_open: bool = False,
     strict: bool = False,
     n_workers: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
+    **reading: Any,
 ) -> tuple[SignatureDataset, list[Failure]]:
-    """The meshes whose signatures are in the cache, after computing what was missing; and those that failed.
+    """The bodies whose signatures are in the cache, after computing what was missing; and those that failed.
 
-    The parameters are options of every command that reads meshes.
+    The parameters, and those of `chosen_dataset`, are options of every command that reads bodies.
 
     Args:
-        source: a folder, files, or what was found in a folder.
-        descriptors: whose needs the signatures satisfy.
-        cache_dir: folder where computed signatures are kept; the user's cache directory if not given.
-        signature: parameters of the signatures.
-        mend: auto does the least that makes a body of each mesh, never refuses what is no body, always makes
-            watertight all that does not bound one body without crossing itself, for collections of mixed quality.
-        component: largest keeps only the largest connected component of each mesh.
+        source: a folder, files, or bodies.
+        descriptors: whose requirements the signatures satisfy.
         n_workers: processes that compute; all cores if not given.
-        time_limit: seconds that the signature of one mesh may take; no limit if not given.
-        memory_limit: gigabytes of memory that the signature of one mesh may take; no limit if not given.
-        paper, allow_open, strict: see `FLAGS`.
+        time_limit: seconds that the signature of one body may take; no limit if not given.
+        memory_limit: gigabytes of memory that the signature of one body may take; no limit if not given.
+        strict: see `FLAGS`.
 
     Raises:
-        ValueError: no mesh could be used, or `paper` beside other parameters of the signatures.
+        ValueError: no body could be used, or `paper` beside other parameters of the signatures.
     """
     needs = reduce(or_, (one.requirements for one in descriptors), Requirements()) if descriptors else None
-    dataset = chosen_dataset(source, needs, cache_dir, signature, paper, mend, component, allow_open)
+    dataset = chosen_dataset(source, needs, **reading)
     limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
     failures = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits)
     if len(failures) == len(dataset):
@@ -83,7 +86,7 @@ def signatures(
 
 
 def chosen_dataset(
-    source: Path | Sequence[Path] | Bodies,
+    source: Folder | Sequence[Path] | Bodies,
     needs: Requirements | None,
     cache_dir: Path | None = None,
     signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
@@ -91,27 +94,41 @@ def chosen_dataset(
     mend: Mending = "auto",
     component: Component | None = None,
     allow_open: bool = False,
+    bodies: BodyKind | None = None,
+    classes: ClassRule | None = None,
+    names: str | None = None,
+    threshold: float = 0.5,
+    max_unpacked: int = MAX_UNPACKED,
 ) -> SignatureDataset:
     """The dataset that the options tell; nothing is computed.
 
     Args:
-        source: a folder, files, or what was found in a folder.
+        source: a folder, files, or bodies.
         needs: what the signatures satisfy, if that is known.
         cache_dir: folder where computed signatures are kept; the user's cache directory if not given.
         signature: parameters of the signatures.
         mend: auto does the least that makes a body of each mesh, never refuses what is no body, always makes
             watertight all that does not bound one body without crossing itself, for collections of mixed quality.
-        component: largest keeps only the largest connected component of each mesh.
+        component: largest keeps only the largest connected component of each body.
+        bodies: what of a file is a body: whole, labels, objects, pieces, chains, models or assembly; the labels of a
+            volume, the chains of a molecule and the whole of anything else if not given.
+        classes: what the class of a body is: folder (or labels.csv), body (its name in its file), or file.
+        names: a table of the names of labels; those of the volume, or beside it, if not given.
+        threshold: a voxel of at least this probability belongs to the body, in volumes of probabilities.
+        max_unpacked: bytes that a compressed file may unpack to.
         paper, allow_open: see `FLAGS`.
 
     Raises:
-        ValueError: `paper` beside other parameters of the signatures.
+        ValueError: `paper` beside other parameters of the signatures, or no classes where they are needed.
     """
     if paper and signature != SignatureConfig():
         raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
     config = SignatureConfig.paper() if paper else signature
-    reading = LoadOptions(mend, component, allow_open)
-    return SignatureDataset(source, config, cache_dir, descriptor=needs, reading=reading)
+    reading = LoadOptions(mend, component, allow_open, bodies, max_unpacked, names, threshold)
+    if isinstance(source, Folder):
+        find = labelled_bodies if source.labelled else find_bodies
+        source, classes = find(source.root, reading, classes=classes or "folder"), None
+    return SignatureDataset(source, config, cache_dir, descriptor=needs, classes=classes, reading=reading)
 
 
 def mending_summary(dataset: SignatureDataset, n_given: int) -> str:

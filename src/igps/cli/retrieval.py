@@ -14,11 +14,11 @@ from tqdm import tqdm
 
 from igps.analysis.comparison import pair_distances
 from igps.cli.index import as_indexed
-from igps.cli.reading import signatures, write_notes, write_rows
+from igps.cli.reading import Folder, signatures, write_notes, write_rows
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure, SignatureDataset
-from igps.data.sources import Bodies, find_bodies, labelled_bodies
+from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
 from igps.gallery.gallery import Gallery
@@ -58,7 +58,7 @@ def retrieve(
     check_report(report, out)
     chosen = descriptor_of(descriptor)
     dataset, descriptions, failures = _described(
-        labelled_bodies(root), descriptor, n_workers=n_workers, strict=strict, **reading
+        Folder(root, labelled=True), descriptor, n_workers=n_workers, strict=strict, **reading
     )
     distances = pair_distances(chosen, descriptions, progress=True)
     scores = retrieval_scores(distances, dataset.bodies.labels or ())
@@ -100,7 +100,7 @@ def extract(
         short: write unit vectors of at most 256 numbers in place of longer ones, for engines that compare by the cosine
             (pretrained).
     """
-    source = meshes[0] if len(meshes) == 1 else meshes
+    source = Folder(meshes[0]) if len(meshes) == 1 and meshes[0].is_dir() else meshes
     shortening = descriptor_of(descriptor) if short else None
     if shortening is not None and not isinstance(shortening, EmbeddedDescriptor):
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}.")
@@ -130,7 +130,7 @@ def query(
     """List the meshes of a gallery that are most similar to one mesh.
 
     Args:
-        mesh: the mesh to look for.
+        mesh: the file to look for, or FILE#PART, one body of several in a file.
         gallery: folder of meshes, with or without classes.
         index: an index of meshes in place of their folder, see igps index.
         top: how many to list.
@@ -146,7 +146,7 @@ def query(
     if index is not None:
         opened = Gallery(index, descriptor)
         reading = as_indexed(opened, reading)
-        _, wanted, _ = _described([mesh], opened.descriptor, **{**reading, "n_workers": 1})
+        wanted = _one(mesh, opened.descriptor, **{**reading, "n_workers": 1})
         matches = opened.nearest(wanted, top=top, rerank=rerank)[0]
         rows = [(match.name, match.label, match.distance) for match in matches]
         missing = sum(not match.path.exists() for match in matches)
@@ -156,8 +156,9 @@ def query(
         return _as_rows(rows)
     descriptor = descriptor or "pretrained"
     chosen = descriptor_of(descriptor)
-    _, wanted, _ = _described([mesh], descriptor, **reading)
-    dataset, descriptions, _ = _described(find_bodies(gallery), descriptor, **reading)  # type: ignore[arg-type]
+    assert gallery is not None
+    wanted = _one(mesh, descriptor, **reading)
+    dataset, descriptions, _ = _described(Folder(gallery), descriptor, **reading)
     n_found = min(top, len(dataset))
     n_near = min(max(top, N_RERANKED), len(dataset)) if rerank else n_found
     found = search(wanted, descriptions, top=n_near, distance=chosen.distances)
@@ -168,6 +169,15 @@ def query(
     rows = [(names[i], None if labels is None else labels[i], distance) for i, distance in places]
     _print_found(rows)
     return _as_rows(rows)
+
+
+def _one(mesh: Path, descriptor: str | Descriptor, **reading: Any) -> Tensor:
+    """The description of the one body of a file, or of the one that is named."""
+    dataset, description, _ = _described([mesh], descriptor, **reading)
+    if len(dataset) > 1:
+        names = ", ".join(dataset.bodies.names[:5])
+        raise ValueError(f"mesh: expected one body, {mesh} holds {len(dataset)}. Name one of them, such as {names}.")
+    return description
 
 
 def _print_found(rows: Sequence[tuple[str, str | None, float]]) -> None:
@@ -185,7 +195,7 @@ def _as_rows(rows: Sequence[tuple[str, str | None, float]]) -> list[dict[str, An
 
 
 def _described(
-    source: Path | Sequence[Path] | Bodies,
+    source: Folder | Sequence[Path] | Bodies,
     descriptor: str | Descriptor,
     n_workers: int | None = None,
     strict: bool = False,

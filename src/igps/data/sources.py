@@ -141,6 +141,8 @@ def given_bodies(
 ) -> Bodies:
     """The bodies of the given files, in the given order, with the classes given to the files.
 
+    ``FILE#PART`` names one body of a file of several.
+
     Raises:
         ValueError: no file, or not one label for each.
     """
@@ -149,13 +151,25 @@ def given_bodies(
         raise ValueError("paths: expected at least one mesh file, got none.")
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
-    found = [(i, part) for i, path in enumerate(files) for part in _parts(path, options or LoadOptions())]
+    split = [_named(path) for path in files]
+    files = tuple(path for path, _ in split)
+    found = [
+        (i, part)
+        for i, (path, named) in enumerate(split)
+        for part in ([named] if named is not None else _parts(path, options or LoadOptions()))
+    ]
     return Bodies(
         tuple(files[i] for i, _ in found),
         tuple(_with_part(str(files[i]), part) for i, part in found),
         None if labels is None else tuple(labels[i] for i, _ in found),
         tuple(part for _, part in found),
     )
+
+
+def _named(path: Path) -> tuple[Path, str | None]:
+    """The file and the part of ``FILE#PART``; no part where a file has this name, or none has what stands before."""
+    file, mark, part = str(path).partition("#")
+    return (Path(file), part) if mark and part and not path.exists() and Path(file).is_file() else (path, None)
 
 
 def _parts(path: Path, options: LoadOptions) -> Sequence[str | None]:

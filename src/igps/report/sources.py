@@ -17,12 +17,13 @@ _FORMAT = "igps-meshes-1"
 
 
 def write_sources(folder: Path, dataset: SignatureDataset) -> None:
-    """Write meshes.json: for each mesh its name in the results and its path; reading, signature, and cache folder."""
+    """Write meshes.json: of each body its name in the results, file and part; reading, signature, and cache folder."""
     pipeline, files = dataset.pipeline, dataset.bodies
     summary = {
         "format": _FORMAT,
         "meshes": [
-            {"file": name, "path": str(path.resolve())} for name, path in zip(files.names, files.paths, strict=True)
+            {"file": name, "path": str(body.path.resolve()), "part": body.part}
+            for name, body in zip(files.names, files, strict=True)
         ],
         "reading": pipeline.reading.as_dict(),
         "signature": asdict(pipeline.config),
@@ -49,10 +50,16 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
         if summary["format"] != _FORMAT:
             raise ValueError(f"its format is {summary['format']!r}")
         names = tuple(str(one["file"]) for one in summary["meshes"])
-        paths = tuple(Path(one["path"]) if meshes is None else meshes / one["file"] for one in summary["meshes"])
+        parts = tuple(one.get("part") for one in summary["meshes"])
+        files = (
+            name if part is None else name.removesuffix(f"#{part}") for name, part in zip(names, parts, strict=True)
+        )
+        paths = tuple(Path(one["path"]) for one in summary["meshes"])
+        if meshes is not None:
+            paths = tuple(meshes / file for file in files)
         signature = {**summary["signature"], "attributes": tuple(summary["signature"]["attributes"])}
         return SignatureDataset(
-            Bodies(paths, names, None),
+            Bodies(paths, names, None, parts),
             SignatureConfig(**signature),
             Path(summary["cache_dir"]),
             reading=LoadOptions(**summary["reading"]),
