@@ -8,9 +8,9 @@ import trimesh
 from one_body import of_mesh
 
 from conftest import as_mesh
+from igps.descriptors._linear_histogram import linear_histogram
 from igps.descriptors.local_diameter_centricity import (
     LocalDiameterCentricity,
-    _joint_histogram,
     centricity,
     local_diameters,
 )
@@ -128,7 +128,7 @@ def test_histogram_equals_a_loop_over_the_samples() -> None:
                 row = max(0.0, 1 - abs(min(max(x, 0.0), 7.0) - i))
                 column = max(0.0, 1 - abs(min(max(y, 0.0), 4.0) - j))
                 expected[i, j] += row * column / 50
-    np.testing.assert_allclose(_joint_histogram(first, second, (8, 5)), expected, atol=1e-12)
+    np.testing.assert_allclose(linear_histogram([first, second], [8, 5]), expected, atol=1e-12)
 
 
 def test_seed_chooses_the_samples(blob: Mesh) -> None:

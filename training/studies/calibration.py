@@ -21,9 +21,6 @@ from igps.gallery.calibration import (
     KINDS,
     Calibration,
     calibration_params,
-    quantiles,
-    threshold_at,
-    threshold_between,
 )
 from igps.gallery.surfaces import Surfaces, distance_if_alike
 from igps.mesh.mesh import Mesh
@@ -31,6 +28,7 @@ from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 from training.graded import GradedShapes, body_of
 from training.studies.disturbances import move, remesh, scale, simplified
+from training.studies.thresholds import quantiles, threshold_at, threshold_between
 
 SUFFIXES = {"triangles": ".off", "half": ".off", "motion": ".ply", "format": ".stl", "all": ".obj", "longer": ".off"}
 """Of the files: what was done to the body, and the format. What was made longer is no copy."""

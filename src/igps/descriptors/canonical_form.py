@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import farthest_points
+from igps.descriptors._parameters import check_at_least, check_one_of
 from igps.mesh.simplification import simplify
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
@@ -59,10 +60,8 @@ class CanonicalForm(BodyDescriptor):
 
     def __post_init__(self) -> None:
         super().__init__()
-        if self.scaling not in ("least squares", "classical"):
-            raise ValueError(f"scaling: expected 'least squares' or 'classical', got {self.scaling!r}.")
-        if self.max_order < 2:
-            raise ValueError(f"max_order: expected at least 2 (lower moments are fixed), got {self.max_order}.")
+        check_one_of(get_args(Scaling), scaling=self.scaling)
+        check_at_least(2, max_order=self.max_order)  # lower moments are fixed
         if not _DIMENSION < self.n_samples <= self.max_vertices:
             raise ValueError(
                 f"n_samples: expected {_DIMENSION + 1} to max_vertices = {self.max_vertices}, got {self.n_samples}."

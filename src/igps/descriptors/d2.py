@@ -13,6 +13,7 @@ from torch import Tensor
 
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
+from igps.descriptors._parameters import check_at_least, check_one_of, check_positive
 from igps.nn.descriptor import BodyDescriptor
 
 ShapeFunction = Literal["d2", "a3", "d1"]
@@ -54,12 +55,9 @@ class D2(BodyDescriptor):
 
     def __post_init__(self) -> None:
         super().__init__()
-        if self.function not in get_args(ShapeFunction):
-            raise ValueError(f"function: expected one of {get_args(ShapeFunction)}, got {self.function!r}.")
-        if self.n_bins < 1 or self.n_triples < 1:
-            raise ValueError(f"n_bins, n_triples: expected at least 1, got {self.n_bins} and {self.n_triples}.")
-        if not (math.isfinite(self.reach) and self.reach > 0):
-            raise ValueError(f"reach: expected a positive number, got {self.reach}.")
+        check_one_of(get_args(ShapeFunction), function=self.function)
+        check_at_least(1, n_bins=self.n_bins, n_triples=self.n_triples)
+        check_positive(reach=self.reach)
 
     def describe_body(self, body: Body) -> NDArray[np.float32]:
         """(n_bins,) histogram of the shape function, without unit; sums to 1.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import farthest_points
+from igps.descriptors._parameters import check_at_least
 from igps.mesh.simplification import simplify
 from igps.nn.descriptor import BodyDescriptor
 from igps.signature.ordering import in_order_of_form
@@ -42,8 +43,7 @@ class GeodesicSpectral(BodyDescriptor):
 
     def __post_init__(self) -> None:
         super().__init__()
-        if self.n_eigenvalues < 1:
-            raise ValueError(f"n_eigenvalues: expected at least 1, got {self.n_eigenvalues}.")
+        check_at_least(1, n_eigenvalues=self.n_eigenvalues)
         if not max(self.n_eigenvalues, 2) <= self.n_samples <= self.max_vertices:
             raise ValueError(
                 f"n_samples: expected {max(self.n_eigenvalues, 2)} to max_vertices = {self.max_vertices}, "

@@ -19,6 +19,8 @@ from scipy.spatial import KDTree
 
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
+from igps.descriptors._linear_histogram import linear_histogram
+from igps.descriptors._parameters import check_at_least, check_positive
 from igps.nn.descriptor import BodyDescriptor
 
 METRICATION = 1.0495
@@ -57,11 +59,9 @@ class InnerDistance(BodyDescriptor):
 
     def __post_init__(self) -> None:
         super().__init__()
-        for name, least in (("n_bins", 2), ("n_sources", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}.")
-        if not self.max_distance > 0:
-            raise ValueError(f"max_distance: expected a positive number, got {self.max_distance}.")
+        check_at_least(2, n_bins=self.n_bins)
+        check_at_least(1, n_sources=self.n_sources)
+        check_positive(max_distance=self.max_distance)
 
     def describe_body(self, body: Body) -> NDArray[np.float32]:
         """(n_bins,) histogram that sums to 1.
@@ -75,12 +75,7 @@ class InnerDistance(BodyDescriptor):
         lengths = inner_distances(points, sources)
         lengths[np.arange(n_sources), sources] = np.nan
         ratio = lengths[~np.isnan(lengths)] / np.sqrt(body.area)
-        # A value at the centre of a bin counts there alone, one between two centres for both.
-        position = np.clip(ratio / self.max_distance * self.n_bins - 0.5, 0, self.n_bins - 1)
-        low = np.minimum(position.astype(int), self.n_bins - 2)
-        part = position - low
-        histogram = np.bincount(low, 1 - part, self.n_bins) + np.bincount(low + 1, part, self.n_bins)
-        return (histogram / len(ratio)).astype(np.float32)
+        return linear_histogram([ratio / self.max_distance], [self.n_bins]).astype(np.float32)
 
 
 def inner_distances(points: NDArray[np.float64], sources: NDArray[np.int64]) -> NDArray[np.float64]:

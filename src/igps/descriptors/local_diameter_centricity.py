@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import farthest_points
+from igps.descriptors._linear_histogram import linear_histogram
+from igps.descriptors._parameters import check_at_least, check_positive
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors, longest_side, unit, vertex_areas
 from igps.nn.descriptor import BodyDescriptor
@@ -61,15 +63,9 @@ class LocalDiameterCentricity(BodyDescriptor):
 
     def __post_init__(self) -> None:
         super().__init__()
-        for name in ("n_diameter_bins", "n_centricity_bins"):
-            if getattr(self, name) < 2:
-                raise ValueError(f"{name}: expected at least 2, got {getattr(self, name)}.")
-        for name in ("n_samples", "n_rays", "n_sources"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}.")
-        for name in ("max_diameter", "max_centricity"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
+        check_at_least(2, n_diameter_bins=self.n_diameter_bins, n_centricity_bins=self.n_centricity_bins)
+        check_at_least(1, n_samples=self.n_samples, n_rays=self.n_rays, n_sources=self.n_sources)
+        check_positive(max_diameter=self.max_diameter, max_centricity=self.max_centricity)
         if not 0 < self.opening_angle < 180:
             raise ValueError(f"opening_angle: expected between 0 and 180 degrees, got {self.opening_angle}.")
 
@@ -89,11 +85,8 @@ class LocalDiameterCentricity(BodyDescriptor):
                 f"{mesh.name}: no ray from the surface inwards meets its far side. Close the surface or repair it."
             )
         scale = np.sqrt(mesh.area)
-        return _joint_histogram(
-            diameter[seen] / scale / self.max_diameter,
-            central[seen] / scale / self.max_centricity,
-            (self.n_diameter_bins, self.n_centricity_bins),
-        ).astype(np.float32)
+        ratios = [diameter[seen] / scale / self.max_diameter, central[seen] / scale / self.max_centricity]
+        return linear_histogram(ratios, [self.n_diameter_bins, self.n_centricity_bins]).astype(np.float32)
 
 
 def local_diameters(
@@ -179,20 +172,3 @@ def _robust_mean(lengths: NDArray[np.float64]) -> NDArray[np.float64]:
     none_left = np.isnan(trimmed).all(axis=1, keepdims=True)
     result[rows] = np.nanmean(np.where(none_left, values, trimmed), axis=1)
     return result
-
-
-def _joint_histogram(
-    first: NDArray[np.float64], second: NDArray[np.float64], n_bins: tuple[int, int]
-) -> NDArray[np.float64]:
-    """Histogram of pairs of numbers in [0, 1], larger ones in the last bin, with a linear kernel in both."""
-    histogram = np.zeros(n_bins)
-    parts = []
-    for values, n in ((first, n_bins[0]), (second, n_bins[1])):
-        # A value at the centre of a bin counts there alone, one between two centres for both.
-        position = np.clip(values * n - 0.5, 0, n - 1)
-        low = np.minimum(position.astype(int), n - 2)
-        parts.append(((low, 1 - (position - low)), (low + 1, position - low)))
-    for row, row_part in parts[0]:
-        for column, column_part in parts[1]:
-            np.add.at(histogram, (row, column), row_part * column_part)
-    return histogram / len(first)

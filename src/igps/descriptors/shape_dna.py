@@ -11,6 +11,7 @@ from torch import Tensor
 
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
+from igps.descriptors._parameters import check_at_least, check_one_of
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
 
@@ -44,10 +45,8 @@ class ShapeDNA(BodyDescriptor):
 
     def __post_init__(self) -> None:
         super().__init__()
-        if self.n_eigenvalues < 1:
-            raise ValueError(f"n_eigenvalues: expected at least 1, got {self.n_eigenvalues}.")
-        if self.normalisation not in get_args(Normalisation):
-            raise ValueError(f"normalisation: expected one of {get_args(Normalisation)}, got {self.normalisation!r}.")
+        check_at_least(1, n_eigenvalues=self.n_eigenvalues)
+        check_one_of(get_args(Normalisation), normalisation=self.normalisation)
         self.requirements = Requirements(n_eigenpairs=self.n_eigenvalues)
 
     def describe_body(self, body: Body) -> NDArray[np.float32]:

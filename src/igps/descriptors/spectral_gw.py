@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from torch import Tensor
 
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
+from igps.descriptors._parameters import check_at_least, check_one_of
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
 from igps.signature.signature import Signature
@@ -69,12 +70,9 @@ class SpectralGromovWasserstein(BodyDescriptor):
     def __post_init__(self) -> None:
         super().__init__()
         _check_samples(self.samples, self.n_samples)
-        if self.bound not in ("trace", "signature", "pairs"):
-            raise ValueError(f"bound: expected 'trace', 'signature' or 'pairs', got {self.bound!r}.")
+        check_one_of(get_args(Bound), bound=self.bound)
         _check_times(self.times)
-        for name in ("n_quantiles", "n_eigenpairs"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}.")
+        check_at_least(1, n_quantiles=self.n_quantiles, n_eigenpairs=self.n_eigenpairs)
         self.requirements = Requirements(n_eigenpairs=self.n_eigenpairs)
 
     def describe_body(self, body: Body) -> NDArray[np.float32]:
@@ -203,10 +201,8 @@ def gromov_wasserstein(
 
 
 def _check_samples(samples: Where, n_samples: int) -> None:
-    if samples not in ("surface", "interior"):
-        raise ValueError(f"samples: expected 'surface' or 'interior', got {samples!r}.")
-    if n_samples < 1:
-        raise ValueError(f"n_samples: expected at least 1, got {n_samples}.")
+    check_one_of(get_args(Where), samples=samples)
+    check_at_least(1, n_samples=n_samples)
 
 
 def _check_times(times: Sequence[float]) -> None:

@@ -16,7 +16,7 @@ only add eigenvalues far above the first ones.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from torch import Tensor
 
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
+from igps.descriptors._parameters import check_at_least, check_one_of
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import longest_side
 from igps.nn.descriptor import BodyDescriptor
@@ -73,12 +74,8 @@ class VolumeShapeDNA(BodyDescriptor):
 
     def __post_init__(self) -> None:
         super().__init__()
-        if self.boundary not in ("dirichlet", "neumann"):
-            raise ValueError(f"boundary: expected 'dirichlet' or 'neumann', got {self.boundary!r}.")
-        if self.n_eigenvalues < 1:
-            raise ValueError(f"n_eigenvalues: expected at least 1, got {self.n_eigenvalues}.")
-        if self.n_voxels < 1:
-            raise ValueError(f"n_voxels: expected at least 1, got {self.n_voxels}.")
+        check_one_of(get_args(Boundary), boundary=self.boundary)
+        check_at_least(1, n_eigenvalues=self.n_eigenvalues, n_voxels=self.n_voxels)
 
     def describe_body(self, body: Body) -> NDArray[np.float32]:
         """(n_eigenvalues,) normalised eigenvalues, ascending, without unit.

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from igps.descriptors.fingerprint import fingerprint, name_of
 from igps.descriptors.pretrained.descriptor import PRETRAINED
@@ -166,41 +164,6 @@ class Calibration:
 def calibration_params(config: SignatureConfig) -> dict[str, int]:
     """What a calibration keeps of the Signatures that it was made with."""
     return {name: config.as_dict()[name] for name in _DEPENDS_ON}
-
-
-def quantiles(distances: ArrayLike) -> list[float]:
-    """Those of distances at `LEVELS`."""
-    return [float(f"{value:.5g}") for value in np.quantile(np.asarray(distances, dtype=np.float64), LEVELS)]
-
-
-def threshold_between(same: ArrayLike, other: ArrayLike, rate: float) -> Threshold:
-    """The threshold between distances of pairs that are the same and of others.
-
-    Where the two do not overlap, the geometric mean of the largest of the ones and the smallest of the others; else as
-    large as the rate of false pairs allows.
-
-    Args:
-        same: distances of pairs that are the same.
-        other: of pairs that are not.
-        rate: of false pairs, at most.
-    """
-    largest, refused = float(np.max(same)), _first_refused(other, rate)
-    return _counted(math.sqrt(largest * refused) if largest < refused else math.nextafter(refused, 0), same, other)
-
-
-def threshold_at(same: ArrayLike, other: ArrayLike, rate: float) -> Threshold:
-    """As large a threshold as the rate of false pairs allows; arguments as for `threshold_between`."""
-    return _counted(math.nextafter(_first_refused(other, rate), 0), same, other)
-
-
-def _first_refused(other: ArrayLike, rate: float) -> float:
-    other = np.sort(np.asarray(other, dtype=np.float64))
-    return float(other[int(rate * len(other))])
-
-
-def _counted(distance: float, same: ArrayLike, other: ArrayLike) -> Threshold:
-    same, other = np.asarray(same), np.asarray(other)
-    return Threshold(distance, len(other), int((other <= distance).sum()), len(same), int((same <= distance).sum()))
 
 
 def _percent(share: float) -> str:

@@ -1,4 +1,4 @@
-"""`rich` is its parts side by side; `pretrained` is the shipped metric on top of its own parts."""
+"""`rich` is its parts side by side; `pretrained` is the shipped head on top of its own parts."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ PART_CELLS = (640, 750, 750, 1000, 1920, 576, 16, 180, 63)
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> SignatureDataset:
-    """Shapes of a seed that the pretrained metric was not fitted to."""
+    """Shapes of a seed that the shipped head was not fitted to."""
     root = tmp_path_factory.mktemp("shapes")
-    ArticulatedShapes(n_classes=24, n_per_class=3, seed=7, n_vertices=1500).write(root)
+    ArticulatedShapes(n_classes=12, n_per_class=3, seed=7, n_vertices=800).write(root)
     needs = rich().requirements | pretrained_parts().requirements
     config = needs.apply_to(SignatureConfig(n_eigenpairs=64, n_surface_samples=1000))
     return SignatureDataset(root, config, root / "cache")
@@ -73,7 +73,7 @@ def test_rich_is_its_histograms_side_by_side_with_equal_shares(
 
 
 def test_a_class_is_closer_to_itself(dataset: SignatureDataset, histograms: torch.Tensor) -> None:
-    """Far beyond what labels dealt out at random give: 2 of the 71 others, 3 %, are of a shape's class."""
+    """Far beyond what labels dealt out at random give: 2 of the 35 others, 6 %, are of a shape's class."""
     scores = retrieval_scores(igps.descriptor("rich").distances(histograms, histograms), dataset.labels).mean()
     shuffled = dataset.labels[torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))]
     by_chance = retrieval_scores(chi_square(histograms, histograms), shuffled).mean()
@@ -140,7 +140,7 @@ def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
 
     Of another seed than those that it was fitted to, and without the twelve templates, which all descriptors tell.
     """
-    GradedShapes(12, 4, 1, seed=3, look_alikes=False).write(tmp_path, n_workers=None)
+    GradedShapes(12, 3, 1, seed=3, n_vertices=(1500, 2000), look_alikes=False).write(tmp_path, n_workers=None)
     module, plain = pretrained(), rich()
     config = (module.requirements | plain.requirements).apply_to(SignatureConfig(n_eigenpairs=64))
     dataset = SignatureDataset(tmp_path, config, tmp_path / "cache")
@@ -156,13 +156,13 @@ def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
     assert learned > first_tier(chi_square(own, own)) + 0.1
 
 
-def test_a_metric_of_ones_own_is_stored_and_loaded(dataset: SignatureDataset, tmp_path: Path) -> None:
+def test_a_head_of_ones_own_is_stored_and_loaded(dataset: SignatureDataset, tmp_path: Path) -> None:
     dataset = dataset.subset(range(20))
     descriptor = pretrained_parts().eval()
     described = describe(dataset, descriptor)
     head = two_levels().fit(described, dataset.labels, descriptor.part_cells)
-    save_pretrained(EmbeddedDescriptor(descriptor, head), tmp_path / "metric.safetensors")
-    loaded = pretrained(tmp_path / "metric.safetensors")
+    save_pretrained(EmbeddedDescriptor(descriptor, head), tmp_path / "head.safetensors")
+    loaded = pretrained(tmp_path / "head.safetensors")
     assert not loaded.training
     torch.testing.assert_close(describe(dataset, loaded), head(described), atol=5e-3, rtol=0)
     shipped = pretrained().head(described)
@@ -173,7 +173,7 @@ def test_shipped_file_is_small() -> None:
     assert PRETRAINED.stat().st_size < 5e6
 
 
-def test_a_file_of_another_metric_is_named(tmp_path: Path) -> None:
+def test_a_file_of_another_head_is_named(tmp_path: Path) -> None:
     path = tmp_path / "other.safetensors"
     save_file({"head.mean": torch.zeros(3)}, path)
     with pytest.raises(ValueError, match=r"other\.safetensors: expected the parameters of `pretrained`"):

@@ -1,0 +1,27 @@
+"""Checks of the parameters of descriptors, in one wording."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+
+def check_at_least(least: int, **values: int) -> None:
+    """Raise a ValueError that names the first of the values that is smaller."""
+    for name, value in values.items():
+        if value < least:
+            raise ValueError(f"{name}: expected at least {least}, got {value}.")
+
+
+def check_positive(**values: float) -> None:
+    """Raise a ValueError that names the first of the values that is not a finite number above 0."""
+    for name, value in values.items():
+        if not 0 < value < math.inf:
+            raise ValueError(f"{name}: expected a positive number, got {value}.")
+
+
+def check_one_of(allowed: Sequence[str], **values: str) -> None:
+    """Raise a ValueError that names the first of the values that is not allowed."""
+    for name, value in values.items():
+        if value not in allowed:
+            raise ValueError(f"{name}: expected one of {', '.join(map(repr, allowed))}, got {value!r}.")
