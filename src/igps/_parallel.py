@@ -1,7 +1,7 @@
-"""Many jobs at once: on processes, where one that fails or kills its process costs no other its result; on threads.
+"""Many jobs at once, on processes or on threads. A job that fails, or kills its process, costs no other its result.
 
-Each worker is a `ProcessPoolExecutor` of one process: where that process dies, the job it had is known by name, and a
-job that takes too long is ended by ending its process. Any other `concurrent.futures.Executor`, such as that of a
+Each worker is a `ProcessPoolExecutor` of one process. So it is known which job a process had when it died, and a job
+that takes too long is ended by killing its process. Any other `concurrent.futures.Executor`, such as that of a
 cluster, may do the work instead.
 """
 
@@ -67,7 +67,7 @@ _KILLED_ELSEWHERE = (
     "the workers that had it were killed, one after the other. It may need more memory than they have: start them with "
     "more."
 )
-# Enough for the workers of a large cluster, few enough for the memory of who asks.
+# Enough for the workers of a large cluster, few enough for the memory of the caller.
 _MOST_SUBMITTED = 10_000
 _MACHINES = frozenset(
     getattr(errno, name, 0)
@@ -115,14 +115,14 @@ def run(
     executor: Executor | None = None,
     limits: Limits | None = None,
 ) -> Generator[tuple[int, Result | Failed], None, None]:
-    """The result of every job with its number, as they come.
+    """The number and the result of every job, in the order in which they end.
 
     Args:
         function: picklable; the exceptions that it raises, but for those of the machine, are failures of the job.
         jobs: picklable.
         n_workers: processes; as many as cores if None. One works in this process, unless there are limits.
-        executor: works in place of these processes.
-        limits: of each job, in processes of ours.
+        executor: does the work instead of these processes.
+        limits: of each job; not with an executor.
 
     Raises:
         MachineError: the disk is full, memory runs out without a limit, a library is missing, or no process can be
@@ -204,7 +204,7 @@ def attempt(result: Callable[[], Result], limits: Limits = Limits()) -> Result |
             raise MachineError(machines_words(error)) from error
         return Failed(_sentence(error))
     except Exception as error:
-        # The exception of Dask, where so many workers were lost with a job that it is not given to another.
+        # Dask raises it after several workers died with the same job.
         return Failed(_KILLED_ELSEWHERE if type(error).__name__ == "KilledWorker" else _sentence(error))
 
 
@@ -305,7 +305,7 @@ def _by_workers(
     workers: list[_Worker[Job, Result]] = [_Worker(limits) for _ in range(n_workers)]
     finished = False
     try:
-        # All at once: a process takes seconds to import what it needs.
+        # All at the same time, as a process takes seconds to import what it needs
         with _workers_environment(), ThreadPoolExecutor(n_workers) as starters:
             list(starters.map(lambda worker: worker.started(), workers))
         while True:
@@ -360,7 +360,7 @@ def _workers_environment() -> Generator[None, None, None]:
 
 
 def _begin(memory: int | None) -> None:
-    """What a worker does first: bound its memory, and watch its parent, without which it would wait for ever."""
+    """What a worker does first: bound its memory, and watch its parent, to end with it."""
     if memory is not None:
         with contextlib.suppress(ImportError, ValueError):
             import resource

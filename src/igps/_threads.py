@@ -1,4 +1,4 @@
-"""How many threads a call may use, in one place: few, and none that wait for each other by spinning.
+"""How many threads a call may use: few, and none that wait for each other by spinning.
 
 The threads of OpenMP and of OpenBLAS divide each small product among them and spin while they wait for the slowest.
 Where another process has the core of one, or a container has fewer cores granted than it sees, all wait for it each
@@ -35,7 +35,7 @@ def n_cores() -> int:
 
 
 def n_threads() -> int:
-    """Threads of Python that the present call may use: as many as cores, but no more than torch had before the call."""
+    """Threads of Python that this call may use: as many as cores, but no more than torch had before the call."""
     if _present.most is not None:
         return _present.most
     most = _get_torch_threads()
@@ -92,7 +92,7 @@ class Team:
             self._pool = None
 
     def each(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
-        """The result of every job, in order; the function must release the interpreter's lock to gain from it."""
+        """The result of every job, in order; only functions that release the interpreter's lock get faster."""
         n_helpers = min(self.n_threads, len(jobs)) - 1
         if self._pool is None or n_helpers < 1:
             return [function(job) for job in jobs]
@@ -195,7 +195,7 @@ _torch_threads = _fork_safe_lock()
 
 
 def _get_torch_threads() -> int:
-    """Of this thread; where it has not computed yet, never what `_set_torch_threads` means for another."""
+    """Of this thread. The lock keeps it from seeing, on a new thread, what `_set_torch_threads` sets for another."""
     with _torch_threads:
         return torch.get_num_threads()
 
@@ -203,8 +203,7 @@ def _get_torch_threads() -> int:
 def _set_torch_threads(n: int) -> None:
     """For this thread alone.
 
-    `torch.set_num_threads` also sets with how many a thread starts that computes for the first time. Another such
-    thread sets that back.
+    `torch.set_num_threads` also sets the number for threads that have not computed yet. One of those sets it back.
     """
     if _get_torch_threads() == n:
         return
@@ -267,7 +266,7 @@ _new_threads = _NewThreads()
 
 @lru_cache(maxsize=1)
 def _libraries(n_modules: int) -> threadpoolctl.ThreadpoolController:
-    """Those that are loaded; to look for them takes as long as a small product, and only an import brings others."""
+    """Those that are loaded. Looking for them takes as long as a small product, and only an import brings others."""
     return threadpoolctl.ThreadpoolController()
 
 

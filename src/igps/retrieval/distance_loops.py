@@ -44,7 +44,7 @@ def chi_square(a: NDArray[Real], b: NDArray[Real], weights: NDArray[Real]) -> Re
     return total
 
 
-# Said in so many words, as Numba else takes what the caller has: the square of a small number may be 0.
+# Explicitly without fastmath, which Numba would take over from the caller: the square of a small number may be 0.
 @compiled(fastmath=False)
 def term(a: Real, b: Real, one: Real) -> Real:
     """(a−b)² / (a+b), divided before it is multiplied; 0 where both are 0."""

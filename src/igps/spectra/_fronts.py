@@ -170,9 +170,9 @@ def invert_front(
 ) -> int:
     """Write the inverse (n, width) of a front's pivot block; the negative eigenvalues of that, -1 if it cannot tell.
 
-    What is definite is inverted accurately with its pivots in any order. What is not loses digits in one order or the
-    other, rarely in both: how many is seen by A X, which is also why their signs can be believed. Between A and the
-    matrix that X is the inverse of, no eigenvalue passes zero.
+    A definite block is inverted accurately with its pivots in any order. An indefinite one may lose digits in one
+    order, rarely in both; I − A X tells how many. Where it is small, the signs of the pivots are right as well: on the
+    way from A to the matrix whose inverse X is, no eigenvalue passes zero.
     """
     for backwards in (False, True):
         load(inverse, front, n, front_width, width, backwards)

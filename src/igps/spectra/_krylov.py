@@ -28,7 +28,7 @@ ROUND_PIVOT = 0.1
 SWEEP_EVERY, SWEEP_LOSS, SINGLE_LOSS = 2, 1e-7, 3e-8
 # Of a larger basis there is no copy in single precision, to save memory: 1 GiB
 MOST_SINGLE_ENTRIES = 2**28
-# Up to here a basis gains by huge pages, which NumPy's memory asks for, a larger one waits longer for them: 256 MiB
+# Up to 256 MiB a basis gains by the huge pages that NumPy asks the system for; for larger ones the wait costs more
 MOST_HUGE_ENTRIES = 2**25
 # Columns of the basis that are turned into eigenvectors at once
 COLUMNS_AT_ONCE = 8192
@@ -105,7 +105,7 @@ class Krylov:
     def _allocate(self, n_rows: int, n_columns: int) -> None:
         """A new basis. Of NumPy's memory a part can be given back.
 
-        A smaller one and its copy are one piece: the C library keeps as much for the next basis as was one piece once.
+        A smaller one and its copy are one piece: the C library keeps what was one piece for the next basis.
         """
         self._memory = np.empty((n_rows if self._large else 0, n_columns))
         if self._large:

@@ -1,4 +1,4 @@
-"""Block Lanczos with a shift inside the wanted part of the spectrum, or below it; `eigensolver` tells how it works."""
+"""Block Lanczos with a shift inside the wanted part of the spectrum, or below it; explained in `eigensolver`."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ logger = logging.getLogger(__name__)
 SHIFT_RANK = 0.55
 # The shift of the second try, in units of 1/area
 SHIFT_BELOW = -1.0
-# Vectors in a block: few make a small basis, many make fast products. Up to so many pairs, few are better.
-# So they are where a basis takes gigabytes.
+# Vectors in a block: few make a small basis, many make fast products. Few are better for up to FEW_EIGENPAIRS pairs,
+# and where the result has more than LARGE_RESULT numbers, as the basis then takes gigabytes.
 SMALL_BLOCK, LARGE_BLOCK, FEW_EIGENPAIRS, LARGE_RESULT = 8, 12, 128, 2**27
 # Basis size at which mostly all pairs have converged, as measured on bodies of 11,000 vertices: so many vectors a pair
 # and, besides, so many blocks, more for each factor of ten in the number of pairs and for each digit beyond seven
@@ -57,7 +57,7 @@ def lanczos(
 
     With the shift inside the spectrum it is fast. With the shift below, A − σI is definite: its factors are accurate.
     """
-    # a solve reads and writes long vectors in the order of elimination: so they had better lie
+    # a solve is faster where vectors lie in memory in the order of elimination
     tree, matrix, order = analyse(matrix, positions).arranged(matrix)
     zero_mode = zero_mode[order]
     few = n_eigenpairs <= FEW_EIGENPAIRS or n_eigenpairs * len(zero_mode) > LARGE_RESULT

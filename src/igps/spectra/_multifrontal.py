@@ -39,7 +39,7 @@ from igps._threads import ALONE, Team
 from igps.spectra import _fronts as loops
 from igps.spectra._checks import canonical, check_entries
 from igps.spectra._ordering import LEAF_SIZE, checked_graph, nested_dissection
-from igps.spectra._tree import Nodes, arranged, side_by_side, stacked_places, tree_nodes
+from igps.spectra._tree import Nodes, side_by_side, stacked_places, tree_nodes
 
 # Own unknowns of a node above which its dense algebra is PyTorch's, for which a team can work
 LARGE = 127
@@ -102,10 +102,11 @@ class Tree(Nodes):
         """The structure for unknowns in the order of elimination, such a matrix, and which each was before (V,)."""
         matrix = canonical(matrix)
         check_entries(matrix, self.indptr, self.indices)
-        indptr, indices, data = arranged(self.indptr, self.indices, matrix.data, self.order, self.number)
+        matrix = matrix[self.order][:, self.order]
+        matrix.sort_indices()
+        indptr, indices = (array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices))
         same = np.arange(len(self.order))
-        structure = replace(self, indptr=indptr, indices=indices, order=same, number=same)
-        return structure, sparse.csr_array((data, indices, indptr), shape=matrix.shape), self.order
+        return replace(self, indptr=indptr, indices=indices, order=same, number=same), matrix, self.order
 
     def _eliminate(self, matrix: sparse.csr_array, shift: float, team: Team, blocks: np.ndarray | None) -> int:
         """Write the blocks, if they are to be kept; the number of negative eigenvalues."""

@@ -77,7 +77,7 @@ def combinations(rows: torch.Tensor, coefficients: torch.Tensor, piece: slice) -
 
 
 def _tile(n_columns: int) -> Any:
-    """A function for one tile of `_product`, ROWS rows of so many numbers, each row one of LLVM's vectors.
+    """A function for one tile of `product`, ROWS rows of so many numbers, each row one of LLVM's vectors.
 
     Of fewer rows the last stands in for the others: it is computed and written several times.
     """
@@ -208,7 +208,7 @@ def four_by_six(
 ) -> tuple[Four, Four, Four, Four, Four, Four]:
     """The products of four rows of one array, from ``i`` on, with each of six of another; the last stands in for more.
 
-    By hand, as only sums that have names are kept in registers.
+    The compiler keeps sums in registers only if each has a name.
     """
     last, last_b = len(a) - 1, len(b) - 1
     a0, a1, a2, a3 = a[i], a[min(i + 1, last)], a[min(i + 2, last)], a[min(i + 3, last)]

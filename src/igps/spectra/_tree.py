@@ -127,27 +127,6 @@ def _parent_rows(first: np.ndarray, parent: np.ndarray, start: np.ndarray, bound
     return rows
 
 
-@compiled()
-def arranged(
-    indptr: np.ndarray, indices: np.ndarray, values: np.ndarray, order: np.ndarray, number: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A csr matrix whose row i and column i are those of ``order[i]`` before; its entries are sorted."""
-    new_indptr, new_indices = np.zeros_like(indptr), np.empty_like(indices)
-    new_values = np.empty_like(values)
-    end = 0
-    for i in range(len(order)):
-        begin = end
-        for k in range(indptr[order[i]], indptr[order[i] + 1]):
-            j, place = number[indices[k]], end
-            while place > begin and new_indices[place - 1] > j:
-                new_indices[place], new_values[place] = new_indices[place - 1], new_values[place - 1]
-                place -= 1
-            new_indices[place], new_values[place] = j, values[k]
-            end += 1
-        new_indptr[i + 1] = end
-    return new_indptr, new_indices, new_values
-
-
 def side_by_side(n_levels: int, n_unknowns: int) -> list[tuple[int, int]]:
     """The ranges of nodes of a few large subtrees, in the order in which a full tree is numbered depth first.
 

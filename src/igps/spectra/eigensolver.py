@@ -222,13 +222,13 @@ def _residual(
         ConvergenceError: one is above the tolerance though rounding allows a smaller one, or above RESIDUAL_LIMIT.
     """
     largest = 0.0
-    defects, corrections = _defects(
+    squares, corrections = _defects(
         matrix.data, matrix.indptr, matrix.indices, eigenvalues, np.ascontiguousarray(vectors)
     )
     for start in range(0, len(eigenvalues), 64):
         part = slice(start, start + 64)
         values = eigenvalues[part]
-        residuals = defects[part] / np.abs(values)
+        residuals = np.sqrt(squares[part]) / np.abs(values)
         largest = max(largest, float(residuals.max()))
         if not (residuals <= tolerance).all():
             rounding = np.linalg.norm(abs(matrix) @ np.abs(vectors[:, part]), axis=0) * ROUNDING / np.abs(values)
@@ -247,7 +247,7 @@ def _residual(
 def _defects(
     values: np.ndarray, indptr: np.ndarray, indices: np.ndarray, eigenvalues: np.ndarray, vectors: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(K,) lengths of A y − λ y and (K,) its products with y, for a csr matrix and vectors (V, K)."""
+    """(K,) squared lengths of A y − λ y and (K,) its products with y, for a csr matrix and vectors (V, K)."""
     n_vertices, n_vectors = vectors.shape
     defect, squares, products = np.empty(n_vectors), np.zeros(n_vectors), np.zeros(n_vectors)
     for i in range(n_vertices):
@@ -260,4 +260,4 @@ def _defects(
         for c in range(n_vectors):
             squares[c] += defect[c] * defect[c]
             products[c] += defect[c] * vectors[i, c]
-    return np.sqrt(squares), products
+    return squares, products
