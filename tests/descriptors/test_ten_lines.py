@@ -1,0 +1,44 @@
+"""The ten lines of the README with every named descriptor in place of the one that is printed there."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+import igps
+from igps.descriptors import NAMES
+
+README = Path(__file__).parents[2] / "README.md"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two classes of three small shapes, and a cache of their signatures with all that any descriptor needs."""
+    root = tmp_path_factory.mktemp("ten_lines")
+    igps.ArticulatedShapes(n_classes=2, n_per_class=3, n_vertices=1100).write(root / "shapes")
+    for name in ("rich", "interior"):
+        dataset = igps.SignatureDataset(root / "shapes", cache_dir=root / "cache", descriptor=name)
+        assert dataset.precompute(n_workers=1, progress=False) == []
+    return root
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_ten_lines_work_with_every_descriptor(
+    folder: Path, name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    match = re.search(r"^```python\n(.*?)^```", README.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    assert match is not None
+    lines = [line for line in match[1].splitlines() if ".write(" not in line]  # the shapes are there
+    example = "\n".join(lines).replace('"interior"', repr(name))
+    assert repr(name) in example
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("igps._parallel.n_cores", lambda: 1)  # starting processes would take longer than all the rest
+    exec(compile(example, str(README), "exec"), {})
+    scores, nearest = capsys.readouterr().out.splitlines()
+    assert ast.literal_eval(scores)["nn"] >= 0.5  # by chance 0.4
+    first, second, third = ast.literal_eval(nearest)
+    assert first.endswith("0.off")
+    assert len({first, second, third}) == 3
