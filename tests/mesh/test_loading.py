@@ -102,7 +102,7 @@ def test_off_files_are_read_as_trimesh_reads_them(tmp_path: Path) -> None:
         "OFF\n5 3 0\n\n\n\n\n\n3 0 1 2\n",
     ]
     alphabet = [*"0123456789.-+eEnaif #\n\t,x", "٣", "\x0c"]
-    for _ in range(1500):
+    for _ in range(800):
         text = list(plain)
         for place in random.integers(0, len(text), random.integers(1, 4)):
             text[place] = random.choice(["", random.choice(alphabet), text[place] + random.choice(alphabet)])
@@ -124,7 +124,7 @@ def test_off_files_are_read_as_trimesh_reads_them(tmp_path: Path) -> None:
             np.testing.assert_array_equal(found.vertices, expected.vertices)
             np.testing.assert_array_equal(found.faces, expected.faces)
         outcomes.append(expected is not None)
-    assert 300 < sum(outcomes) < len(texts) - 300
+    assert 150 < sum(outcomes) < len(texts) - 150
 
 
 def test_texture_seams_do_not_split_vertices(tmp_path: Path) -> None:

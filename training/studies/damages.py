@@ -154,7 +154,7 @@ def _with_holes(
     per_patch = share / n_patches * area.sum()
     pairs, _ = undirected_edges(faces, len(vertices))
     length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
-    graph = sparse.csr_array((np.maximum(length, 1e-300), tuple(pairs.T)), shape=(len(vertices),) * 2)
+    graph = sparse.csr_array((np.maximum(length, 1e-300), tuple(pairs.T.astype(np.int32))), shape=(len(vertices),) * 2)
     left = np.ones(len(faces), dtype=bool)
     for _ in range(n_patches):
         middle = generator.choice(len(area), p=area * left / (area * left).sum())

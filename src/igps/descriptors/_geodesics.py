@@ -145,7 +145,8 @@ def edge_graph(mesh: Mesh, points_per_edge: int = 0) -> sparse.csr_array:
         opposite = mesh.faces[:, (i + 2) % 3]
         tails += [np.repeat(here, n, axis=1).ravel(), np.repeat(opposite, n)]
         heads += [np.tile(following, (1, n)).ravel(), here.ravel()]
-    tail, head = np.concatenate(tails), np.concatenate(heads)
+    # SciPy's shortest paths take no larger whole numbers, up to version 1.14.
+    tail, head = (np.concatenate(ends).astype(np.int32) for ends in (tails, heads))
     length = np.linalg.norm(positions[tail] - positions[head], axis=1)
     entries = (np.concatenate([length, length]), (np.concatenate([tail, head]), np.concatenate([head, tail])))
     return sparse.csr_array(sparse.coo_array(entries, shape=(len(positions), len(positions))))
