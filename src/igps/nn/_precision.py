@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -75,10 +76,15 @@ def _change() -> Callable[[], None]:
     return settings.restore
 
 
-full_precision = ProcessSetting(_change)
-"""A context in which float32 matrix products are computed in float32.
+_setting = ProcessSetting(_change)
 
-`torch.set_float32_matmul_precision("medium")`, and the settings of `torch.backends` like it, allow TF32 or bfloat16: a
-distance from inner products would be wrong by 10⁻³ to 10⁻² of the largest, and fall into another bin. The settings
-belong to the process: while a thread is inside, they hold for all threads; when the last one leaves, they are restored.
-"""
+
+def full_precision() -> AbstractContextManager[None]:
+    """A context in which float32 matrix products are computed in float32.
+
+    `torch.set_float32_matmul_precision("medium")`, and the settings of `torch.backends` like it, allow TF32 or
+    bfloat16: a distance from inner products would be wrong by 10⁻³ to 10⁻² of the largest, and fall into another bin.
+    The settings belong to the process: while a thread is inside, they hold for all threads; when the last one leaves,
+    they are restored. What PyTorch traces for `torch.compile` or `torch.export` runs later, under the settings of then.
+    """
+    return nullcontext() if torch.compiler.is_compiling() else _setting()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import reduce
@@ -77,7 +78,9 @@ class Descriptor(nn.Module, ABC):
             ValueError: the batch lacks what the descriptor needs.
         """
         self.requirements.check(batch)
-        with one_thread():
+        # On other devices nothing is gained, and what is traced runs later.
+        alone = batch.area.device.type == "cpu" and not torch.compiler.is_compiling()
+        with one_thread() if alone else contextlib.nullcontext():
             return self.describe(batch)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:

@@ -20,9 +20,11 @@ from igps.nn.axes import (
     InteriorDistance,
     PairAxis,
     PairCosines,
+    PairValues,
     PointAxis,
     Potential,
 )
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms import PairHistogram, pair_histogram
 from loops import (
@@ -233,6 +235,33 @@ def test_learned_axes_equal_brute_force_loop(batch: SignatureBatch, with_cosines
             pairs.append((look.euclidean(2)[0], euclidean.centres().tolist()))
         expected = pair_histogram_by_loops(memberships, pairs)
         np.testing.assert_allclose(result[i].detach(), expected, atol=1e-6)
+
+
+class DepthDifference(PairAxis):
+    """An axis of one's own, with values of its own."""
+
+    shape = (3,)
+
+    def requirements(self, embedding: nn.Module) -> Requirements:
+        return Requirements(attributes=("depth",))
+
+    def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
+        def between(rows: Sequence[Tensor], columns: Sequence[Tensor]) -> Tensor:
+            return (rows[0][:, None, :, None] - columns[0][:, None, None, :]).abs()
+
+        return PairValues((features.attribute("depth"),), (torch.tensor([0.0, 0.1, 0.5]),), between)
+
+
+def test_an_axis_of_ones_own_counts_values_of_its_own(batch: SignatureBatch) -> None:
+    histogram = PairHistogram([Potential(2), DepthDifference(), InteriorDistance(4)], FINE)
+    assert histogram.shape == (3, 4, 3)
+    assert histogram.requirements == Requirements(6, ("depth",))
+    result = histogram(batch)
+    for i in range(2):
+        look = Look(batch, i)
+        depth = look.attribute("depth").double().numpy()
+        axes = [look.interior(4), (np.abs(np.subtract.outer(depth, depth)), [0.0, 0.1, 0.5])]
+        np.testing.assert_allclose(result[i], pair_histogram_by_loops(look.potential(2), axes), atol=1e-6)
 
 
 def test_defaults_are_the_papers_histogram(batch: SignatureBatch) -> None:

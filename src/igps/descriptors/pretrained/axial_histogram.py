@@ -102,7 +102,7 @@ class AxialHistogram(SampleHistogram):
             # towards the nearer end of the axis: so a body and its mirror image agree
             away = torch.where(along < 0, -of_direction, of_direction)
             direction = [soft_memberships(away, self.cosine), soft_memberships(outward, self.outward)]
-            found.append(counted(joint(place), joint(direction)).view(self.n_bins))
+            found.append(counted(joint(place), joint(direction), torch.tensor(len(points))).view(self.n_bins))
         return torch.stack(found) / 3
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -59,7 +57,7 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
 def _radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
     """(P, 2) radii of one shape by operations of PyTorch, differentiable."""
     points, directions = (one.masked_fill(~mask[:, None], 0) for one in (points, directions))
-    with full_precision() if not torch.compiler.is_compiling() else contextlib.nullcontext():
+    with full_precision():
         squares = torch.cdist(points, points, compute_mode="use_mm_for_euclid_dist").square()
         # n·(x − y): how deep each point lies below the tangent plane of every other one
         depth = (directions * points).sum(dim=1, keepdim=True) - directions @ points.T

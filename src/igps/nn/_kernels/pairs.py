@@ -8,7 +8,6 @@ all pairs, and have gradients by all that the values are computed from, by the w
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -31,7 +30,7 @@ from igps.nn._kernels.pair_values import (
 )
 from igps.nn._precision import full_precision
 
-# Pairs of a block: on the CPU their values stay in a core's second-level cache, elsewhere they fill the device.
+# Of a block: on the CPU pairs, whose values stay in a core's second-level cache; elsewhere numbers, which fill it.
 _BLOCK, _MOST_COLUMNS, _DEVICE_BLOCK = 2**18, 2048, 2**24
 # Of the blocks, which threads count side by side; one where counts of its own for each share would take gigabytes
 _SHARES, _MOST_COUNTS = 4, 2**24
@@ -124,13 +123,13 @@ def _count_by_torch(
     classes: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: Tensor, weights: Tensor, *tensors: Tensor
 ) -> Tensor:
     """(N, C(C+1)/2, B, ...) float64 counts."""
-    n_shapes, n_points, _ = classes.shape
+    n_shapes, n_points, n_members = classes.shape
     # What is padded may be anything, and 0 times that no number.
     clean = [t.masked_fill(~mask.view(*mask.shape, *[1] * (t.ndim - 2)), 0) if t.ndim > 1 else t for t in tensors]
     weights = weights.masked_fill(~mask[:, :, None], 0)
     shape = [n_classes * (n_classes + 1) // 2, *(len(centres) for centres in centres_of(pairs))]
     total = torch.zeros(n_shapes * math.prod(shape), dtype=torch.float64, device=classes.device)
-    n_rows = max(1, _DEVICE_BLOCK // (n_shapes * n_points))
+    n_rows = max(1, _DEVICE_BLOCK // (n_shapes * n_points * n_members**2 * 2 ** (len(shape) - 1)))
     for first in range(0, n_points - 1, n_rows):
         task = partial(_count_rows, first, first + n_rows, classes, n_classes, shape, pairs)
         # What the gradient needs of the pairs is many times what it needs of the points: computed again.
@@ -153,39 +152,33 @@ def _count_rows(
 ) -> Tensor:
     """(cells,) counts of the pairs of points from `first` to `last` with those after them."""
     pairs = _with(pairs, tensors)
-    with full_precision() if not torch.compiler.is_compiling() else contextlib.nullcontext():
+    with full_precision():
         values = [
             one.between([x[:, first:last] for x in one.inputs], [x[:, first:] for x in one.inputs]) for one in pairs
         ]
-    cell = torch.zeros_like(values[0][:, 0], dtype=torch.long)
+    row_of = torch.zeros(n_classes, n_classes, dtype=torch.long, device=classes.device)
+    a, b = torch.triu_indices(n_classes, n_classes, device=classes.device)
+    row_of[a, b] = row_of[b, a] = torch.arange(len(a), device=classes.device)
+    # (N, I, J, M²) where each pair counts and how much, and then (N, I, J, M²·2^K) in each corner of its cell.
+    into = row_of[classes[:, first:last, None, :, None], classes[:, None, first:, None, :]].flatten(3)
+    into = into + shape[0] * torch.arange(len(classes), device=classes.device)[:, None, None, None]
+    weight = (weights[:, first:last, None, :, None] * weights[:, None, first:, None, :]).flatten(3)
+    # Pairs of a point with itself or with one before it weigh nothing.
+    weight = weight * torch.ones_like(weight[0, :, :, 0]).triu(1).unsqueeze(2)
     shares = []
     for value, centres in zip(torch.cat(values, dim=1).unbind(1), centres_of(pairs), strict=True):
         below = torch.bucketize(value.detach(), centres.detach()[1:-1], right=True)
         shares.append(((value - centres[below]) / (centres[below + 1] - centres[below])).clamp(0, 1))
-        cell = cell * len(centres) + below
-    n_shapes = len(classes)
-    row_of = torch.zeros(n_classes, n_classes, dtype=torch.long, device=cell.device)
-    a, b = torch.triu_indices(n_classes, n_classes, device=cell.device)
-    row_of[a, b] = row_of[b, a] = torch.arange(len(a), device=cell.device)
-    shape_of = shape[0] * torch.arange(n_shapes, device=cell.device)[:, None, None]
-    total = torch.zeros(n_shapes * math.prod(shape), dtype=torch.float64, device=cell.device)
-    for m in range(classes.shape[2]):
-        for n in range(classes.shape[2]):
-            row = row_of[classes[:, first:last, None, m], classes[:, None, first:, n]]
-            # Pairs of a point with itself or with one before it weigh nothing.
-            weight = (weights[:, first:last, None, m] * weights[:, None, first:, n]).triu(1)
-            into = (shape_of + row) * math.prod(shape[1:]) + cell
-            corners = [(into, weight)]
-            stride = math.prod(shape[1:])
-            for share, n_bins in zip(shares, shape[1:], strict=True):
-                stride //= n_bins
-                beyond = [(index + stride, weight * share) for index, weight in corners]
-                # Not weight·(1 − share), nor a difference of sums, which rounding could make negative.
-                before = [(i, whole - part) for (i, whole), (_, part) in zip(corners, beyond, strict=True)]
-                corners = [*before, *beyond]
-            for index, weight in corners:
-                total = total.index_add(0, index.flatten(), weight.double().flatten())
-    return total
+        into = into * len(centres) + below.unsqueeze(3)
+    stride = math.prod(shape[1:])
+    for share, n_bins in zip(shares, shape[1:], strict=True):
+        stride //= n_bins
+        beyond = weight * share.unsqueeze(3)
+        # Not weight·(1 − share), nor a difference of sums, which rounding could make negative.
+        weight = torch.cat([weight - beyond, beyond], dim=3)
+        into = torch.cat([into, into + stride], dim=3)
+    total = torch.zeros(len(classes) * math.prod(shape), dtype=torch.float64, device=classes.device)
+    return total.index_add(0, into.flatten(), weight.double().flatten())
 
 
 @dataclass(frozen=True, eq=False)

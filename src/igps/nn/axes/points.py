@@ -46,14 +46,18 @@ class PointAxis(nn.Module, ABC):
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """(N, P) of the samples."""
 
+    def _check(self, values: Tensor) -> None:
+        # What is traced for `torch.compile` cannot raise.
+        if not torch.compiler.is_compiling() and not torch.isfinite(values).all():
+            raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
+
     def memberships(self, values: Tensor) -> Tensor:
-        """(P, C) non-negative, rows of sum 1, from (P,) values.
+        """(..., P, C) non-negative, rows of sum 1, from (..., P) values.
 
         Raises:
             ValueError: values that are not finite.
         """
-        if not torch.isfinite(values).all():
-            raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
+        self._check(values)
         return soft_memberships(values, self.centres()) if self.soft else _nearest(values, self.centres())
 
     def members(self, values: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -69,8 +73,7 @@ class PointAxis(nn.Module, ABC):
         Raises:
             ValueError: values that are not finite.
         """
-        if not torch.compiler.is_compiling() and not torch.isfinite(values[mask]).all():
-            raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
+        self._check(torch.where(mask, values, 0))
         centres = self.centres().to(values.dtype)
         if not self.soft or len(centres) == 1:
             classes = torch.bucketize(values.detach(), _boundaries(centres), right=True).unsqueeze(2)
@@ -223,5 +226,5 @@ def _boundaries(centres: Tensor) -> Tensor:
 
 
 def _nearest(values: Tensor, centres: Tensor) -> Tensor:
-    """(P, C) memberships, 1 in the class whose centre is nearest."""
+    """(..., P, C) memberships, 1 in the class whose centre is nearest."""
     return one_hot(torch.bucketize(values.detach(), _boundaries(centres), right=True), len(centres)).to(values.dtype)

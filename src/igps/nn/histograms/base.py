@@ -87,15 +87,15 @@ def joint(memberships: list[Tensor]) -> Tensor:
     return reduce(lambda one, other: (one[..., :, None] * other[..., None, :]).flatten(-2), memberships)
 
 
-def counted(one: Tensor, other: Tensor) -> Tensor:
-    """(C, D) shares of points in combinations of classes, from memberships (P, C) and (P, D).
+def counted(one: Tensor, other: Tensor, n_points: Tensor) -> Tensor:
+    """(..., C, D) shares of points in combinations of classes, from memberships (..., P, C) and (..., P, D).
 
     Raises:
         ValueError: no point.
     """
-    if not len(one):
+    if not torch.compiler.is_compiling() and int(n_points.min()) < 1:
         raise ValueError("samples: expected at least one of each body, got none.")
-    return one.T @ other / len(one)
+    return one.mT @ other / n_points[..., None, None]
 
 
 def present(features: SampleFeatures) -> list[Tensor | slice]:

@@ -13,7 +13,7 @@ from igps.data.requirements import Requirements
 from igps.nn.axes.points import PointAxis
 from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histograms.base import SampleHistogram, counted, joint, present
+from igps.nn.histograms.base import SampleHistogram, counted, joint
 
 
 class PointHistogram(SampleHistogram):
@@ -68,12 +68,17 @@ class PointHistogram(SampleHistogram):
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, C, ...) histograms of some samples of N shapes."""
-        values = [one.values(features, self.embedding) for one in self.point_axes]
-        return torch.stack(
-            [self._of_shape([value[i, real] for value in values]) for i, real in enumerate(present(features))]
+        mask = features.samples.mask
+        memberships = []
+        for axis in self.point_axes:
+            values = axis.values(features, self.embedding)
+            # What is padded may be anything, and counts nowhere.
+            real = mask.view(*mask.shape, *[1] * (values.ndim - 2))
+            memberships.append(axis.memberships(torch.where(real, values, 0)))
+        first, *others = memberships
+        rest = joint(others) if others else torch.ones_like(first[..., :1])
+        return (
+            counted(first * mask.unsqueeze(2), rest, mask.sum(dim=1))
+            .unflatten(2, self.shape[1:] or (1,))
+            .view(len(mask), *self.shape)
         )
-
-    def _of_shape(self, values: list[Tensor]) -> Tensor:
-        first, *others = (one.memberships(value) for one, value in zip(self.point_axes, values, strict=True))
-        rest = joint(others) if others else torch.ones_like(first[:, :1])
-        return counted(first, rest).view(self.shape)

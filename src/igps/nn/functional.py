@@ -1,0 +1,25 @@
+"""The mathematics of the modules as functions of tensors, without parameters or state."""
+
+from __future__ import annotations
+
+from igps.nn._kernels.balls import ball_radii
+from igps.nn._kernels.pair_values import euclidean_distances, oriented_pairs, point_pair_features
+from igps.nn.axes.points import soft_memberships
+from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding, spectral_weights
+from igps.nn.histograms.pairs import joint_histogram, pair_histogram
+from igps.retrieval import chi_square
+
+__all__ = [
+    "ball_radii",
+    "barycentroid_potential",
+    "chi_square",
+    "euclidean_distances",
+    "interior_distance",
+    "joint_histogram",
+    "oriented_pairs",
+    "pair_histogram",
+    "point_pair_features",
+    "soft_memberships",
+    "spectral_embedding",
+    "spectral_weights",
+]

@@ -1,0 +1,171 @@
+"""Histograms in other people's pipelines: traced, exported, in double precision, differentiated by their inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import igps.nn.functional as functional
+from batches import two_bodies
+from igps.data.batch import SampleBatch, SignatureBatch
+from igps.nn.axes import (
+    Attribute,
+    BallRadius,
+    EmbeddedPairCosines,
+    EuclideanDistance,
+    InteriorDistance,
+    PairCosines,
+    Potential,
+)
+from igps.nn.descriptor import HistogramDescriptor
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histograms import DescriptionPart, PairHistogram, PointHistogram
+
+
+def filtered() -> SpectralEmbedding:
+    return SpectralEmbedding(n_eigenpairs=6, n_knots=5)
+
+
+MODULES: dict[str, Callable[[], DescriptionPart]] = {
+    "hard": lambda: PairHistogram([Potential(3), InteriorDistance(7)], SpectralEmbedding(n_eigenpairs=6)),
+    "learned": lambda: PairHistogram(
+        [
+            Potential(2, learnable=True),
+            Attribute("depth", [0.2, 0.6], learnable=True),
+            EuclideanDistance(3, learnable=True),
+        ],
+        filtered(),
+    ),
+    "in space": lambda: PairHistogram([PairCosines(3, learnable=True)]),
+    "in the embedding": lambda: PairHistogram([InteriorDistance(4), EmbeddedPairCosines(3)], filtered()),
+    "of points": lambda: PointHistogram([BallRadius("inside"), Potential(3, learnable=True)], filtered()),
+}
+
+
+@pytest.fixture(params=MODULES)
+def module(request: pytest.FixtureRequest) -> DescriptionPart:
+    return MODULES[request.param]()
+
+
+def gradients(module: nn.Module, batch: SignatureBatch) -> list[Tensor]:
+    loss = module(batch).square().sum()
+    return list(torch.autograd.grad(loss, list(module.parameters()))) if loss.requires_grad else []
+
+
+def test_the_whole_graph_is_traced(module: DescriptionPart) -> None:
+    batch = two_bodies()
+    torch.compiler.reset()
+    traced = torch.compile(module, backend="aot_eager", fullgraph=True)
+    torch.testing.assert_close(traced(batch), module(batch), rtol=0, atol=1e-6)
+    for found, expected in zip(gradients(traced, batch), gradients(module, batch), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-7)
+
+
+class OfTensors(nn.Module):
+    """A descriptor of the tensors of a padded batch, as a program in another language would call it."""
+
+    def __init__(self, descriptor: nn.Module, like: SignatureBatch) -> None:
+        super().__init__()
+        self.descriptor, self.like = descriptor, like
+
+    def forward(self, eigenvalues: Tensor, area: Tensor, kinds: dict[str, dict[str, Tensor]]) -> Tensor:
+        samples = {
+            kind: SampleBatch(one["points"], one["eigenfunctions"], one["mask"], {
+                name: values for name, values in one.items() if name in ("depth", "surface_direction")})
+            for kind, one in kinds.items()
+        }  # fmt: skip
+        return self.descriptor(replace(self.like, eigenvalues=eigenvalues, area=area, **samples))
+
+
+def tensors(batch: SignatureBatch) -> tuple[Tensor, Tensor, dict[str, dict[str, Tensor]]]:
+    kinds = {
+        kind: {"points": one.points, "eigenfunctions": one.eigenfunctions, "mask": one.mask, **one.attributes}
+        for kind, one in (("interior", batch.interior), ("surface", batch.surface))
+    }
+    return batch.eigenvalues, batch.area, kinds
+
+
+def test_a_description_of_a_padded_batch_is_exported() -> None:
+    descriptor = HistogramDescriptor([make() for make in MODULES.values()]).eval()
+    batch = two_bodies()
+    other = replace(batch, interior=replace(batch.interior, points=batch.interior.points.flip(2) * 1.5))
+    with torch.no_grad():
+        program = torch.export.export(OfTensors(descriptor, batch), tensors(batch)).module()
+        for one in (batch, other):
+            torch.testing.assert_close(program(*tensors(one)), descriptor(one), rtol=0, atol=1e-6)
+
+
+def doubled(batch: SignatureBatch) -> SignatureBatch:
+    def samples(one: SampleBatch) -> SampleBatch:
+        attributes = {name: values.double() for name, values in one.attributes.items()}
+        return replace(
+            one, points=one.points.double(), eigenfunctions=one.eigenfunctions.double(), attributes=attributes
+        )
+
+    return replace(batch, interior=samples(batch.interior), surface=samples(batch.surface))
+
+
+def test_double_precision_stays_double(module: DescriptionPart) -> None:
+    single = module(two_bodies()).detach()
+    result = module.double()(doubled(two_bodies()))
+    assert result.dtype == torch.float64
+    torch.testing.assert_close(result.detach(), single.double(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(result.flatten(1).sum(dim=1).detach(), torch.ones(2).double(), rtol=0, atol=1e-12)
+
+
+def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differences(module: DescriptionPart) -> None:
+    """Of padding there is none: neither of samples nor of eigenvalues, which are infinite there."""
+    batch, module = doubled(two_bodies()), module.double()
+    interior, surface = (one.points.clone().requires_grad_() for one in (batch.interior, batch.surface))
+    eigenvalues = batch.eigenvalues.clone().requires_grad_()
+    upstream = torch.randn(2, *module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    def loss() -> Tensor:
+        moved = replace(
+            batch,
+            eigenvalues=eigenvalues,
+            interior=replace(batch.interior, points=interior),
+            surface=replace(batch.surface, points=surface),
+        )
+        return (module(moved) * upstream).sum()
+
+    leaves = (interior, surface, eigenvalues)
+    found = torch.autograd.grad(loss(), leaves, allow_unused=True)
+    assert any(gradient is not None for gradient in found)
+    for leaf, gradient in zip(leaves, found, strict=True):
+        if gradient is None or not gradient.any():
+            continue
+        assert torch.isfinite(gradient).all()
+        padding = ~batch.interior.mask if leaf is interior else ~batch.surface.mask if leaf is surface else leaf.isinf()
+        assert not gradient[padding].any()
+        entry, moved = int(gradient.abs().argmax()), []
+        with torch.no_grad():
+            for step in (1e-6, -2e-6):
+                leaf.view(-1)[entry] += step
+                moved.append(float(loss()))
+            leaf.view(-1)[entry] += 1e-6
+        assert float(gradient.view(-1)[entry]) == pytest.approx((moved[0] - moved[1]) / 2e-6, rel=1e-3)
+
+
+def test_a_state_is_read_back_to_the_last_key(module: DescriptionPart) -> None:
+    state = {name: value + 0.1 if "log" in name else value for name, value in module.state_dict().items()}
+    module.load_state_dict(state, strict=True)
+    with pytest.raises(RuntimeError, match="Unexpected key"):
+        module.load_state_dict({**state, "axes.9.start": torch.zeros(1)}, strict=True)
+
+
+def test_functions_stand_beside_the_modules() -> None:
+    """The mathematics of a module from its parts: the paper's histogram of a body."""
+    batch = two_bodies()
+    real, known = batch.interior.mask[1], torch.isfinite(batch.eigenvalues[1])
+    embedding = functional.spectral_embedding(
+        batch.interior.eigenfunctions[1, real][:, known], batch.eigenvalues[1, known], batch.area[1]
+    )
+    found = functional.pair_histogram(embedding, functional.barycentroid_potential(embedding))
+    torch.testing.assert_close(found, PairHistogram()(batch)[1], rtol=0, atol=1e-6)
+    assert float(functional.chi_square(found[None].flatten(1), found[None].flatten(1))) == 0
+    assert all(callable(getattr(functional, name)) for name in functional.__all__)
