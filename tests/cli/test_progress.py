@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from training.study import main as study
 
 from igps.cli import main
 from own_descriptors import SMALL, write_egg
@@ -70,7 +71,8 @@ def test_a_bar_tells_how_far_it_is_and_what_time_is_left(
     reads_signatures = not command.startswith(("figure topology", "figure potential", "doctor"))
     cache = ["--cache_dir", str(tmp_path / "cache")] if reads_signatures else []
     monkeypatch.setattr(sys, "argv", ["igps", *line.split(), *cache])
-    main()
+    run = study if command.startswith(("figure", "robustness", "damage")) else main
+    run()
     printed = capsys.readouterr()
     shown = bars(printed.err)
     assert {name for name in expected if name not in shown} == set(), printed.err

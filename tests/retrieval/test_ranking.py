@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from igps.retrieval import chi_square, cosine, euclidean, rank
-from igps.retrieval import ranking as search
+from igps.retrieval import chi_square, cosine, euclidean, rank, search
 
 
 def test_rank_orders_by_distance_and_ties_by_index() -> None:

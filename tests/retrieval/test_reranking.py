@@ -8,8 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from igps.retrieval import euclidean, rerank, rerank_found, retrieval_scores
-from igps.retrieval import ranking as search
+from igps.retrieval import euclidean, rerank, rerank_found, retrieval_scores, search
 
 
 def by_hand(distances: list[list[float]], k: int, n_expanded: int, share: float) -> list[list[float]]:
