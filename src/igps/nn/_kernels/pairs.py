@@ -9,11 +9,11 @@ all pairs, and have gradients by all that the values are computed from, by the w
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations_with_replacement
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.utils.checkpoint import checkpoint
 
-from igps._threads import Team
+from igps._threads import ALONE, Team
 from igps.nn._kernels.pair_loops import COSINES, DISTANCES, VALUES, Axes, count_block, gradient_block
 from igps.nn._kernels.pair_values import (
     PairValues,
@@ -29,6 +29,8 @@ from igps.nn._kernels.pair_values import (
     cosine_factors,
 )
 from igps.nn._precision import full_precision
+
+Result = TypeVar("Result")
 
 # Of a block: on the CPU pairs, whose values stay in a core's second-level cache; elsewhere numbers, which fill it.
 _BLOCK, _MOST_COLUMNS, _DEVICE_BLOCK = 2**18, 2048, 2**24
@@ -198,17 +200,26 @@ class _CompiledCount(torch.autograd.Function):
     def forward(ctx: Any, layout: _Layout, weights: Tensor, *tensors: Tensor) -> Tensor:
         ctx.layout = layout
         ctx.save_for_backward(weights, *tensors)
-        shapes = [_Shape(layout, i, weights, tensors) for i in range(len(weights))]
-        totals = _summed(shapes, _Shape.counts)
-        return torch.stack([_folded(total, shape.bins) for shape, (total,) in zip(shapes, totals, strict=True)])
+
+        def counts(number: int, team: Team) -> Tensor:
+            shape = _Shape(layout, number, weights, tensors)
+            [total] = _summed(shape, shape.counts, team)
+            return _folded(total, shape.bins)
+
+        return torch.stack(_of_shapes(counts, len(weights)))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         weights, *tensors = ctx.saved_tensors
         gradients = [torch.zeros_like(tensor) for tensor in (weights, *tensors)]
-        shapes = [_Shape(ctx.layout, i, weights, tensors, one) for i, one in enumerate(upstream)]
-        for shape, (by_weights, by_centres, *by_inputs) in zip(shapes, _summed(shapes, _Shape.gradients), strict=True):
+
+        def derivatives(number: int, team: Team) -> tuple[Tensor, list[Tensor]]:
+            shape = _Shape(ctx.layout, number, weights, tensors, upstream[number])
+            return shape.order, _summed(shape, shape.gradients, team)
+
+        for number, (order, sums) in enumerate(_of_shapes(derivatives, len(weights))):
+            by_weights, by_centres, *by_inputs = sums
             along, remaining = iter(by_centres), iter(by_inputs)
             found = [by_weights.T]
             for one in ctx.layout.pairs:
@@ -218,21 +229,29 @@ class _CompiledCount(torch.autograd.Function):
                 if into.ndim == 1:  # centres
                     into += gradient
                 else:
-                    into[shape.number, shape.order] = gradient.to(into.dtype)
+                    into[number, order] = gradient.to(into.dtype)
         return None, *gradients
 
 
 Blocks = Sequence[tuple[int, int]]
 
 
-def _summed(shapes: Sequence[_Shape], task: Callable[[_Shape, Blocks], list[Tensor]]) -> Iterator[list[Tensor]]:
-    """What a task finds in the blocks of each shape, in sum."""
-    jobs = [(shape, share) for shape in shapes for share in shape.shares]
+def _of_shapes(task: Callable[[int, Team], Result], n_shapes: int) -> list[Result]:
+    """What a task finds of each shape: of as many side by side as there are threads, or else with a team for each."""
     with full_precision(), Team() as team:
-        results = iter(team.each(lambda job: task(*job), jobs))
-    for shape in shapes:
-        # Each share has sums of its own, added in order: how many threads there are changes no bit.
-        yield [sum(parts[1:], parts[0]) for parts in zip(*(next(results) for _ in shape.shares), strict=True)]
+        if n_shapes >= team.n_threads:
+            return team.each(lambda number: task(number, ALONE), range(n_shapes))
+        return [task(number, team) for number in range(n_shapes)]
+
+
+def _summed(shape: _Shape, task: Callable[[Blocks], list[Tensor]], team: Team) -> list[Tensor]:
+    """What a task finds in the blocks of a shape, in sum."""
+    total, *others = team.each(task, shape.shares)
+    # Each share has sums of its own, added in order: how many threads there are changes no bit.
+    for other in others:
+        for into, part in zip(total, other, strict=True):
+            into += part
+    return total
 
 
 class _Shape:
@@ -249,7 +268,6 @@ class _Shape:
     def __init__(
         self, layout: _Layout, number: int, weights: Tensor, tensors: Sequence[Tensor], upstream: Tensor | None = None
     ) -> None:
-        self.number = number
         real = layout.mask[number].nonzero().flatten()
         classes, own = layout.classes[number, real], weights.detach()[number, real].double()
         key = torch.zeros(len(real), dtype=torch.int64)
