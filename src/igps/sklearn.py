@@ -24,10 +24,10 @@ from igps.signature.signature import SignatureConfig, compute_signature
 
 
 class VolumetricFeatures(TransformerMixin, BaseEstimator):
-    """Mesh files, or meshes, in; descriptions out, one row a mesh; nothing is fitted.
+    """Mesh files, or meshes, to descriptions, a row for each; nothing is fitted.
 
-    The square roots of a histogram's cells are given by default: their Euclidean distance is Hellinger's between
-    histograms, what linear classifiers and Gaussian kernels can work with. For a χ² kernel ask for the cells.
+    Histograms are given by the square roots of their cells: the Euclidean distance of these is Hellinger's, which
+    linear classifiers and Gaussian kernels can use. For a χ² kernel take the cells, `square_root=False`.
 
     Example:
         >>> from igps import ArticulatedShapes, Mesh

@@ -28,7 +28,6 @@ from igps.gallery._alignment import surface_distance
 from igps.gallery.calibration import Calibration
 from igps.gallery.gallery import Gallery
 from igps.gallery.surfaces import Surfaces
-from igps.mesh.mesh import MeshError
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 from igps.retrieval.distances import Distance, euclidean
@@ -119,12 +118,13 @@ def duplicates(
     else:
         chosen = descriptor_of(descriptor)
         calibration.check(descriptor, chosen, source.config)
-        descriptions, failures = _described(source, chosen if poses else None, n_workers, progress)
-        dataset = source.usable(failures)
         if poses:
+            descriptions = describe(source, chosen, failures=failures, n_workers=n_workers, progress=progress)
             near = _near(descriptions, chosen.distances, calibration.pose.distance, progress)
         else:
-            near = _near(descriptions, _profile_distances, 2 * calibration.same.distance + _PROFILE_NOISE, progress)
+            profiles, failures = Surfaces(source).profiles(n_workers, progress)
+            near = _near(profiles, _profile_distances, 2 * calibration.same.distance + _PROFILE_NOISE, progress)
+        dataset = source.usable(failures)
     surfaces = None if poses else Surfaces(dataset)
     joined = _joined(near, surfaces, calibration, n_workers, progress)
     if surfaces is not None:
@@ -245,22 +245,6 @@ def body_distance(
     return BodyDistance(distance, apart, limit, calibration.words(distance), apart <= limit)
 
 
-def _described(
-    dataset: SignatureDataset, descriptor: Descriptor | None, n_workers: int | None, progress: bool
-) -> tuple[Tensor, list[Failure]]:
-    """Descriptions, or where there is no descriptor the profiles of the surfaces, and what has none."""
-    if descriptor is not None:
-        failures: list[Failure] = []
-        return describe(dataset, descriptor, failures=failures, n_workers=n_workers, progress=progress), failures
-    surfaces = Surfaces(dataset)
-    profiled = on_threads(surfaces.profile, range(len(dataset)), n_workers)
-    found = list(tqdm(profiled, desc="surfaces", total=len(dataset), disable=not progress))
-    profiles = [one for one in found if one is not None]
-    if not profiles:
-        raise MeshError(surfaces.failures[0].error)
-    return torch.from_numpy(np.stack(profiles)), [surfaces.failures[i] for i in sorted(surfaces.failures)]
-
-
 def _profile_distances(one: Tensor, other: Tensor) -> Tensor:
     return euclidean(one, other) / one.shape[1] ** 0.5
 
@@ -281,9 +265,7 @@ def _near(descriptions: Tensor, distance: Distance, limit: float, progress: bool
 def _near_in_index(gallery: Gallery, limit: float, progress: bool) -> Iterator[tuple[int, int, float]]:
     """The same of the entries of an index, numbered as in `_files_of`."""
     index = gallery.index
-    numbers: dict[int, int] = {}
-    for positions, _ in index.batches():
-        numbers.update(zip(positions.tolist(), range(len(numbers), len(numbers) + len(positions)), strict=True))
+    numbers = {position: i for i, position in enumerate(p for some, _ in index.batches() for p in some.tolist())}
     with _bar(len(index), progress) as bar:
         for positions, descriptions in index.batches():
             for position, description in zip(positions.tolist(), descriptions, strict=True):

@@ -45,13 +45,11 @@ class Match:
 
 
 class Gallery:
-    """An index of meshes, opened to be asked.
-
-    It needs neither the mesh files nor their Signatures any more.
+    """An index of meshes, opened for queries, which need neither the mesh files nor their Signatures.
 
     Args:
         path: folder of the index.
-        descriptor: the one that it was built with, if that cannot be found by its name; or to be sure that it is this.
+        descriptor: the one that the index was built with. It may be left out if the index knows it by its name.
 
     Raises:
         FileNotFoundError: there is no index.
@@ -153,14 +151,14 @@ class Gallery:
         strict: bool = False,
         progress: bool = False,
     ) -> tuple[Gallery, list[Failure]]:
-        """Index the meshes of a dataset, in place of an index that is there; and tell those that cannot be described.
+        """Index the meshes of a dataset, in place of an index that is there; also returns those that failed.
 
         Signatures that are not cached are computed on the way; `dataset.precompute()` does that on all cores.
 
         Args:
             path: folder of the index.
             dataset: of the meshes.
-            descriptor: a name, which the index remembers, or the descriptor itself, which has to be given again.
+            descriptor: a name, which the index keeps, or a descriptor, which then is given whenever it is opened.
             n_workers: threads or processes that describe; all cores if None.
             strict: raise at the first mesh that cannot be described.
             progress: show bars.
@@ -223,7 +221,7 @@ class Gallery:
 
 
 def about_of(config: SignatureConfig, reading: LoadOptions, descriptor: str | Descriptor) -> dict[str, Any]:
-    """What an index says of itself: with any other of these, distances would mean nothing."""
+    """What an index records of how its descriptions were made; only such descriptions can be compared with them."""
     signature = {**asdict(config), "algorithm_version": SignatureConfig.ALGORITHM_VERSION}
     return {
         "descriptor": name_of(descriptor),

@@ -14,9 +14,12 @@ from dataclasses import replace
 from functools import lru_cache, partial
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
 
-from igps._parallel import Failed
+from igps._parallel import Failed, on_threads
 from igps.data.dataset import Failure, SignatureDataset
 from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
 from igps.gallery.calibration import Calibration
@@ -111,12 +114,24 @@ class Surfaces:
             return 0.0
         return calibration.limit(max(coarseness, of_other))
 
-    def profile(self, i: int) -> NDArray[np.float64] | None:
-        """That of one; None where it cannot be read."""
-        try:
-            return self.samples(i).profile
-        except MeshError:
+    def profiles(self, n_workers: int | None = None, progress: bool = False) -> tuple[Tensor, list[Failure]]:
+        """Those (M, 64) of all that can be read, in order, and the failures of the others.
+
+        Raises:
+            MeshError: none can be read.
+        """
+
+        def profile(i: int) -> NDArray[np.float64] | None:
+            with contextlib.suppress(MeshError):  # which is among the failures
+                return self.samples(i).profile
             return None
+
+        found = on_threads(profile, range(len(self._dataset)), n_workers)
+        bar = tqdm(found, desc="surfaces", total=len(self._dataset), disable=not progress)
+        profiles = [one for one in bar if one is not None]
+        if not profiles:
+            raise MeshError(self.failures[0].error)
+        return torch.from_numpy(np.stack(profiles)), [self.failures[i] for i in sorted(self.failures)]
 
     def _coarseness_and_handles(self, i: int) -> tuple[float, int | None]:
         """Handles are None where the mesh is open, and where mending may have made some or closed holes."""

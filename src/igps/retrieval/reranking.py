@@ -1,4 +1,4 @@
-"""Distances of a collection set right by its neighbourhoods, without a label."""
+"""Re-ranking: distances of a collection are changed by which neighbours shapes have in common, without labels."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def rerank(
     keep_nearest: bool = True,
     progress: bool = False,
 ) -> Tensor:
-    """Diffusion, then k-reciprocal re-ranking: shapes are close that lead to one another, and whose neighbours do.
+    """Diffusion, then k-reciprocal re-ranking: shapes are close that share neighbours.
 
     *Diffusion* (Zhou, Weston, Gretton, Bousquet and Schölkopf 2004): shapes are tied to their k/2 nearest, by weights
     exp(−d² / σσ′), σ the mean distance to these (Zelnik-Manor and Perona 2004). With S = D^−½ W D^−½, two shapes are as
-    alike as all walks between them tell, (I − diffusion · S)⁻¹ with ones on the diagonal.
+    alike as the sum over all walks between them, (I − diffusion · S)⁻¹ scaled to ones on the diagonal.
 
     *k-reciprocal neighbours* (Zhong, Zheng, Cao and Li 2017), by the distances that diffusion gave: the neighbourhood
     of a shape are those among its k nearest that have it among theirs, joined by the neighbourhoods, of k/2, of its
@@ -37,9 +37,9 @@ def rerank(
     the k nearest; the weights are averaged over the nearest shapes, and two such neighbourhoods have their Jaccard
     distance.
 
-    What each step gives is mixed with the distance that it was given. The whole collection decides: a shape less, and
-    the others rank differently. What neighbours have in common tells which class a shape is of, less which body of it;
-    so the nearest of each stays its nearest.
+    The result of each step is mixed with the distances it started from. It depends on the whole collection: without
+    one of the shapes, the others may rank differently. Common neighbours tell the class of a shape rather than its
+    body, so the nearest shape of each stays its nearest.
 
     Args:
         distances: (N, N) of a collection to itself, symmetric, ≥ 0.

@@ -12,7 +12,7 @@ SearchDistance = Literal["cosine", "chi_square"]
 """A distance of descriptions that Euclidean distances of short vectors follow."""
 
 MOST_NUMBERS = 256
-"""Of a short vector."""
+"""The largest width of a short vector."""
 
 # The squared Euclidean distance of the features is then a fifth to a third below 2 χ², in nearly the same order.
 _SAMPLE_STEPS = 2
@@ -66,13 +66,13 @@ class VectorMap:
         return np.concatenate([*parts, np.zeros((0, len(self.components)), dtype=np.float32)])
 
     def arrays(self) -> dict[str, Any]:
-        """What it consists of, for a file of NumPy's."""
+        """Its arrays by name, for `numpy.savez`."""
         kept = {"mean": self.mean, "components": self.components}
         return {"searched_by": np.array(self.searched_by), **{k: v for k, v in kept.items() if v is not None}}
 
     @classmethod
     def of_arrays(cls, arrays: Any) -> VectorMap:
-        """The map that `arrays` told."""
+        """The map of such arrays."""
         names = [name for name in ("mean", "components") if name in arrays]
         return cls(str(arrays["searched_by"]), **{name: arrays[name] for name in names})  # type: ignore[arg-type]
 

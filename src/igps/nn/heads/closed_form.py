@@ -88,10 +88,7 @@ class WhitenedHead(Head):
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Take mean and directions from the histograms (N, ...) and classes (N,) of the training shapes.
-
-        Args:
-            descriptions, labels, part_cells: see `Head.fit`.
+        """Take mean and directions from the training shapes, see `Head.fit`.
 
         Raises:
             ValueError: shapes that do not match, or no class of two shapes.
@@ -103,9 +100,10 @@ class WhitenedHead(Head):
         residuals = self.parts((roots - means[members]).double())
         for part, directions, gains in zip(residuals, self.parts(self.directions), self.gains, strict=True):
             # The mean eigenvalue is that of the N − C that residuals of N shapes of C classes allow.
-            found = within_class_whitening(part, len(roots) - len(means), self.shrinkage, self.n_directions)
-            for all_rows, rows in zip((directions, gains), found, strict=True):
-                all_rows[: len(rows)] = rows
+            rank = len(roots) - len(means)
+            kept, left = within_class_whitening(part, rank, self.shrinkage, self.n_directions)
+            directions[: len(kept)] = kept
+            gains[: len(left)] = left
         if self.prior is not None and len(means) > 1:
             discriminants = torch.stack([_discriminant(part, members) for part in self.whitened_parts(roots)])
             if discriminants.sum() > 0:
@@ -163,12 +161,11 @@ class KernelHead(Head):
 
     The kernel is exp(−d/m), d the cosine distance of the whitened histograms, m its median between training shapes, and
     the mean of such kernels if there are several parts. It is regressed onto the indicators of the classes. Beside a
-    prior, another head of the same descriptions that was fitted elsewhere, such as that of `pretrained`, the kernel of
-    the prior's distance is one more, with a weight of its own. It is the best head here for classes that were trained
-    on; for other classes use the `WhitenedHead`.
+    prior (see `WhitenedHead`), the kernel of the prior's distance is one more, with a weight of its own. It is the best
+    head here for classes that were trained on; for other classes use the `WhitenedHead`.
 
-    An embedding is half the scores about their mean, which say how much of each class a shape has, and half the roots
-    of a softmax of them, which say which class it is of: by the latter alone, shapes of one class would coincide.
+    An embedding is half the scores about their mean, how much of each class a shape has, and half the roots of their
+    softmax, which class it is of: by the latter alone, shapes of one class would coincide.
 
     Example:
         >>> import torch
@@ -219,10 +216,7 @@ class KernelHead(Head):
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Fit whitening and regression to the histograms (N, ...) and classes (N,) of the training shapes.
-
-        Args:
-            descriptions, labels, part_cells: see `Head.fit`.
+        """Fit whitening and regression to the training shapes, see `Head.fit`.
 
         Raises:
             ValueError: shapes that do not match, or fewer than two classes.

@@ -77,10 +77,7 @@ class WCCNHead(Head):
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Take mean and directions from the histograms (N, ...) and classes (N,) of the training shapes.
-
-        Args:
-            descriptions, labels, part_cells: see `Head.fit`.
+        """Take mean and directions from the training shapes, see `Head.fit`.
 
         Raises:
             ValueError: shapes that do not match, a part that is not there, or no class of two shapes.
