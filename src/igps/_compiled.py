@@ -47,12 +47,6 @@ class Compiled(Lazy, Generic[Arguments, Result]):
     def __init__(self, function: Callable[Arguments, Result], **options: Any) -> None:
         super().__init__(lambda: _compile(function, options))
         update_wrapper(self, function)
-        self._function = function
-
-    @property
-    def plain(self) -> Callable[Arguments, Result]:
-        """The function as it is written, which runs anywhere, slowly."""
-        return self._function
 
     def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         return self.dispatcher(*args, **kwargs)
@@ -83,8 +77,3 @@ def _numba() -> ModuleType:
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release)
     return numba
-
-
-def is_available() -> bool:
-    """Whether loops can be compiled: always."""
-    return True
