@@ -373,11 +373,11 @@ def test_a_command_leaves_the_settings(monkeypatch: pytest.MonkeyPatch, capsys: 
     before = settings()
     seen: list[int] = []
 
-    def watched(_: Path) -> Any:
+    def watched(*_: Any, **__: Any) -> Any:
         seen.append(torch.get_num_threads())
         raise ValueError("no meshes")
 
-    monkeypatch.setattr("igps.cli.retrieval.labelled_bodies", watched)
+    monkeypatch.setattr("igps.cli.reading.labelled_bodies", watched)
     monkeypatch.setattr(sys, "argv", ["igps", "retrieve", "nowhere"])
     with pytest.raises(SystemExit):
         main()

@@ -94,9 +94,9 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
 def test_keys_are_those_of_the_caches_that_exist(pipeline: SignaturePipeline, tmp_path: Path) -> None:
     """Frozen: another key leaves all caches useless. It changes with ALGORITHM_VERSION alone."""
     (tmp_path / "frozen.off").write_bytes(b"OFF\n")
-    assert SignatureConfig.ALGORITHM_VERSION == 4
+    assert SignatureConfig.ALGORITHM_VERSION == 5
     found = pipeline.key(BodyRef(tmp_path / "frozen.off"))
-    assert found == "01ffcd7d418826c9647d90cd45997d2fa453e1c1e5306795a1f8032b24de3419"
+    assert found == "d82439dea1136b1e190e78f8f86b4e00542f18578196ad9a829b06e017b0eb6d"
 
 
 def test_a_new_version_of_the_mending_leaves_bodies_that_are_read_as_they_are(

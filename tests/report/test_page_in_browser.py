@@ -515,6 +515,6 @@ def test_the_demo_ends_with_its_page(
     path = Path(last.removeprefix("page of results: "))
     assert path == tmp_path / "report.html"
     with Visit(browser, path) as visit:
-        assert visit.page.locator("h1").inner_text() == "4 shapes in 2 classes, interior"
+        assert visit.page.locator("h1").inner_text() == "4 shapes in 2 classes, pretrained"
         visit.wait_until(lambda: visit.page.locator("#shapes canvas.drawn").count() == 4)
         assert visit.open(0).locator("#ranking-list .shape").count() == 3

@@ -130,6 +130,7 @@ class SignatureBatch:
     """N Signatures, padded so that no descriptor changes by it.
 
     Example:
+        >>> from igps.data.collation import collate
         >>> import trimesh
         >>> from igps.signature.signature import SignatureConfig, compute_signature
         >>> bodies = [trimesh.creation.icosphere(subdivisions=2), trimesh.creation.capsule(height=2.0, radius=0.5)]
