@@ -12,7 +12,7 @@ import trimesh
 
 import igps.data.pipeline as pipeline_module
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import Bodies, find_bodies, given_bodies
+from igps.data.sources import Bodies, find_bodies, given_bodies, labelled_bodies
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
@@ -97,6 +97,35 @@ def test_a_table_names_bodies_and_may_tell_more(root: Path) -> None:
     (root / "labels.csv").write_text("file,body,label\n1.obj,spleen,ill\n1.obj,,well\n")
     with pytest.raises(ValueError, match=r"1\.obj#spleen is listed twice"):
         find_bodies(root, OBJECTS)
+
+
+def test_further_columns_stay_with_their_bodies(root: Path, tmp_path: Path) -> None:
+    table = "file,age,body,label,scanner\n2.obj,30,spleen,ill,A\n1.obj, 41.5 ,,well,\n"
+    (root / "labels.csv").write_text(table)
+    bodies = find_bodies(root, OBJECTS)
+    assert bodies.columns == {"age": ("30", "41.5", "41.5"), "scanner": ("A", None, None)}
+    assert bodies.classed("body").columns == bodies.columns
+    assert bodies.numbers("age") == [30, 41.5, 41.5]
+    assert bodies.subset([0]).column("scanner") == ("A",)
+    with pytest.raises(ValueError, match=r"scanner: 2 of 3 bodies have no value, such as 1\.obj#liver"):
+        bodies.column("scanner")
+    with pytest.raises(ValueError, match=r"weight: no such column of labels\.csv; further columns: age, scanner"):
+        bodies.column("weight")
+    with pytest.raises(ValueError, match=r"scanner: expected numbers, got 'A' of 2\.obj#spleen"):
+        bodies.subset([0]).numbers("scanner")
+    dataset = SignatureDataset(bodies, CONFIG, tmp_path / "cache", reading=OBJECTS)
+    assert dataset[["1.obj#spleen", "2.obj#spleen"]].columns["age"] == ("41.5", "30")
+    dataset[[0, 1]].to_file(tmp_path / "some.igps")
+    assert SignatureDataset.from_file(tmp_path / "some.igps").columns == {"age": ("30", "41.5"), "scanner": ("A", None)}
+
+
+def test_a_table_of_columns_alone_tells_no_classes(root: Path) -> None:
+    (root / "labels.csv").write_text("file,age\n1.obj,30\n2.obj\n")
+    bodies = find_bodies(root, OBJECTS)
+    assert (bodies.labels, bodies.columns) == (None, {"age": ("30", "30", None, None)})
+    with pytest.raises(ValueError, match="no classes found"):
+        labelled_bodies(root, OBJECTS)
+    assert labelled_bodies(root, OBJECTS, classes="body").labels == ("liver", "spleen", "liver", "spleen")
 
 
 def test_counts_that_do_not_fit_are_refused() -> None:

@@ -144,6 +144,8 @@ def told(path: Path, target: Path, **changes: object) -> Path:
         {"labels": ["ball", "egg", "egg", "fish"]},
         {"parts": [None, None, None, 1]},
         {"keys": "four"},
+        {"columns": {"age": ["1", "2", "3"]}},
+        {"columns": {"age": ["1", "2", "3", 4]}},
         {"config": {"n_eigenpairs": -1}},
         {"config": {"unknown": 3, "attributes": []}},
         {"reading": {"mend": "perhaps"}},

@@ -42,6 +42,7 @@ def test_meshes_alone_have_no_classes(tmp_path: Path) -> None:
         ("name,class\n1.off,cat\n", "columns file,label"),
         ("", "columns file,label"),
         ("file,label\n", "no rows"),
+        ("file,label,age,age\n1.off,cat,1,2\n", "named twice"),
         ("file,label\n1.off,cat\n2.off,\n", "line 3"),
         ("file,label\n1.off,cat\n1.off,dog\n", r"1\.off is listed twice"),
     ],

@@ -6,7 +6,7 @@ import json
 import os
 import secrets
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ class About:
         keys: of the Signatures in the cache that they come from.
         reading: how the meshes were read, by the names of `LoadOptions`.
         config: of the Signatures, by the names of `SignatureConfig`.
+        columns: what else is known of the bodies, see `Bodies`.
     """
 
     names: tuple[str, ...]
@@ -43,6 +44,7 @@ class About:
     keys: tuple[str, ...]
     reading: dict[str, Any]
     config: dict[str, Any]
+    columns: dict[str, tuple[str | None, ...]] = field(default_factory=dict)
 
 
 def write_collection(path: Path, about: About, signature: Callable[[int], Signature]) -> None:
@@ -154,12 +156,14 @@ class CollectionFile:
 def _about(told: dict[str, Any]) -> About:
     names, parts = _words(told["names"]), tuple(told["parts"])
     labels = None if told["labels"] is None else _words(told["labels"])
-    about = About(names, parts, labels, _words(told["classes"]), _words(told["keys"]), told["reading"], told["config"])
-    lengths = {len(names), len(parts), len(about.keys), len(names if labels is None else labels)}
+    keys, columns = _words(told["keys"]), {name: tuple(values) for name, values in told.get("columns", {}).items()}
+    about = About(names, parts, labels, _words(told["classes"]), keys, told["reading"], told["config"], columns)
+    lengths = {len(names), len(parts), len(keys), len(names if labels is None else labels), *map(len, columns.values())}
     if len(lengths) > 1 or len(set(names)) < len(names):
         raise ValueError("its names, parts, labels and keys do not fit each other")
-    if not set(labels or ()) <= set(about.classes) or not all(part is None or isinstance(part, str) for part in parts):
-        raise ValueError("its labels are none of its classes, or its parts no names")
+    words = [*parts, *(value for values in columns.values() for value in values)]
+    if not set(labels or ()) <= set(about.classes) or not all(one is None or isinstance(one, str) for one in words):
+        raise ValueError("its labels are none of its classes, or its parts or columns no words")
     if not isinstance(about.reading, dict) or not isinstance(about.config, dict):
         raise ValueError("its reading or configuration is none")
     return about

@@ -140,6 +140,11 @@ class SignatureDataset(Dataset[LabelledSignature]):
         return self.pipeline.reading
 
     @property
+    def columns(self) -> Mapping[str, tuple[str | None, ...]]:
+        """Further columns of the table of labels by name, a value for each body, None where it is missing."""
+        return self.bodies.columns
+
+    @property
     def labels(self) -> Tensor:
         """(N,) int64 index of each body's class in `classes`, −1 where unknown."""
         index = {name: i for i, name in enumerate(self.classes)}
@@ -299,6 +304,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
             keys=tuple(hit.whole_key for hit in hits),
             reading=asdict(self.reading),
             config=asdict(self.config),
+            columns=dict(self.bodies.columns),
         )
         whole = copy.copy(self)
         whole._hits = tuple(hits)
@@ -345,7 +351,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         if descriptor is not None:
             requirements_of(descriptor).check_config(config)
         paths = tuple(Path(name.removesuffix(f"#{part}")) for name, part in zip(about.names, about.parts, strict=True))
-        bodies = Bodies(paths, about.names, about.labels, about.parts)
+        bodies = Bodies(paths, about.names, about.labels, about.parts, about.columns)
         dataset = cls.__new__(cls)
         SignatureDataset.__init__(dataset, bodies, config, cache_dir, reading=reading, transform=transform)
         dataset.classes = about.classes

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -29,18 +30,20 @@ class Bodies:
         names: a distinct name for each: the path of its file relative to the folder it was found in, and `#part`.
         labels: the class of each, or None where no classes are known.
         parts: which body of its file each is; None in a file that is one body. All of them if nothing is given.
+        columns: further columns of the table of labels by name, a value for each body; None where it is missing.
     """
 
     paths: tuple[Path, ...]
     names: tuple[str, ...]
     labels: tuple[str, ...] | None = None
     parts: tuple[str | None, ...] = ()
+    columns: Mapping[str, tuple[str | None, ...]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if not self.parts:
             object.__setattr__(self, "parts", (None,) * len(self.paths))
-        for name in ("names", "labels", "parts"):
-            values = getattr(self, name)
+        given = (("names", self.names), ("labels", self.labels), ("parts", self.parts), *self.columns.items())
+        for name, values in given:
             if values is not None and len(values) != len(self.paths):
                 raise ValueError(f"{name}: expected one for each of {len(self.paths)} files, got {len(values)}.")
 
@@ -60,7 +63,44 @@ class Bodies:
             tuple(self.names[i] for i in indices),
             None if self.labels is None else tuple(self.labels[i] for i in indices),
             tuple(self.parts[i] for i in indices),
+            {name: tuple(values[i] for i in indices) for name, values in self.columns.items()},
         )
+
+    def column(self, name: str) -> tuple[str, ...]:
+        """The values of a column that every body has, such as of "scanner".
+
+        Raises:
+            ValueError: no such column, or bodies without a value.
+        """
+        if name not in self.columns:
+            known = ", ".join(self.columns) or "none"
+            raise ValueError(
+                f"{name}: no such column of {LABELS_FILE}; further columns: {known}. Choose one of them."
+            )
+        values = self.columns[name]
+        missing = [body for body, value in zip(self.names, values, strict=True) if value is None]
+        if missing:
+            raise ValueError(
+                f"{name}: {len(missing)} of {len(self)} bodies have no value, such as {missing[0]}. Fill the column of "
+                f"{LABELS_FILE}, or leave these bodies out."
+            )
+        return tuple(str(value) for value in values)
+
+    def numbers(self, name: str) -> list[float]:
+        """The values of a column of numbers, such as of "age".
+
+        Raises:
+            ValueError: no such column, bodies without a value, or a value that is no finite number.
+        """
+        values = self.column(name)
+        for body, value in zip(self.names, values, strict=True):
+            try:
+                is_number = math.isfinite(float(value))
+            except ValueError:
+                is_number = False
+            if not is_number:
+                raise ValueError(f"{name}: expected numbers, got {value!r} of {body}. Correct it in {LABELS_FILE}.")
+        return [float(value) for value in values]
 
     def classed(self, rule: ClassRule) -> Bodies:
         """The same bodies with the classes that a rule gives them; "folder" leaves them as they are.
@@ -78,12 +118,12 @@ class Bodies:
                 raise ValueError(
                     f"classes: expected files of several bodies with 'body', but {unnamed[0]} is one body."
                 )
-            return Bodies(self.paths, self.names, tuple(str(part) for part in self.parts), self.parts)
+            return replace(self, labels=tuple(str(part) for part in self.parts))
         files = (
             name if part is None else name.removesuffix(f"#{part}")
             for name, part in zip(self.names, self.parts, strict=True)
         )
-        return Bodies(self.paths, self.names, tuple(files), self.parts)
+        return replace(self, labels=tuple(files))
 
 
 def find_bodies(root: str | Path, options: LoadOptions | None = None, *, classes: ClassRule = "folder") -> Bodies:
@@ -91,7 +131,8 @@ def find_bodies(root: str | Path, options: LoadOptions | None = None, *, classes
 
     Three layouts are known: files and a `labels.csv` with the columns `file,label` (paths relative to the folder), or
     `file,body,label`, where an empty `body` stands for every body of the file; one folder per class; files alone,
-    without classes. The first that fits is taken. Further columns of `labels.csv` are passed over.
+    without classes. The first that fits is taken. Further columns of `labels.csv`, such as `scanner` or `age`, become
+    `Bodies.columns`; beside them, `label` may be missing where the folder tells no classes.
 
     Args:
         root: the folder.
@@ -184,25 +225,33 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
     file = root / LABELS_FILE
     with file.open(newline="", encoding="utf-8-sig") as stream:
         reader = csv.DictReader(stream)
-        if not reader.fieldnames or not {"file", "label"} <= set(reader.fieldnames):
+        header = [name for name in reader.fieldnames or () if name]
+        further = [name for name in header if name not in ("file", "body", "label")]
+        if "file" not in header or not ("label" in header or further):
             raise ValueError(f"{file}: expected the columns file,label in the first line, got {reader.fieldnames}.")
-        rows = [(row["file"], row.get("body") or "", row["label"]) for row in reader]
-    incomplete = [i for i, (name, _, label) in enumerate(rows, start=2) if not name or not label]
+        if len(set(header)) < len(header):
+            raise ValueError(f"{file}: a column is named twice in {header}. Give each column a name of its own.")
+        rows = list(reader)
+    has_labels = "label" in header
+    incomplete = [i for i, row in enumerate(rows, start=2) if not row["file"] or (has_labels and not row["label"])]
     if not rows or incomplete:
         where = f"line {incomplete[0]} lacks a file or a label" if incomplete else "no rows"
         raise ValueError(f"{file}: {where}. Each line names a mesh file and its class.")
-    named = [
-        (name, part, label) for name, body, label in rows for part in ([body] if body else _parts(root / name, options))
+    found = [
+        (row["file"], part, row)
+        for row in rows
+        for part in ([row["body"]] if row.get("body") else _parts(root / row["file"], options))
     ]
-    names = tuple(_with_part(name, part) for name, part, _ in named)
+    names = tuple(_with_part(name, part) for name, part, _ in found)
     twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
         raise ValueError(f"{file}: {twice[0]} is listed twice. List each body once.")
     return Bodies(
-        tuple(root / name for name, _, _ in named),
+        tuple(root / name for name, _, _ in found),
         names,
-        tuple(label for _, _, label in named),
-        tuple(part for _, part, _ in named),
+        tuple(row["label"] for _, _, row in found) if has_labels else None,
+        tuple(part for _, part, _ in found),
+        {name: tuple((row[name] or "").strip() or None for _, _, row in found) for name in further},
     )
 
 
