@@ -10,10 +10,12 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from training.graded import GradedShapes
+from training.graded.grammar import GrammarShapes
+from training.graded.polygons import Prism
 from training.studies.contact_sheet import contact_sheet
 
 from igps.shapes import ArticulatedShapes, GeneratedShape
-from igps.shapes.solids import Arc, Box, Cone, Prism, Ring, Solid
+from igps.shapes.solids import Arc, Box, Cone, Ring, Solid
 
 DEFAULTS = ["biped", "quadruped", "octopus", "spider", "hand", "snake", "plier", "mug"]
 # Of the grammar: one class of every family, with and without handles.
@@ -29,7 +31,7 @@ def default_shapes() -> list[GeneratedShape]:
 @pytest.fixture(scope="module")
 def grammar_shapes() -> list[GeneratedShape]:
     """One shape of one class of every family."""
-    shapes = ArticulatedShapes(n_classes=GRAMMAR.stop, n_per_class=1, seed=3)
+    shapes = GrammarShapes(n_classes=GRAMMAR.stop, n_per_class=1, seed=3)
     return [shapes[i] for i in GRAMMAR]
 
 
@@ -113,7 +115,7 @@ def test_same_seed_same_arrays_other_seed_others(default_shapes: list[GeneratedS
 
 def test_a_shape_does_not_depend_on_the_others(grammar_shapes: list[GeneratedShape]) -> None:
     """Neither on those made before nor on how many there are: class 14 of 24 or 15, shape 0 of 1 or 4."""
-    alone = ArticulatedShapes(n_classes=15, n_per_class=4, seed=3)[14 * 4]
+    alone = GrammarShapes(n_classes=15, n_per_class=4, seed=3)[14 * 4]
     among = grammar_shapes[14 - GRAMMAR.start]
     assert alone.name == among.name
     np.testing.assert_array_equal(alone.vertices, among.vertices)
@@ -160,12 +162,12 @@ def test_names_and_labels() -> None:
     assert shapes.names[:3] == ["biped/00", "biped/01", "quadruped/00"]
     last = shapes[-1]
     assert (last.label, last.name) == ("mug", "mug/01")
-    many = ArticulatedShapes(n_classes=200, n_per_class=1)
+    many = GrammarShapes(n_classes=200, n_per_class=1)
     assert len(set(many.class_names)) == 200
     # The structure that the name tells, without its number, is not repeated either.
     assert len({name.rsplit("-", 1)[0] for name in many.class_names}) == 200
     assert many.class_names[:8] == DEFAULTS
-    assert ArticulatedShapes(n_classes=30).class_names == many.class_names[:30]
+    assert GrammarShapes(n_classes=30).class_names == many.class_names[:30]
 
 
 @pytest.mark.parametrize("index", [16, -17])
@@ -174,7 +176,9 @@ def test_no_such_shape(index: int) -> None:
         ArticulatedShapes(n_per_class=2)[index]
 
 
-@pytest.mark.parametrize("arguments", [{"n_classes": 0}, {"n_per_class": 0}, {"seed": -1}, {"n_vertices": 10}])
+@pytest.mark.parametrize(
+    "arguments", [{"n_classes": 0}, {"n_classes": 13}, {"n_per_class": 0}, {"seed": -1}, {"n_vertices": 10}]
+)
 def test_arguments_out_of_range_are_named(arguments: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=next(iter(arguments))):
         ArticulatedShapes(**arguments)

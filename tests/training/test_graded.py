@@ -12,13 +12,13 @@ import pytest
 import trimesh
 from training.graded import GradedShape, GradedShapes, body_of
 from training.graded.bodies import Pose, draw_body, draw_pose
+from training.graded.grammar import GrammarShapes
 from training.graded.kinds import KINDS, LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, body_classes
 from training.graded.plates import MACHINES, SHEETS, Helix, Plate, machine, sheet
 
 from igps.data.sources import find_bodies
 from igps.mesh.loading import load_mesh
 from igps.mesh.options import LoadOptions
-from igps.shapes import ArticulatedShapes
 from igps.shapes.files import off_text
 from igps.shapes.templates import TEMPLATES
 
@@ -177,7 +177,7 @@ def test_the_look_alikes_can_be_left_out() -> None:
 
 def test_the_other_generator_is_as_it_was() -> None:
     """Tests and figures rest on its shapes: sums of coordinates as they were at first."""
-    shapes = ArticulatedShapes(n_classes=24, n_per_class=2)
+    shapes = GrammarShapes(n_classes=24, n_per_class=2)
     found = [(len(shapes[i].vertices), len(shapes[i].faces)) for i in (0, 13, 24, 47)]
     assert found == COUNTS
     assert np.abs(shapes[0].vertices).sum() == pytest.approx(SUM, rel=1e-9)

@@ -7,10 +7,10 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from training.graded.grammar import FAMILIES
 from training.graded.rods import Binding, Rig, Rod, at_rest, bend, bind, carry, limbs
 from training.graded.skinning import Motions, after, motion, moved, normalized, product, same_side, turn_about
 
-from igps.shapes.grammar import FAMILIES
 from igps.shapes.skeleton import Part, Skeleton, limb
 from igps.shapes.solids import Blob, Solid
 from igps.shapes.templates import TEMPLATES

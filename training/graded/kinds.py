@@ -12,9 +12,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from igps.shapes.grammar import FAMILIES
 from igps.shapes.skeleton import Skeleton
 from igps.shapes.templates import TEMPLATES
+from training.graded.grammar import FAMILIES
 from training.graded.plates import MACHINES, SHEETS, coil, machine, sheet
 
 Motion = Literal["limbs", "hinges", "sheet", "rigid"]

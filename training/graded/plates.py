@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from igps.shapes.skeleton import Part, Skeleton, circle, turned
-from igps.shapes.solids import Array, Blob, Cone, Prism, Ring, Shell, Solid, Vector
+from igps.shapes.solids import Array, Blob, Cone, Ring, Shell, Solid, Vector
+from training.graded.polygons import Prism
 
 Bar = tuple[float, float, float, float, float, float]
 Hole = tuple[float, float, float]

@@ -19,8 +19,8 @@ from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads.base import Head
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
 from igps.nn.learner import RetrievalLearner
-from igps.report.learned import learned_layout
 from igps.retrieval import chi_square, retrieval_scores
+from training.studies.learned_figures import learned_layout
 
 Row = Literal["none", "prior", "whitened", "kernel"]
 FITTED: dict[str, type[WhitenedHead | KernelHead]] = {"whitened": WhitenedHead, "kernel": KernelHead}

@@ -12,8 +12,8 @@ from torch import Tensor
 from igps.data.splits import split_seen
 from igps.nn.heads.base import Head
 from igps.nn.heads.closed_form import KernelHead
-from igps.report.learned import transfer_curve
 from igps.retrieval import chi_square, retrieval_scores
+from training.studies.learned_figures import transfer_curve
 
 COLUMNS = ("nn", "ft", "st", "dcg")
 

@@ -14,13 +14,14 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from igps.shapes.files import is_whole_off, off_text, write_whole
-from igps.shapes.grammar import Stream, class_name, class_skeleton
 from igps.shapes.meshing import Faces, defect, mesh, roughen
 from igps.shapes.skeleton import Skeleton, pose
 from igps.shapes.solids import Array
+from igps.shapes.templates import TEMPLATES
 
 _VERSION = 1  # raised whenever the same arguments would give other meshes
 _MAX_ATTEMPTS = 20
+_POSE, _MOTION = 0, 1  # what a random stream is for: keeps the streams of one seed apart
 
 _log = logging.getLogger(__name__)
 
@@ -57,7 +58,7 @@ class ArticulatedShapes:
         (['biped', 'quadruped', 'octopus'], 6)
 
     Args:
-        n_classes: number of classes; the first twelve are named templates, the rest are drawn from a grammar.
+        n_classes: number of classes, at most twelve.
         n_per_class: number of shapes of each class.
         seed: seed of all random draws, not negative.
         n_vertices: vertices of a shape, kept within 40 percent.
@@ -65,6 +66,8 @@ class ArticulatedShapes:
     Raises:
         ValueError: an argument is out of range, or (on access) a shape cannot be made at this resolution.
     """
+
+    most_classes: int | None = len(TEMPLATES)
 
     def __init__(self, n_classes: int = 8, n_per_class: int = 10, seed: int = 0, n_vertices: int = 3000) -> None:
         for name, value, least in (
@@ -75,6 +78,8 @@ class ArticulatedShapes:
         ):
             if operator.index(value) < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
+        if self.most_classes is not None and n_classes > self.most_classes:
+            raise ValueError(f"n_classes must be at most {self.most_classes}, got {n_classes}")
         self.n_classes, self.n_per_class, self.seed, self.n_vertices = n_classes, n_per_class, seed, n_vertices
         self._skeletons: dict[int, Skeleton] = {}
 
@@ -89,7 +94,7 @@ class ArticulatedShapes:
     @property
     def class_names(self) -> list[str]:
         """The unique names of the classes, in order."""
-        return [class_name(self.seed, index) for index in range(self.n_classes)]
+        return [self._class_name(index) for index in range(self.n_classes)]
 
     @property
     def labels(self) -> list[str]:
@@ -113,17 +118,23 @@ class ArticulatedShapes:
             raise IndexError(f"index must lie in [{-len(self)}, {len(self)}), got {index}")
         return self._generate(*divmod(position % len(self), self.n_per_class))
 
+    def _class_name(self, index: int) -> str:
+        return list(TEMPLATES)[index]
+
+    def _skeleton(self, index: int) -> Skeleton:
+        return list(TEMPLATES.values())[index]()
+
     def _generate(self, class_index: int, number: int) -> GeneratedShape:
         if class_index not in self._skeletons:
-            self._skeletons[class_index] = class_skeleton(self.seed, class_index)
+            self._skeletons[class_index] = self._skeleton(class_index)
         skeleton = self._skeletons[class_index]
-        label = class_name(self.seed, class_index)
+        label = self._class_name(class_index)
         name = f"{label}/{number:02d}"
-        motion = np.random.default_rng([self.seed, Stream.MOTION, class_index, number])
+        motion = np.random.default_rng([self.seed, _MOTION, class_index, number])
         rotation = np.asarray(Rotation.from_quat(motion.normal(size=4)).as_matrix())
         found: str | None = None
         for attempt in range(_MAX_ATTEMPTS):
-            rng = np.random.default_rng([self.seed, Stream.POSE, class_index, number, attempt])
+            rng = np.random.default_rng([self.seed, _POSE, class_index, number, attempt])
             target = int(self.n_vertices * rng.uniform(0.8, 1.25))
             # Later attempts bend less: most failures are limbs that touch.
             body = pose(skeleton, rng, 1.0 - 0.8 * attempt / _MAX_ATTEMPTS, rotation)
@@ -154,7 +165,7 @@ class ArticulatedShapes:
         """
         folder = Path(root)
         settings = json.dumps(
-            {"generator": type(self).__name__, "version": _VERSION, "seed": self.seed, "n_vertices": self.n_vertices}
+            {"generator": "ArticulatedShapes", "version": _VERSION, "seed": self.seed, "n_vertices": self.n_vertices}
         )
         manifest = folder / "shapes.json"
         if manifest.exists():

@@ -1,4 +1,4 @@
-"""The classes of the benchmark by number: the templates, then one structure after another of the grammar's families.
+"""Classes of articulated shapes beyond the named templates: one structure after another of the grammar's families.
 
 The grammar's classes are tried out when they are made, since drawn proportions may let limbs touch.
 """
@@ -8,28 +8,23 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Callable, Sequence
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from igps.shapes.artefacts import stack, table, tongs, tool, vessel, wheel
-from igps.shapes.creatures import beast, chain, comb, serpent, star, tree
+from igps.shapes import ArticulatedShapes
 from igps.shapes.meshing import defect, mesh
 from igps.shapes.skeleton import Skeleton, pose
 from igps.shapes.templates import TEMPLATES
+from training.graded.artefacts import stack, table, tongs, tool, vessel, wheel
+from training.graded.creatures import beast, chain, comb, serpent, star, tree
 
 _MAX_DRAWS = 20
+_CLASS, _FAMILY, _TRIAL = 2, 3, 4  # what a random stream is for, beside those of `ArticulatedShapes`
 _TRIAL_VERTICES = 3000  # the same whatever resolution is asked for: a class does not depend on it
 _LAYERS = ("ball", "block", "plate", "post", "hoop")
 
 _log = logging.getLogger(__name__)
-
-
-class Stream(IntEnum):
-    """What a random stream is for: keeps the streams of one seed apart."""
-
-    POSE, MOTION, CLASS, FAMILY, TRIAL = range(5)
 
 
 class Family(NamedTuple):
@@ -122,24 +117,29 @@ _ALL = (
 FAMILIES = {family.build.__name__: family for family in _ALL}
 
 
-def class_name(seed: int, index: int) -> str:
-    """The name of a class, without building it."""
-    return list(TEMPLATES)[index] if index < len(TEMPLATES) else _structure(seed, index)[0]
+class GrammarShapes(ArticulatedShapes):
+    """`ArticulatedShapes` with further classes, which are drawn from the grammar."""
+
+    most_classes = None
+
+    def _class_name(self, index: int) -> str:
+        return super()._class_name(index) if index < len(TEMPLATES) else _structure(self.seed, index)[0]
+
+    def _skeleton(self, index: int) -> Skeleton:
+        return super()._skeleton(index) if index < len(TEMPLATES) else _sound_skeleton(self.seed, index)
 
 
-def class_skeleton(seed: int, index: int) -> Skeleton:
-    """The skeleton of a class: a template, or its structure in the first proportions that pass a trial pose.
+def _sound_skeleton(seed: int, index: int) -> Skeleton:
+    """The structure of a class in the first proportions that pass a trial pose.
 
     Raises:
         ValueError: no proportions did.
     """
-    if index < len(TEMPLATES):
-        return list(TEMPLATES.values())[index]()
     name, build, structure = _structure(seed, index)
     found: str | None = None
     for draw in range(_MAX_DRAWS):
-        skeleton = build(np.random.default_rng([seed, Stream.CLASS, index, draw]), *structure)
-        body = pose(skeleton, np.random.default_rng([seed, Stream.TRIAL, index, draw]), 1.0, np.eye(3))
+        skeleton = build(np.random.default_rng([seed, _CLASS, index, draw]), *structure)
+        body = pose(skeleton, np.random.default_rng([seed, _TRIAL, index, draw]), 1.0, np.eye(3))
         vertices, faces, _ = mesh(body, _TRIAL_VERTICES)
         found = defect(vertices, faces, skeleton.genus, _TRIAL_VERTICES)
         if found is None:
@@ -155,7 +155,7 @@ def _structure(seed: int, index: int) -> tuple[str, Callable[..., Skeleton], tup
     turn, place = divmod(index - len(TEMPLATES), len(FAMILIES))
     family, (build, structures) = list(FAMILIES.items())[place]
     # One walk through the shuffled structures keeps classes of a family apart, however many are asked for.
-    order = np.random.default_rng([seed, Stream.FAMILY, place]).permutation(len(structures))
+    order = np.random.default_rng([seed, _FAMILY, place]).permutation(len(structures))
     structure = structures[order[turn % len(structures)]]
     words = [str(word) for choice in structure for word in (choice if isinstance(choice, tuple) else (choice,))]
     return "-".join([family, *words, f"{index:03d}"]), build, structure

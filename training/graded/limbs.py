@@ -8,7 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from igps.shapes.skeleton import ORIGIN, UP, Part, aim, circle, limb
-from igps.shapes.solids import Arc, Array, Blob, Box, Cone, Prism, Ring, Shell, Solid, Vector
+from igps.shapes.solids import Arc, Array, Blob, Box, Cone, Ring, Shell, Solid, Vector
+from training.graded.polygons import Prism
 
 
 def ending(kind: str, r: float, group: str, at: Vector = ORIGIN, turn: Array | None = None) -> tuple[Part, ...]:

@@ -9,9 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from igps.shapes.limbs import LimbStyle, ending
 from igps.shapes.skeleton import DOWN, ORIGIN, Part, Skeleton, aim, circle, limb, turned
-from igps.shapes.solids import Blob, Box, Cone, Frame, Prism, Ring, Shell, Solid
+from igps.shapes.solids import Blob, Box, Cone, Ring, Shell, Solid
+from training.graded.limbs import LimbStyle, ending
+from training.graded.polygons import Frame, Prism
 
 
 def star(g: np.random.Generator, core: str, n: int, kind: str, end: str) -> Skeleton:

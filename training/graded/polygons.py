@@ -1,0 +1,68 @@
+"""Solids with corners: regular prisms and frames, which only drawn bodies have."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from igps.shapes.solids import Array, Solid
+
+
+@dataclass(frozen=True)
+class Prism(Solid):
+    """A regular prism or plate around the z axis: ``sides`` corners at ``radius``, ``height`` high, rounded edges."""
+
+    sides: int
+    radius: float
+    height: float
+    rounding: float
+
+    def distance(self, x: Array, y: Array, z: Array) -> Array:
+        across, past_corner = _to_polygon(self.sides, self.radius - self.rounding / np.cos(np.pi / self.sides), x, y)
+        a = np.where(across > 0.0, np.hypot(across, past_corner), across)
+        b = np.abs(z) - (0.5 * self.height - self.rounding)
+        return np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0)) + np.minimum(np.maximum(a, b), 0.0) - self.rounding
+
+    def box(self) -> tuple[Array, Array]:
+        upper = np.array([self.radius, self.radius, 0.5 * self.height])
+        return -upper, upper
+
+    def stretched(self, thick: float, length: float) -> Solid:
+        return Prism(self.sides, self.radius * thick, self.height * length, self.rounding * min(thick, length))
+
+
+@dataclass(frozen=True)
+class Frame(Solid):
+    """A tube of radius ``tube`` along a regular polygon around z with corners at ``radius``."""
+
+    sides: int
+    radius: float
+    tube: float
+
+    @property
+    def genus(self) -> int:
+        return 1
+
+    def distance(self, x: Array, y: Array, z: Array) -> Array:
+        across, past_corner = _to_polygon(self.sides, self.radius, x, y)
+        return np.sqrt(across * across + past_corner * past_corner + z * z) - self.tube
+
+    def box(self) -> tuple[Array, Array]:
+        upper = np.array([self.radius + self.tube, self.radius + self.tube, self.tube])
+        return -upper, upper
+
+    def stretched(self, thick: float, length: float) -> Solid:
+        return Frame(self.sides, self.radius * length, self.tube * thick)
+
+    def factors(self, thick: float, length: float) -> Array:
+        return np.full(3, length)
+
+
+def _to_polygon(sides: int, radius: float, x: Array, y: Array) -> tuple[Array, Array]:
+    """How far points lie outside the nearest side's line (negative inside), and along it beyond its corner."""
+    sector = np.pi / sides
+    folded = np.mod(np.arctan2(y, x), 2.0 * sector) - sector
+    radial = np.hypot(x, y)
+    past_corner = np.maximum(radial * np.abs(np.sin(folded)) - radius * np.sin(sector), 0.0)
+    return radial * np.cos(folded) - radius * np.cos(sector), past_corner
