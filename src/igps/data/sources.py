@@ -74,9 +74,7 @@ class Bodies:
         """
         if name not in self.columns:
             known = ", ".join(self.columns) or "none"
-            raise ValueError(
-                f"{name}: no such column of {LABELS_FILE}; further columns: {known}. Choose one of them."
-            )
+            raise ValueError(f"{name}: no such column of {LABELS_FILE}; further columns: {known}. Choose one of them.")
         values = self.columns[name]
         missing = [body for body, value in zip(self.names, values, strict=True) if value is None]
         if missing:
