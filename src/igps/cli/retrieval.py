@@ -13,6 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from igps.analysis.comparison import pair_distances
+from igps.cli.feature_table import SUFFIXES, feature_table, wide_table, write_table
 from igps.cli.index import as_indexed
 from igps.cli.reading import Folder, signatures, write_notes, write_rows
 from igps.cli.report import check_report
@@ -85,33 +86,43 @@ def extract(
     out: Path,
     descriptor: str = "pretrained",
     short: bool = False,
+    wide: bool = False,
     **reading: Any,
 ) -> None:
-    """Write the descriptions of meshes to a file, for use in any classifier or vector database.
+    """Write the descriptions of meshes to a file, for use in any classifier, statistics package or vector database.
 
-    The file is a NumPy archive: `features` (N, ...) as the descriptor gives them, `names` (N,), and `labels` (N,) where
-    the meshes come from a folder with classes.
+    A table (.csv or .parquet) has a row for each body: file, part, name, label, further columns of labels.csv, unit of
+    length, volume, area, and the description as v0, v1 and so on. A NumPy archive (.npz) has `features` (N, ...) as the
+    descriptor gives them, `names` (N,), and `labels` (N,) where the meshes come from a folder with classes.
 
     Args:
         meshes: mesh files, or one folder.
-        out: the archive, a file ending in .npz; what was done to meshes that were mended is written beside it, in a
-            file of the same name ending in .notes.csv.
+        out: the file, ending in .csv, .parquet or .npz; what was done to meshes that were mended is written beside it,
+            in a file of the same name ending in .notes.csv.
         descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
         short: write unit vectors of at most 256 numbers in place of longer ones, for engines that compare by the cosine
             (pretrained).
+        wide: write a row for each file, with columns PART.volume, PART.v0 and so on for each of its bodies.
     """
+    suffix = out.suffix.lower()
+    if suffix not in (*SUFFIXES, ".npz") or (wide and suffix == ".npz"):
+        suffixes = ", ".join(SUFFIXES if wide else (*SUFFIXES, ".npz"))
+        raise ValueError(f"out: expected a file{' of a wide table' * wide} ending in one of {suffixes}, got {out}.")
     source = Folder(meshes[0]) if len(meshes) == 1 and meshes[0].is_dir() else meshes
     shortening = descriptor_of(descriptor) if short else None
     if shortening is not None and not isinstance(shortening, EmbeddedDescriptor):
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}.")
     dataset, descriptions, failures = _described(source, descriptor, **reading)
     features = (descriptions if shortening is None else shortening.short(descriptions)).numpy()
-    arrays: dict[str, Any] = {"features": features, "names": np.array(dataset.bodies.names)}
-    if dataset.bodies.labels is not None:
-        arrays["labels"] = np.array(dataset.bodies.labels)
     out.parent.mkdir(parents=True, exist_ok=True)
-    with out.open("wb") as file:  # given a name, NumPy would append .npz to it
-        np.savez_compressed(file, **arrays)
+    if suffix == ".npz":
+        arrays: dict[str, Any] = {"features": features, "names": np.array(dataset.bodies.names)}
+        if dataset.bodies.labels is not None:
+            arrays["labels"] = np.array(dataset.bodies.labels)
+        np.savez_compressed(out, **arrays)
+    else:
+        known, measured = feature_table(dataset, features)
+        write_table(out, wide_table(known, measured) if wide else {**known, **measured})
     write_notes(out.with_suffix(".notes.csv"), dataset)
     print(
         f"{len(features)} descriptions of shape {features.shape[1:]} written to {out}; {len(failures)} meshes skipped"

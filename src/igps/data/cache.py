@@ -173,6 +173,7 @@ def encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]
         "name": signature.name,
         "notes": signature.notes,
         "residual": signature.residual,
+        "unit": signature.unit,
     }
     return tensors, {name: json.dumps(value) for name, value in scalars.items()}
 
@@ -208,6 +209,7 @@ def decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Si
         name=json.loads(metadata["name"]),
         notes=tuple(json.loads(metadata["notes"])),
         residual=json.loads(metadata["residual"]),
+        unit=json.loads(metadata.get("unit", "null")),
     )
 
 

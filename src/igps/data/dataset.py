@@ -211,6 +211,10 @@ class SignatureDataset(Dataset[LabelledSignature]):
             signature = with_attribute(signature, attribute, values)
         return signature
 
+    def signatures(self) -> Iterator[Signature]:
+        """All Signatures, as they are before `transform`; those not cached are computed."""
+        return map(self._signature, range(len(self)))
+
     def mesh(self, index: int) -> Mesh:
         """The mesh itself, read and checked as for its Signature.
 
@@ -277,8 +281,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
             change: what is done to each before it is kept, such as `FewerSamples`, of which more fit.
         """
         chosen = copy.copy(self)
-        signatures = (self._signature(i) for i in range(len(self)))
-        chosen._at_hand = [_owned(one if change is None else change(one)) for one in signatures]
+        chosen._at_hand = [_owned(one if change is None else change(one)) for one in self.signatures()]
         if change is not None:  # no description of what is in the cache
             chosen._hits = (None,) * len(self)
         chosen._numbers = tuple(range(len(self)))

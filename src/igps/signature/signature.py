@@ -108,6 +108,7 @@ class Signature:
         name: of the mesh.
         notes: what was done to the mesh before, and to the computation, in words.
         residual: the largest of the eigenpairs, relative to the eigenvalue; NaN where it is not known.
+        unit: of length, such as "mm"; None where it is not known.
     """
 
     eigenvalues: NDArray[np.float64]
@@ -119,6 +120,7 @@ class Signature:
     name: str = "mesh"
     notes: tuple[str, ...] = ()
     residual: float = math.nan
+    unit: str | None = None
 
     @property
     def barycentroid(self) -> NDArray[np.float64]:
@@ -209,6 +211,7 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
         name=mesh.name,
         notes=(*mesh.notes, *notes),
         residual=residual,
+        unit=mesh.unit,
     )
 
 

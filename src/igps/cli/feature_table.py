@@ -1,0 +1,81 @@
+"""Descriptions as a table, for statistics packages: a row for each body, or for each file."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from igps.data.dataset import SignatureDataset
+
+SUFFIXES = (".csv", ".parquet")
+Table = Mapping[str, Sequence[Any]]
+"""Columns by name, all of one length; None where a value is missing."""
+
+
+def feature_table(dataset: SignatureDataset, features: np.ndarray) -> tuple[Table, Table]:
+    """What is known of each body, and what was measured of it.
+
+    Args:
+        dataset: N bodies, their Signatures cached.
+        features: (N, ...) descriptions.
+
+    Returns:
+        `file`, `part`, `name`, `label`, further columns of the table of labels, and the `unit` of length; and `volume`,
+        `area`, and the description as `v0`, `v1` and so on.
+    """
+    bodies = dataset.bodies
+    units, volumes, areas = zip(*((one.unit, one.volume, one.area) for one in dataset.signatures()), strict=True)
+    files = [name.removesuffix(f"#{part}") for name, part in zip(bodies.names, bodies.parts, strict=True)]
+    own = {"file": files, "part": bodies.parts, "name": bodies.names, "label": bodies.labels or [None] * len(bodies)}
+    vectors = features.reshape(len(features), -1)
+    known = {**bodies.columns, **own, "unit": units}
+    known = {name: known[name] for name in dict.fromkeys([*own, *bodies.columns, "unit"])}
+    return known, {"volume": volumes, "area": areas, **{f"v{i}": list(column) for i, column in enumerate(vectors.T)}}
+
+
+def wide_table(known: Table, measured: Table) -> Table:
+    """A row for each file: what its bodies share, and `PART.volume`, `PART.v0` and so on; see `feature_table`.
+
+    A body that a file lacks, or that could not be used, has no values.
+    """
+    rows: dict[str, dict[str | None, int]] = {}
+    for i, (file, part) in enumerate(zip(known["file"], known["part"], strict=True)):
+        rows.setdefault(file, {})[part] = i
+    table: dict[str, Sequence[Any]] = {}
+    apart: dict[str, Sequence[Any]] = {}
+    for name, values in known.items():
+        per_file = [{values[i] for i in bodies.values()} for bodies in rows.values()]
+        if all(len(found) == 1 for found in per_file) and name not in ("part", "name"):
+            table[name] = [found.pop() for found in per_file]
+        elif name not in ("part", "name"):
+            apart[name] = values
+    for part in dict.fromkeys(known["part"]):
+        places = [bodies.get(part) for bodies in rows.values()]
+        for name, values in {**apart, **measured}.items():
+            column = name if part is None else f"{part}.{name}"
+            table[column] = [None if i is None else values[i] for i in places]
+    return table
+
+
+def write_table(path: Path, table: Table) -> None:
+    """Write a table as CSV or Parquet, by the suffix.
+
+    Raises:
+        ImportError: Parquet without pyarrow.
+    """
+    if path.suffix.lower() == ".parquet":
+        try:
+            import pyarrow.parquet
+        except ImportError as error:
+            raise ImportError('out: Parquet needs pyarrow: pip install "interior-gps[table]". Or write CSV.') from error
+        arrays = {name: pyarrow.array(list(values)) for name, values in table.items()}
+        pyarrow.parquet.write_table(pyarrow.table(arrays), path)
+        return
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(table)
+        writer.writerows(zip(*table.values(), strict=True))

@@ -1,0 +1,104 @@
+"""`igps extract` writes a row for each body, or for each file, that pandas reads back."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from igps.cli import main
+from own_descriptors import SMALL
+
+nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+INTERIOR = "own_descriptors:small_interior"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two subjects with a liver and a spleen of voxels of 2 mm; the second has seven voxels of a heart as well."""
+    folder = tmp_path_factory.mktemp("subjects")
+    index = np.indices((24, 20, 20))
+    for i in (1, 2):
+        labels = np.zeros((24, 20, 20), dtype=np.uint8)
+        labels[((index - np.array([6, 9, 9]).reshape(3, 1, 1, 1)) ** 2).sum(axis=0) < 20 + 6 * i] = 1
+        labels[14:20, 5:12, 5 : 14 + i] = 2
+        labels[22, 2:9, 2] = 3 * (i == 2)
+        nibabel.save(nibabel.Nifti1Image(labels, np.diag([2.0, 2, 2, 1])), folder / f"{i}.nii.gz")
+        (folder / f"{i}.csv").write_text("label,name\n1,liver\n2,spleen\n3,heart\n")
+    (folder / "labels.csv").write_text("file,age,body,label\n1.nii.gz,40,,well\n2.nii.gz,,,ill\n")
+    return folder
+
+
+def extract(monkeypatch: pytest.MonkeyPatch, root: Path, out: Path, *options: str) -> None:
+    cache = ["--cache_dir", str(root.parent / "cache"), "--n_workers", "1"]
+    words = ["extract", str(root), "--out", str(out), "--descriptor", INTERIOR, *SMALL, *cache, *options]
+    monkeypatch.setattr(sys, "argv", ["igps", *words])
+    main()
+
+
+def test_a_row_for_each_body_tells_what_is_known_of_it(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    extract(monkeypatch, root, tmp_path / "features.csv")
+    assert "4 descriptions of shape (10, 64)" in capsys.readouterr().out
+    table = pd.read_csv(tmp_path / "features.csv", dtype={"age": str}, keep_default_na=False)
+    assert table["name"].tolist() == ["1.nii.gz#liver", "1.nii.gz#spleen", "2.nii.gz#liver", "2.nii.gz#spleen"]
+    assert table["file"].tolist() == ["1.nii.gz"] * 2 + ["2.nii.gz"] * 2
+    assert table["part"].tolist() == ["liver", "spleen"] * 2
+    assert table["label"].tolist() == ["well", "well", "ill", "ill"]
+    assert table["age"].tolist() == ["40", "40", "", ""]
+    assert table["unit"].tolist() == ["mm"] * 4
+    n_voxels = [nibabel.load(root / f"{i}.nii.gz").get_fdata() == label for i in (1, 2) for label in (1, 2)]
+    np.testing.assert_allclose(table["volume"], [8 * mask.sum() for mask in n_voxels], rtol=1e-3)
+    assert (table["area"] > (36 * np.pi) ** (1 / 3) * table["volume"] ** (2 / 3)).all()
+    extract(monkeypatch, root, tmp_path / "features.npz")
+    with np.load(tmp_path / "features.npz") as archive:
+        vectors = archive["features"].reshape(4, -1)
+    columns = [f"v{i}" for i in range(640)]
+    assert table.columns.tolist()[-640:] == columns
+    assert np.array_equal(table[columns].to_numpy(np.float32), vectors)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_a_wide_table_has_a_row_for_each_file(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    if suffix == "parquet":
+        pytest.importorskip("pyarrow", reason="the extra [table]")
+    read = pd.read_csv if suffix == "csv" else pd.read_parquet
+    extract(monkeypatch, root, tmp_path / f"long.{suffix}")
+    extract(monkeypatch, root, tmp_path / f"wide.{suffix}", "--wide")
+    long, wide = read(tmp_path / f"long.{suffix}"), read(tmp_path / f"wide.{suffix}")
+    assert wide.columns.tolist()[:6] == ["file", "label", "age", "unit", "liver.volume", "liver.area"]
+    assert len(wide.columns) == 4 + 2 * (2 + 640)
+    assert wide["label"].tolist() == ["well", "ill"]
+    for part in ("liver", "spleen"):
+        rows = long[long["part"] == part]
+        for column in ("volume", "area", "v17", "v300"):
+            assert wide[f"{part}.{column}"].tolist() == rows[column].tolist()
+
+
+def test_a_body_that_a_file_lacks_has_no_values(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("1.nii.gz", "2.nii.gz", "1.csv", "2.csv"):
+        (tmp_path / name).write_bytes((root / name).read_bytes())
+    (tmp_path / "labels.csv").write_text("file,body,label\n1.nii.gz,liver,a\n2.nii.gz,liver,b\n2.nii.gz,spleen,c\n")
+    extract(monkeypatch, tmp_path, tmp_path / "wide.csv", "--wide")
+    wide = pd.read_csv(tmp_path / "wide.csv")
+    assert wide["liver.label"].tolist() == ["a", "b"]
+    assert wide.loc[:, "spleen.label":].isna().all(axis=1).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [(["out.txt"], "ending in .csv, .parquet, .npz"), (["out.npz", "--wide"], "wide table ending in .csv, .parquet")],
+)
+def test_a_file_of_another_kind_is_refused_before_anything_is_computed(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    options: list[str], words: str,
+) -> None:  # fmt: skip
+    with pytest.raises(SystemExit, match="1"):
+        extract(monkeypatch, root, tmp_path / options[0], *options[1:])
+    assert words in capsys.readouterr().err.replace("one of ", "")
