@@ -21,6 +21,7 @@ from igps.cli.completion import completion
 from igps.cli.demo import demo
 from igps.cli.doctor import doctor
 from igps.cli.duplicates import distance, duplicates
+from igps.cli.groups import groups
 from igps.cli.index import index_add, index_build, index_merge
 from igps.cli.precompute import precompute
 from igps.cli.reading import FLAGS, Verdict
@@ -42,6 +43,7 @@ COMMANDS: Commands = {
     "demo": demo,
     "compare": compare,
     "doctor": doctor,
+    "groups": groups,
     "report": report,
     "completion": completion,
 }

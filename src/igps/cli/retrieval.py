@@ -58,7 +58,7 @@ def retrieve(
     """
     check_report(report, out)
     chosen = descriptor_of(descriptor)
-    dataset, descriptions, failures = _described(
+    dataset, descriptions, failures = described(
         Folder(root, labelled=True), descriptor, n_workers=n_workers, strict=strict, **reading
     )
     distances = pair_distances(chosen, descriptions, progress=True)
@@ -112,7 +112,7 @@ def extract(
     shortening = descriptor_of(descriptor) if short else None
     if shortening is not None and not isinstance(shortening, EmbeddedDescriptor):
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}.")
-    dataset, descriptions, failures = _described(source, descriptor, **reading)
+    dataset, descriptions, failures = described(source, descriptor, **reading)
     features = (descriptions if shortening is None else shortening.short(descriptions)).numpy()
     out.parent.mkdir(parents=True, exist_ok=True)
     if suffix == ".npz":
@@ -169,7 +169,7 @@ def query(
     chosen = descriptor_of(descriptor)
     assert gallery is not None
     wanted = _one(mesh, descriptor, **reading)
-    dataset, descriptions, _ = _described(Folder(gallery), descriptor, **reading)
+    dataset, descriptions, _ = described(Folder(gallery), descriptor, **reading)
     n_found = min(top, len(dataset))
     n_near = min(max(top, N_RERANKED), len(dataset)) if rerank else n_found
     found = search(wanted, descriptions, top=n_near, distance=chosen.distances)
@@ -184,7 +184,7 @@ def query(
 
 def _one(mesh: Path, descriptor: str | Descriptor, **reading: Any) -> Tensor:
     """The description of the one body of a file, or of the one that is named."""
-    dataset, description, _ = _described([mesh], descriptor, **reading)
+    dataset, description, _ = described([mesh], descriptor, **reading)
     if len(dataset) > 1:
         names = ", ".join(dataset.bodies.names[:5])
         raise ValueError(f"mesh: expected one body, {mesh} holds {len(dataset)}. Name one of them, such as {names}.")
@@ -205,7 +205,7 @@ def _as_rows(rows: Sequence[tuple[str, str | None, float]]) -> list[dict[str, An
     ]
 
 
-def _described(
+def described(
     source: Folder | Sequence[Path] | Bodies,
     descriptor: str | Descriptor,
     n_workers: int | None = None,

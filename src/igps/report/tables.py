@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from igps.analysis.comparison import Result
 from igps.analysis.doctor import Finding
+from igps.analysis.groups import GroupTest
 from igps.retrieval import RetrievalScores
 
 TITLES = dict(nn="NN", ft="FT", st="ST", e="E", dcg="DCG", adr="ADR", adr_self="ADR self", map="mAP")  # noqa: C408
@@ -61,4 +62,25 @@ def findings_table(findings: Sequence[Finding]) -> str:
     lines.append(
         f"{len(findings)} files: {n_mended} mended, {n_bad} cannot be used; about {total / 60:.1f} core-minutes"
     )
+    return "\n".join(lines)
+
+
+def groups_table(tests: Sequence[GroupTest]) -> str:
+    """One line a body: sizes of the groups, probabilities and false discovery rates, effect, area under the curve."""
+    width = max(len("body"), *(len(one.body) for one in tests))
+    titles = ("PERMANOVA p", "q", "kernel p", "q", "effect", "95 %", "AUC")
+    widths = (13, 9, 10, 9, 8, 17, 7)
+    lines = [f"{'body':<{width}}" + "".join(f"{t:>{w}}" for t, w in zip(titles, widths, strict=True)) + "  groups"]
+    for one in tests:
+        sizes = ", ".join(f"{count} {name}" for name, count in one.sizes.items())
+        if one.refused is not None:
+            lines.append(f"{one.body:<{width}}  not tested ({sizes}): {one.refused}")
+            continue
+        numbers = (one.permanova_p, one.permanova_q, one.kernel_p, one.kernel_q)
+        cells = [*(f"{p:.4f}" for p in numbers), f"{one.effect:.3f}"]
+        cells += [f"{one.effect_low:.3f} to {one.effect_high:.3f}", f"{one.auc:.2f}"]
+        lines.append(
+            f"{one.body:<{width}}" + "".join(f"{c:>{w}}" for c, w in zip(cells, widths, strict=True)) + f"  {sizes}"
+        )
+    lines.append("p: by permutation; q: false discovery rate over the bodies; effect: share of squared distances")
     return "\n".join(lines)

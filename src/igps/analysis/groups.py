@@ -1,0 +1,281 @@
+"""Whether groups of bodies differ: two tests by permutation, how large the difference is, and how well it sorts."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from igps.nn.descriptor import Descriptor
+
+FEWEST = 5
+"""Of a group, for a test."""
+# Permutations that differ, for the smallest level to be of use
+_FEWEST_ARRANGEMENTS = 100
+# Numbers that permuted designs hold at once
+_BLOCK = 2**24
+_ROUNDING = 1e-9
+
+Rows = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GroupTest:
+    """Whether groups differ in one kind of body.
+
+    Args:
+        body: which, such as an organ.
+        sizes: of the groups by name.
+        permanova_f: pseudo-F (Anderson 2001); this and all that follows is None where nothing was tested.
+        permanova_p: of it, by permutation.
+        kernel: two-sample statistic (Gretton et al. 2012), the squared distance between the kernel means
+            of two groups; of more, their weighted mean square about the mean of all.
+        kernel_p: of it, by the same permutations.
+        permanova_q, kernel_q: smallest false discovery rate at which the body is found (Benjamini and Hochberg 1995).
+        effect: share of the squared distances that the groups explain, without what chance alone explains: 0 on average
+            where there is no difference, at most 1.
+        effect_low, effect_high: its 95 % interval.
+        auc: area under the curve of a ridge classifier by cross-validation, 0.5 for chance; mean over the groups.
+        refused: why nothing was tested.
+    """
+
+    body: str
+    sizes: Mapping[str, int]
+    permanova_f: float | None = None
+    permanova_p: float | None = None
+    permanova_q: float | None = None
+    kernel: float | None = None
+    kernel_p: float | None = None
+    kernel_q: float | None = None
+    effect: float | None = None
+    effect_low: float | None = None
+    effect_high: float | None = None
+    auc: float | None = None
+    refused: str | None = None
+
+
+def vectors_of(descriptor: Descriptor, descriptions: Tensor) -> Rows:
+    """(N, D) vectors whose Euclidean distances are meant: square roots of histograms (Hellinger), or as they are.
+
+    A head's own distance may be no Euclidean one; that of `pretrained` hardly tells bodies of one class apart.
+
+    Args:
+        descriptor: whose they are.
+        descriptions: (N, ...).
+    """
+    rows: Rows = descriptions.flatten(1).double().numpy()
+    return np.sqrt(rows) if descriptor.searched_by == "chi_square" else rows
+
+
+def squared_distances(rows: Rows) -> Rows:
+    """(N, N) squared Euclidean distances of rows (N, D)."""
+    return _squares((centred := rows - rows.mean(axis=0)) @ centred.T)
+
+
+def group_test(
+    vectors: Rows,
+    groups: Sequence[str],
+    *,
+    strata: Sequence[str] | None = None,
+    covariates: Rows | None = None,
+    body: str = "all",
+    n_permutations: int = 10_000,
+    n_bootstraps: int = 2000,
+    n_repeats: int = 3,
+    seed: int = 0,
+) -> GroupTest:
+    """Test whether groups differ.
+
+    Covariates and the means of strata are regressed out of the vectors and of the groups; what is left of the vectors
+    is permuted within strata (Freedman and Lane 1983; with distances, McArdle and Anderson 2001). PERMANOVA is the
+    pseudo-F of these; the kernel test takes a Gaussian kernel with the median distance as its width. A probability is
+    (1 + permutations as extreme) / (1 + permutations) (Phipson and Smyth 2010).
+
+    Args:
+        vectors: (N, D) of N bodies, one of each subject.
+        groups: N names.
+        strata: N names, such as of scanners; None where all may be permuted.
+        covariates: (N, k) numbers, such as ages.
+        body: what is tested.
+        n_permutations, n_bootstraps: at random; without the latter the effect has no interval.
+        n_repeats: of the cross-validation by five folds; 0 for none.
+        seed: of both, and of the folds.
+
+    Raises:
+        ValueError: shapes that do not match.
+    """
+    n = len(vectors)
+    codes_of = [np.unique(np.asarray(one), return_inverse=True)[1] for one in (groups, strata or ["all"] * n)]
+    known = np.ones((n, 0)) if covariates is None else np.asarray(covariates, dtype=float).reshape(len(covariates), -1)
+    for name, found in (("groups", len(groups)), ("strata", len(codes_of[1])), ("covariates", len(known))):
+        if found != n:
+            raise ValueError(f"{name}: expected one for each of {n} bodies, got {found}.")
+    group, stratum = codes_of
+    untested = GroupTest(body, dict(sorted(Counter(groups).items())))
+    if why := _senseless(untested.sizes, group, stratum):
+        return replace(untested, refused=why)
+    # What is known of the bodies, and what the groups add to that, both orthonormal
+    known = np.column_stack([_indicators(stratum), known - known.mean(axis=0)])
+    known = _orthonormal(known, _ROUNDING)
+    indicators = _indicators(group)
+    added = _orthonormal(indicators - known @ (known.T @ indicators), 1e-6)
+    if added.shape[1] < len(untested.sizes) - 1:
+        return replace(untested, refused="covariates or strata tell the groups apart by themselves.")
+    if n - known.shape[1] - added.shape[1] < 3:
+        return replace(untested, refused=f"{n} bodies are too few for so many strata and covariates.")
+    rows = vectors - known @ (known.T @ vectors)
+    gram = rows @ rows.T
+    if np.trace(gram) <= _ROUNDING * np.square(vectors).sum():
+        return replace(untested, refused="the vectors do not differ, but for what covariates and strata explain.")
+    squares = _squares(gram)
+    kernel = np.exp(-squares / (2 * np.median(squares[np.triu_indices(n, 1)]) + 1e-300))
+
+    random = np.random.default_rng(seed)
+    of_groups, of_known, of_kernel = np.empty((3, n_permutations + 1))
+    block = max(1, _BLOCK // (n * (known.shape[1] + added.shape[1])))
+    for first in range(0, n_permutations + 1, block):
+        orders = _orders(stratum, min(block, n_permutations + 1 - first), random)
+        if first == 0:
+            orders[0] = np.arange(n)
+        part = slice(first, first + len(orders))
+        of_groups[part], of_known[part] = _along(gram, added, orders), _along(gram, known, orders)
+        of_kernel[part] = _along(kernel, added, orders)
+    left = np.trace(gram) - of_groups - of_known
+    pseudo_f = of_groups / added.shape[1] / (left / (n - known.shape[1] - added.shape[1]))
+    sizes = np.bincount(group)
+    weights = [random.multinomial(k, np.full(k, 1 / k), n_bootstraps) for k in sizes]
+    low, high = np.quantile(_effects(squares, group, weights), (0.025, 0.975)) if n_bootstraps else (None, None)
+    return replace(
+        untested,
+        permanova_f=float(pseudo_f[0]),
+        permanova_p=_probability(pseudo_f),
+        kernel=float(of_kernel[0] * (n / np.prod(sizes) if len(sizes) == 2 else 1 / n)),
+        kernel_p=_probability(of_kernel),
+        effect=float(_effects(squares, group, [np.ones((1, k)) for k in sizes])[0]),
+        effect_low=None if low is None else float(low),
+        effect_high=None if high is None else float(high),
+        auc=_auc(gram, group, n_repeats, seed) if n_repeats else None,
+    )
+
+
+def with_discovery_rates(tests: Sequence[GroupTest]) -> list[GroupTest]:
+    """The tests with their q-values, over the bodies that were tested (Benjamini and Hochberg 1995)."""
+    from scipy.stats import false_discovery_control
+
+    tested = [one for one in tests if one.refused is None]
+    if not tested:
+        return list(tests)
+    rates = zip(
+        false_discovery_control([one.permanova_p for one in tested]).tolist(),
+        false_discovery_control([one.kernel_p for one in tested]).tolist(),
+        strict=True,
+    )
+    found = {one.body: replace(one, permanova_q=a, kernel_q=b) for one, (a, b) in zip(tested, rates, strict=True)}
+    return [found.get(one.body, one) for one in tests]
+
+
+def _senseless(sizes: Mapping[str, int], group: NDArray[np.int64], stratum: NDArray[np.int64]) -> str | None:
+    """Why a test would make no sense."""
+    if len(sizes) < 2:
+        return f"expected two groups, got {', '.join(sizes) or 'none'} alone."
+    smallest = min(sizes, key=lambda name: sizes[name])
+    if sizes[smallest] < FEWEST:
+        return f"{smallest} has {sizes[smallest]}: fewer than {FEWEST} in a group cannot tell it from chance."
+    counts = np.zeros((stratum.max() + 1, group.max() + 1), dtype=int)
+    np.add.at(counts, (stratum, group), 1)
+    logs = sum(math.lgamma(row.sum() + 1) - sum(math.lgamma(k + 1) for k in row) for row in counts)
+    if logs < math.log(_FEWEST_ARRANGEMENTS):
+        return f"within strata the groups can be arranged in {math.exp(logs):.0f} ways alone, too few for a test."
+    return None
+
+
+def _indicators(codes: NDArray[np.int64]) -> Rows:
+    return np.eye(int(codes.max()) + 1)[codes]
+
+
+def _orthonormal(columns: Rows, least: float) -> Rows:
+    """An orthonormal basis of what columns of like scale span."""
+    lengths = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(lengths > least, lengths, np.inf)
+    left, values, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, values > least]
+
+
+def _squares(gram: Rows) -> Rows:
+    lengths = np.diag(gram)
+    found = np.maximum(lengths[:, None] + lengths - 2 * gram, 0)
+    np.fill_diagonal(found, 0)
+    return found
+
+
+def _orders(stratum: NDArray[np.int64], count: int, random: np.random.Generator) -> NDArray[np.int64]:
+    """(count, N) random permutations within strata."""
+    orders = np.empty((count, len(stratum)), dtype=np.int64)
+    for one in range(stratum.max() + 1):
+        members = np.flatnonzero(stratum == one)
+        orders[:, members] = random.permuted(np.tile(members, (count, 1)), axis=1)
+    return orders
+
+
+def _along(matrix: Rows, basis: Rows, orders: NDArray[np.int64]) -> Rows:
+    """Traces bᵀ M b of a basis (N, k), its rows in each of several orders (n, N)."""
+    count, n = orders.shape
+    moved = basis[orders.T].reshape(n, -1)
+    found: Rows = np.einsum("ij,ij->j", matrix @ moved, moved).reshape(count, -1).sum(axis=1)
+    return found
+
+
+def _probability(values: Rows) -> float:
+    """Of the first among all; ties within rounding count as extreme."""
+    return float((values >= values[0] * (1 - _ROUNDING)).mean())
+
+
+def _effects(squares: Rows, group: NDArray[np.int64], weights: Sequence[NDArray[Any]]) -> Rows:
+    """(n,) effects, each with weights (n, members) of each group's bodies; no pair of a body with itself counts."""
+    members = [np.flatnonzero(group == one) for one in range(len(weights))]
+    shares = [len(one) / len(group) for one in members]
+
+    def mean(a: int, b: int) -> Rows:
+        of_pairs = np.einsum(
+            "ni,ij,nj->n", weights[a], squares[np.ix_(members[a], members[b])], weights[b], optimize=True
+        )
+        pairs = weights[a].sum(axis=1) * weights[b].sum(axis=1)
+        found: Rows = of_pairs / (pairs - np.square(weights[a]).sum(axis=1) if a == b else pairs)
+        return found
+
+    inside = [mean(a, a) / 2 for a in range(len(members))]
+    pairs = combinations(range(len(members)), 2)
+    between: Any = sum(shares[a] * shares[b] * (mean(a, b) - inside[a] - inside[b]) for a, b in pairs)
+    within: Any = sum(share * one for share, one in zip(shares, inside, strict=True))
+    effects: Rows = between / (between + within)
+    return effects
+
+
+def _auc(gram: Rows, group: NDArray[np.int64], n_repeats: int, seed: int) -> float:
+    """By five folds; the rows' principal coordinates are to a ridge what the rows are."""
+    from sklearn.linear_model import RidgeClassifierCV
+    from sklearn.metrics import roc_auc_score
+    from sklearn.model_selection import RepeatedStratifiedKFold
+
+    values, axes = np.linalg.eigh(gram)
+    kept = values > _ROUNDING * values[-1]
+    coordinates = axes[:, kept] * np.sqrt(values[kept])
+    alphas = values[kept].mean() * np.logspace(-3, 3, 7)
+    found = []
+    for training, test in RepeatedStratifiedKFold(n_splits=5, n_repeats=n_repeats, random_state=seed).split(
+        gram, group
+    ):
+        scores = RidgeClassifierCV(alphas).fit(coordinates[training], group[training])
+        scores = scores.decision_function(coordinates[test])
+        if scores.ndim == 1:
+            found.append(roc_auc_score(group[test], scores))
+        else:
+            found.append(np.mean([roc_auc_score(group[test] == one, column) for one, column in enumerate(scores.T)]))
+    return float(np.mean(found))

@@ -1,0 +1,144 @@
+"""Tests of groups hold their level, find what is there, and refuse what makes no sense."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from igps.analysis.groups import GroupTest, group_test, squared_distances, vectors_of, with_discovery_rates
+from igps.descriptors import descriptor
+
+PAIR = ["a"] * 12 + ["b"] * 12
+
+
+def quick(vectors: NDArray[np.float64], groups: list[str] = PAIR, seed: int = 0, **given: object) -> GroupTest:
+    options = {"n_permutations": 199, "n_bootstraps": 0, "n_repeats": 0, **given}
+    return group_test(vectors, groups, seed=seed, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("is_confounded", [False, True])
+def test_without_a_difference_one_test_in_twenty_rejects(is_confounded: bool) -> None:
+    """Of 1,000 draws; also where a covariate that differs between the groups, and the strata, cause a difference."""
+    random = np.random.default_rng(1)
+    found = []
+    for draw in range(1000):
+        vectors, given = random.normal(size=(24, 6)), {}
+        if is_confounded:
+            age, scanner = random.normal(size=24) + np.repeat([0, 1], 12), random.integers(0, 2, 24)
+            vectors += np.outer(age, [2, 1, 0, 0, 0, 0]) + 2 * scanner[:, None]
+            given = {"covariates": age[:, None], "strata": [str(one) for one in scanner]}
+        test = quick(vectors, seed=draw, **given)
+        found.append((test.permanova_p, test.kernel_p))
+    rejected = (np.array(found, dtype=float) <= 0.05).mean(axis=0)
+    assert ((rejected >= 0.03) & (rejected <= 0.07)).all(), rejected
+
+
+def test_power_grows_with_the_difference() -> None:
+    random = np.random.default_rng(2)
+    powers = []
+    for shift in (0.0, 0.7, 1.4, 2.8):
+        tests = [
+            quick(random.normal(size=(24, 4)) + np.outer(np.repeat([0, 1], 12), [shift, 0, 0, 0])) for _ in range(60)
+        ]
+        powers.append([np.mean([getattr(one, name) <= 0.05 for one in tests]) for name in ("permanova_p", "kernel_p")])
+    assert (np.diff(powers, axis=0) > 0).all(), powers
+    assert min(powers[-1]) > 0.95
+
+
+def test_a_covariate_that_causes_all_the_difference_explains_it() -> None:
+    random = np.random.default_rng(3)
+    age = random.normal(size=60) + np.repeat([0, 2], 30)
+    vectors = np.outer(age, [1.0, 0.5, 0, 0]) + 0.3 * random.normal(size=(60, 4))
+    groups = ["young"] * 30 + ["old"] * 30
+    alone = group_test(vectors, groups, n_permutations=999)
+    explained = group_test(vectors, groups, covariates=age[:, None], n_permutations=999)
+    assert max(alone.permanova_p or 1, alone.kernel_p or 1) < 0.002
+    assert min(explained.permanova_p or 0, explained.kernel_p or 0) > 0.05
+    assert (alone.auc or 0) > 0.85 > 0.7 > (explained.auc or 1)
+    assert (alone.effect_low or 0) > 0.1
+    assert (explained.effect or 1) < 0.05
+
+
+def test_statistics_are_those_of_the_textbook() -> None:
+    random = np.random.default_rng(4)
+    vectors = random.normal(size=(24, 3)) + np.repeat([0, 1], 12)[:, None]
+    test = quick(vectors)
+    one, other = vectors[:12], vectors[12:]
+    between = 12 * sum(((part.mean(axis=0) - vectors.mean(axis=0)) ** 2).sum() for part in (one, other))
+    within = sum(((part - part.mean(axis=0)) ** 2).sum() for part in (one, other))
+    assert test.permanova_f == pytest.approx(between / (within / 22))
+    squares = squared_distances(vectors)
+    np.testing.assert_allclose(squares, ((vectors[:, None] - vectors) ** 2).sum(axis=2), atol=1e-12)
+    kernel = np.exp(-squares / (2 * np.median(squares[np.triu_indices(24, 1)])))
+    means = kernel[:12, :12].mean() + kernel[12:, 12:].mean() - 2 * kernel[:12, 12:].mean()
+    assert test.kernel == pytest.approx(means)
+    # Without bias: of the variance of all, the squared distance of the means less what chance adds to it
+    variances = [part.var(axis=0, ddof=1).sum() for part in (one, other)]
+    apart = ((one.mean(axis=0) - other.mean(axis=0)) ** 2).sum() - sum(variances) / 12
+    assert test.effect == pytest.approx(apart / 4 / (apart / 4 + sum(variances) / 2))
+
+
+def test_the_interval_covers_the_effect() -> None:
+    random = np.random.default_rng(5)
+    truth, covered = 0.25 / (0.25 + 2), []  # means 1 apart, two dimensions of variance 1
+    for draw in range(200):
+        vectors = random.normal(size=(80, 2)) + np.outer(np.repeat([0, 1], 40), [1, 0])
+        test = quick(vectors, ["a"] * 40 + ["b"] * 40, draw, n_permutations=1, n_bootstraps=400)
+        covered.append((test.effect_low or 1) <= truth <= (test.effect_high or 0))
+    assert 0.88 < np.mean(covered) < 0.99
+
+
+def test_a_probability_is_that_of_all_arrangements() -> None:
+    """Ten numbers in two groups of five: 252 arrangements, counted one by one."""
+    from itertools import combinations
+
+    values = np.random.default_rng(6).normal(size=10) + np.repeat([0, 0.8], 5)
+    apart = [abs(values[list(one)].mean() - np.delete(values, one).mean()) for one in combinations(range(10), 5)]
+    exact = np.mean([one >= abs(values[:5].mean() - values[5:].mean()) - 1e-12 for one in apart])
+    test = quick(values[:, None], ["a"] * 5 + ["b"] * 5, n_permutations=20_000)
+    assert test.permanova_p == pytest.approx(exact, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({"groups": ["a"] * 21 + ["b"] * 3}, "b has 3"),
+        ({"groups": ["a"] * 24}, "expected two groups, got a alone"),
+        ({"strata": PAIR}, "within strata the groups can be arranged in 1 ways"),
+        ({"covariates": np.repeat([[0.0], [1.0]], 12, axis=0)}, "tell the groups apart by themselves"),
+        ({"vectors": np.ones((24, 3))}, "do not differ"),
+        ({"covariates": np.random.default_rng(0).normal(size=(24, 21))}, "too few"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(given: dict[str, object], why: str) -> None:
+    vectors = np.random.default_rng(7).normal(size=(24, 3))
+    test = quick(**{"vectors": vectors, **given})  # type: ignore[arg-type]
+    assert test.permanova_p is test.kernel_p is test.effect is None
+    assert why in (test.refused or "")
+    with pytest.raises(ValueError, match="strata: expected one for each of 24 bodies, got 2"):
+        quick(vectors, strata=["a", "b"])
+
+
+def test_discovery_rates_are_over_what_was_tested() -> None:
+    tests = [GroupTest(str(i), {}, permanova_p=p, kernel_p=p) for i, p in enumerate((0.01, 0.04, 0.03))]
+    refused = GroupTest("no", {}, refused="too few")
+    found = with_discovery_rates([tests[0], refused, *tests[1:]])
+    assert found[1] is refused
+    assert [one.permanova_q for one in found] == pytest.approx([0.03, None, 0.04, 0.04])
+    assert with_discovery_rates([refused]) == [refused]
+
+
+def test_three_groups_are_tested_together() -> None:
+    random = np.random.default_rng(8)
+    vectors = random.normal(size=(45, 3)) + np.outer(np.repeat([0, 0, 3], 15), [1, 0, 0])
+    test = quick(vectors, ["a"] * 15 + ["b"] * 15 + ["c"] * 15, n_repeats=1)
+    assert test.permanova_p == test.kernel_p == 1 / 200
+    assert 0.6 < (test.auc or 0) < 1
+
+
+def test_vectors_of_histograms_are_roots_and_those_of_a_head_are_as_they_are() -> None:
+    values = torch.tensor([[0.25, 0.75]])
+    np.testing.assert_allclose(vectors_of(descriptor("interior"), values), [[0.5, 0.75**0.5]])
+    np.testing.assert_allclose(vectors_of(descriptor("pretrained"), values), [[0.25, 0.75]])

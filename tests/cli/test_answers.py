@@ -1,0 +1,88 @@
+"""Answers from the command line: their files and what they print are what Python computes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from igps.analysis.groups import group_test, vectors_of
+from igps.cli import main
+from igps.data.dataset import SignatureDataset
+from igps.nn.description import describe
+from igps.signature.signature import SignatureConfig
+from own_descriptors import SMALL, small_interior, write_egg
+
+CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
+OWN = ["--descriptor", "own_descriptors:small_interior"]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six short eggs and seven long ones, one of which lies among the short, with scanner and age."""
+    folder = tmp_path_factory.mktemp("answers") / "meshes"
+    rows = [("file", "label", "scanner", "age")]
+    for label, heights in (
+        ("short", (1.0, 1.1, 1.2, 1.05, 1.15, 1.25)),
+        ("long", (2, 2.1, 2.2, 2.3, 2.15, 2.05, 1.12)),
+    ):
+        for i, height in enumerate(heights):
+            write_egg(folder / f"{label}{i}.off", height, subdivisions=2)
+            rows.append((f"{label}{i}.off", label, "xy"[i % 2], str(50 + i)))
+    with (folder / "labels.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    return folder
+
+
+def igps(monkeypatch: pytest.MonkeyPatch, root: Path, *arguments: object) -> None:
+    cache = ["--cache_dir", root.parent / "cache"]
+    monkeypatch.setattr(sys, "argv", ["igps", *map(str, [*arguments, *cache, *SMALL])])
+    main()
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_groups_prints_and_writes_the_tests(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--strata", "scanner", "--covariate", "age", "--size", "--n_permutations", "199", "--out", tmp_path]
+    igps(monkeypatch, root, "groups", root, *OWN, *words)
+    printed = capsys.readouterr().out
+    dataset = SignatureDataset(root, CONFIG, root.parent / "cache")
+    descriptions = describe(dataset, small_interior())
+    expected = group_test(
+        vectors_of(small_interior(), descriptions),
+        dataset.bodies.labels or (),
+        strata=dataset.bodies.column("scanner"),
+        covariates=np.array([dataset.bodies.numbers("age")]).T,
+        n_permutations=199,
+    )
+    shape, size = json.loads((tmp_path / "groups.json").read_text())
+    assert (shape["body"], size["body"]) == ("all", "all, size")
+    assert shape["permanova_p"] == expected.permanova_p < 0.05
+    assert shape["auc"] == pytest.approx(expected.auc)
+    assert shape["sizes"] == "long:7 short:6"
+    assert f"{expected.effect:.3f}" in printed
+    assert [row["body"] for row in table(tmp_path / "groups.csv")] == ["all", "all, size"]
+    assert imread(tmp_path / "groups.png").std() > 0.02
+    assert (tmp_path / "groups.svg").read_text().startswith("<?xml")
+
+
+def test_groups_refuses_three_of_a_group(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = table(root / "labels.csv")
+    (tmp_path / "labels.csv").write_text(
+        "file,ill\n" + "".join(f"{root / row['file']},{'yes' if i < 3 else 'no'}\n" for i, row in enumerate(rows))
+    )
+    igps(monkeypatch, root, "groups", tmp_path, "--group", "ill", *OWN, "--out", tmp_path / "out")
+    assert "not tested (10 no, 3 yes): yes has 3: fewer than 5" in capsys.readouterr().out
+    assert not (tmp_path / "out" / "groups.png").exists()
