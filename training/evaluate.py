@@ -1,6 +1,7 @@
 """Retrieval scores over several seeded splits, and of a trained checkpoint.
 
     python -m training.evaluate splits DATA --descriptor rich --protocol unseen
+    python -m training.evaluate fitted DATA --first_seed 200
     python -m training.evaluate checkpoint build/training/lightning_logs/version_0/checkpoints/X.ckpt
 
 Nothing is chosen here: the heads are fitted to the training part with fixed parameters, the test part is scored once.
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 from jsonargparse import auto_cli
 
-from training.studies.learning import checkpoint, splits
+from training.studies.learning import checkpoint, fitted, splits
 
 if __name__ == "__main__":
-    auto_cli([splits, checkpoint])
+    auto_cli([splits, fitted, checkpoint])

@@ -12,11 +12,12 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from igps.analysis.fitting import fit
 from igps.data.batch import SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.requirements import register_descriptors
-from igps.descriptors import descriptor
+from igps.descriptors import descriptor, load
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
@@ -25,9 +26,9 @@ from igps.nn.descriptor import BodyDescriptor, Descriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
 from igps.nn.histograms.pairs import PairHistogram
-from igps.retrieval import chi_square, retrieval_scores, search
+from igps.retrieval import retrieval_scores, search
 from igps.shapes import ArticulatedShapes
-from igps.signature.signature import Signature, SignatureConfig, compute_signature
+from igps.signature.signature import SignatureConfig, compute_signature
 
 if TYPE_CHECKING:
     from igps.data.datamodule import SignatureDataModule
@@ -51,18 +52,18 @@ __all__ = [
     "MeshError",
     "PairHistogram",
     "RetrievalLearner",
-    "Signature",
     "SignatureBatch",
     "SignatureConfig",
     "SignatureDataModule",
     "SignatureDataset",
     "SpectralEmbedding",
     "WhitenedHead",
-    "chi_square",
     "collate",
     "compute_signature",
     "describe",
     "descriptor",
+    "fit",
+    "load",
     "load_mesh",
     "retrieval_scores",
     "search",

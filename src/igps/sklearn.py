@@ -104,7 +104,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         else:
             dataset = SignatureDataset(shapes, self.config, self.cache_dir, descriptor=chosen, reading=self.reading)
             dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
-            tag = cache_tag(self.descriptor, chosen)
+            tag = cache_tag(chosen)
             features = describe(dataset, chosen, cache_tag=tag, n_workers=self.n_workers)
         cells = features.flatten(1)
         rooted = self.square_root and isinstance(chosen, HistogramDescriptor)

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from outcome import Row
 from scipy.spatial.transform import Rotation
 
-from igps import Mesh, Signature, SignatureConfig, collate, compute_signature, descriptor
+from igps import Mesh, SignatureConfig, collate, compute_signature, descriptor
 from igps.data.requirements import Requirements
 from igps.descriptors import NAMES
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.retrieval import Distance, cosine
-from igps.signature.signature import Samples
+from igps.signature.signature import Samples, Signature
 
 SEED = 13
 

@@ -13,9 +13,10 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from igps import Mesh, PairHistogram, Signature, SignatureConfig, SpectralEmbedding, collate, compute_signature
+from igps import Mesh, PairHistogram, SignatureConfig, SpectralEmbedding, collate, compute_signature
 from igps.descriptors.d2 import D2
 from igps.nn.axes import InteriorDistance, Potential
+from igps.signature.signature import Signature
 
 Floats = NDArray[np.float64]
 Surface = tuple[Floats, NDArray[np.int64]]

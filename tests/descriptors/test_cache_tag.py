@@ -9,8 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 
+import own_descriptors
 from igps.descriptors import NAMES, descriptor, fingerprint
 from igps.descriptors.fingerprint import cache_tag
+from igps.nn.axes import Attribute, EuclideanDistance
+from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.heads import WhitenedHead
+from igps.nn.histograms.pairs import PairHistogram
 
 
 @pytest.fixture(autouse=True)
@@ -21,27 +26,36 @@ def _forgotten() -> Iterator[None]:
 
 
 def words() -> str:
-    found = cache_tag("d2", descriptor("d2"))
+    found = cache_tag(descriptor("d2"))
     assert found is not None
     return found
 
 
 def test_every_descriptor_has_words_of_its_own() -> None:
-    assert len({cache_tag(name, descriptor(name)) for name in NAMES} - {None}) == len(NAMES)
+    assert len({cache_tag(descriptor(name)) for name in NAMES} - {None}) == len(NAMES)
     assert words() == words()
 
 
 def test_what_is_not_the_librarys_has_none() -> None:
-    own = descriptor("interior")
-    assert cache_tag(own, own) is None
-    assert cache_tag("package.module:interior", own) is None
+    assert cache_tag(own_descriptors.Same()) is None
+    assert cache_tag(EmbeddedDescriptor(own_descriptors.Same(), WhitenedHead())) is None
+
+
+def test_what_it_was_made_with_changes_the_words() -> None:
+    one, other = (PairHistogram([EuclideanDistance(8), Attribute(name, [0.1, 0.2])]) for name in ("depth", "twist"))
+    assert cache_tag(HistogramDescriptor(one)) != cache_tag(HistogramDescriptor(other))
+    assert (
+        cache_tag(own_descriptors.small_interior())
+        == cache_tag(own_descriptors.small_interior())
+        != cache_tag(descriptor("interior"))
+    )
 
 
 def test_parameters_change_the_words() -> None:
     changed = descriptor("interior")
     with torch.no_grad():
         next(changed.buffers()).mul_(1.5)
-    assert cache_tag("interior", changed) != cache_tag("interior", descriptor("interior"))
+    assert cache_tag(changed) != cache_tag(descriptor("interior"))
 
 
 def test_the_code_changes_the_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ from igps.gallery.gallery import Gallery
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
+from igps.retrieval import chi_square
 from igps.retrieval.index import VectorIndex
 from igps.retrieval.ranking import SearchResult
 from igps.signature.signature import SignatureConfig
@@ -68,7 +69,7 @@ def test_it_ranks_as_the_descriptor_does(dataset: SignatureDataset, root: Path, 
     gallery, failures = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     assert failures == []
     histograms = describe(dataset, small_interior())
-    distances = igps.chi_square(histograms[4:5], histograms)[0]
+    distances = chi_square(histograms[4:5], histograms)[0]
     found = gallery.query(root / "egg" / "1.off", top=4, cache_dir=tmp_path / "cache")
     nearest = torch.argsort(distances, stable=True)[:4].tolist()
     assert [match.name for match in found] == [dataset.bodies.names[i] for i in nearest]

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 import igps
+from igps.analysis.fitting import histograms_and_prior
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, split_seen
 from igps.nn.description import describe
 from igps.nn.heads.base import Head
 from igps.nn.heads.closed_form import KernelHead
 from igps.nn.learner import RetrievalLearner
-from training.studies.learning import histograms_and_prior
+from training.studies.learning import part_cells_of
 
 
 def classify(
@@ -46,7 +47,7 @@ def classify(
         module, prior = histograms_and_prior(descriptor)
         dataset = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=module)
         dataset.precompute(strict=True)
-        histograms, part_cells = describe(dataset, module, progress=True), module.part_cells
+        histograms, part_cells = describe(dataset, module, progress=True), part_cells_of(module)
         seeds = range(first_seed, first_seed + n_splits)
         found = [split_seen(dataset.labels, n_train, seed=seed) for seed in seeds]
         labels = dataset.labels

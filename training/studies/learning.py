@@ -10,13 +10,17 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torchmetrics.classification import BinaryAUROC
 
 import igps
+from igps.analysis.fitting import Goal, calibration_error, classify, fit, histograms_and_prior
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, SplitProtocol, split_seen, split_unseen
+from igps.descriptors.fingerprint import cache_tag
 from igps.nn.description import describe
-from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads.base import Head
+from igps.nn.heads.classifier import ClassifierHead
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
 from igps.nn.learner import RetrievalLearner
 from igps.retrieval import chi_square, retrieval_scores
@@ -52,6 +56,7 @@ def splits(
         out: a JSON file to which the rows are added.
     """
     module, prior = histograms_and_prior(descriptor)
+    cells = part_cells_of(module)
     dataset = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=module)
     dataset.precompute(strict=True)
     histograms, labels = describe(dataset, module, progress=True).flatten(1), dataset.labels
@@ -67,7 +72,7 @@ def splits(
                 split = split_seen(labels, n_train, seed=seed)
             else:
                 split = split_unseen(labels, n_train, n_test=n_test, seed=seed)
-            results.append(score(histograms, labels, split, head, module.part_cells, prior))
+            results.append(score(histograms, labels, split, head, cells, prior))
         values = {name: [one[name] for one in results] for name in COLUMNS}
         found = {name: {"mean": mean(v), "stdev": stdev(v) if n_splits > 1 else 0.0} for name, v in values.items()}
         print(f"{head:<10}" + "".join(f"{100 * v['mean']:>8.1f} ± {100 * v['stdev']:>3.1f}" for v in found.values()))
@@ -76,20 +81,6 @@ def splits(
         earlier = json.loads(out.read_text()) if out.exists() else []
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps([*earlier, *rows], indent=1) + "\n")
-
-
-def histograms_and_prior(name: str) -> tuple[HistogramDescriptor, Head | None]:
-    """The descriptor of a name, whose histograms heads are fitted to, and the metric that it has of them, if any.
-
-    Raises:
-        ValueError: it gives no histograms.
-    """
-    found = igps.descriptor(name)
-    if isinstance(found, EmbeddedDescriptor) and isinstance(found.descriptor, HistogramDescriptor):
-        return found.descriptor, found.head
-    if not isinstance(found, HistogramDescriptor):
-        raise ValueError(f"descriptor: expected one of histograms, such as interior or rich, got {name}.")
-    return found, None
 
 
 def score(
@@ -108,6 +99,70 @@ def score(
     distance = chi_square if chosen is None else chosen.distances
     vectors = histograms[test] if chosen is None else chosen(histograms[test])
     return retrieval_scores(distance(vectors, vectors), labels[test]).mean()
+
+
+def fitted(
+    root: Path,
+    descriptor: str = "pretrained",
+    n_train: int = 10,
+    n_splits: int = 5,
+    first_seed: int = 100,
+    cache_dir: Path | None = None,
+) -> None:
+    """What `igps fit` makes of the training part of several splits, on their test parts, in percent.
+
+    Of known classes also as a classifier: the share that is classified correctly, the expected calibration error, and
+    the area under the curve by which the bodies of a class that is left out of the fit are told from all others, mean
+    over the classes.
+
+    Args:
+        root: labelled collection.
+        descriptor: what is fitted.
+        n_train: shapes of each class (known) or classes (new) to fit to.
+        n_splits: how many splits, with the seeds from `first_seed` on.
+        first_seed: see n_splits.
+        cache_dir: folder of cached signatures; the user's cache directory if not given.
+    """
+    dataset = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=descriptor)
+    dataset.precompute(strict=True)
+    goals: tuple[Goal, ...] = ("known", "new")
+    for goal in goals:
+        rows = [_fitted(dataset, descriptor, goal, n_train, first_seed + i) for i in range(n_splits)]
+        for name in rows[0]:
+            values = [100 * row[name] for row in rows]
+            print(f"{goal:<6}{name:<18}{mean(values):>6.1f} ± {stdev(values) if n_splits > 1 else 0:.1f}")
+
+
+def _fitted(dataset: igps.SignatureDataset, descriptor: str, goal: Goal, n_train: int, seed: int) -> dict[str, float]:
+    split = (split_seen if goal == "known" else split_unseen)(dataset.labels, n_train, seed=seed)
+    train, test = dataset.subset(split.train), dataset.subset(split.test)
+    model = fit(train, descriptor, goal=goal)
+    described = describe(test, model, cache_tag=cache_tag(model))
+    scores = retrieval_scores(model.distances(described, described), test.labels).mean()
+    found = {name: scores[name] for name in ("ft", "nn", "dcg")}
+    if goal == "new":
+        return found
+    told, labels = classify(test, model), test.labels
+    found["accuracy"] = float((told.probabilities.argmax(dim=1) == labels).float().mean())
+    found["calibration_error"] = calibration_error(told.probabilities, labels)
+    areas = []
+    for label in labels.unique():
+        rest = train.subset(torch.nonzero(train.labels != label).flatten().tolist())
+        strange = classify(test, _classifier(rest, descriptor)).strangeness
+        areas.append(float(BinaryAUROC()(strange, (labels == label).long())))
+    return {**found, "unknown_auc": mean(areas)}
+
+
+def _classifier(dataset: igps.SignatureDataset, descriptor: str) -> EmbeddedDescriptor:
+    base, prior = histograms_and_prior(descriptor)
+    histograms = describe(dataset, base, cache_tag=cache_tag(base)).flatten(1)
+    head = ClassifierHead(prior).fit(histograms, dataset.labels, part_cells_of(base), calibrate=False)
+    return EmbeddedDescriptor(base, head)
+
+
+def part_cells_of(descriptor: Descriptor) -> tuple[int, ...] | None:
+    """Cells of each part of a descriptor of histograms, None of others."""
+    return descriptor.part_cells if isinstance(descriptor, HistogramDescriptor) else None
 
 
 def checkpoint(path: Path, out: Path = Path("build/evaluation")) -> None:

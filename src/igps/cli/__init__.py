@@ -21,6 +21,7 @@ from igps.cli.completion import completion
 from igps.cli.demo import demo
 from igps.cli.doctor import doctor
 from igps.cli.duplicates import distance, duplicates
+from igps.cli.fit import classify, fit
 from igps.cli.groups import groups
 from igps.cli.index import index_add, index_build, index_merge
 from igps.cli.precompute import precompute
@@ -36,6 +37,8 @@ COMMANDS: Commands = {
     "retrieve": retrieve,
     "extract": extract,
     "query": query,
+    "fit": fit,
+    "classify": classify,
     "precompute": precompute,
     "index": {"build": index_build, "add": index_add, "merge": index_merge},
     "duplicates": duplicates,

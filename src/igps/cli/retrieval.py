@@ -220,7 +220,7 @@ def described(
         dataset,
         module,
         failures=None if strict else failures,
-        cache_tag=cache_tag(descriptor, module),
+        cache_tag=cache_tag(module),
         n_workers=n_workers,
         progress=True,
     )

@@ -1,5 +1,5 @@
 """Every descriptor by its name, one file each."""
 
-from igps.descriptors.registry import NAMES, descriptor
+from igps.descriptors.registry import NAMES, descriptor, load
 
-__all__ = ["NAMES", "descriptor"]
+__all__ = ["NAMES", "descriptor", "load"]

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
+import json
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from torch import nn
 
-from igps.descriptors.registry import NAMES
+from igps.descriptors.registry import is_file
 from igps.nn.descriptor import Descriptor
+from igps.nn.specification import specification
 
 # The packages that descriptions are computed with.
 _COMPUTE_WITH = "torch", "numpy", "scipy", "numba", "libigl"
 
 
-def name_of(descriptor: str | Descriptor) -> str:
-    """The name by which a descriptor was asked for, or its own."""
-    return descriptor if isinstance(descriptor, str) else descriptor.name
+def name_of(descriptor: str | Path | Descriptor) -> str:
+    """The name by which a descriptor was asked for, of a file its whole path; or the descriptor's own."""
+    if isinstance(descriptor, Descriptor):
+        return descriptor.name
+    return str(Path(descriptor).resolve()) if is_file(descriptor) else str(descriptor)
 
 
 def fingerprint(descriptor: nn.Module) -> str:
@@ -36,17 +40,17 @@ def fingerprint(descriptor: nn.Module) -> str:
     return found.hexdigest()[:32]
 
 
-def cache_tag(descriptor: str | Descriptor, module: Descriptor) -> str | None:
+def cache_tag(module: nn.Module) -> str | None:
     """All that descriptions depend on beside Signatures, in words, see `igps.nn.description.describe`.
 
-    Name and parameters of the descriptor, the library's code, and the versions of what that computes with.
-
-    Args:
-        descriptor: as it was asked for. Only a name of the library's has a tag; for all others, whose code is not
-            known, None is returned.
-        module: the descriptor itself.
+    What the descriptor is made of, its parameters, the library's code, and the versions of what that computes with.
+    None for a descriptor that holds anything of others, whose code is not known.
     """
-    return f"{descriptor} {fingerprint(module)} {_code()}" if descriptor in NAMES else None
+    try:
+        made_of = json.dumps(specification(module))
+    except ValueError:
+        return None
+    return f"{hashlib.sha256(made_of.encode()).hexdigest()[:32]} {fingerprint(module)} {_code()}"
 
 
 @cache

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 from igps.descriptors.canonical_form import CanonicalForm
 from igps.descriptors.d2 import D2
@@ -20,6 +22,7 @@ from igps.descriptors.shape_dna import ShapeDNA
 from igps.descriptors.spectral_gw import SpectralGromovWasserstein
 from igps.descriptors.volume_shape_dna import VolumeShapeDNA
 from igps.nn.descriptor import Descriptor
+from igps.nn.specification import load_module
 
 _MAKERS: Mapping[str, Callable[[], Descriptor]] = {
     "interior": interior,
@@ -40,26 +43,52 @@ _MAKERS: Mapping[str, Callable[[], Descriptor]] = {
 NAMES: tuple[str, ...] = tuple(_MAKERS)
 """The names of the library's descriptors of any body."""
 
+_NAME = re.compile(r"\w{1,100}")
+
 # Descriptors of bodies that bring attributes of their own.
 _OF_ATTRIBUTES: Mapping[str, Callable[[], Descriptor]] = {"molecular": molecular}
 
 
-def descriptor(which: str | Descriptor) -> Descriptor:
-    """A descriptor by its name, in evaluation mode; one that is given is returned as it is.
+def is_file(which: str | Path) -> bool:
+    """Whether a descriptor is asked for by its file."""
+    return str(which).endswith(".safetensors")
+
+
+def load(path: str | Path) -> Descriptor:
+    """A descriptor that `Descriptor.save` or `igps fit` wrote, in evaluation mode, with its `card`. No code runs.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: it is another file, or a damaged one.
+    """
+    module, card = load_module(path)
+    if not isinstance(module, Descriptor):
+        raise ValueError(f"{path}: expected a descriptor, got {type(module).__name__}.")
+    if not _NAME.fullmatch(module.name):  # files are called after it
+        raise ValueError(f"{path}: expected a descriptor's name of letters, digits and _, got {module.name[:80]!r}.")
+    module.card = card
+    return module
+
+
+def descriptor(which: str | Path | Descriptor) -> Descriptor:
+    """A descriptor by its name or file, in evaluation mode; one that is given is returned as it is.
 
     Example:
         >>> descriptor("interior").requirements.n_eigenpairs
         250
 
     Args:
-        which: one of `NAMES`, or "molecular"; or "package.module:NAME", where NAME is a descriptor of your own or
-            makes one when called; or a descriptor.
+        which: one of `NAMES`, or "molecular"; or a file, see `load`; or "package.module:NAME", where NAME is a
+            descriptor of your own or makes one when called; or a descriptor.
 
     Raises:
-        ValueError: no descriptor has this name.
+        ValueError: no descriptor has this name, or see `load`.
     """
     if isinstance(which, Descriptor):
         return which
+    if is_file(which):
+        return load(which)
+    which = str(which)
     if maker := _MAKERS.get(which) or _OF_ATTRIBUTES.get(which):
         return maker().eval()
     module, colon, name = which.partition(":")

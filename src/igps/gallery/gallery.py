@@ -14,6 +14,7 @@ from tqdm import tqdm
 from igps.data.dataset import Failure, SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import fingerprint, name_of
+from igps.descriptors.registry import is_file
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
@@ -59,10 +60,12 @@ class Gallery:
     def __init__(self, path: str | Path, descriptor: str | Descriptor | None = None) -> None:
         self.index = VectorIndex(path)
         about = self.index.about
-        if isinstance(descriptor, str):
-            check_alike(self.index, {"descriptor": descriptor})
+        by_name = not isinstance(descriptor, Descriptor) and not is_file(descriptor or "")  # a file may have moved
+        if by_name and descriptor is not None:
+            check_alike(self.index, {"descriptor": str(descriptor)})
         self.descriptor = descriptor_of(about["descriptor"] if descriptor is None else descriptor)
-        check_alike(self.index, {"descriptor": name_of(descriptor or about["descriptor"])})
+        if isinstance(descriptor, Descriptor):
+            check_alike(self.index, {"descriptor": descriptor.name})
         check_alike(self.index, {"model": fingerprint(self.descriptor)})
         version = SignatureConfig.ALGORITHM_VERSION
         if about["signature"]["algorithm_version"] != version:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import reduce
 from itertools import islice
 from operator import or_
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,15 +19,19 @@ from torch import Tensor, nn
 
 from igps._threads import one_thread
 from igps.data.batch import Body, SignatureBatch
+from igps.data.collation import collate
 from igps.data.requirements import Requirements
+from igps.mesh.mesh import Mesh
 from igps.nn.batch_features import BatchFeatures
 from igps.nn.heads.base import Head
 from igps.nn.histograms.base import DescriptionPart
+from igps.nn.specification import Specified, save_module
 from igps.retrieval import chi_square
 from igps.retrieval.vectors import MOST_NUMBERS, SearchDistance
+from igps.signature.signature import SignatureConfig, compute_signature
 
 
-class Descriptor(nn.Module, ABC):
+class Descriptor(Specified, ABC):
     """A descriptor: a module from a `SignatureBatch` to descriptions (N, ...), with the distance that compares them.
 
     A descriptor of your own defines `describe`, its `name`, and where the defaults do not fit its `requirements` and
@@ -59,6 +66,7 @@ class Descriptor(nn.Module, ABC):
         searched_by: the distance by which an index finds candidates, "cosine" for unit vectors or "chi_square" for
             histograms; what is near by `distances` must be among the few hundred that are nearest by it. None where
             neither is: an index compares with all.
+        card: what is told of one that was fitted, by name.
     """
 
     name: str = "descriptor"
@@ -66,6 +74,30 @@ class Descriptor(nn.Module, ABC):
     invariant_to: tuple[str, ...] = ()
     requirements: Requirements = Requirements(whole_spectrum=True)
     searched_by: SearchDistance | None = None
+    card: Mapping[str, Any] = MappingProxyType({})
+
+    @property
+    def n_features(self) -> int:
+        """Numbers of a description; of a descriptor that does not know, those of a ball that is described for it."""
+        import trimesh
+
+        ball = trimesh.creation.icosphere(subdivisions=3)
+        mesh = Mesh(ball.vertices, ball.faces)
+        config = self.requirements.apply_to(SignatureConfig(n_surface_samples=100, resolution=10, min_samples=0))
+        with torch.no_grad():
+            return self(collate([compute_signature(mesh, config)], [mesh]))[0].numel()
+
+    def save(self, path: str | Path, card: Mapping[str, Any] | None = None) -> None:
+        """Write it to a safetensors file, which `igps.load` and every `--descriptor` takes.
+
+        Args:
+            path: such as ``mine.safetensors``; a file that is there is replaced.
+            card: what a reader should know of it, for JSON; its own if None.
+
+        Raises:
+            ValueError: it is made of other modules than the library's.
+        """
+        save_module(self, path, dict(self.card if card is None else card))
 
     @abstractmethod
     def describe(self, batch: SignatureBatch) -> Tensor:
@@ -172,6 +204,11 @@ class HistogramDescriptor(Descriptor):
         """Cells of each part."""
         return tuple(sum(histogram.n_cells for histogram in part) for part in self.parts)
 
+    @property
+    def n_features(self) -> int:
+        """Cells of all parts."""
+        return sum(self.part_cells)
+
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, C(C+1)/2, B, ...) histograms of a single one, (N, cells) of several; each body's of sum 1."""
         features = BatchFeatures(batch, self.training)
@@ -210,6 +247,13 @@ class EmbeddedDescriptor(Descriptor):
         self.name, self.source = name, source
         self.invariant_to = descriptor.invariant_to if invariant_to is None else tuple(invariant_to)
         self.requirements = descriptor.requirements
+
+    @property
+    def n_features(self) -> int:
+        """D of the embeddings."""
+        device = next(self.head.buffers()).device
+        with torch.no_grad():
+            return self.head(torch.ones(2, self.descriptor.n_features, device=device)).shape[1]
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, D) embeddings of length 1."""

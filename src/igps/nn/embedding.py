@@ -8,6 +8,8 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from igps.nn.specification import Specified
+
 EmbeddingKind = Literal["commute_time", "diffusion", "biharmonic"]
 
 # λ·area from below the smallest of elongated bodies to beyond the 250th of any (4π·250, Weyl's law).
@@ -97,7 +99,7 @@ def barycentroid_potential(embedding: Tensor) -> Tensor:
     return torch.linalg.vector_norm(embedding, dim=-1)
 
 
-class SpectralEmbedding(nn.Module):
+class SpectralEmbedding(Specified):
     """`spectral_embedding` as a module, its weights fixed or learned.
 
     A learned filter multiplies the weights of the kind by exp(s(log(λ·area))), s piecewise linear between knots and

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from igps.nn.specification import Specified
+
 # The part of its start that a learned gap between centres always keeps, so that no interval closes.
 _LEAST_GAP = 1e-3
 
@@ -24,7 +26,7 @@ def middles(n: int, largest: float, name: str) -> Tensor:
     return (torch.arange(n) + 0.5) * (largest / n)
 
 
-class OrderedCentres(nn.Module):
+class OrderedCentres(Specified):
     """Ascending centres of bins or classes, fixed or learned.
 
     Learned centres are the running sum of positive gaps, each its start times softplus(θ)/log 2 with θ = 0 at first,

@@ -14,9 +14,10 @@ from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn._kernels.pair_values import PairValues, euclidean_distances, oriented_pairs
 from igps.nn.axes.centres import OrderedCentres, middles
 from igps.nn.batch_features import SampleFeatures
+from igps.nn.specification import Specified
 
 
-class PairAxis(nn.Module, ABC):
+class PairAxis(Specified, ABC):
     """Bins of pairs, shared out linearly: a pair counts in the two bins whose centres surround its value.
 
     An axis of your own defines `shape`, `pairs`, and where the samples alone do not suffice `requirements`. `pairs`

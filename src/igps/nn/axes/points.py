@@ -15,10 +15,11 @@ from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn.axes.centres import OrderedCentres, middles
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import barycentroid_potential
+from igps.nn.specification import Specified
 from igps.signature.attributes import AttributeName
 
 
-class PointAxis(nn.Module, ABC):
+class PointAxis(Specified, ABC):
     """Classes of points.
 
     Args:

@@ -1,8 +1,18 @@
 """Heads: what turns descriptions into vectors whose distances answer a question, fitted or trained on labels."""
 
 from igps.nn.heads.base import Head
+from igps.nn.heads.classifier import ClassifierHead
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
 from igps.nn.heads.learned import BlendedDistance, ProjectionHead
 from igps.nn.heads.two_level import TwoLevelHead, WCCNHead
 
-__all__ = ["BlendedDistance", "Head", "KernelHead", "ProjectionHead", "TwoLevelHead", "WCCNHead", "WhitenedHead"]
+__all__ = [
+    "BlendedDistance",
+    "ClassifierHead",
+    "Head",
+    "KernelHead",
+    "ProjectionHead",
+    "TwoLevelHead",
+    "WCCNHead",
+    "WhitenedHead",
+]

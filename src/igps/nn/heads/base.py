@@ -7,15 +7,16 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from igps.nn.specification import Specified
 from igps.retrieval.distances import cosine, square_root
 
 # Of the largest sum of squares: directions along which less is left are rounding
 _NOTHING_LEFT = 1e-10
 
 
-class Head(nn.Module, ABC):
+class Head(Specified, ABC):
     """Descriptions to embeddings of length 1, and the distance that compares embeddings.
 
     A head of your own defines `fit` and `forward`, and `distances` where the cosine distance is not its own. Its

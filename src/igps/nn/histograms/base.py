@@ -7,14 +7,15 @@ from abc import ABC, abstractmethod
 from functools import reduce
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from igps.data.batch import SignatureBatch
 from igps.data.requirements import Requirements
 from igps.nn.batch_features import BatchFeatures, SampleFeatures, SampleKind, check_kind
+from igps.nn.specification import Specified
 
 
-class DescriptionPart(nn.Module, ABC):
+class DescriptionPart(Specified, ABC):
     """A module that makes one part of a description: non-negative numbers of sum 1 for each body.
 
     A part of your own defines `shape`, `requirements` and `of_features`.

@@ -1,0 +1,257 @@
+"""From a labelled collection to a metric or a classifier, and its answers."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from igps.data.dataset import Failure, SignatureDataset
+from igps.descriptors import descriptor as descriptor_of
+from igps.descriptors.fingerprint import cache_tag
+from igps.nn.description import describe
+from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.heads import ClassifierHead, Head, WhitenedHead
+from igps.nn.heads.classifier import folds
+from igps.retrieval import chi_square, retrieval_scores
+
+Goal = Literal["known", "new"]
+HeadName = Literal["auto", "classifier", "whitened", "as_is"]
+# Which heads a goal chooses from
+_CANDIDATES: Mapping[Goal, tuple[HeadName, ...]] = {"known": ("classifier", "whitened"), "new": ("whitened", "as_is")}
+# Of the prior beside a WhitenedHead for classes that come up later
+_PRIOR_SHARE = 0.5
+_N_FOLDS, _N_INNER_FOLDS = 5, 3
+_N_BINS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Classification:
+    """What N bodies are taken for.
+
+    Args:
+        names: of the bodies.
+        classes: C names.
+        probabilities: (N, C), calibrated.
+        strangeness: (N,), larger for what is like no class.
+        unknown: (N,) whether a body is unlike everything that the classifier knows.
+    """
+
+    names: tuple[str, ...]
+    classes: tuple[str, ...]
+    probabilities: Tensor
+    strangeness: Tensor
+    unknown: Tensor
+
+    @property
+    def predicted(self) -> list[str | None]:
+        """The most probable class of each body; None of what is unknown."""
+        best = self.probabilities.argmax(dim=1).tolist()
+        return [None if new else self.classes[i] for i, new in zip(best, self.unknown.tolist(), strict=True)]
+
+
+def histograms_and_prior(which: str | Descriptor) -> tuple[Descriptor, Head | None]:
+    """The descriptor whose histograms heads are fitted to, and the metric of these that it has already, if any."""
+    found = descriptor_of(which)
+    return (found.descriptor, found.head) if isinstance(found, EmbeddedDescriptor) else (found, None)
+
+
+def fit(
+    dataset: SignatureDataset,
+    descriptor: str | Descriptor = "pretrained",
+    *,
+    goal: Goal = "known",
+    head: HeadName = "auto",
+    prior: bool = True,
+    failures: list[Failure] | None = None,
+    n_workers: int | None = None,
+    progress: bool = False,
+) -> Descriptor:
+    """The descriptor under a head that is fitted to the classes of a dataset, with what that is worth in its `card`.
+
+    Held-out scores are of folds that neither the fit nor the choice of the head has seen; the head that is returned is
+    fitted to all bodies.
+
+    Args:
+        dataset: labelled bodies.
+        descriptor: of histograms; or one with a metric, which is the prior.
+        goal: known for classes of the dataset, whose other bodies are held out in turn; new for a metric of classes
+            that come up later, where whole classes are held out.
+        head: classifier (`ClassifierHead`), whitened (`WhitenedHead`), as_is for the descriptor itself; auto takes the
+            one that is best on held-out bodies, by FT.
+        prior: whether the metric that the descriptor has counts beside the new head.
+        failures: a list to which bodies that cannot be described are added; None to raise at the first.
+        n_workers: threads that describe; all cores if None.
+        progress: show a bar.
+
+    Raises:
+        ValueError: no labels, too few of them, or a descriptor without histograms.
+    """
+    for name, value, allowed in (("goal", goal, Goal), ("head", head, HeadName)):
+        if value not in get_args(allowed):
+            raise ValueError(f"{name}: expected one of {', '.join(get_args(allowed))}, got {value!r}.")
+    base, metric = histograms_and_prior(descriptor)
+    metric = metric if prior else None
+    histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
+    labels, counts = dataset.labels, Counter(dataset.bodies.labels or ())
+    least = 2 if goal == "known" else 4
+    if len(counts) < least or max(counts.values()) < 2:
+        raise ValueError(f"classes: expected at least {least}, one of them of two bodies, got {dict(counts)}.")
+    names = tuple(dataset.classes[int(i)] for i in labels.unique())
+    cells = base.part_cells if isinstance(base, HistogramDescriptor) else None
+
+    def fitted(name: HeadName, x: Tensor, y: Tensor, calibrate: bool = True) -> Head | None:
+        if name == "classifier":
+            return ClassifierHead(metric, names=names).fit(x, y, cells, calibrate=calibrate)
+        share = _PRIOR_SHARE if goal == "new" else 1 / 3
+        return WhitenedHead(prior=metric, prior_share=share).fit(x, y, cells) if name == "whitened" else metric
+
+    def chosen(x: Tensor, y: Tensor) -> HeadName:
+        if head != "auto":
+            return head
+        held_out = [out for out in _held_out(y, goal, _N_INNER_FOLDS) if _has_pair(y[out])]
+
+        def tier(name: HeadName) -> float:
+            return fmean(_retrieved(fitted(name, x[~out], y[~out], False), x[out], y[out])["ft"] for out in held_out)
+
+        return max(_CANDIDATES[goal], key=tier) if held_out else _CANDIDATES[goal][0]
+
+    scores = _scores(histograms, labels, goal, chosen, fitted)
+    name = chosen(histograms, labels)
+    made = fitted(name, histograms, labels)
+    model: Descriptor = base if made is None else EmbeddedDescriptor(base, made, name=f"{base.name}_{name}").eval()
+    model.card = {
+        "descriptor": descriptor if isinstance(descriptor, str) else descriptor.name,
+        "goal": goal,
+        "head": name,
+        "prior": metric is not None,
+        "classes": {name: counts[name] for name in names},
+        "held_out_scores": scores,
+        "signature": dataset.config.as_dict(),
+        "version": importlib.metadata.version("interior-gps"),
+    }
+    return model
+
+
+def classify(
+    dataset: SignatureDataset,
+    model: str | Descriptor,
+    *,
+    failures: list[Failure] | None = None,
+    n_workers: int | None = None,
+    progress: bool = False,
+) -> Classification:
+    """The classes of the bodies of a dataset by a model that `fit` made.
+
+    Args:
+        dataset: bodies, labelled or not.
+        model: a file, or the model.
+        failures, n_workers, progress: see `fit`.
+
+    Raises:
+        ValueError: the model has no classifier.
+    """
+    found = descriptor_of(model)
+    head = found.head if isinstance(found, EmbeddedDescriptor) else None
+    if not isinstance(found, EmbeddedDescriptor) or not isinstance(head, ClassifierHead):
+        raise ValueError(f"model: expected one with a classifier, got {found.name}. Fit one with head='classifier'.")
+    histograms, dataset = _histograms(dataset, found.descriptor, failures, n_workers, progress)
+    strangeness = head.strangeness(histograms)
+    return Classification(
+        dataset.bodies.names, head.names, head.probabilities(histograms), strangeness, strangeness > head.strange_from
+    )
+
+
+def calibration_error(probabilities: Tensor, labels: Tensor) -> float:
+    """Expected calibration error of (N, C) probabilities against labels (N,), in ten bins (Naeini et al. 2015)."""
+    sure, taken_for = probabilities.max(dim=1)
+    bins = (sure * _N_BINS).ceil().long()
+    gaps = torch.zeros(_N_BINS + 1).index_add_(0, bins, sure - (taken_for == labels).float())
+    return float(gaps.abs().sum() / len(labels))
+
+
+def _histograms(
+    dataset: SignatureDataset,
+    base: Descriptor,
+    failures: list[Failure] | None,
+    n_workers: int | None,
+    progress: bool,
+) -> tuple[Tensor, SignatureDataset]:
+    new: list[Failure] | None = None if failures is None else []
+    tag = cache_tag(base)
+    found = describe(dataset, base, failures=new, cache_tag=tag, n_workers=n_workers, progress=progress)
+    if failures is not None and new:
+        failures += new
+    return found.flatten(1), dataset.usable(new or ())
+
+
+def _held_out(labels: Tensor, goal: Goal, n_folds: int) -> Iterator[Tensor]:
+    """(N,) masks: of known classes folds of their bodies, of new ones random halves of the classes."""
+    if goal == "known":  # of a class of four two at a time, so that they find each other
+        largest = int(labels.unique(return_counts=True)[1].max())
+        yield from folds(labels, max(2, min(n_folds, largest // 2)))
+        return
+    classes, generator = labels.unique(), torch.Generator().manual_seed(0)
+    for _ in range(n_folds):
+        half = torch.randperm(len(classes), generator=generator)[: len(classes) // 2]
+        yield torch.isin(labels, classes[half])
+
+
+def _has_pair(labels: Tensor) -> bool:
+    return len(labels.unique()) < len(labels)
+
+
+def _retrieved(head: Head | None, histograms: Tensor, labels: Tensor) -> dict[str, float]:
+    """Scores among some bodies, those of whose class is no other left out."""
+    vectors = histograms if head is None else head(histograms)
+    distances = (chi_square if head is None else head.distances)(vectors, vectors)
+    return retrieval_scores(distances, labels.tolist()).mean()
+
+
+def _scores(
+    histograms: Tensor,
+    labels: Tensor,
+    goal: Goal,
+    chosen: Callable[[Tensor, Tensor], HeadName],
+    fitted: Callable[..., Head | None],
+) -> dict[str, float]:
+    """Means over held-out folds: of retrieval, and of a classifier what it is worth as such."""
+    found: list[dict[str, float]] = []
+    said, truth, known, strange = [], [], [], []
+    classes = labels.unique()
+    for number, out in enumerate(_held_out(labels, goal, _N_FOLDS)):
+        x, y = histograms[~out], labels[~out]
+        name = chosen(x, y)
+        head = fitted(name, x, y)
+        if _has_pair(labels[out]):
+            scores = _retrieved(head, histograms[out], labels[out])
+            found.append({one: scores[one] for one in ("nn", "ft", "dcg")})
+        if isinstance(head, ClassifierHead):
+            said.append(head.probabilities(histograms[out]))
+            truth.append(torch.searchsorted(head.classes, labels[out]))
+            left_out = torch.isin(labels, classes[number::_N_FOLDS])
+            if bool((out & left_out).any()) and len(labels[~out & ~left_out].unique()) > 1:
+                less = fitted(name, histograms[~out & ~left_out], labels[~out & ~left_out], False)
+                assert isinstance(less, ClassifierHead)
+                known.append(less.strangeness(histograms[out & ~left_out]))
+                strange.append(less.strangeness(histograms[out & left_out]))
+    means = {one: fmean(scores[one] for scores in found) for one in (found[0] if found else ())}
+    if said:
+        probabilities, right = torch.cat(said), torch.cat(truth)
+        means["accuracy"] = float((probabilities.argmax(dim=1) == right).float().mean())
+        means["calibration_error"] = calibration_error(probabilities, right)
+    if strange:
+        means["unknown_auc"] = fmean(_auc(one, other) for one, other in zip(strange, known, strict=True))
+    return means
+
+
+def _auc(positive: Tensor, negative: Tensor) -> float:
+    """Area under the curve: how often a positive is above a negative, ties by half (Mann and Whitney 1947)."""
+    above = (positive[:, None] > negative).float() + 0.5 * (positive[:, None] == negative).float()
+    return float(above.mean())

@@ -1,0 +1,123 @@
+"""`igps fit` and `igps classify`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from igps.analysis.fitting import Goal, HeadName
+from igps.analysis.fitting import classify as classify_bodies
+from igps.analysis.fitting import fit as fit_head
+from igps.cli.reading import Folder, signatures, write_rows
+from igps.data.dataset import Failure
+from igps.descriptors import descriptor as descriptor_of
+from igps.descriptors import load
+from igps.nn.descriptor import Descriptor
+
+_TITLES = {
+    "nn": "NN",
+    "ft": "FT",
+    "dcg": "DCG",
+    "accuracy": "classified correctly",
+    "calibration_error": "expected calibration error",
+    "unknown_auc": "a class left out called unknown, AUC",
+}
+
+
+def fit(
+    root: Path,
+    out: Path,
+    descriptor: str = "pretrained",
+    goal: Goal = "known",
+    head: HeadName = "auto",
+    no_prior: bool = False,
+    n_workers: int | None = None,
+    strict: bool = False,
+    **reading: Any,
+) -> dict[str, Any]:
+    """Fit a metric or a classifier to a labelled folder, for --descriptor of every command and igps classify.
+
+    A card of it, with scores on bodies that were held out, is written beside it in Markdown.
+
+    Args:
+        root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
+        out: the model, a file ending in .safetensors.
+        descriptor: a name (a wrong one lists all), a file, or package.module:NAME of one of your own.
+        goal: known for the classes of the folder; new for a metric of classes that come up later.
+        head: classifier, whitened, or as_is for the descriptor itself; auto takes the best on held-out bodies.
+        no_prior: leave the metric that the descriptor has aside, and take its histograms alone
+        n_workers: processes that compute; all cores if not given.
+        strict: stop at the first mesh that cannot be used instead of skipping it
+    """
+    if out.suffix != ".safetensors":
+        raise ValueError(f"out: expected a file ending in .safetensors, got {out}.")
+    chosen = descriptor_of(descriptor)
+    dataset, unread = signatures(Folder(root, labelled=True), [chosen], n_workers=n_workers, strict=strict, **reading)
+    failures: list[Failure] | None = None if strict else []
+    model = fit_head(
+        dataset, chosen, goal=goal, head=head, prior=not no_prior, failures=failures, n_workers=n_workers, progress=True
+    )
+    model.save(out, {**model.card, "descriptor": descriptor})
+    card = _card(model, out)
+    out.with_suffix(".md").write_text(card)
+    print(card.partition("\n\n")[2])
+    if n_lost := len(unread) + len(failures or ()):
+        print(f"{n_lost} meshes could not be used.")
+    print(f"written to {out}")
+    return {**model.card, "n_refused": n_lost}
+
+
+def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading: Any) -> list[dict[str, Any]]:
+    """Tell the classes of meshes, how probable they are, and which meshes are like none.
+
+    Args:
+        meshes: mesh files, or one folder.
+        model: a file that igps fit wrote.
+        out: a table of the probabilities of all classes, a file ending in .csv.
+    """
+    source = Folder(meshes[0]) if len(meshes) == 1 and meshes[0].is_dir() else meshes
+    chosen = load(model)
+    dataset, failures = signatures(source, [chosen], **reading)
+    found = classify_bodies(
+        dataset, chosen, failures=None if reading.get("strict") else failures, n_workers=reading.get("n_workers")
+    )
+    width = max(map(len, found.names))
+    print(f"{'mesh':<{width}}  {'probability':>11}  class")
+    best = found.probabilities.max(dim=1)
+    rows = []
+    for name, predicted, value, likely in zip(
+        found.names, found.predicted, best.values.tolist(), best.indices.tolist(), strict=True
+    ):
+        told = f"unlike everything known, most like {found.classes[likely]}" if predicted is None else predicted
+        print(f"{name:<{width}}  {value:>11.1%}  {told}")
+        rows.append({"mesh": name, "class": predicted, "most_like": found.classes[likely], "probability": value})
+    if failures:
+        print(f"{len(failures)} meshes could not be used.")
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        values = zip(found.names, found.unknown.tolist(), found.probabilities.tolist(), strict=True)
+        header = ("mesh", "unknown", *found.classes)
+        write_rows(out, header, [(n, str(int(new)), *(f"{p:.6f}" for p in of_each)) for n, new, of_each in values])
+    return rows
+
+
+def _card(model: Descriptor, path: Path) -> str:
+    """A page on a fitted model."""
+    card = model.card
+    scores = "\n".join(f"| {_TITLES[name]} | {100 * value:.1f} |" for name, value in card["held_out_scores"].items())
+    classes = ", ".join(f"{name} ({n})" for name, n in card["classes"].items())
+    what = {"known": "bodies of its classes", "new": "bodies of classes that it was not fitted to"}[card["goal"]]
+    return f"""# {path.name}
+
+`{card["descriptor"]}` under the head `{card["head"]}`, {"beside" if card["prior"] else "without"} a prior metric,
+for {what}. Held out, in percent, mean over folds that neither the fit nor the choice of the head has seen:
+
+| | |
+|---|---|
+{scores}
+
+Fitted to {sum(card["classes"].values())} bodies of {len(card["classes"])} classes: {classes}.
+
+Signatures: `{json.dumps(card["signature"])}`. igps {card["version"]}.
+"""

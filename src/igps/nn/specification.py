@@ -1,0 +1,158 @@
+"""Modules in files: what they were made with, in words, and their parameters; nothing runs when they are read."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import nn
+
+_FORMAT = "igps-descriptor-1"
+_CLASS = re.compile(r"igps\.(?:nn|descriptors)(?:\.[a-z0-9_]+)*\.[A-Z][A-Za-z0-9]*")
+# A hostile file asks for no more: modules, a number, and numbers in a module whose size the file does not show
+_MOST_MODULES, _MOST, _MOST_PARAMETERS = 200, 100_000, 1_000_000
+
+
+class Specified(nn.Module):
+    """A module that remembers what it was made with."""
+
+    def __new__(cls, *arguments: Any, **options: Any) -> Self:
+        made = super().__new__(cls)
+        made.__dict__["_made_with"] = arguments, options
+        return made
+
+
+def specification(module: nn.Module) -> dict[str, Any]:
+    """A module of the library as `class_path` and `init_args`, for JSON or YAML; parameters are not in it.
+
+    A module that occurs again is `same_as`, and the number of the module that was told.
+
+    Example:
+        >>> from igps.nn.embedding import SpectralEmbedding
+        >>> specification(SpectralEmbedding(n_eigenpairs=50))
+        {'class_path': 'igps.nn.embedding.SpectralEmbedding', 'init_args': {'n_eigenpairs': 50}}
+
+    Raises:
+        ValueError: it, or what it was made with, is not the library's.
+    """
+    told: list[nn.Module] = []
+
+    def words(value: Any) -> Any:
+        if value is None or isinstance(value, bool | int | float | str):
+            return value
+        if isinstance(value, list | tuple):
+            return [words(one) for one in value]
+        if any(value is one for one in told):
+            return {"same_as": next(i for i, one in enumerate(told) if value is one)}
+        path = f"{type(value).__module__}.{type(value).__qualname__}"
+        if not isinstance(value, Specified) or not _CLASS.fullmatch(path):
+            raise ValueError(f"descriptor: expected to be made of modules of igps and numbers, got {path} in it.")
+        told.append(value)
+        arguments, options = value.__dict__["_made_with"]
+        given = inspect.signature(type(value)).bind(*arguments, **options).arguments
+        return {"class_path": path, "init_args": {name: words(one) for name, one in given.items()}}
+
+    found: dict[str, Any] = words(module)
+    return found
+
+
+def made(told: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
+    """The module that a `specification` tells of.
+
+    Args:
+        told: the specification.
+        n_bytes: of the parameters that are at hand for it; none is made that would need many more.
+
+    Raises:
+        ValueError: it tells of something else than modules of the library.
+    """
+    known: list[nn.Module] = []
+
+    def module(told: Mapping[str, Any]) -> nn.Module:
+        if set(told) == {"same_as"}:
+            return known[told["same_as"]]
+        path, arguments = told["class_path"], told.get("init_args", {})
+        if not set(told) <= {"class_path", "init_args"} or not _CLASS.fullmatch(path) or len(known) >= _MOST_MODULES:
+            raise ValueError(f"{path!r} is no module of igps, or one of too many")
+        room, _, name = path.rpartition(".")
+        kind = getattr(importlib.import_module(room), name, None)
+        if not isinstance(kind, type) or not issubclass(kind, Specified):
+            raise ValueError(f"{path} is no module of igps")
+        numbers = [one for one in _numbers(arguments.values()) if one > 1]
+        if max(numbers, default=0) > _MOST or ("Head" in name and math.prod(numbers) > max(_MOST_PARAMETERS, n_bytes)):
+            raise ValueError(f"{name} of {numbers} is too large")
+        place = len(known)
+        known.append(nn.Identity())
+        known[place] = kind(**{name: value(one) for name, one in arguments.items()})
+        return known[place]
+
+    def value(told: Any) -> Any:
+        if isinstance(told, Mapping):
+            return module(told)
+        return tuple(map(value, told)) if isinstance(told, list | tuple) else told
+
+    return module(told)
+
+
+def _numbers(values: Any) -> Iterator[int]:
+    for one in values:
+        if isinstance(one, list | tuple):
+            yield from _numbers(one)
+        elif isinstance(one, int):
+            yield one
+
+
+def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) -> None:
+    """Write a module of the library, with its parameters and what is told of it, to a safetensors file.
+
+    Raises:
+        ValueError: see `specification`.
+    """
+    words = {"format": _FORMAT, "specification": json.dumps(specification(module)), "card": json.dumps(card)}
+    state = {name: value.detach().cpu().clone().contiguous() for name, value in module.state_dict().items()}
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    save_file(state, path, metadata=words)
+
+
+def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
+    """The module that `save_module` wrote, in evaluation mode, and what is told of it. No code of the file runs.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: it is none of these files, or a damaged one.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file. Check the path.")
+    try:
+        with safe_open(path, framework="pt") as file:
+            words = file.metadata() or {}
+            if words.get("format") != _FORMAT:
+                raise ValueError(f"its format is {words.get('format')!r}")
+            module = made(json.loads(words["specification"]), path.stat().st_size)
+            module.load_state_dict({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
+        if not all(bool(torch.isfinite(one).all()) for one in module.state_dict().values()):
+            raise ValueError("a parameter is not finite")
+        card = json.loads(words["card"])
+    except (
+        SafetensorError,
+        OSError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        RuntimeError,
+        ImportError,
+    ) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path}: expected a descriptor in the format {_FORMAT} ({reason}). Save it again.") from error
+    return module.eval(), card

@@ -1,0 +1,124 @@
+"""From a labelled folder to a model: the head that is chosen, honest scores, and answers to new bodies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from sklearn.metrics import roc_auc_score
+from torch import Tensor
+
+import igps
+from igps.analysis.fitting import _auc, calibration_error, classify
+from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.heads import ClassifierHead, KernelHead, WhitenedHead
+from igps.nn.heads.classifier import folds
+from own_descriptors import small_interior, write_egg
+
+HEIGHTS = {"flat": 0.5, "round": 1.0, "long": 1.8, "rod": 3.0}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> igps.SignatureDataset:
+    """Four classes of four eggs, of which none is as another."""
+    root = tmp_path_factory.mktemp("fitting")
+    for label, height in HEIGHTS.items():
+        for i in range(4):
+            write_egg(root / "eggs" / label / f"{i}.off", height * (1 + 0.04 * i), subdivisions=2)
+    config = igps.SignatureConfig(n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=30)
+    found = igps.SignatureDataset(root / "eggs", config, root / "cache")
+    assert found.precompute(n_workers=1, progress=False) == []
+    return found
+
+
+def histograms(dataset: igps.SignatureDataset) -> Tensor:
+    return igps.describe(dataset, small_interior()).flatten(1)
+
+
+def test_a_classifier_is_fitted_saved_and_asked(dataset: igps.SignatureDataset, tmp_path: Path) -> None:
+    train = dataset.subset([i for i in range(16) if i % 4])
+    test = dataset.subset(range(0, 16, 4))
+    model = igps.fit(train, small_interior(), head="classifier")
+    model.save(tmp_path / "mine.safetensors")
+    for one in (model, tmp_path / "mine.safetensors"):
+        found = classify(test, one)  # type: ignore[arg-type]
+        assert found.classes == tuple(sorted(HEIGHTS))
+        assert found.names == test.bodies.names
+        expected = KernelHead().fit(histograms(train), train.labels).predict(histograms(test))
+        assert found.probabilities.argmax(dim=1).tolist() == expected.tolist()
+    card = igps.load(tmp_path / "mine.safetensors").card
+    assert card["classes"] == dict.fromkeys(sorted(HEIGHTS), 3)
+    assert (card["head"], card["goal"], card["prior"]) == ("classifier", "known", False)
+
+
+def test_held_out_scores_are_of_what_was_held_out(dataset: igps.SignatureDataset) -> None:
+    """Accuracy by hand, of a kernel head that is fitted without each fold in turn."""
+    model = igps.fit(dataset, small_interior(), head="classifier")
+    cells, labels = histograms(dataset), dataset.labels
+    hits = []
+    for out in folds(labels, 2):  # of four bodies two
+        head = KernelHead().fit(cells[~out], labels[~out])
+        hits += (head.predict(cells[out]) == labels[out]).tolist()
+    scores = model.card["held_out_scores"]
+    assert scores["accuracy"] == pytest.approx(sum(hits) / 16)
+    assert 0 <= scores["calibration_error"] <= 1
+    assert 0 <= scores["unknown_auc"] <= 1
+
+
+def test_the_prior_stands_beside_the_new_head_or_not(dataset: igps.SignatureDataset) -> None:
+    base = small_interior()
+    assert isinstance(base, HistogramDescriptor)
+    prior = WhitenedHead().fit(histograms(dataset), dataset.labels)
+    with_prior = EmbeddedDescriptor(base, prior)
+    for wanted in (True, False):
+        model = igps.fit(dataset, with_prior, head="classifier", prior=wanted)
+        assert isinstance(model, EmbeddedDescriptor)
+        assert isinstance(model.head, ClassifierHead)
+        assert (model.head.prior is prior) == wanted == model.card["prior"]
+
+
+def test_a_metric_for_new_classes_is_chosen_by_classes_that_are_held_out(dataset: igps.SignatureDataset) -> None:
+    model = igps.fit(dataset, small_interior(), goal="new")
+    assert set(model.card["held_out_scores"]) == {"nn", "ft", "dcg"}
+    assert model.card["head"] in ("whitened", "as_is")
+    said = {name: igps.fit(dataset, small_interior(), goal="new", head=name).card for name in ("whitened", "as_is")}  # type: ignore[arg-type]
+    best = max(card["held_out_scores"]["ft"] for card in said.values())
+    assert said[model.card["head"]]["held_out_scores"]["ft"] == pytest.approx(best, abs=0.1)
+    with pytest.raises(ValueError, match="model: expected one with a classifier, got interior"):
+        classify(dataset, model)
+
+
+def test_too_little_to_fit_to_is_said(dataset: igps.SignatureDataset) -> None:
+    with pytest.raises(ValueError, match=r"classes: expected at least 2, .* of two bodies, got \{'flat': 4\}"):
+        igps.fit(dataset.subset(range(4)), small_interior())
+    with pytest.raises(ValueError, match="classes: expected at least 4"):
+        igps.fit(dataset.subset(range(8)), small_interior(), goal="new")
+    with pytest.raises(ValueError, match="goal: expected one of known, new, got 'both'"):
+        igps.fit(dataset, small_interior(), goal="both")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="head: expected one of auto, classifier, whitened, as_is, got 'best'"):
+        igps.fit(dataset, small_interior(), head="best")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="descriptions: expected histograms"):
+        igps.fit(dataset, Below(), head="whitened")
+
+
+class Below(igps.Descriptor):
+    """Gives negative numbers."""
+
+    def describe(self, batch: igps.SignatureBatch) -> Tensor:
+        return -batch.eigenvalues[:, :3].float()
+
+
+def test_the_calibration_error_is_that_of_its_definition() -> None:
+    """Two bins: of ten that are sure by 0.85 six are right, of five that are sure by 0.55 four."""
+    probabilities = torch.tensor([[0.85, 0.15]] * 10 + [[0.55, 0.45]] * 5)
+    labels = torch.tensor([0] * 6 + [1] * 4 + [0] * 4 + [1])
+    assert calibration_error(probabilities, labels) == pytest.approx((10 * 0.25 + 5 * 0.25) / 15)
+    assert calibration_error(torch.eye(2)[[0, 1]], torch.tensor([0, 1])) == 0
+
+
+def test_the_area_under_the_curve_is_scikit_learns() -> None:
+    generator = torch.Generator().manual_seed(0)
+    positive, negative = (torch.randint(0, 9, (n,), generator=generator) + bias for n, bias in ((20, 2), (30, 0)))
+    expected = roc_auc_score([1] * 20 + [0] * 30, torch.cat([positive, negative]))
+    assert _auc(positive, negative) == pytest.approx(expected)

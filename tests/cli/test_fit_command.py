@@ -1,0 +1,149 @@
+"""`igps fit` makes a file that every command takes, and `igps classify` asks it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import igps as library
+from igps.analysis.fitting import classify
+from igps.cli import main
+from igps.nn.description import describe
+from own_descriptors import write_egg
+
+SMALL = ["--signature.resolution", "9", "--signature.min_samples", "0", "--signature.n_surface_samples", "40"]
+HEIGHTS = {"flat": 0.5, "long": 2.0}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two classes of three eggs, and a model that was fitted to them by the command."""
+    folder = tmp_path_factory.mktemp("fit_command")
+    for label, height in HEIGHTS.items():
+        for i in range(3):
+            write_egg(folder / "eggs" / label / f"{i}.off", height * (1 + 0.05 * i), subdivisions=2)
+    return folder
+
+
+def call(monkeypatch: pytest.MonkeyPatch, root: Path, *words: object) -> None:
+    command = ["igps", *map(str, words), "--cache_dir", str(root / "cache"), "--n_workers", "1", *SMALL]
+    monkeypatch.setattr(sys, "argv", command)
+    main()
+
+
+@pytest.fixture
+def model(root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    path = root / "out" / "mine.safetensors"
+    if not path.exists():
+        options = ["--descriptor", "rich", "--head", "classifier", "--out", path]
+        call(monkeypatch, root, "fit", root / "eggs", *options)
+    return path
+
+
+def dataset(root: Path, model: Path) -> library.SignatureDataset:
+    config = library.SignatureConfig(resolution=9, min_samples=0, n_surface_samples=40)
+    return library.SignatureDataset(root / "eggs", config, root / "cache", descriptor=str(model))
+
+
+def test_fit_writes_model_and_card(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "mine.safetensors"
+    call(monkeypatch, root, "fit", root / "eggs", "--descriptor", "rich", "--out", out, "--json")
+    told = json.loads(capsys.readouterr().out)
+    card = library.load(out).card
+    assert {**card, "n_refused": 0} == told
+    assert card["classes"] == {"flat": 3, "long": 3}
+    page = out.with_suffix(".md").read_text()
+    assert "`rich` under the head" in page
+    assert f"| FT | {100 * card['held_out_scores']['ft']:.1f} |" in page
+
+
+def test_every_command_takes_the_file(
+    root: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = library.load(model)
+    expected = describe(dataset(root, model), found)
+    call(monkeypatch, root, "extract", root / "eggs", "--descriptor", model, "--out", tmp_path / "features.npz")
+    with np.load(tmp_path / "features.npz") as archive:
+        np.testing.assert_allclose(archive["features"], expected, atol=1e-6)
+    call(monkeypatch, root, "retrieve", root / "eggs", "--descriptor", model, "--out", tmp_path / "retrieved")
+    with np.load(tmp_path / "retrieved" / "distances.npz") as archive:
+        np.testing.assert_allclose(archive["distances"], found.distances(expected, expected), atol=1e-6)
+    call(
+        monkeypatch, root, "compare", root / "eggs", "--descriptors", model, "interior", "--out", tmp_path / "compared"
+    )
+    rows = json.loads((tmp_path / "compared" / "compare.json").read_text())
+    assert [row["descriptor"] for row in rows] == ["rich_classifier", "interior"]
+    call(monkeypatch, root, "precompute", root / "eggs", "--descriptors", model)
+
+    capsys.readouterr()
+    query = ["query", root / "eggs" / "long" / "0.off", "--top", "3", "--json"]
+    call(monkeypatch, root, *query, "--gallery", root / "eggs", "--descriptor", model)
+    nearest = json.loads(capsys.readouterr().out)
+    assert [row["class"] for row in nearest] == ["long"] * 3
+    call(monkeypatch, root, "index", "build", root / "eggs", "--descriptor", model, "--out", tmp_path / "eggs.igps")
+    monkeypatch.chdir(tmp_path)
+    moved = tmp_path / "moved.safetensors"
+    moved.write_bytes(model.read_bytes())
+    for options in ([], ["--descriptor", "moved.safetensors"]):
+        capsys.readouterr()
+        words = [*map(str, query), "--index", "eggs.igps", *options, "--cache_dir", str(root / "cache")]
+        monkeypatch.setattr(sys, "argv", ["igps", *words])
+        main()
+        assert [row["mesh"] for row in json.loads(capsys.readouterr().out)] == [row["mesh"] for row in nearest]
+
+
+def test_classify_tells_what_python_computes(
+    root: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "classes.csv"
+    call(monkeypatch, root, "classify", root / "eggs", "--model", model, "--out", out, "--json")
+    told: list[dict[str, Any]] = json.loads(capsys.readouterr().out)
+    expected = classify(dataset(root, model), str(model))
+    assert [one["mesh"] for one in told] == list(expected.names)
+    assert [one["most_like"] for one in told] == ["flat"] * 3 + ["long"] * 3
+    assert [one["probability"] for one in told] == pytest.approx(expected.probabilities.max(dim=1).values.tolist())
+    with out.open(newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header == ["mesh", "unknown", "flat", "long"]
+    torch.testing.assert_close(
+        torch.tensor([[float(one) for one in row[2:]] for row in rows]), expected.probabilities, rtol=0, atol=1e-6
+    )
+
+
+def test_what_is_unlike_everything_is_said(
+    root: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import trimesh
+
+    box = trimesh.creation.box((1, 1, 12)).subdivide().subdivide().subdivide().subdivide()
+    box.export(tmp_path / "rod.off")
+    call(monkeypatch, root, "classify", tmp_path / "rod.off", root / "eggs" / "flat" / "1.off", "--model", model)
+    lines = capsys.readouterr().out.splitlines()
+    assert "unlike everything known" in next(line for line in lines if "rod.off" in line)
+    assert next(line for line in lines if "1.off" in line).endswith("flat")
+
+
+def test_wrong_files_cost_one_sentence(
+    root: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.safetensors").write_bytes(model.read_bytes()[:-10])
+    for words, message in (
+        (["fit", root / "eggs", "--out", tmp_path / "mine.pt"], "out: expected a file ending in .safetensors"),
+        (["classify", root / "eggs", "--model", tmp_path / "bad.safetensors"], "expected a descriptor in the format"),
+        (["retrieve", root / "eggs", "--descriptor", tmp_path / "bad.safetensors"], "expected a descriptor in the"),
+        (["retrieve", root / "eggs", "--descriptor", tmp_path / "no.safetensors"], "no such file. Check the path."),
+    ):
+        with pytest.raises(SystemExit, match="1"):
+            call(monkeypatch, root, *words)
+        told = capsys.readouterr().err.strip().splitlines()[-1]
+        assert told.startswith("igps: ")
+        assert message in told

@@ -1,0 +1,145 @@
+"""Descriptors in files: what was saved comes back to the bit; what is hostile is refused in a sentence."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+import igps
+import own_descriptors
+from batches import two_bodies
+from igps.descriptors.fingerprint import fingerprint
+from igps.descriptors.registry import NAMES
+from igps.nn.axes import EuclideanDistance, InteriorDistance, Potential
+from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.heads import WhitenedHead
+from igps.nn.histograms.pairs import PairHistogram
+from igps.nn.specification import specification
+
+
+def learnable() -> HistogramDescriptor:
+    """Two histograms that share one embedding with parameters."""
+    embedding = SpectralEmbedding(n_eigenpairs=6, n_knots=5)
+    one = PairHistogram([Potential(2, learnable=True), InteriorDistance(n_bins=5)], embedding, n_samples=40)
+    return HistogramDescriptor([one, PairHistogram(["interior_distance"], embedding)], name="mine")
+
+
+@pytest.mark.parametrize("name", [*NAMES, "molecular"])
+def test_every_descriptor_of_the_library_comes_back(name: str, tmp_path: Path) -> None:
+    descriptor = igps.descriptor(name)
+    descriptor.save(tmp_path / "mine.safetensors")
+    found = igps.load(tmp_path / "mine.safetensors")
+    assert (type(found), found.name, found.requirements) == (type(descriptor), name, descriptor.requirements)
+    assert not found.training
+    assert fingerprint(found) == fingerprint(descriptor)
+
+
+def test_trained_parameters_and_what_is_shared_come_back(tmp_path: Path) -> None:
+    descriptor, batch = learnable(), two_bodies()
+    with torch.no_grad():
+        for parameter in descriptor.parameters():
+            parameter += 0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0))
+    descriptor.save(tmp_path / "mine.safetensors", {"fitted to": "nothing"})
+    found = igps.descriptor(tmp_path / "mine.safetensors")
+    assert found.card == {"fitted to": "nothing"}
+    assert isinstance(found, HistogramDescriptor)
+    assert found.histograms[0].embedding is found.histograms[1].embedding
+    assert torch.equal(found(batch), descriptor.eval()(batch))
+    found.save(tmp_path / "again.safetensors")
+    assert igps.load(tmp_path / "again.safetensors").card == found.card
+
+
+def test_a_fitted_head_comes_back_with_its_sizes(tmp_path: Path) -> None:
+    histograms = torch.rand(6, 4, generator=torch.Generator().manual_seed(1))
+    histograms /= histograms.sum(dim=1, keepdim=True)
+    head = WhitenedHead(2).fit(histograms, torch.tensor([0, 0, 1, 1, 2, 2]), (1, 3))
+    base = HistogramDescriptor(PairHistogram([EuclideanDistance(4)]))
+    EmbeddedDescriptor(base, head, name="mine").save(tmp_path / "mine.safetensors")
+    found = igps.load(tmp_path / "mine.safetensors")
+    assert isinstance(found, EmbeddedDescriptor)
+    assert torch.equal(found.head(histograms), head(histograms))
+    assert found.n_features == 4
+
+
+def test_what_is_of_others_is_not_saved(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"made of modules of igps and numbers, got own_descriptors\.Height"):
+        own_descriptors.Height().save(tmp_path / "mine.safetensors")
+    assert not (tmp_path / "mine.safetensors").exists()
+
+
+def histogram(**arguments: Any) -> dict[str, Any]:
+    return {"class_path": "igps.nn.histograms.pairs.PairHistogram", "init_args": arguments}
+
+
+HOSTILE: dict[str, Callable[[], object]] = {
+    "another package": lambda: {"class_path": "subprocess.Popen", "init_args": {"args": "true"}},
+    "a function": lambda: {"class_path": "igps.nn.specification.load_module", "init_args": {"path": "x"}},
+    "an imported class": lambda: {"class_path": "igps.nn.specification.Path", "init_args": {}},
+    "another room": lambda: {"class_path": "igps.data.dataset.SignatureDataset", "init_args": {"root_or_paths": "/"}},
+    "no class": lambda: {"class_path": "igps.nn.histograms.pairs.Nothing"},
+    "no module": lambda: {"class_path": "igps.nn.no_such.Thing"},
+    "no descriptor": lambda: histogram(),
+    "wrong words": lambda: {**specification(learnable()), "init_args": {"nothing": 1}},
+    "more keys": lambda: {**specification(learnable()), "run": "rm"},
+    "too large": lambda: {
+        "class_path": "igps.nn.heads.learned.ProjectionHead", "init_args": {"width": 90_000, "n_hidden": 90_000}},
+    "too many": lambda: {
+        "class_path": "igps.nn.descriptor.HistogramDescriptor", "init_args": {"histograms": [histogram()] * 300}},
+    "a long number": lambda: histogram(n_samples=10**9),
+    "itself": lambda: {"same_as": 0},
+    "other sizes": lambda: specification(HistogramDescriptor(PairHistogram([Potential(3), InteriorDistance(5)]))),
+    "a list": lambda: [1],
+    "deep": lambda: json.loads("[" * 900 + "]" * 900),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_a_hostile_file_is_refused_in_a_sentence(what: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.safetensors"
+    learnable().save(path)
+    words = {"format": "igps-descriptor-1", "specification": json.dumps(HOSTILE[what]()), "card": "{}"}
+    save_file(load_file(path), path, metadata=words)
+    with pytest.raises(ValueError, match=r"mine\.safetensors: expected a descriptor") as caught:
+        igps.load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "mine.safetensors"
+    learnable().save(path)
+    content, state = path.read_bytes(), load_file(path)
+    for wrong in (b"", b"nothing", content[:-9], pickle.dumps([1]), (2**40).to_bytes(8, "little") + content[8:]):
+        path.write_bytes(wrong)
+        with pytest.raises(ValueError, match="expected a descriptor in the format"):
+            igps.load(path)
+    save_file(state, path)
+    with pytest.raises(ValueError, match="its format is None"):
+        igps.load(path)
+    path.write_bytes(content)
+    state = {name: torch.full_like(value, torch.nan) for name, value in state.items()}
+    words = {"format": "igps-descriptor-1", "specification": json.dumps(specification(learnable())), "card": "{}"}
+    save_file(state, path, metadata=words)
+    with pytest.raises(ValueError, match="a parameter is not finite"):
+        igps.load(path)
+    with pytest.raises(FileNotFoundError, match="gone"):
+        igps.descriptor(tmp_path / "gone.safetensors")
+
+
+def test_numbers_of_a_description_are_known() -> None:
+    batch = two_bodies()
+    assert learnable().n_features == learnable()(batch).shape[1]
+    assert igps.descriptor("interior").n_features == 640
+    pretrained = igps.descriptor("pretrained")
+    assert isinstance(pretrained, EmbeddedDescriptor)
+    assert pretrained.n_features == 1089
+    assert pretrained.descriptor.n_features == sum(pretrained.descriptor.part_cells)  # type: ignore[operator]
+    assert own_descriptors.Same().n_features == 1
+    assert igps.descriptor("d2").n_features == 64
