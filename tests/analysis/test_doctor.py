@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from damaged_files import (
@@ -21,7 +22,9 @@ from damaged_files import (
 from igps._parallel import Limits
 from igps.analysis.doctor import Finding, examine, expected_cost, usable
 from igps.data.sources import find_bodies
+from igps.mesh._label_measures import VoxelMeasures, thinnest_part
 from igps.mesh.options import LoadOptions
+from igps.report.tables import findings_table
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
@@ -117,3 +120,44 @@ def test_the_cost_is_that_of_the_mesh_that_is_simplified(tmp_path: Path) -> None
     (simplified,) = examine(files, config=fewer, n_workers=1, progress=False)
     assert full.memory == expected_cost(N_VERTICES, 20)[1]
     assert simplified.memory == expected_cost(60, 20)[1]
+
+
+def test_labels_of_a_volume_are_told_one_by_one_by_their_voxels(tmp_path: Path) -> None:
+    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+    labels = np.zeros((30, 20, 20), dtype=np.uint8)
+    labels[2:14, 4:16, 4:16] = labels[16:17, 2:3, 2:3] = 1  # a cube, and a voxel apart
+    labels[17:29, 4:16, 4:6] = 2  # a plate of two voxels
+    labels[17:24, 2, 18] = 3
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "x.nii.gz")
+    (tmp_path / "x.csv").write_text("label,name\n1,cube\n2,plate\n3,line\n")
+    found = findings(tmp_path)
+    assert list(found) == ["x.nii.gz#cube", "x.nii.gz#plate", "x.nii.gz#line"]
+    measures = [one.voxels for one in found.values()]
+    assert measures == [VoxelMeasures(12**3 + 1, 2, 10), VoxelMeasures(288, 1, 2), VoxelMeasures(7, 1, 1)]
+    cube, plate, line = found.values()
+    assert cube.notes == ("dropped 1 small piece apart of 1 voxels, 0.1% of the label",)
+    assert (cube.error, plate.error, plate.fault, plate.steps) == (None, None, None, ())
+    assert line.error == f"{tmp_path / 'x.nii.gz'}#line: " + (
+        "7 voxels, at least 8 expected: they tell no shape. Leave it out, or label it on a finer grid."
+    )
+    table = findings_table(list(found.values())).splitlines()
+    assert table[0].split()[:4] == ["voxels", "pieces", "thinnest", "vertices"]
+    assert table[1].split()[1:4] == ["1729", "2", "10"]
+    assert table[3].split()[1:6] == ["7", "1", "1", "cannot", "be"]
+
+
+@pytest.mark.parametrize("thickness", [1, 2, 3, 4, 7])
+def test_the_thinnest_part_is_measured_in_voxels(thickness: int) -> None:
+    mask = np.zeros((30, 30, 30), dtype=bool)
+    mask[3:27, 4:26, 5 : 5 + thickness] = True
+    mask[8:20, 8:20, 5:15] = True
+    assert thinnest_part(mask) == thickness
+
+
+def test_a_body_that_is_not_in_its_file_is_told(tmp_path: Path) -> None:
+    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+    nibabel.save(nibabel.Nifti1Image(np.ones((9, 9, 9), dtype=np.uint8), np.eye(4)), tmp_path / "x.nii")
+    (tmp_path / "labels.csv").write_text("file,body,label\nx.nii,1,a\nx.nii,liver,b\n")
+    found = findings(tmp_path)
+    assert found["x.nii#1"].error is None
+    assert "has no such body" in str(found["x.nii#liver"].error)

@@ -48,7 +48,7 @@ def bars(text: str) -> dict[str, tuple[int, int]]:
         ("figure potential MESH --out OUT.png --n_eigenpairs 20 --resolution 10", {"steps": 7}),
         ("robustness MESH OTHER --descriptors INTERIOR SMALL", {"signatures": 2, "altered meshes": None}),
         ("damage ROOT --descriptors INTERIOR --damages noise SMALL", {"signatures": 4, "altered meshes": 8}),
-        ("doctor ROOT --n_workers 1", {"files": 4}),
+        ("doctor ROOT --n_workers 1", {"bodies": 4}),
         ("distance MESH OTHER --n_workers 1", {"signatures": 2, "descriptions": 2}),
         ("duplicates ROOT --n_workers 1", {"signatures": 4, "surfaces": 4, "compared": 4}),
     ],

@@ -1,4 +1,4 @@
-"""What is wrong with mesh files, what will be done about it, and what that will cost."""
+"""What is wrong with the bodies of files, what will be done about it, and what that will cost."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 from tqdm import tqdm
 
 from igps._parallel import Failed, Limits, run
 from igps.data.sources import Bodies, BodyRef
-from igps.mesh.loading import load_mesh, read_surface
+from igps.mesh.formats import RawBody
+from igps.mesh.formats.volumes import VoxelMeasures
+from igps.mesh.loading import each_surface, surface_body
 from igps.mesh.mending import Step, mended_by
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
@@ -29,18 +32,19 @@ _BYTES, _BYTES_PER_VERTEX, _BYTES_PER_ENTRY = 4.57e8, 2820.0, 30.0
 
 @dataclass(frozen=True)
 class Finding:
-    """What is known of a file before its signature is computed.
+    """What is known of a body before its signature is computed.
 
     Args:
         id: its name.
         fault: why the surface as it is in the file is no body; None if it is one.
         steps: what is done to it.
         notes: the same in words.
-        n_vertices: in the file; None if it cannot be read.
+        n_vertices: in the file, or of the surface made of it; None if it cannot be read.
         n_vertices_after: of the body; None if there is none.
         seconds: expected processor time from file to signature.
         memory: expected peak memory, bytes.
         error: why the file cannot be used; None if it can.
+        voxels: of a label of a volume; None of anything else.
     """
 
     id: str
@@ -52,6 +56,7 @@ class Finding:
     seconds: float | None = None
     memory: float | None = None
     error: str | None = None
+    voxels: VoxelMeasures | None = None
 
 
 def examine(
@@ -63,7 +68,7 @@ def examine(
     limits: Limits | None = None,
     progress: bool = True,
 ) -> list[Finding]:
-    """Read and mend every file as for its signature, and say what was found.
+    """Read and mend every body as for its signature, and say what was found.
 
     Args:
         files: to be examined.
@@ -73,14 +78,20 @@ def examine(
         limits: time and memory of one file.
         progress: show a bar.
     """
+    groups: dict[Path, list[int]] = {}
+    for i, path in enumerate(files.paths):
+        groups.setdefault(path, []).append(i)
+    jobs = list(groups.values())
     one = partial(_examine, reading or LoadOptions(), config or SignatureConfig())
-    outcomes = run(one, list(files), n_workers=n_workers, limits=limits)
+    outcomes = run(one, [[files[i] for i in job] for job in jobs], n_workers=n_workers, limits=limits)
     found: dict[int, Finding] = {}
-    with tqdm(total=len(files), desc="files", disable=not progress) as bar, contextlib.closing(outcomes):
-        for i, outcome in outcomes:
-            bar.update()
-            found[i] = Finding(files.names[i], error=outcome.reason) if isinstance(outcome, Failed) else outcome
-    return [replace(found[i], id=files.names[i]) for i in range(len(files))]
+    with tqdm(total=len(files), desc="bodies", disable=not progress) as bar, contextlib.closing(outcomes):
+        for number, outcome in outcomes:
+            bar.update(len(jobs[number]))
+            for k, i in enumerate(jobs[number]):
+                one_found = Finding("", error=outcome.reason) if isinstance(outcome, Failed) else outcome[k]
+                found[i] = replace(one_found, id=files.names[i])
+    return [found[i] for i in range(len(files))]
 
 
 def expected_cost(n_vertices: int, n_eigenpairs: int) -> tuple[float, float]:
@@ -90,30 +101,37 @@ def expected_cost(n_vertices: int, n_eigenpairs: int) -> tuple[float, float]:
     return seconds, _BYTES + _BYTES_PER_VERTEX * n_vertices + _BYTES_PER_ENTRY * entries
 
 
-def _examine(reading: LoadOptions, config: SignatureConfig, body: BodyRef) -> Finding:
-    start = time.process_time()
-    path, part, name = body.path, body.part, str(body)
+def _examine(reading: LoadOptions, config: SignatureConfig, bodies: Sequence[BodyRef]) -> list[Finding]:
+    """The bodies of one file, which is read once."""
+    path, found = bodies[0].path, {}
+    start, fault = time.process_time(), f"{path}: has no such body. Choose one that the file has."
     try:
-        vertices = read_surface(path, reading, part=part).vertices
-    except MeshError as error:
-        return Finding(name, fault=str(error), error=str(error))
-    fault = None
-    try:
-        load_mesh(path, replace(reading, mend="never"), part=part)
+        for ref, raw in each_surface(path, reading, parts=[body.part for body in bodies]):
+            found[ref] = _finding(ref, raw, reading, config, start)
+            start = time.process_time()
     except MeshError as error:
         fault = str(error)
+    return [found.get(body, Finding(str(body), fault=fault, error=fault)) for body in bodies]
+
+
+def _finding(ref: BodyRef, raw: RawBody, reading: LoadOptions, config: SignatureConfig, start: float) -> Finding:
+    found = Finding(str(ref), n_vertices=len(raw.vertices), voxels=None if raw.voxels is None else raw.voxels())
+    if raw.fault is not None:
+        return replace(found, n_vertices=None, fault=str(raw.fault), error=str(raw.fault))
     try:
-        mesh = load_mesh(path, reading, part=part, least_vertices=config.n_vertices_read)
+        surface_body(raw, ref, replace(reading, mend="never"))
     except MeshError as error:
-        return Finding(name, fault=fault, n_vertices=len(vertices), error=str(error))
+        found = replace(found, fault=str(error))
+    try:
+        mesh = surface_body(raw, ref, reading, least_vertices=config.n_vertices_read)
+    except MeshError as error:
+        return replace(found, error=str(error))
     n_after = min(len(mesh.vertices), config.max_vertices or len(mesh.vertices))
     seconds, memory = expected_cost(n_after, config.n_kept)
-    return Finding(
-        id=name,
-        fault=fault,
+    return replace(
+        found,
         steps=mended_by(mesh.notes),
         notes=mesh.notes,
-        n_vertices=len(vertices),
         n_vertices_after=len(mesh.vertices),
         seconds=time.process_time() - start + seconds,
         memory=memory,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from pathlib import Path
 
 from igps._parallel import Limits
@@ -15,7 +15,8 @@ from igps.report.tables import findings_table
 from igps.signature.signature import SignatureConfig
 
 _HEADER = (
-    "file", "usable", "fault", "mended_by", "notes", "vertices", "vertices_after", "seconds", "megabytes", "error",
+    "file", "usable", "fault", "mended_by", "notes", "voxels", "pieces", "thinnest", "vertices", "vertices_after",
+    "seconds", "megabytes", "error",
 )  # fmt: skip
 
 
@@ -34,9 +35,10 @@ def doctor(
     time_limit: float | None = None,
     memory_limit: float | None = None,
 ) -> Verdict:
-    """Tell what is wrong with each mesh file of a folder, what will be done about it, and what that will cost.
+    """Tell what is wrong with each body of a folder, what will be done about it, and what that will cost.
 
-    Nothing is computed but the mending. The exit status is 1 if a file cannot be used.
+    Of labels of volumes it tells the number of voxels and of pieces, and how many voxels thick the thinnest part is, up
+    to ten. Nothing is computed but the mending. The exit status is 1 if a body cannot be used.
 
     Args:
         root: folder of meshes, with or without classes.
@@ -67,12 +69,14 @@ def doctor(
 
 
 def _row(finding: Finding) -> tuple[str, ...]:
+    voxels = ("",) * 3 if finding.voxels is None else tuple(map(str, astuple(finding.voxels)))
     return (
         finding.id,
         "no" if finding.error else "yes",
         finding.fault or "",
         " ".join(finding.steps),
         "; ".join(finding.notes),
+        *voxels,
         "" if finding.n_vertices is None else str(finding.n_vertices),
         "" if finding.n_vertices_after is None else str(finding.n_vertices_after),
         "" if finding.seconds is None else f"{finding.seconds:.1f}",

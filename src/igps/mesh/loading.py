@@ -82,7 +82,8 @@ def load_mesh(
     Raises:
         MeshError: the file is missing or unreadable, has no such part, or the surface is not usable.
     """
-    return _body(read_surface(path, options, part=part), Path(path), options, least_vertices)
+    raw = read_surface(path, options, part=part)
+    return surface_body(raw, BodyRef(Path(path), raw.part), options, least_vertices=least_vertices)
 
 
 def load_bodies(path: str | Path, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> list[Mesh]:
@@ -117,14 +118,28 @@ def each_body(
     Raises:
         MeshError: the file is missing or unreadable.
     """
+    for ref, raw in each_surface(path, options, parts=parts):
+        with one_thread():
+            try:
+                body: Mesh | MeshError = surface_body(raw, ref, options, least_vertices=least_vertices)
+            except MeshError as error:
+                body = error
+        yield ref, body
+
+
+def each_surface(
+    path: str | Path, options: LoadOptions = LoadOptions(), *, parts: Sequence[str | None] | None = None
+) -> Iterator[tuple[BodyRef, RawBody]]:
+    """The surfaces of the bodies of a file, or of the given parts, unchecked, one after the other; see `each_body`.
+
+    Raises:
+        MeshError: the file is missing or unreadable.
+    """
     path = Path(path)
     for raw in _read(path, options, parts[0] if parts and len(parts) == 1 else None):
         if parts is None or raw.part in parts:
-            with one_thread():
-                try:
-                    body: Mesh | MeshError = _body(raw, path, options, least_vertices)
-                except MeshError as error:
-                    body = error
+            with one_thread(), _faults(path, _format(path)):
+                body = raw.made()
             yield BodyRef(path, raw.part), body
 
 
@@ -138,7 +153,8 @@ def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part
     bodies = _read(path, options, part)
     found = [body for body in bodies if body.part == part] if part is not None else bodies
     if len(found) == 1:
-        return found[0]
+        with _faults(path, _format(path)):
+            return found[0].made()
     names = [body.part for body in bodies] if part is None else [one.part for one in list_bodies(path, options)]
     shown = ", ".join(repr(name) for name in names[:8]) + (", ..." if len(names) > 8 else "")
     if part is None:
@@ -146,10 +162,15 @@ def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part
     raise MeshError(f"{path}: has no body {part!r}; there are: {shown}. Choose one of them.")
 
 
-def _body(raw: RawBody, path: Path, options: LoadOptions, least_vertices: int) -> Mesh:
+def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> Mesh:
+    """The body that the options make of a surface; see `load_mesh`.
+
+    Raises:
+        MeshError: the surface is not usable.
+    """
     if raw.fault is not None:
         raise raw.fault
-    name = str(BodyRef(path, raw.part))
+    name = str(ref)
     vertices, faces, notes = raw.vertices, raw.faces, raw.notes
     if options.mend == "never" or len(faces):
         check_arrays(vertices, faces, name)

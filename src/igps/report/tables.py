@@ -42,25 +42,33 @@ def comparison_table(results: Sequence[Result]) -> str:
 
 
 def findings_table(findings: Sequence[Finding]) -> str:
-    """One line a file: what is done to it, vertices, expected time and memory; or why it cannot be used."""
+    """One line a body: what is done to it, vertices, expected time and memory; or why it cannot be used.
+
+    Where labels of volumes are among them, also their voxels, pieces, and the thickness of the thinnest part in voxels.
+    """
     width = max(len(finding.id) for finding in findings)
-    lines = [f"{'':<{width}}{'vertices':>10}{'after':>9}{'seconds':>9}{'MB':>7}  what is done"]
+    of_voxels = any(finding.voxels for finding in findings)
+    header = f"{'voxels':>10}{'pieces':>8}{'thinnest':>10}" if of_voxels else ""
+    lines = [f"{'':<{width}}{header}{'vertices':>10}{'after':>9}{'seconds':>9}{'MB':>7}  what is done"]
     for finding in findings:
+        voxels = finding.voxels
+        counts = ("", "", "") if voxels is None else (voxels.n_voxels, voxels.n_pieces, voxels.thinnest)
+        told = f"{finding.id:<{width}}" + ("{:>10}{:>8}{:>10}".format(*counts) if of_voxels else "")
         if finding.error is not None:
-            lines.append(f"{finding.id:<{width}}  cannot be used: {finding.error}")
+            lines.append(f"{told}  cannot be used: {finding.error}")
             continue
-        assert finding.seconds is not None  # of every file that can be used
+        assert finding.seconds is not None  # of every body that can be used
         assert finding.memory is not None
-        steps = ", ".join(finding.steps) or "nothing"
+        done = ", ".join(finding.steps) or ("; ".join(finding.notes) if voxels else "") or "nothing"
         lines.append(
-            f"{finding.id:<{width}}{finding.n_vertices:>10}{finding.n_vertices_after:>9}{finding.seconds:>9.1f}"
-            f"{finding.memory / 1e6:>7.0f}  {steps}"
+            f"{told}{finding.n_vertices:>10}{finding.n_vertices_after:>9}{finding.seconds:>9.1f}"
+            f"{finding.memory / 1e6:>7.0f}  {done}"
         )
     n_bad = sum(finding.error is not None for finding in findings)
     n_mended = sum(bool(finding.steps) for finding in findings)
     total = sum(finding.seconds or 0 for finding in findings)
     lines.append(
-        f"{len(findings)} files: {n_mended} mended, {n_bad} cannot be used; about {total / 60:.1f} core-minutes"
+        f"{len(findings)} bodies: {n_mended} mended, {n_bad} cannot be used; about {total / 60:.1f} core-minutes"
     )
     return "\n".join(lines)
 

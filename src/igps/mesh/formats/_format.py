@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.mesh._label_measures import VoxelMeasures
 from igps.mesh._tidying import are_specks, places
 from igps.mesh.mesh import MeshError, check_arrays
 from igps.mesh.options import BodyKind, LoadOptions
@@ -38,6 +39,8 @@ class RawBody:
         normals: (V, 3) of a cloud of points that has them.
         notes: what was noticed on reading, in words.
         fault: why there is no surface of this body, where there are others.
+        make: makes the surface, where that takes time; see `made`.
+        voxels: measures the voxels that the surface was made of.
     """
 
     vertices: NDArray[np.float64] = field(default_factory=no_vertices)
@@ -47,6 +50,12 @@ class RawBody:
     normals: NDArray[np.float64] | None = None
     notes: tuple[str, ...] = ()
     fault: MeshError | None = None
+    make: Callable[[], RawBody] | None = None
+    voxels: Callable[[], VoxelMeasures] | None = None
+
+    def made(self) -> RawBody:
+        """The same with its surface, or with the fault for which there is none."""
+        return self if self.make is None else self.make()
 
 
 @dataclass(frozen=True)
@@ -78,6 +87,7 @@ class Format:
 
 def joined(bodies: Sequence[RawBody]) -> RawBody:
     """All of them as one."""
+    bodies = [body.made() for body in bodies]
     if len(bodies) == 1:
         return replace(bodies[0], part=None)
     meshes = [body for body in bodies if len(body.faces)]

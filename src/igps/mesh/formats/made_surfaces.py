@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from igps.mesh._label_measures import VoxelMeasures
 from igps.mesh.formats import _structures, _volume_files
 from igps.mesh.formats._format import Format, RawBody
 from igps.mesh.mesh import Mesh, MeshError
@@ -28,9 +29,12 @@ def read_volume(path: Path, options: LoadOptions, part: str | None) -> list[RawB
     if options.bodies in ("whole", "pieces"):
         labelled = np.any([layer > 0 for layer in volume.layers], axis=0).astype(np.uint8)
         volume = replace(volume, layers=(labelled,), names=None, segments=None)
-        return [_made(partial(label_surface, volume, 1), None, volume.unit)]
+        return [_body(partial(label_surface, volume, 1), None, volume.unit, partial(volume.measures, 1))]
     names = [body.name for body in volume.bodies] if part is None else [volume.body(part).name]
-    return [_made(partial(label_surface, volume, name, how=options.mend), name, volume.unit) for name in names]
+    return [
+        _body(partial(label_surface, volume, name, how=options.mend), name, volume.unit, partial(volume.measures, name))
+        for name in names
+    ]
 
 
 def volume_parts(path: Path, options: LoadOptions) -> list[str]:
@@ -52,7 +56,7 @@ def read_structure(path: Path, options: LoadOptions, part: str | None) -> list[R
 
     found = _molecules(path, options)
     return [
-        _made(partial(molecular_surface, molecule), name, "Å")
+        _body(partial(molecular_surface, molecule), name, "Å")
         for name, molecule in found.items()
         if part in (None, name)
     ]
@@ -71,13 +75,22 @@ def _molecules(path: Path, options: LoadOptions) -> dict[str, Molecule]:
     return {molecule.name.removeprefix(str(path)).strip() or "model": molecule for molecule in found}
 
 
-def _made(make: Callable[[], Mesh], part: str | None, unit: str | None) -> RawBody:
+def _body(
+    make: Callable[[], Mesh], part: str | None, unit: str | None, voxels: Callable[[], VoxelMeasures] | None = None
+) -> RawBody:
+    """A body whose surface is made when it is asked for."""
+    return RawBody(part=part, make=partial(_made, make, part, unit, voxels))
+
+
+def _made(
+    make: Callable[[], Mesh], part: str | None, unit: str | None, voxels: Callable[[], VoxelMeasures] | None
+) -> RawBody:
     """A body, or why there is none: the others are made all the same."""
     try:
         mesh = make()
     except MeshError as fault:
-        return RawBody(part=part, fault=fault)
-    return RawBody(mesh.vertices, mesh.faces, part, unit, notes=mesh.notes)
+        return RawBody(part=part, fault=fault, voxels=voxels)
+    return RawBody(mesh.vertices, mesh.faces, part, unit, notes=mesh.notes, voxels=voxels)
 
 
 _STRUCTURES = tuple(sorted(suffix + packed for suffix in _structures.SUFFIXES for packed in ("", ".gz")))

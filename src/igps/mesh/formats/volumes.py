@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
+from igps.mesh._label_measures import VoxelMeasures, measured
 from igps.mesh.formats._volume_files import READERS, RawVolume
 from igps.mesh.formats.label_names import names_beside, read_label_names
 from igps.mesh.label_surface import MAX_VERTICES, checked_spacing, voxel_surface
@@ -137,6 +138,15 @@ class LabelVolume:
         known = ", ".join(body.name for body in self.bodies[:10]) + (", …" if len(self.bodies) > 10 else "")
         raise MeshError(f"{self.name}: no label {part!r}. It has {len(self.bodies)}: {known}.")
 
+    def mask(self, part: int | str) -> NDArray[np.bool_]:
+        """Where the label is, within `LabelBody.box`."""
+        body = self.body(part)
+        return np.asarray(self.layers[body.layer][body.box] == body.value)
+
+    def measures(self, part: int | str) -> VoxelMeasures:
+        """Of the voxels of a label."""
+        return measured(self.mask(part))
+
 
 def is_label_volume(path: str | Path) -> bool:
     """Whether a file has the suffix of a label volume."""
@@ -197,7 +207,7 @@ def label_surface(
     name = f"{volume.name}#{body.name}"
     affine = np.array(volume.affine, dtype=np.float64)
     affine[:3, 3] += affine[:3, :3] @ [side.start for side in body.box]
-    mask, affine = _canonical(volume.layers[body.layer][body.box] == body.value, affine)
+    mask, affine = _canonical(volume.mask(part), affine)
     vertices, faces, notes = voxel_surface(mask, affine, max_vertices=max_vertices, name=name)
     return mend(vertices, faces, how=how, name=name, notes=(*volume.notes, *notes))
 
