@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from pages import (
     DESCRIPTORS,
     EVIL,
@@ -56,8 +58,6 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A page of each kind of results."""
-    import trimesh
-
     body = trimesh.creation.icosphere(subdivisions=3)
     body.vertices *= [1.0, 0.6 + 0.3 * (body.vertices[:, 2] > 0).mean(), 2.2]
     mesh: Mesh = as_mesh(body)
@@ -131,6 +131,26 @@ def test_every_kind_opens_without_complaint_or_request(browser: Any, folder: Pat
         assert len(visit.shown()) == (3 if kind == "robustness" else len(NAMES))
         visit.open(1).locator("#close").click()
         visit.page.locator("dialog[open]").wait_for(state="detached")
+
+
+def test_bodies_of_one_file_are_shown_together_with_part_unit_and_volume(browser: Any, tmp_path: Path) -> None:
+    names = ("1.nii#liver", "1.nii#spleen", "2.nii#liver")
+    np.savez(tmp_path / "distances.npz", distances=1 - np.eye(3), names=names, labels=("liver", "spleen", "liver"))
+    files = [{"file": name, "part": name[6:]} for name in names]
+    (tmp_path / "meshes.json").write_text(json.dumps({"meshes": files}))
+    body = as_mesh(trimesh.creation.icosphere(subdivisions=2)).told(unit="mm")
+    one = next(iter(surfaces(body).values()))
+    write_page(tmp_path / "page.html", read_results(tmp_path), dict.fromkeys(names, one))
+    with Visit(browser, tmp_path / "page.html") as visit:
+        dialog = visit.open(1)
+        facts = dialog.locator("#facts").inner_text()
+        assert "spleen" in facts
+        assert f"{body.area:.4g} mm², {body.volume:.4g} mm³" in facts
+        assert dialog.locator("#together-list .name").all_inner_texts() == [names[0]]
+        dialog.locator("#together-list .shape").click()
+        visit.wait_until(lambda: visit.name() == names[0])
+        dialog.locator("#close").click()
+        assert visit.open(2).locator("#together").is_hidden()
 
 
 def test_names_run_nothing(retrieval: Visit) -> None:

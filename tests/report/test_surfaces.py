@@ -109,7 +109,7 @@ def test_written_and_read_again(tmp_path: Path) -> None:
     write_surfaces(path, {})
     assert read_surfaces(path) == {}
     np.savez(path, names=np.array(["a"]))
-    with pytest.raises(ValueError, match="igps-surfaces-1"):
+    with pytest.raises(ValueError, match="igps-surfaces-2"):
         read_surfaces(path)
 
 

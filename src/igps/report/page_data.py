@@ -46,18 +46,29 @@ def letters(content: bytes) -> str:
 
 
 def _shapes(results: Results, surfaces: Mapping[str, Surface], classes: Sequence[str]) -> list[dict[str, Any]]:
-    """Of each mesh its name, class, notes and surface: place among the surfaces and numbers of vertices and faces."""
+    """Of each body its name, class, notes and surface: place among the surfaces and numbers of vertices and faces.
+
+    Of one of several in a file, its part and the others of the file by their numbers.
+    """
     found, place = [], 0
+    files: dict[str, list[int]] = {}
+    for i, name in enumerate(results.names):
+        if name in results.parts:
+            files.setdefault(name.removesuffix(f"#{results.parts[name]}"), []).append(i)
+    together = {i: [j for j in bodies if j != i] for bodies in files.values() for i in bodies}
     for i, name in enumerate(results.names):
         shape: dict[str, Any] = {
             "name": name,
             "label": classes.index(results.labels[i]) if results.labels else -1,
             "notes": list(results.notes.get(name, ())),
         }
+        if i in together:
+            shape.update(part=results.parts[name], together=together[i])
         if name in surfaces:
             one = surfaces[name]
             shape["surface"] = [place, len(one.vertices), len(one.faces)]
             shape["mesh"] = [one.n_vertices, one.n_faces, _significant(one.area), _significant(one.volume)]
+            shape["unit"] = one.unit
             shape["potential"] = [_significant(value) for value in one.potential_range]
             place += 1
         found.append(shape)

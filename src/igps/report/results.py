@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +85,7 @@ class Results:
         unused: meshes that could not be used.
         notes: what was done to a mesh, by name.
         config: the parameters.
+        parts: of bodies that share their file with others, by name.
     """
 
     command: str
@@ -96,6 +97,7 @@ class Results:
     unused: tuple[Unused, ...] = ()
     notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)
+    parts: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_results(folder: Path) -> Results:
@@ -111,7 +113,9 @@ def read_results(folder: Path) -> Results:
             f"{folder}: no results found. Expected {', '.join(readers)}, which `igps retrieve`, `igps compare` and "
             "`python -m training.study robustness` write with --out."
         )
-    return readers[max(written, key=lambda name: written[name])](folder)
+    found = readers[max(written, key=lambda name: written[name])](folder)
+    bodies = (_json(folder / "meshes.json") or {}).get("meshes", [])
+    return replace(found, parts={one["file"]: one["part"] for one in bodies if one.get("part")})
 
 
 def _retrieval(folder: Path) -> Results:

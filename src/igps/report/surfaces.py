@@ -24,7 +24,7 @@ from igps.signature.signature import Signature
 
 logger = logging.getLogger(__name__)
 
-_FORMAT = "igps-surfaces-1"
+_FORMAT = "igps-surfaces-2"
 _MOST_VERTICES, _LEAST_VERTICES = 1200, 150
 # What the surfaces of a page may take in all, and what a vertex takes: 19 bytes, in letters of six bits.
 _MOST_BYTES, _BYTES_A_VERTEX = 20e6, 19 * 4 / 3
@@ -46,6 +46,7 @@ class Surface:
         area: of that mesh, length².
         volume: of that mesh, length³.
         key: of the Signature in the cache, which tells whether the mesh file has changed since.
+        unit: of length, such as "mm"; None where it is not known.
     """
 
     vertices: NDArray[np.uint16]
@@ -57,6 +58,7 @@ class Surface:
     area: float
     volume: float
     key: str
+    unit: str | None = None
 
     def packed(self) -> bytes:
         """Vertices, faces and potential behind each other, little-endian."""
@@ -138,6 +140,7 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
         area=mesh.area,
         volume=mesh.volume,
         key=key,
+        unit=mesh.unit,
     )
 
 
@@ -145,8 +148,8 @@ def write_surfaces(path: Path, surfaces: Mapping[str, Surface]) -> None:
     """Write surfaces as a NumPy archive.
 
     The arrays of all N surfaces lie behind each other: `vertices` (ΣV, 3), `faces` (ΣF, 3) with indices that begin at 0
-    in each surface, `potential` (ΣV,). Beside them (N,) `names`, `keys`, `counts` (N, 2) of vertices and faces,
-    `mesh_counts` (N, 2) of those of the mesh, and `measures` (N, 4): least and largest potential, area, volume.
+    in each surface, `potential` (ΣV,). Beside them (N,) `names`, `keys`, `units`, `counts` (N, 2) of vertices and of
+    faces, `mesh_counts` (N, 2) of the mesh, and `measures` (N, 4): least and largest potential, area, volume.
     """
     many = list(surfaces.values())
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -155,6 +158,7 @@ def write_surfaces(path: Path, surfaces: Mapping[str, Surface]) -> None:
         format=np.array(_FORMAT),
         names=np.array(list(surfaces), dtype=str),
         keys=np.array([one.key for one in many], dtype=str),
+        units=np.array([one.unit or "" for one in many], dtype=str),
         vertices=np.concatenate([np.empty((0, 3), np.uint16), *(one.vertices for one in many)]),
         faces=np.concatenate([np.empty((0, 3), np.uint16), *(one.faces for one in many)]),
         potential=np.concatenate([np.empty(0, np.uint8), *(one.potential for one in many)]),
@@ -194,6 +198,7 @@ def _read(path: Path) -> Iterator[tuple[str, Surface]]:
                 area=area,
                 volume=volume,
                 key=str(arrays["keys"][i]),
+                unit=str(arrays["units"][i]) or None,
             ),
         )
         start_v, start_f = start_v + n_vertices, start_f + n_faces

@@ -104,10 +104,11 @@ function fact(term, ...definition) {
 }
 
 function factsOf(shape) {
-  const { label, notes, mesh, potential } = shapes[shape];
+  const { label, notes, mesh, part, potential, unit } = shapes[shape];
   const scores = systems[system]?.per_query;
   const row = systems[system]?.row.get(shape);
   const facts = [];
+  if (part) facts.push(fact("body of its file", part));
   if (label >= 0) facts.push(fact("class", classes[label]));
   if (scores && row !== undefined && scores.nn[row] !== null) {
     facts.push(fact("first tier", `${percent(scores.ft[row])} %`));
@@ -116,7 +117,8 @@ function factsOf(shape) {
   }
   if (mesh) {
     facts.push(fact("mesh", `${mesh[0].toLocaleString("en")} vertices, ${mesh[1].toLocaleString("en")} faces`));
-    facts.push(fact("area, volume", `${mesh[2]}, ${mesh[3]} (units of the file, squared and cubed)`));
+    const units = unit ? [`${mesh[2]} ${unit}²`, `${mesh[3]} ${unit}³`] : [mesh[2], `${mesh[3]} (units of the file, squared and cubed)`];
+    facts.push(fact("area, volume", units.join(", ")));
     facts.push(fact("potential", `${potential[0]} to ${potential[1]} on the surface`));
   }
   const done = notes.map((note) => element("div", {}, note));
@@ -191,6 +193,9 @@ function openShape(shape) {
     ? `Nearest to it by ${name}, ${ranking.length} of ${systems[system].shapes.length - 1}`
     : `${name} could not describe this shape; the section Not used tells why.`;
   byId("ranking-list").replaceChildren(...(ranking ?? []).map((found, i) => card(shape, found, i + 1)));
+  const together = shapes[shape].together ?? [];
+  byId("together").hidden = !together.length;
+  byId("together-list").replaceChildren(...together.map((one) => element("li", {}, picture(one))));
   const moves = Object.keys(data.movements).length > 0;
   byId("moved").hidden = !moves;
   if (moves) showMovements(byId("moved-table"), shapes[shape].name, data.movements);
