@@ -16,6 +16,7 @@ from jsonargparse import ArgumentParser, Namespace
 
 from igps._parallel import MachineError, is_machines, machines_words
 from igps._threads import one_thread
+from igps.cli.cache import cache_export
 from igps.cli.compare import compare
 from igps.cli.completion import completion
 from igps.cli.demo import demo
@@ -40,6 +41,7 @@ COMMANDS: Commands = {
     "fit": fit,
     "classify": classify,
     "precompute": precompute,
+    "cache": {"export": cache_export},
     "index": {"build": index_build, "add": index_add, "merge": index_merge},
     "duplicates": duplicates,
     "distance": distance,

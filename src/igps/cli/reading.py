@@ -30,10 +30,10 @@ FLAGS = {
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder whose bodies are found as the options say.
+    """A folder whose bodies are found as the options say, or a file that `igps cache export` wrote of one.
 
     Args:
-        root: the folder.
+        root: the folder or file.
         labelled: whether it must tell classes.
     """
 
@@ -125,6 +125,13 @@ def chosen_dataset(
         raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
     config = SignatureConfig.paper() if paper else signature
     reading = LoadOptions(mend, component, allow_open, bodies, max_unpacked, names, threshold)
+    if isinstance(source, Folder) and source.root.is_file():
+        if config != SignatureConfig() or reading != LoadOptions() or classes is not None:
+            raise ValueError(f"{source.root}: expected no options of reading beside a file of signatures.")
+        dataset = SignatureDataset.from_file(source.root, descriptor=needs, cache_dir=cache_dir)
+        if source.labelled and dataset.bodies.labels is None:
+            raise ValueError(f"{source.root}: expected signatures with classes. Export those of a labelled folder.")
+        return dataset
     if isinstance(source, Folder):
         find = labelled_bodies if source.labelled else find_bodies
         source, classes = find(source.root, reading, classes=classes or "folder"), None

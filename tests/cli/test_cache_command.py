@@ -1,0 +1,52 @@
+"""`igps cache export`: one file in place of the folder, for every command, without the meshes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from igps.cli import main
+from own_descriptors import SMALL, write_egg
+
+INTERIOR = "own_descriptors:small_interior"
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["igps", *map(str, words)])
+    main()
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_the_file_stands_for_the_folder(
+    labelled: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for label, height in (("flat", 0.5), ("long", 2.0)):
+        for i in range(2):
+            name = f"eggs/{label}/{i}.off" if labelled else f"eggs/{label}{i}.off"
+            write_egg(tmp_path / name, height * (1 + 0.05 * i), subdivisions=2)
+    (tmp_path / "eggs" / "bad.off").write_text("nothing") if not labelled else None
+    cache, out = ["--cache_dir", tmp_path / "cache"], tmp_path / "signatures.igps"
+    command = ["retrieve", "--json"] if labelled else ["query", tmp_path / "egg.off", "--json"]
+    where = [] if labelled else ["--gallery"]
+    write_egg(tmp_path / "egg.off", 2.0, subdivisions=2)
+    call(monkeypatch, *command, *where, tmp_path / "eggs", "--descriptor", INTERIOR, *cache, *SMALL)
+    expected = json.loads(capsys.readouterr().out)
+    call(monkeypatch, "cache", "export", tmp_path / "eggs", "--out", out, "--descriptors", INTERIOR, *cache, *SMALL)
+    told = capsys.readouterr().out
+    assert f"4 signatures written to {out}; {int(not labelled)} meshes skipped" in told
+    shutil.rmtree(tmp_path / "eggs")
+    shutil.rmtree(tmp_path / "cache")
+    if labelled:
+        call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache)
+        assert json.loads(capsys.readouterr().out) == expected
+        with pytest.raises(SystemExit, match="1"):
+            call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache, "--mend", "never")
+        assert "expected no options of reading beside a file of signatures" in capsys.readouterr().err
+    else:
+        with pytest.raises(SystemExit, match="1"):
+            call(monkeypatch, "retrieve", out, "--descriptor", INTERIOR, *cache)
+        assert "expected signatures with classes" in capsys.readouterr().err
