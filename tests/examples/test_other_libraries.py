@@ -1,0 +1,184 @@
+"""Examples to copy: descriptions, heads and spectra in PyTorch Geometric, DiffusionNet and pytorch-metric-learning."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+import igps
+from igps.data.geometric import to_pyg
+from igps.nn.axes import InteriorDistance, Potential
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.heads import ProjectionHead
+from igps.retrieval.metric import RetrievalScoresMetric
+from own_descriptors import small_interior, write_egg
+
+pytest.importorskip("torch_geometric", reason="the extra geometric is not installed")
+distances = pytest.importorskip("pytorch_metric_learning.distances", reason="the extra metric is not installed")
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> igps.SignatureDataset:
+    """Eight eggs of two classes."""
+    root = tmp_path_factory.mktemp("examples")
+    for label, height in (("flat", 0.5), ("long", 2.0)):
+        for i in range(4):
+            write_egg(root / "eggs" / label / f"{i}.off", height * (1 + 0.05 * i), subdivisions=2)
+    config = igps.SignatureConfig(n_eigenpairs=20, resolution=9, min_samples=0, n_surface_samples=80)
+    found = igps.SignatureDataset(root / "eggs", config, root / "cache")
+    found.precompute(n_workers=1, progress=False)
+    return found.to_memory()
+
+
+def test_pytorch_geometric_batches_samples_with_their_eigenfunctions(dataset: igps.SignatureDataset) -> None:
+    from torch_geometric.loader import DataLoader as GeometricLoader
+    from torch_geometric.nn import global_add_pool
+
+    bodies = [to_pyg(item.signature, "surface", item.label) for item in dataset]
+    batch = next(iter(GeometricLoader(bodies, batch_size=8)))
+    assert (batch.pos.shape, batch.eigenfunctions.shape) == ((640, 3), (640, 20))
+    assert batch.eigenvalues.shape == (8, 20)
+    assert batch.y.tolist() == dataset.labels.tolist()
+    # A heat kernel signature (Sun, Ovsjanikov and Guibas 2009) of each sample, pooled over each body: the heat trace.
+    weights = (-0.05 * batch.eigenvalues * batch.area[:, None]).exp()[batch.batch]
+    traces = global_add_pool((batch.mass[:, None] * weights * batch.eigenfunctions**2).sum(dim=1), batch.batch)
+    for trace, item in zip(traces.tolist(), dataset, strict=True):
+        expected = np.exp(-0.05 * item.signature.eigenvalues * item.signature.area).sum()
+        assert trace == pytest.approx(expected, rel=0.5)  # samples of 80 points
+
+
+class DiffusionBlock(nn.Module):
+    """A block of DiffusionNet (Sharp, Attaiki, Crane and Ovsjanikov 2022), without gradient features.
+
+    Each channel diffuses for a time of its own in the eigenbasis, and a perceptron mixes the channels of each point.
+    """
+
+    def __init__(self, n_channels: int) -> None:
+        super().__init__()
+        self.log_time = nn.Parameter(torch.full((n_channels,), -3.0))
+        self.mix = nn.Sequential(nn.Linear(2 * n_channels, n_channels), nn.ReLU(), nn.Linear(n_channels, n_channels))
+
+    def diffused(self, x: Tensor, eigenvalues: Tensor, eigenfunctions: Tensor, mass: Tensor) -> Tensor:
+        """(P, D) values after a time, the constant eigenfunction included, which spectra leave out."""
+        mean = (mass @ x) / mass.sum()
+        spectral = eigenfunctions.T @ (mass[:, None] * (x - mean))
+        return mean + eigenfunctions @ ((-eigenvalues[:, None] * self.log_time.exp()).exp() * spectral)
+
+    def forward(self, x: Tensor, eigenvalues: Tensor, eigenfunctions: Tensor, mass: Tensor) -> Tensor:
+        """(P, D) features of points to (P, D)."""
+        return x + self.mix(torch.cat([x, self.diffused(x, eigenvalues, eigenfunctions, mass)], dim=1))
+
+
+def test_a_diffusion_net_reads_the_spectrum_of_a_surface() -> None:
+    """Against implicit Euler steps of the heat equation, and it trains."""
+    import scipy.sparse.linalg
+    import trimesh
+
+    from igps.signature.laplacian import laplacian
+    from igps.spectra.eigensolver import eigenpairs
+
+    body = trimesh.creation.icosphere(subdivisions=3)
+    mesh = igps.Mesh(body.vertices * [1, 1.3, 0.8], body.faces)
+    stiffness, mass = laplacian(mesh)
+    spectrum = eigenpairs(stiffness, mass, 200)
+    eigenvalues, functions, weights = (
+        torch.from_numpy(np.asarray(one)).float() for one in (spectrum.eigenvalues, spectrum.eigenfunctions, mass)
+    )
+    block, x = DiffusionBlock(3), torch.from_numpy(np.array(mesh.vertices)).float()
+    found = block.diffused(x, eigenvalues, functions, weights).detach().numpy()
+    time, n_steps = float(block.log_time[0].detach().exp()), 400
+    step = scipy.sparse.linalg.factorized((scipy.sparse.diags(mass) + time / n_steps * stiffness).tocsc())
+    expected = np.array(mesh.vertices)
+    for _ in range(n_steps):
+        expected = np.column_stack([step(mass * column) for column in expected.T])
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+
+    torch.manual_seed(0)
+    block, target = DiffusionBlock(3), x.norm(dim=1, keepdim=True).expand(-1, 3)
+    optimizer, losses = torch.optim.Adam(block.parameters(), lr=0.01), []
+    for _ in range(100):
+        loss = (block(x, eigenvalues, functions, weights) - target).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < losses[0] / 3
+
+
+class AsTheirs(distances.BaseDistance):  # type: ignore[misc]
+    """A head's or a descriptor's distance for pytorch-metric-learning; its own are passed on by `compute_mat`."""
+
+    def __init__(self, distances: Any) -> None:
+        super().__init__(normalize_embeddings=False)
+        self.distances = distances
+
+    def compute_mat(self, query: Tensor, reference: Tensor) -> Tensor:
+        return self.distances(query, reference)
+
+    def pairwise_distance(self, query: Tensor, reference: Tensor) -> Tensor:
+        return torch.stack([self.distances(q[None], r[None])[0, 0] for q, r in zip(query, reference, strict=True)])
+
+
+def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back(
+    dataset: igps.SignatureDataset,
+) -> None:
+    from pytorch_metric_learning.distances import LpDistance
+    from pytorch_metric_learning.losses import TripletMarginLoss
+    from pytorch_metric_learning.miners import BatchHardMiner
+    from pytorch_metric_learning.samplers import MPerClassSampler
+    from pytorch_metric_learning.utils.accuracy_calculator import AccuracyCalculator
+    from pytorch_metric_learning.utils.inference import CustomKNN
+
+    torch.manual_seed(0)
+    axes = [Potential(3, learnable=True), InteriorDistance(12, learnable=True)]
+    descriptor = igps.HistogramDescriptor(igps.PairHistogram(axes, SpectralEmbedding(n_eigenpairs=20)))
+    head = ProjectionHead(width=8, n_hidden=0, cell_dropout=0).fit(
+        igps.describe(dataset, descriptor).flatten(1), dataset.labels
+    )
+    distance = AsTheirs(head.distances)
+    miner, loss = BatchHardMiner(distance=distance), TripletMarginLoss(margin=0.2, distance=distance)
+    head(torch.ones(1, descriptor.n_features))
+    optimizer = torch.optim.Adam([*descriptor.parameters(), *head.parameters()], lr=0.01)
+    sampler = MPerClassSampler(dataset.labels, m=4, batch_size=8, length_before_new_iter=160)
+    losses = []
+    for batch in DataLoader(dataset, batch_size=8, sampler=sampler, collate_fn=igps.collate):
+        embeddings = head(descriptor(batch).flatten(1))
+        value = loss(embeddings, batch.labels, miner(embeddings, batch.labels))
+        optimizer.zero_grad()
+        value.backward()
+        optimizer.step()
+        losses.append(float(value.detach()))
+    assert losses[-1] <= losses[0]
+
+    plain = small_interior()
+    cells = igps.describe(dataset, plain).flatten(1)
+    nearest = CustomKNN(AsTheirs(plain.distances))
+    calculator = AccuracyCalculator(include=("precision_at_1",), k=1, knn_func=nearest)
+    found = calculator.get_accuracy(cells, dataset.labels)["precision_at_1"]
+    ours = igps.retrieval_scores(plain.distances(cells, cells), dataset.labels).mean()["nn"]
+    assert found == pytest.approx(ours)
+
+    theirs = LpDistance(normalize_embeddings=False)  # and back: any of theirs is a distance here
+    scores = igps.retrieval_scores(theirs(cells, cells), dataset.labels).mean()
+    assert scores == igps.retrieval_scores(torch.cdist(cells, cells), dataset.labels).mean()
+
+
+def test_retrieval_scores_accumulate_step_by_step(dataset: igps.SignatureDataset) -> None:
+    descriptor = small_interior()
+    metric = RetrievalScoresMetric(descriptor.distances)
+    for batch in DataLoader(dataset, batch_size=3, collate_fn=igps.collate):
+        metric.update(descriptor(batch), batch.labels, batch.ids)
+    histograms = igps.describe(dataset, descriptor)
+    expected = igps.retrieval_scores(descriptor.distances(histograms, histograms), dataset.labels).mean()
+    assert {name: float(value) for name, value in metric.compute().items()} == pytest.approx(expected)
+
+
+def test_missing_extras_are_named(monkeypatch: pytest.MonkeyPatch, dataset: igps.SignatureDataset) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "torch_geometric.data", None)
+    with pytest.raises(ImportError, match=r"interior-gps\[geometric\]"):
+        to_pyg(dataset[0].signature)
