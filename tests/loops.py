@@ -53,6 +53,17 @@ def distances(points: Tensor) -> np.ndarray:
     return np.array([[math.dist(p, q) for q in rows] for p in rows])
 
 
+def twists(points: Tensor, directions: Tensor) -> np.ndarray:
+    """The signed twist of each pair of oriented points, (P, P)."""
+    p, n = points.double().numpy(), directions.double().numpy()
+    found = np.zeros((len(p), len(p)))
+    for i in range(len(p)):
+        for j in range(len(p)):
+            if i != j:
+                found[i, j] = np.linalg.det([n[i], n[j], p[j] - p[i]]) / np.linalg.norm(p[j] - p[i])
+    return found
+
+
 def cosines(points: Tensor, directions: Tensor) -> list[np.ndarray]:
     """The three cosines of each pair of oriented points (Wahl et al. 2003), each (P, P)."""
     p, n = points.double().numpy(), directions.double().numpy()

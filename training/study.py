@@ -1,4 +1,4 @@
-"""Studies of the library: `python -m training.study {robustness,damage,figure} …`, `--help` for each."""
+"""Studies of the library: `python -m training.study {robustness,damage,scales,figure} …`, `--help` for each."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from igps.cli import main as run
 from training.studies.damage_command import damage
 from training.studies.figure_command import pose, potential, topology
 from training.studies.robustness_command import robustness
+from training.studies.scales import scales
 
 COMMANDS: Commands = {
     "robustness": robustness,
     "damage": damage,
+    "scales": scales,
     "figure": {"pose": pose, "topology": topology, "potential": potential},
 }
 

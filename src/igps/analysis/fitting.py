@@ -15,6 +15,7 @@ from torch import Tensor
 from igps.data.dataset import Failure, SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
+from igps.descriptors.individual import IndividualDescriptor
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead, Head, WhitenedHead
@@ -29,6 +30,8 @@ _CANDIDATES: Mapping[Goal, tuple[HeadName, ...]] = {"known": ("classifier", "whi
 _PRIOR_SHARE = 0.5
 _N_FOLDS, _N_INNER_FOLDS = 5, 3
 _N_BINS = 10
+# Bodies between which distances are measured for their scale
+_MOST_MEASURED = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +99,9 @@ def fit(
     for name, value, allowed in (("goal", goal, Goal), ("head", head, HeadName)):
         if value not in get_args(allowed):
             raise ValueError(f"{name}: expected one of {', '.join(get_args(allowed))}, got {value!r}.")
-    base, metric = histograms_and_prior(descriptor)
+    which = descriptor_of(descriptor)
+    individual = which if isinstance(which, IndividualDescriptor) else None  # size and side stay beside the head
+    base, metric = histograms_and_prior(which if individual is None else individual.descriptor)
     metric = metric if prior else None
     histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
     labels, counts = dataset.labels, Counter(dataset.bodies.labels or ())
@@ -126,7 +131,14 @@ def fit(
     name = chosen(histograms, labels)
     made = fitted(name, histograms, labels)
     model: Descriptor = base if made is None else EmbeddedDescriptor(base, made, name=f"{base.name}_{name}").eval()
+    vectors = histograms[:_MOST_MEASURED] if made is None else made(histograms[:_MOST_MEASURED])
+    apart = labels[:_MOST_MEASURED, None] != labels[None, :_MOST_MEASURED]
+    # Bodies of one class that the head has seen are nearer than others will be
+    scale = float(model.distances(vectors, vectors)[apart].median()) / 5
+    if individual is not None:
+        model = individual.around(model, scale)
     model.card = {
+        "scale": scale,
         "descriptor": descriptor if isinstance(descriptor, str) else descriptor.name,
         "goal": goal,
         "head": name,
@@ -158,6 +170,7 @@ def classify(
         ValueError: the model has no classifier.
     """
     found = descriptor_of(model)
+    found = found.descriptor if isinstance(found, IndividualDescriptor) else found
     head = found.head if isinstance(found, EmbeddedDescriptor) else None
     if not isinstance(found, EmbeddedDescriptor) or not isinstance(head, ClassifierHead):
         raise ValueError(f"model: expected one with a classifier, got {found.name}. Fit one with head='classifier'.")

@@ -11,12 +11,13 @@ import numpy as np
 
 from igps.analysis.comparison import Result
 from igps.analysis.comparison import compare as compare_descriptors
-from igps.cli.reading import Folder, signatures, write_notes, write_rows
+from igps.cli.reading import Folder, signatures, sized, with_side, write_notes, write_rows
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
+from igps.descriptors.individual import Mirror, Size
 from igps.report.sources import write_sources
 from igps.report.tables import comparison_table
 from igps.retrieval import precision_recall_curve
@@ -27,6 +28,8 @@ def compare(
     descriptors: list[str] | None = None,
     out: Path | None = None,
     report: bool = False,
+    size: Size = "auto",
+    mirror: Mirror = "same",
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
@@ -42,12 +45,16 @@ def compare(
         out: folder for compare.json, distances/NAME.npz, precision_recall.png, meshes.json that tells where the meshes
             lie, and failures.csv if there are any.
         report: make a page of the results in that folder, report.html, see `igps report`
+        size: keep lets differences in size count, ignore does not; auto keeps it where all files have a unit of length.
+        mirror: distinct tells a body from its mirror image.
         n_workers: processes that compute; all cores if not given.
         strict: stop at the first mesh that cannot be used instead of skipping it
     """
     check_report(report, out)
-    chosen = [descriptor_of(name) for name in descriptors or NAMES]
+    wanted = [with_side(name, mirror) for name in descriptors or NAMES]
+    chosen = [descriptor_of(name) for name in wanted]
     dataset, failures = signatures(Folder(root, labelled=True), chosen, n_workers=n_workers, strict=strict, **reading)
+    chosen = [descriptor_of(sized(name, size, dataset)) for name in wanted]
     results: list[Result] = []
     for result in compare_descriptors(dataset, chosen, n_workers=n_workers, strict=strict):
         results.append(result)

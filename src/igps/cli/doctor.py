@@ -9,7 +9,7 @@ from igps._parallel import Limits
 from igps.analysis.doctor import Finding, examine, usable
 from igps.cli.reading import Verdict, write_rows
 from igps.data.sources import find_bodies
-from igps.mesh.mending import Mending
+from igps.mesh.mending import Cavities, Mending
 from igps.mesh.options import MAX_UNPACKED, BodyKind, Component, LoadOptions
 from igps.report.tables import findings_table
 from igps.signature.signature import SignatureConfig
@@ -30,6 +30,7 @@ def doctor(
     bodies: BodyKind | None = None,
     names: str | None = None,
     threshold: float = 0.5,
+    cavities: Cavities = "fill",
     max_unpacked: int = MAX_UNPACKED,
     n_workers: int | None = None,
     time_limit: float | None = None,
@@ -52,12 +53,13 @@ def doctor(
             volume, the chains of a molecule and the whole of anything else if not given.
         names: a table of the names of labels; those of the volume, or beside it, if not given.
         threshold: a voxel of at least this probability belongs to the body, in volumes of probabilities.
+        cavities: fill takes a hollow body for the full one, keep lets the surfaces of its hollows bound it, too.
         max_unpacked: bytes that a compressed file may unpack to.
         n_workers: processes; all cores if not given.
         time_limit: seconds that one file may take; no limit if not given.
         memory_limit: gigabytes of memory that one file may take; no limit if not given.
     """
-    reading = LoadOptions(mend, component, allow_open, bodies, max_unpacked, names, threshold)
+    reading = LoadOptions(mend, component, allow_open, bodies, max_unpacked, names, threshold, cavities)
     limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
     found = examine(find_bodies(root, reading), reading, signature, n_workers=n_workers, limits=limits)
     print(findings_table(found))

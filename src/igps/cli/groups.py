@@ -46,8 +46,9 @@ def groups(
         n_permutations: random ones.
         seed: of what is random.
     """
-    chosen = descriptor_of(descriptor)
-    dataset, descriptions, failures = described(Folder(root, labelled=group is None), descriptor, **reading)
+    folder = Folder(root, labelled=group is None)
+    dataset, descriptions, failures, name = described(folder, descriptor, size="ignore", **reading)
+    chosen = descriptor_of(name)
     bodies = dataset.bodies
     vectors = {"": vectors_of(chosen, descriptions)}
     if size:

@@ -7,9 +7,10 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from igps.cli.reading import Folder, signatures
+from igps.cli.reading import Folder, signatures, sized, with_side
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
+from igps.descriptors.individual import SIZE, Mirror, Size
 from igps.gallery.gallery import Gallery, about_of
 from igps.mesh.options import LoadOptions
 from igps.retrieval.index import check_alike
@@ -20,6 +21,8 @@ def index_build(
     root: Path,
     out: Path,
     descriptor: str = "pretrained",
+    size: Size = "auto",
+    mirror: Mirror = "same",
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
@@ -32,11 +35,15 @@ def index_build(
         root: folder of meshes, with or without classes.
         out: the index, a folder that will be made, such as gallery.igps.
         descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
+        size: keep lets differences in size count, ignore does not; auto keeps it where all files have a unit of length.
+        mirror: distinct tells a body from its mirror image.
         n_workers: processes that compute; all cores if not given.
         strict: stop at the first mesh that cannot be used instead of skipping it
     """
+    descriptor = with_side(descriptor, mirror)
     chosen = descriptor_of(descriptor)
     dataset, unread = signatures(Folder(root), [chosen], n_workers=n_workers, strict=strict, **reading)
+    descriptor = sized(descriptor, size, dataset)
     gallery, undescribed = Gallery.build(out, dataset, descriptor, n_workers=n_workers, strict=strict, progress=True)
     _print_state(gallery, [*unread, *undescribed])
 
@@ -81,6 +88,10 @@ def as_indexed(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]:
         ValueError: others are asked for.
     """
     given = dict(reading)
+    size, mirror, name = given.pop("size", "auto"), given.pop("mirror", "same"), gallery.index.about["descriptor"]
+    if size != "auto":
+        check_alike(gallery.index, {"descriptor": name.replace(SIZE, "") + SIZE * (size == "keep")})
+    check_alike(gallery.index, {"descriptor": with_side(name, mirror)})
     config = given.pop("signature", SignatureConfig())
     if given.pop("paper", False):
         config = SignatureConfig.paper()

@@ -15,7 +15,9 @@ from igps._parallel import Limits
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, ClassRule, find_bodies, labelled_bodies
-from igps.mesh.mending import Mending, mended_by
+from igps.descriptors import descriptor as descriptor_of
+from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size
+from igps.mesh.mending import Cavities, Mending, mended_by
 from igps.mesh.options import MAX_UNPACKED, BodyKind, Component, LoadOptions
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig
@@ -85,6 +87,23 @@ def signatures(
     return usable, failures
 
 
+def with_side(descriptor: str, mirror: Mirror) -> str:
+    """The name of a descriptor that tells mirror images apart, or not, as is asked for."""
+    if mirror == "same" or SIDE in descriptor:
+        return descriptor
+    return descriptor.replace(SIZE, "") + SIDE + SIZE * (SIZE in descriptor)
+
+
+def sized(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
+    """The name of a descriptor that keeps the size of the bodies, or not, as is asked for; says what is left open."""
+    if SIZE in descriptor or "scale" not in descriptor_of(descriptor).invariant_to:
+        return descriptor
+    is_kept, told = keeps_size(size, () if size == "ignore" else dataset.units())
+    if told:
+        print(told)
+    return descriptor + SIZE * is_kept
+
+
 def chosen_dataset(
     source: Folder | Sequence[Path] | Bodies,
     needs: Requirements | None,
@@ -98,6 +117,7 @@ def chosen_dataset(
     classes: ClassRule | None = None,
     names: str | None = None,
     threshold: float = 0.5,
+    cavities: Cavities = "fill",
     max_unpacked: int = MAX_UNPACKED,
 ) -> SignatureDataset:
     """The dataset that the options tell; nothing is computed.
@@ -115,6 +135,7 @@ def chosen_dataset(
         classes: what the class of a body is: folder (or labels.csv), body (its name in its file), or file.
         names: a table of the names of labels; those of the volume, or beside it, if not given.
         threshold: a voxel of at least this probability belongs to the body, in volumes of probabilities.
+        cavities: fill takes a hollow body for the full one, keep lets the surfaces of its hollows bound it, too.
         max_unpacked: bytes that a compressed file may unpack to.
         paper, allow_open: see `FLAGS`.
 
@@ -124,7 +145,7 @@ def chosen_dataset(
     if paper and signature != SignatureConfig():
         raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
     config = SignatureConfig.paper() if paper else signature
-    reading = LoadOptions(mend, component, allow_open, bodies, max_unpacked, names, threshold)
+    reading = LoadOptions(mend, component, allow_open, bodies, max_unpacked, names, threshold, cavities)
     if isinstance(source, Folder) and source.root.is_file():
         if config != SignatureConfig() or reading != LoadOptions() or classes is not None:
             raise ValueError(f"{source.root}: expected no options of reading beside a file of signatures.")

@@ -15,13 +15,14 @@ from tqdm import tqdm
 from igps.analysis.comparison import pair_distances
 from igps.cli.feature_table import SUFFIXES, feature_table, wide_table, write_table
 from igps.cli.index import as_indexed
-from igps.cli.reading import Folder, signatures, write_notes, write_rows
+from igps.cli.reading import Folder, signatures, sized, with_side, write_notes, write_rows
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
+from igps.descriptors.individual import Mirror, Size
 from igps.gallery.gallery import Gallery
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
@@ -57,11 +58,10 @@ def retrieve(
         strict: stop at the first mesh that cannot be used instead of skipping it
     """
     check_report(report, out)
-    chosen = descriptor_of(descriptor)
-    dataset, descriptions, failures = described(
+    dataset, descriptions, failures, name = described(
         Folder(root, labelled=True), descriptor, n_workers=n_workers, strict=strict, **reading
     )
-    distances = pair_distances(chosen, descriptions, progress=True)
+    distances = pair_distances(descriptor_of(name), descriptions, progress=True)
     scores = retrieval_scores(distances, dataset.bodies.labels or ())
     print(scores_table(scores))
     reranked = reranked_distances(distances, progress=True) if rerank else None
@@ -70,7 +70,7 @@ def retrieve(
         print(f"\nre-ranked by the whole collection, without its labels\n{scores_table(scores_reranked)}")
     if failures:
         print(f"{len(failures)} of {len(failures) + len(dataset)} meshes could not be used.")
-    summary = _summary(dataset, descriptor, scores, failures)
+    summary = _summary(dataset, str(name), scores, failures)
     if scores_reranked is not None:
         summary["reranked"] = scores_reranked.mean()
     if out is not None:
@@ -109,11 +109,10 @@ def extract(
         suffixes = ", ".join(SUFFIXES if wide else (*SUFFIXES, ".npz"))
         raise ValueError(f"out: expected a file{' of a wide table' * wide} ending in one of {suffixes}, got {out}.")
     source = Folder(meshes[0]) if len(meshes) == 1 and meshes[0].is_dir() else meshes
-    shortening = descriptor_of(descriptor) if short else None
-    if shortening is not None and not isinstance(shortening, EmbeddedDescriptor):
+    if short and not isinstance(descriptor_of(descriptor.partition("+")[0]), EmbeddedDescriptor):
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}.")
-    dataset, descriptions, failures = described(source, descriptor, **reading)
-    features = (descriptions if shortening is None else shortening.short(descriptions)).numpy()
+    dataset, descriptions, failures, name = described(source, descriptor, **reading)
+    features = (descriptor_of(name).short(descriptions) if short else descriptions).numpy()
     out.parent.mkdir(parents=True, exist_ok=True)
     if suffix == ".npz":
         arrays: dict[str, Any] = {"features": features, "names": np.array(dataset.bodies.names)}
@@ -165,11 +164,10 @@ def query(
         if missing:
             print(f"{missing} of these {len(matches)} files are no longer where they were when they were indexed.")
         return _as_rows(rows)
-    descriptor = descriptor or "pretrained"
-    chosen = descriptor_of(descriptor)
     assert gallery is not None
-    wanted = _one(mesh, descriptor, **reading)
-    dataset, descriptions, _ = described(Folder(gallery), descriptor, **reading)
+    dataset, descriptions, _, name = described(Folder(gallery), descriptor or "pretrained", **reading)
+    chosen, unsized = descriptor_of(name), {**reading, "size": "ignore"}  # as the name says already
+    wanted = _one(mesh, name, **unsized)
     n_found = min(top, len(dataset))
     n_near = min(max(top, N_RERANKED), len(dataset)) if rerank else n_found
     found = search(wanted, descriptions, top=n_near, distance=chosen.distances)
@@ -184,7 +182,7 @@ def query(
 
 def _one(mesh: Path, descriptor: str | Descriptor, **reading: Any) -> Tensor:
     """The description of the one body of a file, or of the one that is named."""
-    dataset, description, _ = described([mesh], descriptor, **reading)
+    dataset, description, *_ = described([mesh], descriptor, **reading)
     if len(dataset) > 1:
         names = ", ".join(dataset.bodies.names[:5])
         raise ValueError(f"mesh: expected one body, {mesh} holds {len(dataset)}. Name one of them, such as {names}.")
@@ -210,11 +208,26 @@ def described(
     descriptor: str | Descriptor,
     n_workers: int | None = None,
     strict: bool = False,
+    size: Size = "auto",
+    mirror: Mirror = "same",
     **reading: Any,
-) -> tuple[SignatureDataset, Tensor, list[Failure]]:
-    """The meshes that could be used, their descriptions, and the failures of the others."""
+) -> tuple[SignatureDataset, Tensor, list[Failure], str | Descriptor]:
+    """The meshes that could be used, their descriptions, the failures of the others, and the descriptor by name.
+
+    Args:
+        source: a folder, files, or bodies.
+        descriptor: a name, to which size and mirror are added; or a descriptor as it is.
+        n_workers: processes that compute; all cores if not given.
+        strict: see `FLAGS`.
+        size: keep lets differences in size count, ignore does not; auto keeps it where all files have a unit of length.
+        mirror: distinct tells a body from its mirror image.
+    """
+    if isinstance(descriptor, str):
+        descriptor = with_side(descriptor, mirror)
+    dataset, unread = signatures(source, [descriptor_of(descriptor)], n_workers=n_workers, strict=strict, **reading)
+    if isinstance(descriptor, str):
+        descriptor = sized(descriptor, size, dataset)
     module = descriptor_of(descriptor)
-    dataset, unread = signatures(source, [module], n_workers=n_workers, strict=strict, **reading)
     failures: list[Failure] = []
     descriptions = describe(
         dataset,
@@ -224,7 +237,7 @@ def described(
         n_workers=n_workers,
         progress=True,
     )
-    return dataset.usable(failures), descriptions, [*unread, *failures]
+    return dataset.usable(failures), descriptions, [*unread, *failures], descriptor
 
 
 def _summary(

@@ -148,6 +148,7 @@ class SignatureBatch:
         labels: (N,) int64, −1 where unknown.
         ids: N names.
         meshes: the N surfaces, for descriptors that need more than the Signatures; None if they were not asked for.
+        units: the N units of length, None where one is not known; None if none is.
     """
 
     eigenvalues: Tensor
@@ -158,6 +159,7 @@ class SignatureBatch:
     labels: Tensor
     ids: tuple[str, ...]
     meshes: tuple[Mesh, ...] | None = None
+    units: tuple[str | None, ...] | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -186,6 +188,7 @@ class SignatureBatch:
             self.map(lambda values: values[rows]),
             ids=tuple(self.ids[i] for i in chosen),
             meshes=None if self.meshes is None else tuple(self.meshes[i] for i in chosen),
+            units=None if self.units is None else tuple(self.units[i] for i in chosen),
         )
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SignatureBatch:
@@ -234,6 +237,7 @@ class SignatureBatch:
             labels=torch.cat([batch.labels for batch in batches]),
             ids=tuple(name for batch in batches for name in batch.ids),
             meshes=tuple(mesh for several in meshes for mesh in several) if meshes else None,
+            units=tuple(unit for batch in batches for unit in batch.units or (None,) * len(batch)),
         )
 
     def bodies(self) -> Iterator[Body]:

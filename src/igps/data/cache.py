@@ -147,6 +147,10 @@ class SignatureCache(FileCache[Signature]):
         """What was done to the mesh of the Signature under `key`, in words; nothing if there is none."""
         return self._read(key, lambda file, metadata: tuple(json.loads(metadata["notes"]))) or ()
 
+    def unit(self, key: str) -> str | None:
+        """The unit of length of the Signature under `key`; None where it has none, or there is none."""
+        return self._read(key, lambda file, metadata: json.loads(metadata.get("unit", "null")))
+
     @staticmethod
     def _encode(value: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         return encode(value)

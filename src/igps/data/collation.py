@@ -70,6 +70,7 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
         labels=labels,
         ids=tuple(item.id for item in labelled),
         meshes=None if meshes is None else tuple(meshes),
+        units=tuple(s.unit for s in signatures),
     )
 
 

@@ -254,6 +254,13 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """The notes of all meshes; of files that are known from `precompute` without reading them again."""
         return [() if hit is None else hit.notes for hit in self._found()]
 
+    def units(self) -> list[str | None]:
+        """The unit of length of each body, as cached Signatures tell; None where its file tells none."""
+        if self._at_hand is not None:
+            return [self._at_hand[number].unit for number in self._numbers]
+        cache = SignatureCache(self.pipeline.cache_dir)
+        return [None if hit is None else cache.unit(hit.key) for hit in self._found()]
+
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
         """Some of the items as a batch, with or without their meshes."""
         return collate([self[i] for i in indices], [self.mesh(i) for i in indices] if meshes else None)

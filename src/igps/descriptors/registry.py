@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from igps.descriptors.canonical_form import CanonicalForm
 from igps.descriptors.d2 import D2
 from igps.descriptors.geodesic_spectral import GeodesicSpectral
 from igps.descriptors.gps import gps
+from igps.descriptors.individual import SIDE, SIZE, IndividualDescriptor, Mirror, Size, keeps_size
 from igps.descriptors.inner_distance import InnerDistance
 from igps.descriptors.interior import interior
 from igps.descriptors.local_diameter_centricity import LocalDiameterCentricity
@@ -43,7 +44,8 @@ _MAKERS: Mapping[str, Callable[[], Descriptor]] = {
 NAMES: tuple[str, ...] = tuple(_MAKERS)
 """The names of the library's descriptors of any body."""
 
-_NAME = re.compile(r"\w{1,100}")
+_MARKED = re.compile(r"(.*?)((?:\+size|\+side)*)", re.DOTALL)
+_NAME = re.compile(r"\w{1,100}(\+side)?(\+size)?")
 
 # Descriptors of bodies that bring attributes of their own.
 _OF_ATTRIBUTES: Mapping[str, Callable[[], Descriptor]] = {"molecular": molecular}
@@ -67,23 +69,51 @@ def load(path: str | Path) -> Descriptor:
     if not _NAME.fullmatch(module.name):  # files are called after it
         raise ValueError(f"{path}: expected a descriptor's name of letters, digits and _, got {module.name[:80]!r}.")
     module.card = card
+    module.scale = card.get("scale")
     return module
 
 
-def descriptor(which: str | Path | Descriptor) -> Descriptor:
+def descriptor(
+    which: str | Path | Descriptor,
+    *,
+    size: Size = "ignore",
+    mirror: Mirror = "same",
+    units: Sequence[str | None] | None = None,
+) -> Descriptor:
     """A descriptor by its name or file, in evaluation mode; one that is given is returned as it is.
 
     Example:
         >>> descriptor("interior").requirements.n_eigenpairs
         250
+        >>> descriptor("rich", size="keep", mirror="distinct").name, descriptor("rich+size").name
+        ('rich+side+size', 'rich+size')
 
     Args:
         which: one of `NAMES`, or "molecular"; or a file, see `load`; or "package.module:NAME", where NAME is a
-            descriptor of your own or makes one when called; or a descriptor.
+            descriptor of your own or makes one when called; or a descriptor. "+size" behind a name keeps size, "+side"
+            tells mirror images apart.
+        size: "keep" lets differences in size count, see `IndividualDescriptor`; "auto" where all bodies have a unit of
+            length.
+        mirror: "distinct" tells a body from its mirror image.
+        units: of the bodies, for size="auto", see `SignatureDataset.units`.
 
     Raises:
         ValueError: no descriptor has this name, or see `load`.
     """
+    if size == "auto" and units is None:
+        raise ValueError('size: expected "keep" or "ignore", or the units of the bodies beside "auto", got none.')
+    marks = ""
+    if isinstance(which, str):
+        which, marks = _MARKED.fullmatch(which).groups()  # type: ignore[union-attr] (it matches anything)
+    plain = _plain(which)
+    with_size = SIZE in marks or (size == "keep" if units is None else keeps_size(size, units)[0])
+    with_side = SIDE in marks or mirror == "distinct"
+    if not (with_size or with_side):
+        return plain
+    return IndividualDescriptor(plain, size=with_size, side=with_side).eval()
+
+
+def _plain(which: str | Path | Descriptor) -> Descriptor:
     if isinstance(which, Descriptor):
         return which
     if is_file(which):

@@ -69,6 +69,7 @@ class SpectralGromovWasserstein(BodyDescriptor):
 
     def __post_init__(self) -> None:
         super().__init__()
+        self.description_shape = (len(self.times), -1)
         _check_samples(self.samples, self.n_samples)
         check_one_of(get_args(Bound), bound=self.bound)
         _check_times(self.times)

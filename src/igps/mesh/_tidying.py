@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 from numpy.typing import NDArray
 
 from igps.mesh.mesh import Mesh, MeshError
-from igps.mesh.surface import compact, diagonal, face_areas, face_parts, undirected_edges
+from igps.mesh.surface import compact, diagonal, face_areas, face_parts, signed_volume, undirected_edges
 from igps.mesh.winding import winding_number
 
 # Vertices closer than this share of the bounding box's diagonal are one.
@@ -110,9 +112,15 @@ def _without_fins(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> ND
 
 
 def without_hidden(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str], *, cavities: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Without the parts that lie inside the largest, if that is closed."""
+    """Without the parts that lie inside the largest, if that is closed.
+
+    Args:
+        vertices, faces: the surface.
+        notes: what was done is added.
+        cavities: keep those of them that are closed and lie in no other, turned so that they bound hollows.
+    """
     part, areas = face_parts(vertices, faces)
     if len(areas) < 2:
         return vertices, faces
@@ -127,5 +135,20 @@ def without_hidden(
     hidden = np.bincount(part, weights=~within[faces].all(axis=1), minlength=len(areas)) == 0
     if not hidden.any():
         return vertices, faces
-    notes.append(f"dropped {int(hidden.sum())} parts hidden inside")
+    if cavities:
+        faces = faces.copy()
+        kept: list[Mesh] = []
+        for k in sorted(np.flatnonzero(hidden), key=lambda k: -areas[k]):
+            own = part == k
+            with contextlib.suppress(MeshError):
+                cavity = Mesh(*compact(vertices, faces[own]))
+                if any((winding_number(one.vertices, one.faces, cavity.vertices) > 0.5).any() for one in kept):
+                    continue
+                kept.append(cavity)
+                hidden[k] = False
+                if signed_volume(*compact(vertices, faces[own])) > 0:
+                    notes.append("turned the surface of a cavity towards the inside")
+                    faces[own] = faces[own][:, ::-1]
+    if hidden.any():
+        notes.append(f"dropped {int(hidden.sum())} parts hidden inside")
     return compact(vertices, faces[~hidden[part]])

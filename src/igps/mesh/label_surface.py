@@ -39,7 +39,12 @@ _TOUCHING = np.ones((3, 3, 3), dtype=bool)  # voxels that share a corner belong 
 
 
 def voxel_surface(
-    inside: ArrayLike, affine: ArrayLike | None = None, *, max_vertices: int = MAX_VERTICES, name: str = "volume"
+    inside: ArrayLike,
+    affine: ArrayLike | None = None,
+    *,
+    max_vertices: int = MAX_VERTICES,
+    cavities: bool = False,
+    name: str = "volume",
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], tuple[str, ...]]:
     """The closed, outward surface of the voxels of a body.
 
@@ -59,6 +64,7 @@ def voxel_surface(
         inside: (X, Y, Z), true at voxels whose centre lies in the body.
         affine: (4, 4) from indices of voxels to the world; may shear and mirror. None for voxels of side 1.
         max_vertices: about so many vertices at most.
+        cavities: hollows of the size of a label, too, get a surface, turned towards the inside.
         name: what error messages call the body.
 
     Returns:
@@ -82,7 +88,7 @@ def voxel_surface(
         )
     low = np.array([part.start for part in box[0]], dtype=np.float64)
     notes: list[str] = []
-    mask = _whole(mask[box[0]], notes)
+    mask, hollows = _whole(mask[box[0]], notes, LEAST_VOXELS if cavities else None)
     share, factor = _coarsened(mask, spacing, max_vertices)
     mask = _joined(share >= 0.5)
     share = np.pad(np.where(mask, np.maximum(share, 0.5), share), PAD)
@@ -96,7 +102,13 @@ def voxel_surface(
     index = (vertices / sides - PAD) * factor + (factor - 1) / 2 + low
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = np.ascontiguousarray(faces[:, ::-1])
-    return index @ matrix[:3, :3].T + matrix[:3, 3], faces, tuple(notes)
+    surfaces = [(index @ matrix[:3, :3].T + matrix[:3, 3], faces)]
+    matrix = matrix @ np.block([[np.eye(3), low[:, None]], [np.zeros(3), 1]])
+    for hollow in hollows:
+        points, inwards, _ = voxel_surface(hollow, matrix, max_vertices=max_vertices, name=name)
+        surfaces.append((points, inwards[:, ::-1] + sum(len(other) for other, _ in surfaces)))
+    vertices, faces = (np.concatenate(arrays) for arrays in zip(*surfaces, strict=True))
+    return vertices, faces, tuple(notes)
 
 
 def checked_spacing(affine: NDArray[np.float64], name: str) -> NDArray[np.float64]:
@@ -116,8 +128,10 @@ def checked_spacing(affine: NDArray[np.float64], name: str) -> NDArray[np.float6
     return spacing
 
 
-def _whole(mask: NDArray[np.bool_], notes: list[str]) -> NDArray[np.bool_]:
-    """Without islands, and with holes filled."""
+def _whole(
+    mask: NDArray[np.bool_], notes: list[str], least: int | None
+) -> tuple[NDArray[np.bool_], list[NDArray[np.bool_]]]:
+    """Without islands, and with holes filled; and the holes of at least so many voxels, none if None."""
     label, island, size = _islands(mask)
     if len(island):
         mask = mask & ~np.isin(label, island)
@@ -127,10 +141,16 @@ def _whole(mask: NDArray[np.bool_], notes: list[str]) -> NDArray[np.bool_]:
     # What is outside shares faces.
     hollow, n_hollow = ndimage.label(np.pad(~mask, 1, constant_values=True))
     if n_hollow > 1:
-        filled = (hollow != hollow[0, 0, 0])[1:-1, 1:-1, 1:-1]
-        notes.append(f"filled holes of {np.count_nonzero(filled) - np.count_nonzero(mask)} voxels")
-        return np.asarray(filled)
-    return mask
+        hollow_outside = hollow[0, 0, 0]
+        hollow = hollow[1:-1, 1:-1, 1:-1]
+        filled = hollow != hollow_outside
+        size = np.bincount(hollow.reshape(-1))
+        size[[0, hollow_outside]] = 0
+        kept = [] if least is None else np.flatnonzero(size >= least).tolist()
+        if n_filled := int(size.sum() - size[kept].sum()):
+            notes.append(f"filled holes of {n_filled} voxels")
+        return np.asarray(filled), [hollow == k for k in kept]
+    return mask, []
 
 
 def _islands(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64]]:

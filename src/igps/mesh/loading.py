@@ -193,6 +193,7 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
         how=options.mend,
         least_vertices=least_vertices,
         normals=raw.normals,
+        cavities=options.cavities,
         name=name,
         notes=notes,
     )

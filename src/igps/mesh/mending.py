@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
+from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -24,6 +26,7 @@ from igps.mesh.watertight import crosses_itself, watertight
 logger = logging.getLogger(__name__)
 
 Mending = Literal["auto", "never", "always"]
+Cavities = Literal["fill", "keep"]
 Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertight"]
 
 MENDING_VERSION = 5
@@ -52,6 +55,7 @@ def mend(
     how: Mending = "auto",
     least_vertices: int = 0,
     normals: NDArray[np.float64] | None = None,
+    cavities: Cavities = "fill",
     name: str = "mesh",
     notes: tuple[str, ...] = (),
 ) -> Mesh:
@@ -72,6 +76,8 @@ def mend(
             side nearer than a cell, as the coils of a spring do.
         least_vertices: such as the number of eigenpairs plus two; not with "never".
         normals: (V, 3) of a cloud of points, if known.
+        cavities: "fill" drops closed parts inside the body; "keep" takes them for the surfaces of hollows. What is made
+            watertight is filled.
         name: what error messages call the surface, usually its file.
         notes: what was done to it before.
 
@@ -82,7 +88,7 @@ def mend(
     if how not in ("auto", "never", "always"):
         raise ValueError(f"how: expected 'auto', 'never' or 'always', got {how!r}.")
     if how == "never":
-        return Mesh(vertices, np.asarray(faces), name=name, notes=notes)
+        return Mesh(vertices, np.asarray(faces), name=name, notes=notes, cavities=cavities == "keep")
     if faces is None or np.size(faces) == 0:
         _check_cloud(vertices, name)
         mesh = watertight(vertices, normals=normals, name=name)
@@ -90,9 +96,10 @@ def mend(
         check_arrays(vertices, faces, name)
         vertices, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
         _check_extent(vertices, triangles, name)
-        mesh = _remade(vertices, triangles, name) if how == "always" else _mended(vertices, triangles, name)
-    if len(mesh.vertices) < least_vertices:
-        mesh = subdivided(mesh, _PLENTY * least_vertices)
+        mesh = (_remade if how == "always" else _mended)(vertices, triangles, name, cavities == "keep")
+    n_outer = int(mesh.outer()[1].sum())
+    if n_outer < least_vertices:
+        mesh = subdivided(mesh, _PLENTY * least_vertices + len(mesh.vertices) - n_outer)
     for note in mesh.notes:
         logger.info("%s: %s", name, note)
     return mesh.told(notes=notes)
@@ -104,40 +111,43 @@ def mended_by(notes: Iterable[str]) -> tuple[Step, ...]:
     return tuple(dict.fromkeys(steps))
 
 
-def _mended(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> Mesh:
+def _mended(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str, cavities: bool) -> Mesh:
     notes: list[str] = []
     given = vertices, faces
-    for step in (None, welded, tidied, with_small_holes_filled, without_hidden):
+    hidden = partial(without_hidden, cavities=cavities)
+    for step in (None, welded, tidied, with_small_holes_filled, hidden):
         if step is not None and len(faces):
             vertices, faces = step(vertices, faces, notes)
-        if body := _body(vertices, faces, notes, name):
+        if body := _body(vertices, faces, notes, name, cavities):
             return body
     # What may go wrong with a heap of parts is tried, and left behind where it makes no body.
     for attempt, surface, done in ((without_walls, (vertices, faces), list(notes)), (united, given, [])):
-        if len(surface[1]) and (body := _body(*attempt(*surface, done), done, name)):
+        if len(surface[1]) and (body := _body(*attempt(*surface, done), done, name, cavities)):
             return body
     body = watertight(_smoothed(vertices, faces, notes), faces, name=name)
     return body.told(notes=tuple(notes))
 
 
-def _body(vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str], name: str) -> Mesh | None:
+def _body(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str], name: str, cavities: bool
+) -> Mesh | None:
     """The body that these are, smoothed if it is noisy; None if they are none."""
     try:
-        mesh = Mesh(vertices, faces, name=name, notes=tuple(notes))
+        mesh = Mesh(vertices, faces, name=name, notes=tuple(notes), cavities=cavities)
     except MeshError:
         return None
     smooth = _smoothed(mesh.vertices, mesh.faces, notes)
-    return mesh if smooth is mesh.vertices else Mesh(smooth, mesh.faces, name=name, notes=tuple(notes))
+    return mesh if smooth is mesh.vertices else replace(mesh, vertices=smooth, notes=tuple(notes))
 
 
-def _remade(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> Mesh:
+def _remade(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str, cavities: bool) -> Mesh:
     """The surface as it is, welded or smoothed, if it bounds one body then; otherwise what a grid makes of it."""
     notes: list[str] = []
     neat, triangles = vertices, faces
     for step in (None, welded):
         if step is not None:
             neat, triangles = step(vertices, faces, notes)
-        if (body := _body(neat, triangles, notes, name)) and not crosses_itself(body.vertices, body.faces):
+        if (body := _body(neat, triangles, notes, name, cavities)) and not crosses_itself(body.vertices, body.faces):
             return body
         notes = []
     smooth = _smoothed(neat, triangles, notes)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import logging
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from igps.mesh.surface import (
+    compact,
     components,
     diagonal,
     directed_edges,
@@ -20,8 +22,16 @@ from igps.mesh.surface import (
     signed_volume,
     undirected_edges,
 )
+from igps.mesh.winding import winding_number
 
 logger = logging.getLogger(__name__)
+
+MILLIMETRES: Mapping[str, float] = {
+    "m": 1e3, "cm": 10.0, "mm": 1.0, "µm": 1e-3, "um": 1e-3, "micron": 1e-3, "nm": 1e-6, "Å": 1e-7, "in": 25.4,
+    "inch": 25.4, "inches": 25.4, "ft": 304.8, "feet": 304.8, "meter": 1e3, "meters": 1e3, "centimeters": 10.0,
+    "millimeter": 1.0, "millimeters": 1.0, "\\u00b5m": 1e-3,
+}  # fmt: skip
+"""Of a unit of length, by the names that files and libraries call it."""
 
 # What the reader of a message is to do.
 _REPAIR = 'LoadOptions(mend="auto"), on the command line --mend auto,'
@@ -66,6 +76,7 @@ class Mesh:
         allow_open: accept boundary edges; the winding number then decides what is inside.
         notes: what was done to the mesh on its way here, in words.
         unit: of length, such as "mm"; None where it is not known.
+        cavities: accept closed surfaces inside the largest, turned the other way, which bound hollows of the body.
 
     Raises:
         MeshError: no faces, NaN or infinite vertices, out-of-range or repeated indices, unreferenced vertices,
@@ -79,13 +90,14 @@ class Mesh:
     allow_open: bool = False
     notes: tuple[str, ...] = field(default=())
     unit: str | None = None
+    cavities: bool = False
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype=np.float64, order="C")
         faces = np.array(self.faces)
         check_arrays(vertices, faces, self.name)
         faces = np.ascontiguousarray(faces, dtype=np.int64)
-        _check_topology(faces, len(vertices), self.name, self.allow_open)
+        _check_topology(faces, len(vertices), self.name, self.allow_open, self.cavities)
         check_size(vertices, self.name)
         volume = signed_volume(vertices, faces)
         if abs(volume) <= _FLAT * diagonal(vertices) ** 3:
@@ -97,6 +109,8 @@ class Mesh:
             faces = np.ascontiguousarray(faces[:, ::-1])
             object.__setattr__(self, "notes", (*self.notes, "was inside out: all faces turned"))
             logger.info("%s: was inside out, all faces turned", self.name)
+        if self.cavities:
+            _check_cavities(vertices, faces, self.name)
         vertices.flags.writeable = faces.flags.writeable = False
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
@@ -143,6 +157,17 @@ class Mesh:
         object.__setattr__(other, "faces", rank[self.faces])
         return other
 
+    def outer(self) -> tuple[Mesh, NDArray[np.bool_]]:
+        """The body without its cavities, and which of the vertices (V,) are its."""
+        n_components, owner = components(self.faces, len(self.vertices)) if self.cavities else (1, None)
+        if n_components == 1:
+            return self, np.ones(len(self.vertices), dtype=bool)
+        assert owner is not None
+        surfaces = [self.faces[owner[self.faces[:, 0]] == k] for k in range(n_components)]
+        outermost = int(np.argmax([signed_volume(self.vertices, faces) for faces in surfaces]))
+        vertices, faces = compact(self.vertices, surfaces[outermost])
+        return replace(self, vertices=vertices, faces=faces, cavities=False), owner == outermost
+
     @cached_property
     def area(self) -> float:
         """Surface area, length²."""
@@ -160,7 +185,7 @@ class Mesh:
 
     @property
     def genus(self) -> int:
-        """Number of handles, of a closed mesh.
+        """Number of handles, of a closed mesh; of one with cavities those of all its surfaces.
 
         Raises:
             MeshError: the mesh is open.
@@ -213,7 +238,7 @@ def check_size(vertices: NDArray[np.float64], name: str) -> None:
         )
 
 
-def _check_topology(faces: NDArray[np.int64], n_vertices: int, name: str, allow_open: bool) -> None:
+def _check_topology(faces: NDArray[np.int64], n_vertices: int, name: str, allow_open: bool, cavities: bool) -> None:
     repeated = int((faces == np.roll(faces, 1, axis=1)).any(axis=1).sum())
     if repeated:
         raise MeshError(f"{name}: {repeated} faces use a vertex twice. Read the file with {_REPAIR} to drop them.")
@@ -244,9 +269,29 @@ def _check_topology(faces: NDArray[np.int64], n_vertices: int, name: str, allow_
             f"Read the file with {_REPAIR} to orient the faces."
         )
     n_components, _ = components(faces, n_vertices)
-    if n_components > 1:
+    if n_components > 1 and not cavities:
         raise MeshError(
             f"{name}: {n_components} connected components; the commute time between them is infinite. Read the "
             "file with LoadOptions(component='largest'), on the command line --component largest, to keep one; with "
             f"{_REPAIR} if coincident vertices are merely not welded; or join them."
         )
+
+
+def _check_cavities(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> None:
+    n_components, owner = components(faces, len(vertices))
+    if n_components == 1:
+        return
+    owner = owner[faces[:, 0]]
+    surfaces = [compact(vertices, faces[owner == k]) for k in range(n_components)]
+    volumes = [signed_volume(*surface) for surface in surfaces]
+    outer = int(np.argmax(volumes))
+    for k, (points, _) in enumerate(surfaces):
+        # About a point of a cavity's own surface the winding number of that surface is anything from 0 to 1
+        around = {other: winding_number(*surfaces[other], points) for other in range(n_components) if other != k}
+        if k != outer and (volumes[k] >= 0 or around.pop(outer).min() < 0.5 or any(
+            abs(winding).max() > 0.5 for winding in around.values()
+        )):  # fmt: skip
+            raise MeshError(
+                f"{name}: one of {n_components} closed surfaces is no cavity of the body: it is turned outwards, lies "
+                f"outside the largest, or in another cavity. Read the file with {_REPAIR}, or without cavities."
+            )

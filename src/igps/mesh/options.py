@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 
-from igps.mesh.mending import Mending
+from igps.mesh.mending import Cavities, Mending
 
 Component = Literal["largest"]
 BodyKind = Literal["whole", "labels", "objects", "pieces", "chains", "models", "assembly"]
@@ -41,6 +41,8 @@ class LoadOptions:
         max_unpacked: bytes that a file may unpack to.
         names: a table of the names of labels, see `read_label_names`; None for those of the volume, or beside it.
         threshold: a voxel of at least this probability belongs to the body, in volumes of probabilities.
+        cavities: "fill" takes a hollow body for the full one; "keep" lets the surfaces of its hollows bound it too, of
+            meshes and of labels of volumes.
 
     Raises:
         ValueError: a value that is not among those.
@@ -53,10 +55,13 @@ class LoadOptions:
     max_unpacked: int = MAX_UNPACKED
     names: str | None = None
     threshold: float = 0.5
+    cavities: Cavities = "fill"
 
     def __post_init__(self) -> None:
         if self.mend not in get_args(Mending):
             raise ValueError(f"mend: expected 'auto', 'never' or 'always', got {self.mend!r}.")
+        if self.cavities not in get_args(Cavities):
+            raise ValueError(f"cavities: expected 'fill' or 'keep', got {self.cavities!r}.")
         if self.component is not None and self.component not in get_args(Component):
             raise ValueError(f"component: expected 'largest' or None, got {self.component!r}.")
         if self.bodies is not None and self.bodies not in get_args(BodyKind):
@@ -68,6 +73,10 @@ class LoadOptions:
 
     def as_dict(self) -> dict[str, object]:
         """All on which a body depends, for the keys of caches; what says no more than the default is left out."""
-        said = {"bodies": self.bodies is not None, "threshold": self.threshold != 0.5}
+        said = {
+            "bodies": self.bodies is not None,
+            "threshold": self.threshold != 0.5,
+            "cavities": self.cavities != "fill",
+        }
         left_out = {"max_unpacked", "names", *(name for name, is_said in said.items() if not is_said)}
         return {name: value for name, value in asdict(self).items() if name not in left_out}

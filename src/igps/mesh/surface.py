@@ -138,8 +138,8 @@ def compact(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[ND
 
 
 def genus(faces: NDArray[np.int64], n_vertices: int) -> int:
-    """Handles of a closed connected surface, by Euler's formula V − E + F = 2 − 2 genus with 2E = 3F."""
-    return (2 - (n_vertices - len(faces) // 2)) // 2
+    """Handles of a closed surface of C pieces, by Euler's formula V − E + F = 2 C − 2 genus with 2E = 3F."""
+    return components(faces, n_vertices)[0] - (n_vertices - len(faces) // 2) // 2
 
 
 def has_area(corners: NDArray[np.float64]) -> NDArray[np.bool_]:

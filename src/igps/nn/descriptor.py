@@ -67,6 +67,9 @@ class Descriptor(Specified, ABC):
             histograms; what is near by `distances` must be among the few hundred that are nearest by it. None where
             neither is: an index compares with all.
         card: what is told of one that was fitted, by name.
+        scale: the median of its distances between bodies of one class, by which size and side are weighed against it,
+            see `IndividualDescriptor`; None if it is not known.
+        description_shape: of the entries of a description in the eyes of `distances`, (-1,) where it is a row.
     """
 
     name: str = "descriptor"
@@ -75,6 +78,8 @@ class Descriptor(Specified, ABC):
     requirements: Requirements = Requirements(whole_spectrum=True)
     searched_by: SearchDistance | None = None
     card: Mapping[str, Any] = MappingProxyType({})
+    scale: float | None = None
+    description_shape: tuple[int, ...] = (-1,)
 
     @property
     def n_features(self) -> int:
@@ -118,6 +123,14 @@ class Descriptor(Specified, ABC):
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, ...) and (G, ...) descriptions to (Q, G) distances ≥ 0, smaller is closer; χ² unless redefined."""
         return chi_square(queries, gallery)
+
+    def short(self, descriptions: Tensor) -> Tensor:
+        """(N, D) descriptions to (N, ≤ 256), for engines that take no more and compare by the cosine.
+
+        Raises:
+            ValueError: the descriptor has none.
+        """
+        raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {self.name!r}.")
 
 
 class BodyDescriptor(Descriptor):

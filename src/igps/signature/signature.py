@@ -154,6 +154,11 @@ class Signature:
 def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | None = None) -> Signature:
     """Sample the eigenfunctions of a mesh in its interior and on its surface (Rustamov 2010, section 3).
 
+    Of a body with cavities they are those of its outer surface, carried by the mean value coordinates of that to the
+    wall and to the surfaces of the cavities. So a cavity is a part of the inside that is missing: as it shrinks, the
+    Signature becomes that of the full body, and the two sides of a thin wall lie side by side. With eigenfunctions of
+    its own each surface would be at right angles to the others, at an infinite commute time.
+
     Example:
         The first eigenvalues of the unit sphere are l (l + 1), each 2 l + 1 times.
 
@@ -174,26 +179,33 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
     """
     config = (config or SignatureConfig()).resolved()
     mesh = Mesh.of(mesh).numbered_by_faces()  # to rounding, results depend on the numbers
+    unit = mesh.unit
     if config.max_vertices is not None:
         mesh = simplify(mesh, config.max_vertices)
-    if len(mesh.vertices) < config.n_kept + 2:
+    outer, is_outer = mesh.outer()
+    if len(outer.vertices) < config.n_kept + 2:
         raise MeshError(
-            f"{mesh.name}: {len(mesh.vertices)} vertices are too few for {config.n_kept} eigenpairs; at least "
+            f"{mesh.name}: {len(outer.vertices)} vertices are too few for {config.n_kept} eigenpairs; at least "
             f"{config.n_kept + 2} are needed. Subdivide the mesh or lower n_eigenpairs."
         )
     points = interior_samples(mesh, config.resolution, config.min_samples)
-    spectrum, notes = _spectrum(mesh, config)
-    surface = _surface(mesh, spectrum, config)
+    spectrum, notes = _spectrum(outer, config)
     # The accuracy is that of interior distances, which are those between rows of eigenfunctions so weighted.
     extension = Extension(
-        mesh.vertices,
-        mesh.faces,
+        outer.vertices,
+        outer.faces,
         spectrum.eigenfunctions,
         divisors=np.sqrt(spectrum.eigenvalues),
         accuracy=config.accuracy,
     )
     eigenvalues, residual = spectrum.eigenvalues, spectrum.residual
-    del spectrum  # of a large mesh the eigenfunctions fill more memory than all else
+    functions = spectrum.eigenfunctions
+    if not is_outer.all():  # a cavity is a part of the inside that is missing
+        functions = np.empty((len(mesh.vertices), len(eigenvalues)))
+        functions[is_outer] = spectrum.eigenfunctions
+        functions[~is_outer] = extension(mesh.vertices[~is_outer]) * np.sqrt(eigenvalues)
+    surface = _surface(mesh, functions, eigenvalues, config)
+    del spectrum, functions  # of a large mesh the eigenfunctions fill more memory than all else
     interior = _interior(mesh, extension, eigenvalues, points, config)
     for where, samples in (("interior", interior), ("surface", surface)):
         if not np.isfinite(samples.eigenfunctions).all():
@@ -211,7 +223,7 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
         name=mesh.name,
         notes=(*mesh.notes, *notes),
         residual=residual,
-        unit=mesh.unit,
+        unit=unit,
     )
 
 
@@ -258,9 +270,11 @@ def _interior(
     return Samples(points, np.asarray(values, dtype=np.float32), interior_attributes(mesh, points, config.attributes))
 
 
-def _surface(mesh: Mesh, spectrum: Spectrum, config: SignatureConfig) -> Samples:
+def _surface(
+    mesh: Mesh, functions: NDArray[np.float64], eigenvalues: NDArray[np.float64], config: SignatureConfig
+) -> Samples:
     marks = shares_around(mesh.faces, face_areas(mesh.vertices, mesh.faces))
-    order = places(spectrum.eigenfunctions, spectrum.eigenvalues, mesh.area, marks)
+    order = places(functions, eigenvalues, mesh.area, marks)
     points = surface_points(mesh, config.n_surface_samples, config.seed, order)
-    values = points.interpolate(spectrum.eigenfunctions).astype(np.float32)
+    values = points.interpolate(functions).astype(np.float32)
     return Samples(points.positions, values, surface_attributes(mesh, points.face, config.attributes))

@@ -16,6 +16,7 @@ from igps.nn.axes import (
     InteriorDistance,
     PairAxis,
     PairCosines,
+    PairTwist,
     PointAxis,
     Potential,
     axis_of,
@@ -119,6 +120,7 @@ def test_needs() -> None:
     assert EuclideanDistance().requirements(fine) == Requirements()
     assert PairCosines().requirements(fine) == Requirements(attributes=("surface_direction",))
     assert EmbeddedPairCosines().requirements(fine) == Requirements(n_eigenpairs=9)
+    assert PairTwist().requirements(fine) == Requirements(attributes=("surface_direction",))
     assert BallRadius().requirements(fine) == Requirements(attributes=("surface_direction",))
     assert Potential(embedding=coarse).requirements(fine) == Requirements(n_eigenpairs=2)
     assert Attribute("depth", [0.1]).requirements(fine) == Requirements(attributes=("depth",))
@@ -127,7 +129,7 @@ def test_needs() -> None:
 
 def test_shapes() -> None:
     assert InteriorDistance(7).shape == (7,)
-    assert EuclideanDistance(3).shape == (3,)
+    assert EuclideanDistance(3).shape == PairTwist(3).shape == (3,)
     assert PairCosines(4).shape == EmbeddedPairCosines(4).shape == (4, 4, 4)
 
 
@@ -147,6 +149,7 @@ def test_a_wrong_name_lists_the_axes() -> None:
     [
         (lambda: InteriorDistance(1), "n_bins: expected at least 2, got 1"),
         (lambda: EuclideanDistance(0), "n_bins: expected at least 2, got 0"),
+        (lambda: PairTwist(1), "n_bins: expected at least 2, got 1"),
         (lambda: PairCosines(1), "n_bins: expected at least 2, got 1"),
         (lambda: EmbeddedPairCosines(-3), "n_bins: expected at least 2, got -3"),
         (lambda: InteriorDistance(reach=0.0), "a positive range"),

@@ -16,14 +16,14 @@ from conftest import torch_threads
 from igps import _threads as threads
 from igps.nn._kernels import pairs as pair_module
 from igps.nn._kernels.pairs import class_pairs
-from igps.nn.axes import PairValues, euclidean_distances, oriented_pairs, point_pair_features
+from igps.nn.axes import PairValues, euclidean_distances, oriented_pairs, pair_twists, point_pair_features
 from igps.nn.histograms import joint_histogram
-from loops import Axis, cosines, distances, pair_histogram_by_loops
+from loops import Axis, cosines, distances, pair_histogram_by_loops, twists
 
 FEW = [0.3, 0.5, 0.52, 1.9]
 EQUAL = [0.25, 0.75, 1.25, 1.75, 2.25]
 MANY = [0.1, 0.4, 0.401, 0.4012, 0.4013, 0.7, 0.9, 1.0, 1.1, 1.15, 1.3, 1.5, 1.6, 1.9, 2.2, 2.9]
-TOWARDS, AMONG = [-0.7, 0.1, 0.6], [-0.5, 0.3]
+TOWARDS, AMONG, TWISTS = [-0.7, 0.1, 0.6], [-0.5, 0.3], [-0.4, 0.0, 0.4]
 BACK_ENDS = ["compiled", "torch", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(),
                                                                                 reason="no CUDA device"))]  # fmt: skip
 
@@ -92,6 +92,10 @@ KINDS: dict[str, tuple[Callable[..., PairValues], Callable[..., list[Axis]]]] = 
         ),
         lambda s: list(zip(cosines(s["points"], s["directions"]), (TOWARDS, TOWARDS, AMONG), strict=True)),
     ),
+    "twists": (
+        lambda s: pair_twists(s["points"], s["directions"], centres(TWISTS, s["points"])),
+        lambda s: [(twists(s["points"], s["directions"]), TWISTS)],
+    ),
     "cosines of five": (
         lambda s: oriented_pairs(
             s["coordinates"], normalize(s["coordinates"].roll(1, 0), dim=1), *[centres(AMONG, s["points"])] * 2
@@ -102,6 +106,7 @@ KINDS: dict[str, tuple[Callable[..., PairValues], Callable[..., list[Axis]]]] = 
 LAYOUTS = [
     ["equal"], ["many"], ["own"], ["few", "many"], ["equal", "own"], ["few", "equal", "many"], ["cosines"],
     ["few", "cosines"], ["cosines", "equal"], ["own", "cosines", "many"], ["cosines", "cosines of five"],
+    ["twists"], ["equal", "twists"],
 ]  # fmt: skip
 
 
@@ -221,6 +226,15 @@ def test_points_that_coincide_have_no_line(device: str) -> None:
     angles = torch.tensor([-1.0, 0.0, 1.0], device=device)
     result = joint_histogram(points.new_ones(2, 1), [oriented_pairs(points, directions, angles, angles)])
     assert float(result[0, 1, 1].sum()) == pytest.approx(1)
+
+
+def test_a_reflection_turns_the_order_of_twists(device: str) -> None:
+    given = {name: values.to(device) for name, values in some().items()}
+    mirror = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64, device=device)
+    mirrored = {**given, "points": given["points"] * mirror, "directions": given["directions"] * mirror}
+    counts = counted(["equal", "twists"], given)
+    assert float((counts - counts.flip(-1)).abs().max()) > 1e-3
+    torch.testing.assert_close(counted(["equal", "twists"], mirrored), counts.flip(-1))
 
 
 @pytest.mark.parametrize("layout", [["cosines"], ["few", "cosines"]])

@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 
 from igps.mesh.formats.label_names import names_in_extensions
 from igps.mesh.limits import available_memory
-from igps.mesh.mesh import MeshError
+from igps.mesh.mesh import MILLIMETRES, MeshError
 
 # Bytes for each voxel beside those of the file: the labels, and what counts them.
 _BESIDE = 4
 _FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])  # from LPS, which DICOM and ITK have, to RAS
-_TO_MM = {"m": 1000.0, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "micron": 1e-3, "nm": 1e-6, "inch": 25.4}
-_TO_MM |= {"meter": 1000.0, "millimeter": 1.0, "\\u00b5m": 1e-3}
 
 
 @dataclass
@@ -82,7 +80,7 @@ def _nibabel(path: Path) -> RawVolume:
     values = np.asanyarray(image.dataobj).reshape(image.shape[:3])
     affine, names = np.array(image.affine, dtype=np.float64), {}
     if isinstance(image, nibabel.Nifti1Image):
-        affine[:3] *= _TO_MM.get(image.header.get_xyzt_units()[0], 1.0)
+        affine[:3] *= MILLIMETRES.get(image.header.get_xyzt_units()[0], 1.0)
         names = names_in_extensions(
             bytes(extension.get_content_bytes())
             if hasattr(extension, "get_content_bytes")
@@ -202,12 +200,12 @@ def _tiff_spacing(file: Any) -> tuple[float, float, float] | None:
         for axis in "XYZ":
             size = re.search(rf'\bPhysicalSize{axis}="([\d.eE+-]+)"', file.ome_metadata)
             unit = re.search(rf'\bPhysicalSize{axis}Unit="([^"]*)"', file.ome_metadata)
-            scale = _TO_MM.get(unit[1] if unit else "µm")
+            scale = MILLIMETRES.get(unit[1] if unit else "µm")
             if size and scale:
                 found[axis] = float(size[1]) * scale
         return (found["X"], found["Y"], found["Z"]) if len(found) == 3 else None
     about, tags = file.imagej_metadata or {}, file.pages[0].tags
-    scale = _TO_MM.get(str(about.get("unit", "")))
+    scale = MILLIMETRES.get(str(about.get("unit", "")))
     if scale is None or not about.get("spacing") or "XResolution" not in tags or "YResolution" not in tags:
         return None
     sides = [tags[f"{axis}Resolution"].value for axis in "XY"]

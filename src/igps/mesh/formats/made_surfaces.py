@@ -29,10 +29,12 @@ def read_volume(path: Path, options: LoadOptions, part: str | None) -> list[RawB
     if options.bodies in ("whole", "pieces"):
         labelled = np.any([layer > 0 for layer in volume.layers], axis=0).astype(np.uint8)
         volume = replace(volume, layers=(labelled,), names=None, segments=None)
-        return [_body(partial(label_surface, volume, 1), None, volume.unit, partial(volume.measures, 1))]
+        made = partial(label_surface, volume, 1, cavities=options.cavities)
+        return [_body(made, None, volume.unit, partial(volume.measures, 1))]
+    made = partial(label_surface, volume, how=options.mend, cavities=options.cavities)
     names = [body.name for body in volume.bodies] if part is None else [volume.body(part).name]
     return [
-        _body(partial(label_surface, volume, name, how=options.mend), name, volume.unit, partial(volume.measures, name))
+        _body(partial(made, name), name, volume.unit, partial(volume.measures, name))
         for name in names
     ]
 

@@ -20,7 +20,7 @@ from igps.mesh._label_measures import VoxelMeasures, measured
 from igps.mesh.formats._volume_files import READERS, RawVolume
 from igps.mesh.formats.label_names import names_beside, read_label_names
 from igps.mesh.label_surface import MAX_VERTICES, checked_spacing, voxel_surface
-from igps.mesh.mending import Mending, mend
+from igps.mesh.mending import Cavities, Mending, mend
 from igps.mesh.mesh import Mesh, MeshError
 
 logger = logging.getLogger(__name__)
@@ -190,7 +190,12 @@ def label_bodies(volume: LabelVolume) -> list[tuple[int, str, int]]:
 
 
 def label_surface(
-    volume: LabelVolume, part: int | str, *, how: Mending = "auto", max_vertices: int = MAX_VERTICES
+    volume: LabelVolume,
+    part: int | str,
+    *,
+    how: Mending = "auto",
+    max_vertices: int = MAX_VERTICES,
+    cavities: Cavities = "fill",
 ) -> Mesh:
     """The surface of a label as a body in the world, in the unit of the volume, see `voxel_surface`.
 
@@ -199,6 +204,7 @@ def label_surface(
         part: a label, or a name.
         how: what is done to a label of several pieces, see `mend`.
         max_vertices: about so many vertices at most.
+        cavities: "keep" gives hollows a surface, too.
 
     Raises:
         MeshError: no such label, too few voxels, or no body can be made of it.
@@ -208,8 +214,9 @@ def label_surface(
     affine = np.array(volume.affine, dtype=np.float64)
     affine[:3, 3] += affine[:3, :3] @ [side.start for side in body.box]
     mask, affine = _canonical(volume.mask(part), affine)
-    vertices, faces, notes = voxel_surface(mask, affine, max_vertices=max_vertices, name=name)
-    return mend(vertices, faces, how=how, name=name, notes=(*volume.notes, *notes))
+    kept = cavities == "keep"
+    vertices, faces, notes = voxel_surface(mask, affine, max_vertices=max_vertices, cavities=kept, name=name)
+    return mend(vertices, faces, how=how, cavities=cavities, name=name, notes=(*volume.notes, *notes))
 
 
 def _canonical(mask: NDArray[np.bool_], affine: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:

@@ -65,6 +65,17 @@ def oriented_pairs(points: Tensor, directions: Tensor, towards: Tensor, among: T
     return PairValues((points, directions), (towards, towards, among), _cosines, (COSINES,))
 
 
+def pair_twists(points: Tensor, directions: Tensor, centres: Tensor) -> PairValues:
+    """Twists (m × n)·(q − p)/|q − p| of points p and q with directions m and n; a reflection turns their signs.
+
+    Args:
+        points: (N, P, 3) or (P, 3).
+        directions: the same, of length 1 at most.
+        centres: (B,) ascending, in [−1, 1].
+    """
+    return PairValues((points, directions), (centres,), _twists)
+
+
 def cosine_factors(points: Tensor, directions: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Matrices whose products hold u·(y − x), v·(x − y) and u·v of points x and y with directions u and v.
 
@@ -109,6 +120,16 @@ def _cosines(rows: Inputs, columns: Inputs) -> Tensor:
     inverse = torch.where(length > 0, 1 / torch.where(length > 0, length, 1), 0)
     here, there = (here * inverse).clamp(-1, 1), (there * inverse).clamp(-1, 1)
     return torch.stack([torch.maximum(here, there), torch.minimum(here, there), among], dim=-3)
+
+
+def _twists(rows: Inputs, columns: Inputs) -> Tensor:
+    centre = rows[0].detach().mean(dim=-2, keepdim=True)
+    (p, m), (q, n) = (rows[0] - centre, rows[1]), (columns[0] - centre, columns[1])
+    # (m × n)·(q − p) = m·(n × q) − (p × m)·n: products of matrices
+    triple = m @ torch.linalg.cross(n, q).mT - torch.linalg.cross(p, m) @ n.mT
+    squares = (p.unsqueeze(-2) - q.unsqueeze(-3)).square().sum(dim=-1)
+    inverse = torch.where(squares > 0, torch.where(squares > 0, squares, 1).rsqrt(), 0)
+    return (triple * inverse).clamp(-1, 1).unsqueeze(-3)
 
 
 def centres_of(pairs: Sequence[PairValues]) -> list[Tensor]:

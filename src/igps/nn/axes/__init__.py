@@ -6,9 +6,22 @@ folder, exported here, and entered in `AXES` by its name if it has a default lay
 
 from __future__ import annotations
 
-from igps.nn._kernels.pair_values import PairValues, euclidean_distances, oriented_pairs, point_pair_features
+from igps.nn._kernels.pair_values import (
+    PairValues,
+    euclidean_distances,
+    oriented_pairs,
+    pair_twists,
+    point_pair_features,
+)
 from igps.nn.axes.centres import OrderedCentres
-from igps.nn.axes.pairs import EmbeddedPairCosines, EuclideanDistance, InteriorDistance, PairAxis, PairCosines
+from igps.nn.axes.pairs import (
+    EmbeddedPairCosines,
+    EuclideanDistance,
+    InteriorDistance,
+    PairAxis,
+    PairCosines,
+    PairTwist,
+)
 from igps.nn.axes.points import Attribute, BallRadius, PointAxis, Potential
 
 __all__ = [
@@ -21,12 +34,14 @@ __all__ = [
     "OrderedCentres",
     "PairAxis",
     "PairCosines",
+    "PairTwist",
     "PairValues",
     "PointAxis",
     "Potential",
     "axis_of",
     "euclidean_distances",
     "oriented_pairs",
+    "pair_twists",
     "point_pair_features",
 ]
 
@@ -36,6 +51,7 @@ AXES: dict[str, type[PointAxis | PairAxis]] = {
     "euclidean_distance": EuclideanDistance,
     "pair_cosines": PairCosines,
     "embedded_pair_cosines": EmbeddedPairCosines,
+    "pair_twist": PairTwist,
     "ball_radius": BallRadius,
 }
 """The axes that have a layout of their own, by name."""

@@ -1,7 +1,7 @@
 """Axes of pairs: the bins that the pairs of samples of a body are sorted into.
 
-By interior distance, by Euclidean distance, or by the cosines that tell how two samples lie to each other and to the
-surface next to them.
+By interior distance, by Euclidean distance, by the cosines that tell how two samples lie to each other and to the
+surface next to them, or by the twist between them, which alone tells left from right.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from torch import Tensor, nn
 
 from igps.data.requirements import Requirements, embedding_requirements
-from igps.nn._kernels.pair_values import PairValues, euclidean_distances, oriented_pairs
+from igps.nn._kernels.pair_values import PairValues, euclidean_distances, oriented_pairs, pair_twists
 from igps.nn.axes.centres import OrderedCentres, middles
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.specification import Specified
@@ -187,3 +187,36 @@ class EmbeddedPairCosines(_CosineAxes):
     def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Embedded samples, and the directions between them and the embedded samples of the other kind."""
         return self._oriented(features.embedded(embedding), features.embedded_directions(embedding))
+
+
+class PairTwist(PairAxis):
+    """Bins of the signed twist of a pair, the only axis that tells a body from its mirror image.
+
+    With the directions m and n of `PairCosines` at samples p and q it is (m × n)·(q − p)/|q − p|: how one direction is
+    turned against the other about the line between the samples. A reflection turns its sign, and the bins are
+    symmetric, so that the histogram of a mirror image is that of the body with the bins in the other order.
+
+    Args:
+        n_bins: B.
+        reach: ends of the outer bins are at ±`reach`; what lies beyond counts in these.
+        learnable: whether the centres are parameters.
+    """
+
+    def __init__(self, n_bins: int = 6, reach: float = 0.75, *, learnable: bool = False) -> None:
+        super().__init__()
+        if n_bins < 2:
+            raise ValueError(f"n_bins: expected at least 2, got {n_bins}.")
+        self.centres = OrderedCentres(middles(n_bins, 2 * reach, "bins") - reach, learnable)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(B,)."""
+        return (len(self.centres.start),)
+
+    def requirements(self, embedding: nn.Module) -> Requirements:
+        """The directions."""
+        return Requirements(attributes=("surface_direction",))
+
+    def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
+        """Samples over √area, and the directions to the surface."""
+        return pair_twists(features.positions(), features.attribute("surface_direction"), self.centres())

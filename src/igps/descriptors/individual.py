@@ -1,0 +1,143 @@
+"""What tells individuals apart beside their form: size, and which of two mirror images a body is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from igps.data.batch import SignatureBatch
+from igps.mesh.mesh import MILLIMETRES
+from igps.nn.axes import InteriorDistance, PairTwist
+from igps.nn.batch_features import BatchFeatures
+from igps.nn.descriptor import Descriptor
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histograms.pairs import PairHistogram
+from igps.retrieval import euclidean
+
+Size = Literal["auto", "keep", "ignore"]
+Mirror = Literal["same", "distinct"]
+
+SIZE, SIDE = "+size", "+side"
+"""Behind the name of a descriptor that keeps size, and of one that tells a body from its mirror image."""
+
+SCALES: Mapping[str, float] = {
+    "interior": 0.017, "gps": 0.017, "multiscale": 0.03, "rich": 0.026, "pretrained": 0.093, "d2": 0.035,
+    "shape_dna": 17, "volume_shape_dna": 23, "local_diameter_centricity": 0.14, "inner_distance": 0.004,
+    "canonical_form": 0.066, "geodesic_spectral": 0.0014, "spectral_gw": 0.0014,
+}  # fmt: skip
+"""The median distance between generated bodies of one class, by descriptor, as `training.study scales` prints it."""
+
+# Share of that scale which a difference in the other counts by where form is the same; how much more it counts at most;
+# the difference in size of half that; and the difference in twist between poses of one body.
+_SHARE, _MOST, _HALF, _TWIST = 0.25, 5.0, 0.3, 0.002
+
+
+class IndividualDescriptor(Descriptor):
+    """A descriptor that also keeps size, or tells left from right, or both: `NAME+side+size`.
+
+    A description is that of the descriptor, then for the side the odd part of a histogram of `PairTwist`, whose signs a
+    mirror image turns, then for size log √area and log ∛volume, of millimetres where the unit is known. With d the
+    distance of the descriptor, n a quarter of its scale, t the Euclidean distance of the odd parts and s the sum of the
+    two differences in size, that of the bodies is e + 5 (e + n) s/(0.3 + s) of e = d + t. So where bodies are much the
+    same in form size adds to the distance, and else multiplies it, up to six times; no collection is looked at. The
+    numbers of side and size are written so that Euclidean distances of whole descriptions, too, count them like this.
+
+    Args:
+        descriptor: any.
+        size: whether to keep size.
+        side: whether to tell a body from its mirror image.
+        scale: of the descriptor, see `Descriptor`; its own, or that of `SCALES`, if None.
+
+    Raises:
+        ValueError: the scale of the descriptor is not known, or it keeps size already.
+    """
+
+    def __init__(
+        self, descriptor: Descriptor, *, size: bool = False, side: bool = False, scale: float | None = None
+    ) -> None:
+        super().__init__()
+        if size and "scale" not in descriptor.invariant_to:
+            raise ValueError(f"size: expected a descriptor that ignores size by itself, got {descriptor.name!r}.")
+        scale = scale or descriptor.scale or SCALES.get(descriptor.name)
+        if scale is None:
+            raise ValueError(
+                f"size, mirror: expected a descriptor whose distances are known, got {descriptor.name!r}. Set its "
+                "attribute `scale` to the median of its distances between bodies of one class."
+            )
+        self.descriptor, self.scale, self.keeps_size = descriptor, scale, size
+        embedding = SpectralEmbedding(n_eigenpairs=16)
+        self.twists = (
+            PairHistogram([InteriorDistance(6, 3.0), PairTwist()], embedding, n_samples=1000) if side else None
+        )
+        self.name, self.source = descriptor.name + SIDE * side + SIZE * size, descriptor.source
+        # "motion" holds reflections
+        lost = ["scale"] * size + ["motion"] * side
+        self.invariant_to = tuple(one for one in descriptor.invariant_to if one not in lost)
+        self.requirements = descriptor.requirements
+        if self.twists is not None:
+            self.requirements |= self.twists.requirements
+
+    def around(self, descriptor: Descriptor, scale: float) -> IndividualDescriptor:
+        """The same of another descriptor and its scale."""
+        return IndividualDescriptor(descriptor, size=self.keeps_size, side=self.twists is not None, scale=scale).eval()
+
+    def describe(self, batch: SignatureBatch) -> Tensor:
+        """(N, D + 18 + 2), of which side and size are there if they are told."""
+        parts, unit = [self.descriptor(batch).flatten(1)], _SHARE * self.scale
+        if self.twists is not None:
+            counts = self.twists(BatchFeatures(batch, self.training))
+            odd = (counts - counts.flip(-1))[..., counts.shape[-1] // 2 :] / 2
+            parts.append(unit / _TWIST * odd.flatten(1))
+        if self.keeps_size:
+            lengths = [MILLIMETRES.get(one or "mm", 1.0) for one in batch.units or [None] * len(batch)]
+            size = torch.stack([batch.area.log() / 2, batch.volume.log() / 3], dim=1)
+            size = size + torch.tensor(lengths, dtype=size.dtype, device=size.device).log()[:, None]
+            parts.append(unit * _MOST / _HALF * size.to(parts[0].dtype))
+        return torch.cat(parts, dim=1)
+
+    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        """(Q, D) and (G, D) descriptions to (Q, G) distances."""
+        (form, side, size), (forms, sides, sizes) = self._parts(queries), self._parts(gallery)
+        shape = self.descriptor.description_shape
+        found = self.descriptor.distances(form.unflatten(1, shape), forms.unflatten(1, shape))
+        if self.twists is not None:
+            found = found + euclidean(side, sides)
+        if self.keeps_size:
+            unit = _SHARE * self.scale
+            apart = torch.cdist(size, sizes, p=1) / (unit * _MOST)  # over 0.3
+            found = found + _MOST * (found + unit) * apart / (1 + apart)
+        return found
+
+    def short(self, descriptions: Tensor) -> Tensor:
+        """(N, D) descriptions to (N, ≤ 256 + 20): the short ones of the descriptor, and the numbers of side and size.
+
+        Raises:
+            ValueError: the descriptor has no short ones.
+        """
+        form, *others = self._parts(descriptions)
+        return torch.cat([self.descriptor.short(form), *others], dim=1)
+
+    def _parts(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        n_size, n_side = 2 * self.keeps_size, 0 if self.twists is None else self.twists.n_cells // 2
+        n_form = descriptions.shape[1] - n_side - n_size
+        form, side, size = descriptions.split([n_form, n_side, n_size], dim=1)
+        return form, side, size
+
+
+def keeps_size(size: Size, units: Sequence[str | None]) -> tuple[bool, str]:
+    """Whether bodies are to be compared in size, too, and a sentence where their units leave that open.
+
+    Args:
+        size: "auto" keeps it where all have a unit, and ignores it else.
+        units: of the N bodies.
+    """
+    n_known = sum(unit in MILLIMETRES for unit in units)
+    if size == "ignore" or n_known == len(units) or (n_known == 0 and size == "auto"):
+        return size == "keep" or (size == "auto" and n_known > 0), ""
+    some = f"{len(units) - n_known} of {len(units)} bodies have no unit of length"
+    if size == "keep":
+        return True, f"size is kept: {some}; their numbers count as millimetres" if n_known else ""
+    return False, f"size is ignored: {some}; where their numbers are millimetres, say --size keep"

@@ -1,0 +1,169 @@
+"""Size and side beside form: by hand-worked distances, scaled bodies and mirror images."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import igps
+from igps import Mesh, Signature, SignatureConfig, collate, compute_signature
+from igps.cli.retrieval import query, retrieve
+from igps.descriptors.fingerprint import cache_tag
+from igps.descriptors.individual import SCALES, keeps_size
+from igps.gallery.gallery import Gallery
+
+CONFIG = SignatureConfig(n_eigenpairs=250, attributes=("depth", "electrostatic_potential", "surface_direction"))
+SURFACE = trimesh.creation.icosphere(subdivisions=3)
+
+
+def twisted(turns: float, scale: float = 1.0, unit: str | None = None, mirrored: bool = False) -> Mesh:
+    """An ellipsoid whose flat side turns along its axis, which is no mirror image of itself."""
+    x, y, z = (SURFACE.vertices * [1.4, 0.6, 2.2]).T
+    angle = turns * z
+    points = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y, z], axis=1) * scale
+    if mirrored:
+        return Mesh(points * [1, -1, 1], SURFACE.faces[:, ::-1], unit=unit)
+    return Mesh(points, SURFACE.faces, unit=unit)
+
+
+@pytest.fixture(scope="module")
+def signatures() -> dict[str, Signature]:
+    bodies = {
+        "body": twisted(0.5, unit="mm"),
+        "centimetres": twisted(0.5, 0.1, "cm"),
+        "larger": twisted(0.5, 1.1, "mm"),
+        "mirrored": twisted(0.5, unit="mm", mirrored=True),
+        "straight": twisted(0.0, unit="mm"),
+    }
+    return {name: compute_signature(body, CONFIG) for name, body in bodies.items()}
+
+
+def from_body(name: str, signatures: dict[str, Signature]) -> dict[str, float]:
+    """The distances from the first body by a descriptor."""
+    descriptor = igps.descriptor(name)
+    descriptions = torch.cat([descriptor(collate([one])) for one in signatures.values()])
+    return dict(zip(signatures, descriptor.distances(descriptions[:1], descriptions)[0].tolist(), strict=True))
+
+
+@pytest.mark.parametrize("name", ["interior", "pretrained"])
+def test_distances_with_size_are_those_of_the_formula(name: str, signatures: dict[str, Signature]) -> None:
+    plain, sized = from_body(name, signatures), from_body(f"{name}+size", signatures)
+    for other in ("body", "centimetres", "mirrored"):
+        assert sized[other] == pytest.approx(plain[other], rel=1e-2, abs=1e-3 * SCALES[name])
+    apart = 2 * np.log(1.1)  # in log √area and in log ∛volume
+    n = SCALES[name] / 4
+    expected = plain["larger"] + 5 * (plain["larger"] + n) * apart / (0.3 + apart)
+    assert sized["larger"] == pytest.approx(expected, rel=1e-3)
+
+
+def test_vectors_count_a_small_difference_in_size_as_distances_do(signatures: dict[str, Signature]) -> None:
+    descriptor = igps.descriptor("interior", size="keep")
+    body = descriptor(collate([signatures["body"]]))
+    other = body.clone()
+    other[:, -1] += 1e-6
+    # The slope at nothing, along one of the two numbers.
+    assert float(descriptor.distances(body, other)) == pytest.approx(float((body - other).norm()), rel=1e-2)
+
+
+@pytest.mark.parametrize("name", ["interior", "rich"])
+def test_a_mirror_image_is_the_body_unless_it_is_distinct(name: str, signatures: dict[str, Signature]) -> None:
+    same, distinct = from_body(name, signatures), from_body(f"{name}+side", signatures)
+    assert same["mirrored"] < 0.1 * SCALES[name]
+    assert distinct["mirrored"] > SCALES[name] / 2
+    assert distinct["larger"] < 0.2 * distinct["mirrored"]  # to sampling noise the body itself
+
+
+def test_twists_of_a_mirror_image_have_the_other_sign_and_a_symmetric_body_has_none(
+    signatures: dict[str, Signature],
+) -> None:
+    descriptor = igps.descriptor("interior", mirror="distinct")
+    odd = {name: descriptor(collate([one]))[0, -18:] for name, one in signatures.items()}
+    assert float((odd["body"] + odd["mirrored"]).norm()) < 0.15 * float(odd["body"].norm())
+    assert float(odd["straight"].norm()) < 0.2 * float(odd["body"].norm())
+
+
+def test_names_carry_the_choice() -> None:
+    assert igps.descriptor("rich", size="keep", mirror="distinct").name == "rich+side+size"
+    assert igps.descriptor("rich+size", mirror="distinct").name == "rich+side+size"
+    assert igps.descriptor("rich", size="auto", units=["mm", "Å"]).name == "rich+size"
+    assert igps.descriptor("rich", size="auto", units=["mm", None]).name == "rich"
+    assert igps.descriptor("gps+size").invariant_to == ("motion", "pose")
+    assert igps.descriptor("gps+side").invariant_to == ("scale", "pose")
+    assert (cache_tag("gps+size", igps.descriptor("gps+size")) or "").startswith("gps+size ")
+
+
+def test_what_cannot_be_weighed_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"size: expected .* the units of the bodies beside \"auto\""):
+        igps.descriptor("gps", size="auto")
+    with pytest.raises(ValueError, match=r"expected \+size or \+side behind a name, got \+colour"):
+        igps.descriptor("gps+colour")
+    with pytest.raises(ValueError, match="expected a descriptor that ignores size by itself, got 'molecular'"):
+        igps.descriptor("molecular", size="keep")
+    own = igps.descriptor("gps")
+    own.name = "own"
+    with pytest.raises(ValueError, match="Set its attribute `scale`"):
+        igps.descriptor(own, size="keep")
+    own.scale = 0.02
+    assert igps.descriptor(own, size="keep").name == "own+size"
+
+
+@pytest.mark.parametrize(
+    ("size", "units", "expected", "told"),
+    [
+        ("auto", ["mm", "cm"], True, ""),
+        ("auto", [None, None], False, ""),
+        ("auto", ["mm", None], False, "size is ignored: 1 of 2 bodies have no unit of length; where"),
+        ("auto", ["mm", "furlong"], False, "size is ignored: 1 of 2"),
+        ("keep", [None, None], True, ""),
+        ("keep", ["mm", None], True, "size is kept: 1 of 2 bodies have no unit of length; their numbers count as"),
+        ("ignore", ["mm", "mm"], False, ""),
+    ],
+)
+def test_size_is_kept_where_there_are_units(size, units, expected: bool, told: str) -> None:  # type: ignore[no-untyped-def]
+    kept, sentence = keeps_size(size, units)
+    assert kept is expected
+    assert sentence.startswith(told)
+    assert bool(sentence) is bool(told)
+
+
+def write_3mf(path: Path, radius: float, unit: str) -> None:
+    """A ball of a radius in a unit."""
+    points = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in SURFACE.vertices * radius)
+    faces = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in SURFACE.faces)
+    mesh = f"<mesh><vertices>{points}</vertices><triangles>{faces}</triangles></mesh>"
+    space = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(
+            "3D/3dmodel.model",
+            f'<model unit="{unit}" xmlns="{space}"><resources><object id="1">{mesh}</object></resources>'
+            '<build><item objectid="1"/></build></model>',
+        )
+
+
+def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = tmp_path / "balls"
+    for name, radius, unit in (("1/a", 1, "inch"), ("1/b", 25.4, "millimeter"), ("2/c", 28, "millimeter"),
+                               ("2/d", 2.8, "centimeter")):  # fmt: skip
+        write_3mf(root / f"{name}.3mf", radius, unit)
+    options: dict[str, Any] = {"cache_dir": tmp_path / "cache", "n_workers": 1}
+    summary = retrieve(root, "shape_dna", **options)
+    assert summary["config"]["descriptor"] == "shape_dna+size"
+    assert summary["nn"] == 1
+    assert retrieve(root, "shape_dna", size="ignore", **options)["config"]["descriptor"] == "shape_dna"
+    dataset = igps.SignatureDataset(root, cache_dir=tmp_path / "cache", descriptor="shape_dna")
+    assert dataset.units() == ["in", "mm", "mm", "cm"]
+    Gallery.build(tmp_path / "index", dataset, "shape_dna+size", n_workers=1)
+    found = query(root / "1/a.3mf", index=tmp_path / "index", top=2, cache_dir=tmp_path / "cache")
+    assert [row["mesh"] for row in found] == ["1/a.3mf", "1/b.3mf"]
+    with pytest.raises(ValueError, match=r"descriptor: .*shape_dna"):
+        query(root / "1/a.3mf", index=tmp_path / "index", size="ignore", cache_dir=tmp_path / "cache")
+    SURFACE.export(root / "2/e.off")
+    retrieve(root, "shape_dna", **options)
+    assert "size is ignored: 1 of 5 bodies have no unit of length" in capsys.readouterr().out

@@ -1,0 +1,134 @@
+"""Bodies with cavities: balls in balls and boxes in boxes, whose areas, volumes and insides are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from igps import LoadOptions, Mesh, MeshError, SignatureConfig, compute_signature, load_mesh
+from igps.mesh.label_surface import voxel_surface
+from igps.mesh.mending import mend, mended_by
+from igps.mesh.simplification import simplify
+from igps.mesh.surface import signed_volume
+from igps.signature.voxels import interior_samples
+
+BALL = trimesh.creation.icosphere(subdivisions=3)
+Surface = tuple[np.ndarray, np.ndarray]
+
+
+def joined(*parts: Surface) -> Surface:
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    faces = [faces + start for (_, faces), start in zip(parts, starts, strict=False)]
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
+
+
+def ball(radius: float, at: float = 0.0, *, inwards: bool = False) -> Surface:
+    faces = np.asarray(BALL.faces)
+    return BALL.vertices * radius + [at, 0, 0], faces[:, ::-1] if inwards else faces
+
+
+def test_a_cavity_that_is_turned_inwards_is_part_of_the_body_as_it_is() -> None:
+    hollow = mend(*joined(ball(1), ball(0.5, inwards=True)), cavities="keep")
+    assert hollow.notes == ()
+    assert hollow.volume == pytest.approx((1 - 0.5**3) * BALL.volume, rel=1e-12)
+    assert hollow.area == pytest.approx((1 + 0.5**2) * BALL.area, rel=1e-12)
+    assert hollow.genus == 0
+
+
+@pytest.mark.parametrize("inwards", [False, True])
+def test_filled_it_is_the_ball(inwards: bool) -> None:
+    full = mend(*joined(ball(1), ball(0.5, inwards=inwards)))
+    np.testing.assert_array_equal(full.vertices, BALL.vertices)
+    np.testing.assert_array_equal(full.faces, BALL.faces)
+
+
+def test_a_hidden_part_that_is_turned_outwards_is_turned_for_a_cavity_and_kept_once() -> None:
+    surface = joined(ball(1), ball(0.5), ball(0.2), ball(0.1, 0.75))
+    hollow = mend(*surface, cavities="keep")
+    assert hollow.volume == pytest.approx((1 - 0.5**3 - 0.1**3) * BALL.volume, rel=1e-12)
+    assert hollow.notes == (
+        "turned the surface of a cavity towards the inside",
+        "turned the surface of a cavity towards the inside",
+        "dropped 1 parts hidden inside",
+    )
+    assert mended_by(hollow.notes) == ("welded",)
+
+
+def test_loose_triangles_are_welded_before() -> None:
+    vertices, faces = joined(ball(1), ball(0.5))
+    hollow = mend(vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), cavities="keep")
+    assert hollow.volume == pytest.approx((1 - 0.5**3) * BALL.volume, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [ball(0.5), ball(0.5, 3.0, inwards=True), ball(0.5, 0.8, inwards=True),
+     joined(ball(0.5, inwards=True), ball(0.2, inwards=True))],
+    ids=["turned outwards", "outside", "across", "in another"],
+)  # fmt: skip
+def test_what_is_no_cavity_is_refused(other: Surface) -> None:
+    with pytest.raises(MeshError, match="closed surfaces is no cavity of the body"):
+        Mesh(*joined(ball(1), other), cavities=True)
+    with pytest.raises(MeshError, match="connected components"):
+        Mesh(*joined(ball(1), other))
+
+
+def test_samples_lie_in_the_wall_and_on_all_surfaces() -> None:
+    hollow = Mesh(*joined(ball(1), ball(0.7, inwards=True)), cavities=True)
+    radii = np.linalg.norm(interior_samples(hollow, 32, 1000), axis=1)
+    assert radii.min() > 0.69
+    assert radii.max() < 1
+    signature = compute_signature(hollow, SignatureConfig(n_eigenpairs=30, attributes=("surface_direction", "depth")))
+    on_cavity = np.linalg.norm(signature.surface.points, axis=1) < 0.85
+    assert on_cavity.mean() == pytest.approx(0.49 / 1.49, abs=0.01)
+    # Normals of the body point into its cavity, and its depth is that of the wall.
+    radial = (signature.surface.attributes["surface_direction"] * signature.surface.points).sum(axis=1)
+    assert radial[on_cavity].max() < 0 < radial[~on_cavity].min()
+    assert signature.interior.attributes["depth"].max() * np.sqrt(hollow.area) == pytest.approx(0.15, abs=0.02)
+
+
+def test_eigenfunctions_of_the_outside_go_on_through_the_wall() -> None:
+    """To a ball's first three, linear functions, so that they are the coordinates over their norm everywhere."""
+    config = SignatureConfig(n_eigenpairs=30, accuracy=None)
+    hollow = compute_signature(Mesh(*joined(ball(1), ball(0.7, inwards=True)), cavities=True), config)
+    full = compute_signature(Mesh(*ball(1)), config)
+    np.testing.assert_allclose(hollow.eigenvalues, full.eigenvalues, rtol=1e-6)
+    for samples in (hollow.interior, hollow.surface):
+        squares = np.square(samples.eigenfunctions[:, :3]).sum(axis=1) * 4 * np.pi / 3
+        np.testing.assert_allclose(squares, np.square(samples.points).sum(axis=1), rtol=0.03)
+
+
+def test_the_outer_surface_has_vertices_enough_whatever_the_cavity_has() -> None:
+    box = trimesh.creation.box((4, 4, 4))
+    surface = joined((np.asarray(box.vertices), np.asarray(box.faces)), ball(1, inwards=True))
+    hollow = mend(*surface, least_vertices=100, cavities="keep")
+    assert hollow.outer()[1].sum() >= 100
+    assert hollow.volume == pytest.approx(64 - BALL.volume, rel=1e-9)
+    assert simplify(hollow, 700).cavities
+
+
+def test_a_file_is_read_with_its_cavities_where_they_are_kept(tmp_path: Path) -> None:
+    vertices, faces = joined(ball(1), ball(0.5, inwards=True))
+    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "hollow.off")
+    kept = load_mesh(tmp_path / "hollow.off", LoadOptions(cavities="keep"))
+    assert kept.volume == pytest.approx((1 - 0.5**3) * BALL.volume, rel=1e-6)
+    assert load_mesh(tmp_path / "hollow.off").volume == pytest.approx(BALL.volume, rel=1e-6)
+    assert LoadOptions(cavities="keep").as_dict() == {**LoadOptions().as_dict(), "cavities": "keep"}
+    with pytest.raises(ValueError, match="cavities: expected 'fill' or 'keep', got 'leave'"):
+        LoadOptions(cavities="leave")  # type: ignore[arg-type]
+
+
+def test_a_label_keeps_its_cavities() -> None:
+    radius = np.linalg.norm(np.indices((40, 40, 40)) - 19.5, axis=0)
+    mask = (radius < 16) & (radius > 7)
+    mask[19, 19, 4] = False  # a voxel of noise is no cavity
+    vertices, faces, notes = voxel_surface(mask, cavities=True)
+    hollow = Mesh(vertices, faces, cavities=True)
+    assert hollow.volume == pytest.approx(np.count_nonzero(mask), rel=0.01)
+    assert hollow.area == pytest.approx(4 * np.pi * (16**2 + 7**2), rel=0.04)
+    full = voxel_surface(mask)
+    assert signed_volume(*full[:2]) == pytest.approx(np.count_nonzero(radius < 16), rel=0.01)
+    assert notes != full[2]

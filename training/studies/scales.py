@@ -1,0 +1,38 @@
+"""The scale of each descriptor: the median of its distances between generated bodies of one class."""
+
+from __future__ import annotations
+
+from functools import reduce
+from operator import or_
+
+import torch
+
+from igps.data.collation import collate
+from igps.descriptors import NAMES
+from igps.descriptors import descriptor as descriptor_of
+from igps.mesh.mesh import Mesh
+from igps.signature.signature import SignatureConfig, compute_signature
+from training.graded import GradedShapes
+
+
+def scales(descriptors: list[str] | None = None, n_classes: int = 8, n_bodies: int = 4, seed: int = 77) -> None:
+    """Print the scales of descriptors, for `igps.descriptors.individual.SCALES`.
+
+    Args:
+        descriptors: names; all of the library if not given.
+        n_classes: classes of generated bodies.
+        n_bodies: bodies of each class, in one pose.
+        seed: of the bodies.
+    """
+    shapes = list(GradedShapes(n_classes, n_bodies, 1, seed=seed, n_vertices=(1800, 2600)))
+    labels = [shape.label for shape in shapes]
+    same = torch.tensor([[one == other for one in labels] for other in labels]).triu(1)
+    modules = [descriptor_of(name) for name in descriptors or NAMES]
+    config = reduce(or_, (module.requirements for module in modules)).apply_to(SignatureConfig(n_eigenpairs=250))
+    meshes = [Mesh(shape.vertices, shape.faces) for shape in shapes]
+    batches = [collate([compute_signature(mesh, config)], [mesh]) for mesh in meshes]
+    for module in modules:
+        with torch.inference_mode():
+            descriptions = torch.cat([module(batch) for batch in batches])
+            median = module.distances(descriptions, descriptions)[same].median()
+        print(f'    "{module.name}": {float(median):.2g},', flush=True)
