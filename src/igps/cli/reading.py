@@ -16,7 +16,7 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, ClassRule, find_bodies, labelled_bodies
 from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size
+from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
 from igps.mesh.mending import Cavities, Mending, mended_by
 from igps.mesh.options import MAX_UNPACKED, BodyKind, Component, LoadOptions
 from igps.nn.descriptor import Descriptor
@@ -96,9 +96,12 @@ def with_side(descriptor: str, mirror: Mirror) -> str:
 
 def sized(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
     """The name of a descriptor that keeps the size of the bodies, or not, as is asked for; says what is left open."""
-    if SIZE in descriptor or "scale" not in descriptor_of(descriptor).invariant_to:
+    module = descriptor_of(descriptor)
+    if SIZE in module.name or "scale" not in module.invariant_to:
         return descriptor
     is_kept, told = keeps_size(size, () if size == "ignore" else dataset.units())
+    if is_kept and size == "auto" and scale_of(module) is None:
+        is_kept, told = False, f"size is ignored: set the attribute `scale` of {descriptor} to keep it"
     if told:
         print(told)
     return descriptor + SIZE * is_kept

@@ -61,7 +61,7 @@ class IndividualDescriptor(Descriptor):
         super().__init__()
         if size and "scale" not in descriptor.invariant_to:
             raise ValueError(f"size: expected a descriptor that ignores size by itself, got {descriptor.name!r}.")
-        scale = scale or descriptor.scale or SCALES.get(descriptor.name)
+        scale = scale or scale_of(descriptor)
         if scale is None:
             raise ValueError(
                 f"size, mirror: expected a descriptor whose distances are known, got {descriptor.name!r}. Set its "
@@ -125,6 +125,11 @@ class IndividualDescriptor(Descriptor):
         n_form = descriptions.shape[1] - n_side - n_size
         form, side, size = descriptions.split([n_form, n_side, n_size], dim=1)
         return form, side, size
+
+
+def scale_of(descriptor: Descriptor) -> float | None:
+    """The median of the distances of a descriptor between bodies of one class; None if it is not known."""
+    return descriptor.scale or SCALES.get(descriptor.name)
 
 
 def keeps_size(size: Size, units: Sequence[str | None]) -> tuple[bool, str]:

@@ -342,6 +342,10 @@ def test_gradients_equal_those_of_the_dense_definition(
             line = normalize(points[j] - points[i], dim=1)
             ends = [(directions[i] * line).sum(dim=1), -(directions[j] * line).sum(dim=1)]
             values += [torch.maximum(*ends), torch.minimum(*ends), (directions[i] * directions[j]).sum(dim=1)]
+        elif kind == "twists":
+            way = one.inputs[0][j] - one.inputs[0][i]
+            turned = torch.linalg.cross(one.inputs[1][i], one.inputs[1][j])
+            values.append((turned * way).sum(dim=1) / way.norm(dim=1))
         elif kind == "own":
             values.append((one.inputs[0][i] - one.inputs[0][j]).abs())
         else:

@@ -33,10 +33,7 @@ def read_volume(path: Path, options: LoadOptions, part: str | None) -> list[RawB
         return [_body(made, None, volume.unit, partial(volume.measures, 1))]
     made = partial(label_surface, volume, how=options.mend, cavities=options.cavities)
     names = [body.name for body in volume.bodies] if part is None else [volume.body(part).name]
-    return [
-        _body(partial(made, name), name, volume.unit, partial(volume.measures, name))
-        for name in names
-    ]
+    return [_body(partial(made, name), name, volume.unit, partial(volume.measures, name)) for name in names]
 
 
 def volume_parts(path: Path, options: LoadOptions) -> list[str]:
