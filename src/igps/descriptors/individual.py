@@ -68,6 +68,7 @@ class IndividualDescriptor(Descriptor):
                 "attribute `scale` to the median of its distances between bodies of one class."
             )
         self.descriptor, self.scale, self.keeps_size = descriptor, scale, size
+        self._unit = _SHARE * scale
         embedding = SpectralEmbedding(n_eigenpairs=16)
         self.twists = (
             PairHistogram([InteriorDistance(6, 3.0), PairTwist()], embedding, n_samples=1000) if side else None
@@ -86,16 +87,16 @@ class IndividualDescriptor(Descriptor):
 
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, D + 18 + 2), of which side and size are there if they are told."""
-        parts, unit = [self.descriptor(batch).flatten(1)], _SHARE * self.scale
+        parts = [self.descriptor(batch).flatten(1)]
         if self.twists is not None:
             counts = self.twists(BatchFeatures(batch, self.training))
             odd = (counts - counts.flip(-1))[..., counts.shape[-1] // 2 :] / 2
-            parts.append(unit / _TWIST * odd.flatten(1))
+            parts.append(self._unit / _TWIST * odd.flatten(1))
         if self.keeps_size:
             lengths = [MILLIMETRES.get(one or "mm", 1.0) for one in batch.units or [None] * len(batch)]
             size = torch.stack([batch.area.log() / 2, batch.volume.log() / 3], dim=1)
             size = size + torch.tensor(lengths, dtype=size.dtype, device=size.device).log()[:, None]
-            parts.append(unit * _MOST / _HALF * size.to(parts[0].dtype))
+            parts.append(self._unit * _MOST / _HALF * size.to(parts[0].dtype))
         return torch.cat(parts, dim=1)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
@@ -106,9 +107,8 @@ class IndividualDescriptor(Descriptor):
         if self.twists is not None:
             found = found + euclidean(side, sides)
         if self.keeps_size:
-            unit = _SHARE * self.scale
-            apart = torch.cdist(size, sizes, p=1) / (unit * _MOST)  # over 0.3
-            found = found + _MOST * (found + unit) * apart / (1 + apart)
+            apart = torch.cdist(size, sizes, p=1) / (self._unit * _MOST)  # over 0.3
+            found = found + _MOST * (found + self._unit) * apart / (1 + apart)
         return found
 
     def short(self, descriptions: Tensor) -> Tensor:

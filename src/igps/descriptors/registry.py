@@ -44,7 +44,7 @@ _MAKERS: Mapping[str, Callable[[], Descriptor]] = {
 NAMES: tuple[str, ...] = tuple(_MAKERS)
 """The names of the library's descriptors of any body."""
 
-_MARKED = re.compile(r"(.*?)((?:\+size|\+side)*)", re.DOTALL)
+_MARKED = re.compile(r"(\+size|\+side)+$")
 _NAME = re.compile(r"\w{1,100}(\+side)?(\+size)?")
 
 # Descriptors of bodies that bring attributes of their own.
@@ -104,7 +104,8 @@ def descriptor(
         raise ValueError('size: expected "keep" or "ignore", or the units of the bodies beside "auto", got none.')
     marks = ""
     if isinstance(which, str):
-        which, marks = _MARKED.fullmatch(which).groups()  # type: ignore[union-attr] (it matches anything)
+        found = _MARKED.search(which)
+        marks, which = (found[0], which[: found.start()]) if found else ("", which)
     plain = _plain(which)
     with_size = SIZE in marks or (size == "keep" if units is None else keeps_size(size, units)[0])
     with_side = SIDE in marks or mirror == "distinct"
