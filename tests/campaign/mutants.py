@@ -38,7 +38,7 @@ from outcome import Row, table
 # Nothing here imports the library: each process of tests is forked from this one, and imports it with a fault in it.
 HERE = Path(__file__).parent.resolve()
 ROOT = HERE.parents[1]
-ROOMS = ("geometry", "nn", "retrieval")
+ROOMS = ("mesh", "signature", "nn", "retrieval")
 SEED = 13
 # Of the faults that are tried, so many are to be noticed by a test.
 TARGET = 0.9
@@ -75,12 +75,11 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
             "random_state=seed)",
         ),
         # A constant that was chosen, one off: directions to look into, bytes of a line that sizes are guessed from.
-        ("src/igps/geometry/union.py", "_DIRECTIONS, _PLACES_PER_PATCH = 99, 30"),
-        ("src/igps/geometry/limits.py", "_OBJ_BYTES, _TEXT_STL_BYTES = 34, 200"),
+        ("src/igps/mesh/_union.py", "_DIRECTIONS, _PLACES_PER_PATCH = 99, 30"),
+        ("src/igps/mesh/limits.py", "_OBJ_BYTES, _TEXT_STL_BYTES = 34, 200"),
         (
-            "src/igps/nn/levels.py",
-            "self, parts: Sequence[int] | None = None, width: int = 128, n_directions: int = 59, "
-            "shrinkage: float = 0.03",
+            "src/igps/nn/heads/two_level.py",
+            "n_directions: int = 59,",
         ),
         # Points whose classes are not side by side only cost time.
         (
@@ -90,13 +89,13 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         # Two columns more, which nothing reads.
         ("src/igps/nn/_kernels/pair_loops.py", "inverse = np.ones((n_axes, most_centres + 1), centres.dtype)"),
         # No resolution is larger than the finest: one that is asked for is refused before, one that grows is cut.
-        ("src/igps/geometry/voxels.py", "if min_samples == 0 or resolution == finest:"),
+        ("src/igps/signature/voxels.py", "if min_samples == 0 or resolution == finest:"),
         # Nothing compares two of them.
-        ("src/igps/geometry/sampling.py", "@dataclass(frozen=True, eq=True)"),
+        ("src/igps/signature/sampling.py", "@dataclass(frozen=True, eq=True)"),
         # NumPy takes every negative length for the one that is not known.
-        ("src/igps/geometry/subdivision.py", "order = (np.arange(3) + np.reshape(turn, (- 2, 1)) + first) % 3"),
+        ("src/igps/mesh/subdivision.py", "order = (np.arange(3) + np.reshape(turn, (- 2, 1)) + first) % 3"),
         # By how much one ring of a patch is turned against the next.
-        ("src/igps/geometry/hole_filling.py", "disc.append(_circle((np.arange(size) + ring / 3) / size, radius))"),
+        ("src/igps/mesh/_hole_filling.py", "disc.append(_circle((np.arange(size) + ring / 3) / size, radius))"),
         # Below zero there is only rounding.
         (
             "src/igps/retrieval/reranking.py",
@@ -178,7 +177,7 @@ def sample(number: int, rooms: Sequence[str] = ROOMS) -> list[Mutant]:
 
 
 def _modules(room: str) -> list[Path]:
-    found = sorted((ROOT / "src" / "igps" / room).glob("*.py"))
+    found = sorted((ROOT / "src" / "igps" / room).rglob("*.py"))
     return [path.relative_to(ROOT) for path in found if path.name != "__init__.py"]
 
 

@@ -19,9 +19,9 @@ from igps.nn.heads.closed_form import WhitenedHead
 from igps.nn.heads.learned import BlendedDistance
 from igps.nn.histograms.pairs import PairHistogram
 from igps.nn.learner import RetrievalLearner
-from training.studies.learning import score
+from training.studies.learning import Row, score
 
-HEADS = ("none", "whitened", "kernel")
+HEADS: tuple[Row, ...] = ("none", "whitened", "kernel")
 # Dimensions, and whether bins and spectral filter are learned.
 ROWS = (
     ("interior", False, False),

@@ -99,7 +99,7 @@ def calibrate(
         return [(surfaces, i[k], surfaces, j[k]) for k in np.flatnonzero(chosen)]
 
     def of_made(chosen: NDArray[np.bool_]) -> list[_Pair]:
-        return [(surfaces, originals[n], surfaces_of_copies, n) for n in np.flatnonzero(chosen)]
+        return [(surfaces, originals[n], surfaces_of_copies, n) for n in np.flatnonzero(chosen).tolist()]
 
     # The hard ones tell the rate: other poses of bodies that bend, and other bodies of the class.
     others = among(of_kind["poses"] | of_kind["bodies"])

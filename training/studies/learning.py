@@ -191,6 +191,7 @@ def checkpoint(path: Path, out: Path = Path("build/evaluation")) -> None:
     print(f"{'':<10}" + "".join(f"{title:>8}" for title in COLUMNS.values()))
     for name, scores in found.items():
         print(f"{name:<10}" + "".join(f"{100 * scores[column]:>8.1f}" for column in COLUMNS))
-    out.mkdir(parents=True, exist_ok=True)
-    learned_layout(learner.descriptor, out / "layout.png")
-    print(f"learned bins and filter: {out / 'layout.png'}")
+    if isinstance(learner.descriptor, HistogramDescriptor):
+        out.mkdir(parents=True, exist_ok=True)
+        learned_layout(learner.descriptor, out / "layout.png")
+        print(f"learned bins and filter: {out / 'layout.png'}")

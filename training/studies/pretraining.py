@@ -83,8 +83,8 @@ def pretrain(
     ways = [("pretrained", others, others)]
     if min(len(among) for among in strangers) >= _FEWEST:
         ways += [("without look-alikes", strangers, strangers), ("as many, with them", others, strangers)]
-    for name, among, like in ways:
-        heads = [fit(len(other), seed, one) for one, other in zip(among, like, strict=True)]
+    for name, chosen, like in ways:
+        heads = [fit(len(other), seed, one) for one, other in zip(chosen, like, strict=True)]
         score(name, [_distances(head, histograms[where]) for head, where in zip(heads, scored, strict=True)])
     for name in plain:
         other = igps.descriptor(name)

@@ -65,8 +65,8 @@ def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: Head, par
         }
         for head in fitted.values():
             head.fit(histograms[train], labels[train], part_cells)
-        for name, head in {"pretrained, no labels": pretrained, **fitted}.items():
-            found[name].append(100 * scores(head, histograms[test], labels[test])["ft"])
+        for name, other in {"pretrained, no labels": pretrained, **fitted}.items():
+            found[name].append(100 * scores(other, histograms[test], labels[test])["ft"])
     rows = ", ".join(f"{name} FT {mean(values):.1f} ± {stdev(values):.1f}" for name, values in found.items())
     print(f"{n} labels a class: {rows}")
 
