@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from igps.spectra._fronts import AT_ONCE, invert_front
+from igps.spectra._pivots import AT_ONCE, invert_front
 
 
 def invert(matrix: np.ndarray) -> tuple[int, np.ndarray]:

@@ -24,7 +24,8 @@ def scales(descriptors: list[str] | None = None, n_classes: int = 8, n_bodies: i
         n_bodies: bodies of each class, in one pose.
         seed: of the bodies.
     """
-    shapes = list(GradedShapes(n_classes, n_bodies, 1, seed=seed, n_vertices=(1800, 2600)))
+    generated = GradedShapes(n_classes, n_bodies, 1, seed=seed, n_vertices=(1800, 2600))
+    shapes = [generated[i] for i in range(len(generated))]
     labels = [shape.label for shape in shapes]
     same = torch.tensor([[one == other for one in labels] for other in labels]).triu(1)
     modules = [descriptor_of(name) for name in descriptors or NAMES]

@@ -79,6 +79,11 @@ class Tree(Nodes):
     carried_start: np.ndarray
     n_carried: int
 
+    @property
+    def structure(self) -> loops.Structure:
+        """As the compiled loops take it."""
+        return loops.Structure(**{name: getattr(self, name) for name in loops.Structure._fields})
+
     def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> Factors:
         """The factors of ``matrix − shift · I``; their bits do not depend on the team.
 
@@ -135,17 +140,14 @@ class Tree(Nodes):
         block_start = self.block_start
         if blocks is None:
             blocks, block_start = np.empty(int((n_own * (n_own + n_boundary)).max())), np.zeros_like(block_start)
-        place = np.empty(len(self.order), dtype=np.int64)
-        problem = (
-            values, shift, self.indptr, self.indices, self.order, self.number, self.first, self.children, self.start,
-            self.boundary, self.parent_row, updates, self.update_start, place, front,
-        )  # fmt: skip
         padded = min(LARGE, int(n_own.max())) + loops.AT_ONCE
         squares = [np.empty(padded**2) for _ in range(3)]
         strips = [np.empty(loops.AT_ONCE * (padded + loops.AT_ONCE)) for _ in range(2)]
+        room = loops.Room(np.empty(len(self.order), dtype=np.int64), front, *squares, *strips)
+        problem = self.structure, values, shift, updates, self.update_start, blocks, block_start, room
         n_negative, node = 0, begin
         while True:
-            n_more, node = loops.eliminate((node, end), LARGE, *problem, blocks, block_start, *squares, *strips)
+            n_more, node = loops.eliminate((node, end), LARGE, *problem)
             n_negative += n_more
             if node == end:
                 return n_negative
@@ -175,23 +177,18 @@ class Factors:
 
     def solve(self, right_hand_sides: torch.Tensor, team: Team = ALONE) -> torch.Tensor:
         """The solutions (V, b) for right-hand sides (V, b), float64, both best stored by columns."""
-        tree = self.tree
+        tree, structure = self.tree, self.tree.structure
         n_vertices, b = right_hand_sides.shape
         right, solution = right_hand_sides.T.contiguous().numpy(), torch.empty(b, n_vertices, dtype=torch.float64)
         x, carried = (torch.empty(n * b, dtype=torch.float64).numpy() for n in (n_vertices, tree.n_carried))
         largest = int((np.diff(tree.first) + np.diff(tree.start)).max())
 
         def forward(nodes: tuple[int, int]) -> None:
-            loops.forward(
-                nodes, right, tree.order, tree.first, tree.children, tree.start, tree.parent_row, self.blocks,
-                tree.block_start, x, carried, tree.carried_start, largest,
-            )  # fmt: skip
+            places = x, carried, tree.carried_start
+            loops.forward(nodes, right, structure, self.blocks, tree.block_start, *places, largest)
 
         def backward(nodes: tuple[int, int]) -> None:
-            loops.backward(
-                nodes, tree.order, tree.first, tree.start, tree.boundary, self.blocks, tree.block_start, x, largest,
-                solution.numpy(),
-            )  # fmt: skip
+            loops.backward(nodes, structure, self.blocks, tree.block_start, x, largest, solution.numpy())
 
         team.each(forward, tree.subtrees)
         for nodes in tree.above:
