@@ -15,8 +15,10 @@ import igps
 from igps import Mesh, SignatureConfig, collate, compute_signature
 from igps.cli.retrieval import query, retrieve
 from igps.descriptors.fingerprint import cache_tag
-from igps.descriptors.individual import SCALES, keeps_size
+from igps.descriptors.individual import SCALES, IndividualDescriptor, keeps_size
+from igps.gallery.duplicates import duplicates
 from igps.gallery.gallery import Gallery
+from igps.nn.descriptor import EmbeddedDescriptor
 from igps.signature.signature import Signature
 
 CONFIG = SignatureConfig(n_eigenpairs=250, attributes=("depth", "electrostatic_potential", "surface_direction"))
@@ -134,10 +136,10 @@ def test_size_is_kept_where_there_are_units(size, units, expected: bool, told: s
     assert bool(sentence) is bool(told)
 
 
-def write_3mf(path: Path, radius: float, unit: str) -> None:
-    """A ball of a radius in a unit."""
-    points = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in SURFACE.vertices * radius)
-    faces = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in SURFACE.faces)
+def write_3mf(path: Path, radius: float, unit: str, body: trimesh.Trimesh | Mesh = SURFACE) -> None:
+    """A ball of a radius in a unit, or another body so many times as large."""
+    points = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in body.vertices * radius)
+    faces = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in body.faces)
     mesh = f"<mesh><vertices>{points}</vertices><triangles>{faces}</triangles></mesh>"
     space = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -169,3 +171,28 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path: Path, caps
     SURFACE.export(root / "2/e.off")
     retrieve(root, "shape_dna", **options)
     assert "size is ignored: 1 of 5 bodies have no unit of length" in capsys.readouterr().out
+
+
+def test_copies_of_another_size_are_no_duplicates_where_size_counts(tmp_path: Path) -> None:
+    for name, factor, unit in (("a", 1, "inch"), ("b", 25.4, "millimeter"), ("c", 30, "millimeter")):
+        write_3mf(tmp_path / f"{name}.3mf", factor, unit, twisted(0.5))
+    dataset = igps.SignatureDataset(tmp_path, cache_dir=tmp_path / "cache", descriptor="pretrained")
+    assert duplicates(dataset, n_workers=1).groups == (("a.3mf", "b.3mf"),)
+    assert [set(group) for group in duplicates(dataset, size="ignore", n_workers=1).groups] == [
+        {"a.3mf", "b.3mf", "c.3mf"}
+    ]
+
+
+def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_path: Path) -> None:
+    shapes = igps.ArticulatedShapes(n_classes=2, n_per_class=4, n_vertices=600)
+    shapes.write(tmp_path / "shapes")
+    dataset = igps.SignatureDataset(tmp_path / "shapes", cache_dir=tmp_path / "cache", descriptor="interior+side")
+    model = igps.fit(dataset, "interior+side+size", head="whitened", n_workers=1)
+    assert isinstance(model, IndividualDescriptor)
+    assert isinstance(model.descriptor, EmbeddedDescriptor)
+    assert model.scale == pytest.approx(model.card["scale"])
+    model.save(tmp_path / "mine.safetensors")
+    batch = dataset.batch(range(8))
+    loaded = igps.descriptor(tmp_path / "mine.safetensors")
+    torch.testing.assert_close(loaded(batch), model(batch))
+    torch.testing.assert_close(loaded.distances(loaded(batch), loaded(batch)), model.distances(*[model(batch)] * 2))

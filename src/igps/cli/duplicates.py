@@ -9,6 +9,7 @@ from typing import Any
 from igps.cli.index import as_indexed
 from igps.cli.reading import Folder, signatures, write_rows
 from igps.descriptors import descriptor as descriptor_of
+from igps.descriptors.individual import Size
 from igps.gallery.calibration import Calibration
 from igps.gallery.duplicates import Duplicates, body_distance
 from igps.gallery.duplicates import duplicates as find_duplicates
@@ -22,18 +23,20 @@ def duplicates(
     root: Path | None = None,
     index: Path | None = None,
     poses: bool = False,
+    size: Size = "auto",
     out: Path | None = None,
     cache_dir: Path | None = None,
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
 ) -> dict[str, Any]:
-    """List the files that show the same body, whatever its scale, mirror image, triangles, detail or file format.
+    """List the files that show the same body, whatever its mirror image, triangles, detail, format, and unitless scale.
 
     Args:
         root: folder of meshes, with or without classes.
         index: an index of meshes in place of their folder, see igps index.
         poses: take other poses of a body for the same, which mistakes more siblings for it
+        size: keep takes files that differ in size for different, ignore does not; auto does where all have a unit.
         out: a table of the groups, a file ending in .csv.
         cache_dir: folder where computed signatures are kept; the user's cache directory if not given.
         n_workers: processes that compute; all cores if not given.
@@ -51,7 +54,9 @@ def duplicates(
         chosen, files = descriptor_of(DESCRIPTOR), Folder(root)
         source, unread = signatures(files, [chosen], n_workers=n_workers, strict=strict, cache_dir=cache_dir, **reading)
         n_skipped = len(unread)
-    found = find_duplicates(source, DESCRIPTOR, poses=poses, cache_dir=cache_dir, n_workers=n_workers, progress=True)
+    found = find_duplicates(
+        source, DESCRIPTOR, poses=poses, size=size, cache_dir=cache_dir, n_workers=n_workers, progress=True
+    )
     _print_groups(found, calibration, poses)
     n_skipped += len(found.failures)
     if n_skipped:

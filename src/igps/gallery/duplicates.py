@@ -24,10 +24,12 @@ from igps._parallel import on_threads
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
+from igps.descriptors.individual import Size, keeps_size
 from igps.gallery._alignment import surface_distance
 from igps.gallery.calibration import Calibration
 from igps.gallery.gallery import Gallery
 from igps.gallery.surfaces import Surfaces
+from igps.mesh.mesh import MILLIMETRES
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 from igps.retrieval.distances import Distance, euclidean
@@ -36,6 +38,8 @@ from igps.retrieval.distances import Distance, euclidean
 _ROWS, _PAIRS = 256, 256
 # Pairs as near as copies are asked for among so many of an index, then among ever more.
 _FIRST_TOP = 32
+# Of the logarithm of √area; a level of detail of a body takes up to half of it
+_ONE_SIZE = 0.05
 # What sampling adds to the difference of the profiles of one surface: between copies, it is up to 0.01.
 _PROFILE_NOISE = 0.02
 
@@ -87,6 +91,7 @@ def duplicates(
     descriptor: str | Descriptor = "pretrained",
     *,
     poses: bool = False,
+    size: Size = "auto",
     cache_dir: str | Path | None = None,
     calibration: Calibration | None = None,
     n_workers: int | None = None,
@@ -100,6 +105,7 @@ def duplicates(
         descriptor: a calibrated one; for an index its own.
         poses: whether other poses of a body count as the same; then nothing tells them from siblings but the distance
             of descriptions, and false pairs are more.
+        size: whether files that differ in size are different, too, see `keeps_size`.
         cache_dir: of Signatures, for an index; the user's cache directory if None.
         calibration: of the descriptor; the one that is shipped if None.
         n_workers: threads; all cores if None.
@@ -125,6 +131,8 @@ def duplicates(
             profiles, failures = Surfaces(source).profiles(n_workers, progress)
             near = _near(profiles, _profile_distances, 2 * calibration.same.distance + _PROFILE_NOISE, progress)
         dataset = source.usable(failures)
+    if keeps_size(size, dataset.units())[0]:
+        near = _of_one_size(near, dataset)
     surfaces = None if poses else Surfaces(dataset)
     joined = _joined(near, surfaces, calibration, n_workers, progress)
     if surfaces is not None:
@@ -166,6 +174,19 @@ def _joined(
             if distance < math.inf and group.merge(i, j):
                 joined[i, j] = distance
     return joined
+
+
+def _of_one_size(near: Iterator[tuple[int, int, float]], dataset: SignatureDataset) -> Iterator[tuple[int, int, float]]:
+    """Those of the pairs that are of one size."""
+    known: dict[int, float] = {}
+
+    def log_length(i: int) -> float:
+        if i not in known:
+            signature = dataset[i].signature
+            known[i] = math.log(signature.area) / 2 + math.log(MILLIMETRES.get(signature.unit or "mm", 1.0))
+        return known[i]
+
+    return (pair for pair in near if abs(log_length(pair[0]) - log_length(pair[1])) < _ONE_SIZE)
 
 
 def _laid(surfaces: Surfaces, calibration: Calibration, pair: tuple[int, int, float]) -> float:
