@@ -7,13 +7,8 @@ cluster, may do the work instead.
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import multiprocessing
-import os
 import queue
-import signal
-import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import (
@@ -22,17 +17,17 @@ from concurrent.futures import (
     CancelledError,
     Executor,
     Future,
-    ProcessPoolExecutor,
     ThreadPoolExecutor,
     wait,
 )
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import Any, Generic, TypeVar
+from typing import TypeVar
 
 from igps._threads import n_cores, one_thread, stay_on_one_thread
 from igps._threads import n_threads as available_threads
+from igps._workers import MachineError, Worker, workers_environment
 
 __all__ = [
     "Failed",
@@ -50,13 +45,6 @@ __all__ = [
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-# A worker has one thread for linear algebra, or n workers on n cores run n² threads. And glibc's allocator keeps what
-# is freed for the next body: pages that are given back come again one by one, each cleared by the system.
-_WORKERS_ENVIRONMENT = {
-    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
-    "MALLOC_MMAP_THRESHOLD_": str(2**26),
-    "MALLOC_TRIM_THRESHOLD_": str(2**28),
-}
 # A job whose process died is tried once more: an administrator or another program may have been the cause.
 _MOST_DEATHS = 2
 _KILLED = (
@@ -74,12 +62,6 @@ _MACHINES = frozenset(
     for name in ("ENOSPC", "EDQUOT", "EFBIG", "EIO", "EROFS", "EACCES", "EPERM", "EMFILE", "ENFILE", "ENOMEM")
 )
 _FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
-# A process that is killed while it starts is started once more: an administrator may have been the cause.
-_MOST_STARTS = 2
-
-
-class MachineError(RuntimeError):
-    """The machine, not a job, is at fault: a full disk, no memory, a library that is missing. What is done is kept."""
 
 
 @dataclass(frozen=True)
@@ -245,68 +227,16 @@ def _by_executor(
             future.cancel()
 
 
-class _Worker(Generic[Job, Result]):
-    """A process, and the job it has."""
-
-    def __init__(self, limits: Limits) -> None:
-        self._limits = limits
-        self._pool: ProcessPoolExecutor | None = None
-        self._pid = 0
-        self.number = -1
-        self.future: Future[Result] | None = None
-        self.deadline = float("inf")
-
-    def give(self, number: int, function: Callable[[Job], Result], job: Job) -> None:
-        try:
-            self.future = self.started().submit(function, job)
-        except BrokenExecutor:  # killed while it waited for a job
-            self.end()
-            self.future = self.started().submit(function, job)
-        self.number = number
-        self.deadline = time.monotonic() + (self._limits.seconds or float("inf"))
-
-    def started(self) -> ProcessPoolExecutor:
-        """The process, started if there is none."""
-        context = multiprocessing.get_context("spawn")
-        starts = 0
-        while self._pool is None:
-            starts += 1
-            with _workers_environment():
-                pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(self._limits.memory,))
-                try:
-                    self._pid = pool.submit(os.getpid).result()
-                    self._pool = pool
-                except BrokenExecutor as error:
-                    pool.shutdown()
-                    if starts == _MOST_STARTS:
-                        raise MachineError(
-                            "no worker process could be started. A script that computes on several processes must call "
-                            "it under `if __name__ == '__main__':`; otherwise look for a want of memory, or pass "
-                            "n_workers=1. What is done is kept."
-                        ) from error
-        return self._pool
-
-    def end(self, kill: bool = False) -> None:
-        """End the process, in the midst of its work if need be."""
-        if self._pool is None:
-            return
-        if kill:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(self._pid, getattr(signal, "SIGKILL", signal.SIGTERM))
-        self._pool.shutdown(wait=True, cancel_futures=True)
-        self._pool, self.future, self.deadline = None, None, float("inf")
-
-
 def _by_workers(
     function: Callable[[Job], Result], jobs: Sequence[Job], n_workers: int, limits: Limits
 ) -> Generator[tuple[int, Result | Failed], None, None]:
     waiting = list(range(len(jobs)))[::-1]
     deaths = [0] * len(jobs)
-    workers: list[_Worker[Job, Result]] = [_Worker(limits) for _ in range(n_workers)]
+    workers: list[Worker[Job, Result]] = [Worker(limits.seconds, limits.memory) for _ in range(n_workers)]
     finished = False
     try:
         # All at the same time, as a process takes seconds to import what it needs
-        with _workers_environment(), ThreadPoolExecutor(n_workers) as starters:
+        with workers_environment(), ThreadPoolExecutor(n_workers) as starters:
             list(starters.map(lambda worker: worker.started(), workers))
         while True:
             for worker in workers:
@@ -339,38 +269,3 @@ def _by_workers(
     finally:
         for worker in workers:
             worker.end(kill=not finished)
-
-
-@contextlib.contextmanager
-def _workers_environment() -> Generator[None, None, None]:
-    """The environment of the processes that are started meanwhile.
-
-    The libraries read it when they are loaded, which in a spawned process is before any initialiser runs.
-    """
-    before: dict[str, Any] = {name: os.environ.get(name) for name in _WORKERS_ENVIRONMENT}
-    os.environ.update(_WORKERS_ENVIRONMENT)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _begin(memory: int | None) -> None:
-    """What a worker does first: bound its memory, and watch its parent, to end with it."""
-    if memory is not None:
-        with contextlib.suppress(ImportError, ValueError):
-            import resource
-
-            resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
