@@ -21,6 +21,7 @@ from igps import _threads as threads
 from igps.mesh.mesh import Mesh
 from igps.signature.laplacian import laplacian
 from igps.spectra import ConvergenceError, Spectrum, eigenpairs, eigensolver
+from igps.spectra import _basis as basis
 from igps.spectra import _krylov as krylov
 from igps.spectra import _lanczos as lanczos
 from igps.spectra._multifrontal import analyse
@@ -214,7 +215,7 @@ def test_a_large_basis_gives_its_place_to_the_eigenvectors(
     torus_problem: Problem, torus_oracle: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stiffness, mass, positions = torus_problem
-    monkeypatch.setattr(krylov, "MOST_SINGLE_ENTRIES", 1000)
+    monkeypatch.setattr(basis, "MOST_SINGLE_ENTRIES", 1000)
     monkeypatch.setattr(krylov, "COLUMNS_AT_ONCE", 100)
     monkeypatch.delattr(krylov.Krylov, "eigenvectors")  # which would need memory beside the basis
     spectrum = eigenpairs(stiffness, mass, 130, positions=positions)

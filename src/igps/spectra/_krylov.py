@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 import torch
 from scipy.linalg import qr
 
 from igps._threads import ALONE, Team
+from igps.spectra._basis import Basis, pieces_of
 from igps.spectra._checks import ROUNDING
 from igps.spectra._multifrontal import Factors
 from igps.spectra._products import combinations, overlaps, subtract
@@ -26,14 +26,8 @@ ROUND_PIVOT = 0.1
 # So many blocks go by between two sweeps, or one where a sweep has found a larger loss of orthogonality; a smaller one
 # may be taken out in single precision
 SWEEP_EVERY, SWEEP_LOSS, SINGLE_LOSS = 2, 1e-7, 3e-8
-# Of a larger basis there is no copy in single precision, to save memory: 1 GiB
-MOST_SINGLE_ENTRIES = 2**28
-# Up to 256 MiB a basis gains by the huge pages that NumPy asks the system for; for larger ones the wait costs more
-MOST_HUGE_ENTRIES = 2**25
 # Columns of the basis that are turned into eigenvectors at once
 COLUMNS_AT_ONCE = 8192
-# Columns of a piece of the basis, of which a thread computes with one at a time, and the most pieces
-PIECE, MOST_PIECES = 2**12, 8
 
 
 @dataclass(frozen=True)
@@ -63,12 +57,11 @@ class RitzPairs:
         return torch.cat([below, above[:n_above]])
 
 
-class Krylov:
+class Krylov(Basis):
     """Orthonormal basis of a block Krylov space of (A − σI)⁻¹, grown block by block, and the operator projected on it.
 
     Vectors are stored as rows, since products of the basis with a block are fastest so. The first row is the zero mode:
-    the others stay orthogonal to it, and the projected problem leaves it out. The columns are cut into pieces, which a
-    team works on side by side; how many depends on their number alone, so that a team changes no bit.
+    the others stay orthogonal to it, and the projected problem leaves it out.
     """
 
     def __init__(
@@ -80,43 +73,16 @@ class Krylov:
         generator: np.random.Generator,
         team: Team = ALONE,
     ) -> None:
+        super().__init__(zero_mode, capacity, team)
         self._factors = factors
-        self._team = team
         self._generator = generator
         self._block_size = block_size
-        n_vertices = len(zero_mode)
-        self._pieces = _pieces(n_vertices, max(1, min(MOST_PIECES, n_vertices // PIECE)))
-        self._large = (capacity + 1) * n_vertices > MOST_SINGLE_ENTRIES
-        # with a copy in single precision, to be read in half the time
-        self._single: torch.Tensor | None
-        self._allocate(capacity + 1, n_vertices)
-        self._basis[0] = torch.from_numpy(zero_mode)
-        if self._single is not None:
-            self._single[0] = self._basis[0]
-        self._projected = torch.zeros(capacity + 1, capacity + 1, dtype=torch.float64)
-        # rows previous:current and current:stop of the basis are the last two blocks, the last not yet multiplied; rows
-        # before swept are orthogonal to all before them, those behind it to their neighbours
-        self._previous = self._current = self._stop = self._swept = 1
+        # rows previous:current and current:stop of the basis are the last two blocks, the last not yet multiplied
+        self._previous = self._current = 1
         self._every = SWEEP_EVERY
         self._coupling = torch.empty(0, 0, dtype=torch.float64)
         # a random vector is mostly high frequencies: one application leaves what matters
         self._append(self._orthonormal(self._apply(self._random(block_size)), near=1)[0], swept=True)
-
-    def _allocate(self, n_rows: int, n_columns: int) -> None:
-        """A new basis. Of NumPy's memory a part can be given back.
-
-        A smaller one and its copy are one piece: the C library keeps what was one piece for the next basis.
-        """
-        self._memory = np.empty((n_rows if self._large else 0, n_columns))
-        if self._large:
-            self._basis, self._single = torch.from_numpy(self._memory), None
-            return
-        size = n_rows * n_columns
-        length = size + (size + 1) // 2
-        huge = length <= MOST_HUGE_ENTRIES
-        room = torch.from_numpy(np.empty(length)) if huge else torch.empty(length, dtype=torch.float64)
-        self._basis = room[:size].view(n_rows, n_columns)
-        self._single = room[size:].view(torch.float32)[:size].view(n_rows, n_columns)
 
     @property
     def size(self) -> int:
@@ -210,7 +176,7 @@ class Krylov:
 
     def _small_pieces(self) -> list[slice]:
         n_vertices = self._basis.shape[1]
-        return _pieces(n_vertices, -(-n_vertices // COLUMNS_AT_ONCE))
+        return pieces_of(n_vertices, -(-n_vertices // COLUMNS_AT_ONCE))
 
     def _random(self, n_rows: int) -> torch.Tensor:
         return torch.from_numpy(self._generator.standard_normal((n_rows, self._basis.shape[1])))
@@ -218,46 +184,6 @@ class Krylov:
     def _apply(self, block: torch.Tensor) -> torch.Tensor:
         """The products (b, V) of the operator with b rows."""
         return self._factors.solve(block.T, self._team).T
-
-    def _sums(self, parts: Callable[[slice], tuple[torch.Tensor, ...]]) -> tuple[torch.Tensor, ...]:
-        """What each piece of the columns contributes, added in the order of the pieces."""
-        first, *others = self._team.each(parts, self._pieces)
-        for other in others:
-            for total, part in zip(first, other, strict=True):
-                total.add_(part)
-        return first
-
-    def _room(self, n_rows: int) -> torch.Tensor:
-        """The rows of the basis behind the last, which a block is written to before it is appended."""
-        stop = self._stop + n_rows
-        if stop > len(self._basis):
-            capacity = len(self._basis) * 3 // 2 + n_rows
-            basis, single, projected = self._basis, self._single, self._projected
-            self._allocate(capacity, basis.shape[1])
-            self._basis[: self._stop] = basis[: self._stop]
-            if self._single is not None and single is not None:
-                self._single[: self._swept] = single[: self._swept]
-            self._projected = projected.new_zeros(capacity, capacity)
-            self._projected[: self._stop, : self._stop] = projected[: self._stop, : self._stop]
-        return self._basis[self._stop : stop]
-
-    def _append(self, block: torch.Tensor, *, swept: bool) -> None:
-        room = self._room(len(block))
-        if block.data_ptr() != room.data_ptr():
-            room.copy_(block)
-        self._stop += len(block)
-        if swept:
-            self._mark_swept()
-
-    def _mark_swept(self) -> None:
-        rows = slice(self._swept, self._stop)
-
-        def copy(piece: slice) -> None:
-            if self._single is not None:
-                self._single[rows, piece] = self._basis[rows, piece]
-
-        self._team.each(copy, self._pieces)
-        self._swept = self._stop
 
     def _sweep(self) -> float:
         """Make the rows since the last sweep orthogonal to all before them, and orthonormal; how far they were from it.
@@ -287,17 +213,6 @@ class Krylov:
             self._multiply(_inverse(torch.linalg.cholesky(squares)), new, new)
         self._mark_swept()
         return largest
-
-    def _multiply(self, factor: torch.Tensor, rows: torch.Tensor, out: torch.Tensor) -> None:
-        """The product of a matrix (b, b) with rows (b, V), which ``out`` may be."""
-
-        def multiply(piece: slice) -> None:
-            if out is rows:
-                rows[:, piece] = factor @ rows[:, piece]
-            else:
-                torch.mm(factor, rows[:, piece], out=out[:, piece])
-
-        self._team.each(multiply, self._pieces)
 
     def _orthonormal(
         self, block: torch.Tensor, near: int, scale: float | None = None
@@ -356,11 +271,6 @@ def _coefficients(ritz: RitzPairs, index: torch.Tensor) -> torch.Tensor:
     """(m + b, K) of the Ritz pairs with these indices, of length 1."""
     coefficients = ritz.coefficients[:, index]
     return coefficients / torch.linalg.norm(coefficients, dim=0)
-
-
-def _pieces(size: int, number: int) -> list[slice]:
-    cuts = np.linspace(0, size, number + 1).astype(int).tolist()
-    return [slice(begin, end) for begin, end in pairwise(cuts)]
 
 
 def _empty(n_rows: int, n_columns: int) -> torch.Tensor:
