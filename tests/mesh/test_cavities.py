@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
-from igps import LoadOptions, Mesh, MeshError, SignatureConfig, compute_signature, load_mesh
+from igps import LoadOptions, Mesh, MeshError, SignatureConfig, collate, compute_signature, descriptor, load_mesh
+from igps.descriptors.interior import interior
 from igps.mesh.label_surface import voxel_surface
 from igps.mesh.mending import mend, mended_by
 from igps.mesh.simplification import simplify
@@ -132,3 +134,15 @@ def test_a_label_keeps_its_cavities() -> None:
     full = voxel_surface(mask)
     assert signed_volume(*full[:2]) == pytest.approx(np.count_nonzero(radius < 16), rel=0.01)
     assert notes != full[2]
+
+
+def test_the_larger_the_cavity_the_farther_from_the_ball() -> None:
+    bodies = [Mesh(*ball(1))]
+    bodies += [Mesh(*joined(ball(1), ball(radius, inwards=True)), cavities=True) for radius in (0.2, 0.5, 0.8)]
+    names = ("depth", "electrostatic_potential", "surface_direction")
+    config = SignatureConfig(n_eigenpairs=64, resolution=16, min_samples=500, attributes=names)
+    batches = [collate([compute_signature(body, config)]) for body in bodies]
+    for module in (interior(64), descriptor("rich"), descriptor("pretrained")):
+        descriptions = torch.cat([module(batch) for batch in batches])
+        distances = module.distances(descriptions[:1], descriptions)[0]
+        assert bool((distances.diff() > 0).all()), (module.name, distances)

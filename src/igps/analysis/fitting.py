@@ -136,7 +136,8 @@ def fit(
     # Bodies of one class that the head has seen are nearer than others will be
     scale = float(model.distances(vectors, vectors)[apart].median()) / 5
     if individual is not None:
-        model = individual.around(model, scale)
+        kept = {"size": individual.keeps_size, "side": individual.twists is not None}
+        model = IndividualDescriptor(model, scale=scale, **kept).eval()
     model.card = {
         "scale": scale,
         "descriptor": descriptor if isinstance(descriptor, str) else descriptor.name,

@@ -81,10 +81,6 @@ class IndividualDescriptor(Descriptor):
         if self.twists is not None:
             self.requirements |= self.twists.requirements
 
-    def around(self, descriptor: Descriptor, scale: float) -> IndividualDescriptor:
-        """The same of another descriptor and its scale."""
-        return IndividualDescriptor(descriptor, size=self.keeps_size, side=self.twists is not None, scale=scale).eval()
-
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, D + 18 + 2), of which side and size are there if they are told."""
         parts = [self.descriptor(batch).flatten(1)]
