@@ -49,13 +49,15 @@ class FileCache(ABC, Generic[T]):
     Attributes:
         what: the values are, in a word.
         file_format: name and version of the files' format.
+        folder: of the values in the directory, "" where they lie in it themselves.
     """
 
     what: ClassVar[str]
     file_format: ClassVar[str]
+    folder: ClassVar[str] = ""
 
     def __init__(self, directory: str | Path) -> None:
-        self.directory = Path(directory)
+        self.directory = Path(directory) / self.folder
 
     @staticmethod
     @abstractmethod
@@ -223,17 +225,11 @@ def _check_array(name: str, values: np.ndarray, kind: type[np.floating[Any]], sh
 
 
 class AttributeCache(FileCache[dict[str, NDArray[np.float32]]]):
-    """Attributes of the samples of one Signature by room, beside the Signatures in a folder of their own.
-
-    Args:
-        directory: that of the Signatures.
-    """
+    """Attributes of the samples of one Signature by room, beside the Signatures."""
 
     what = "attribute"
     file_format = "igps-attribute-2"
-
-    def __init__(self, directory: str | Path) -> None:
-        super().__init__(Path(directory) / "attributes")
+    folder = "attributes"
 
     @staticmethod
     def _encode(value: dict[str, NDArray[np.float32]]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
@@ -245,17 +241,11 @@ class AttributeCache(FileCache[dict[str, NDArray[np.float32]]]):
 
 
 class DescriptionCache(FileCache[NDArray[np.float32]]):
-    """Descriptions by key, beside the Signatures in a folder of their own, see `FileCache`.
-
-    Args:
-        directory: that of the Signatures.
-    """
+    """Descriptions by key, beside the Signatures, see `FileCache`."""
 
     what = "description"
     file_format = "igps-description-2"
-
-    def __init__(self, directory: str | Path) -> None:
-        super().__init__(Path(directory) / "descriptions")
+    folder = "descriptions"
 
     @staticmethod
     def _encode(value: NDArray[np.float32]) -> tuple[dict[str, np.ndarray], dict[str, str]]:

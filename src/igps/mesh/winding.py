@@ -34,20 +34,32 @@ def winding_number(
 
     if accuracy is not None and not accuracy > 0:
         raise ValueError(f"accuracy: expected None (exact) or a positive error, got {accuracy}")
-    vertices, faces, points = np.asarray(vertices, np.float64), np.asarray(faces), np.asarray(points, np.float64)
-    for name, array in (("vertices", vertices), ("faces", faces), ("points", points)):
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise ValueError(f"{name}: expected shape (n, 3), got {array.shape}")
-    for name, array in (("vertices", vertices), ("points", points)):
-        if not np.isfinite(array).all():
-            raise ValueError(f"{name}: expected finite coordinates, got NaN or infinity; remove those rows")
-    if not np.issubdtype(faces.dtype, np.integer):
-        raise ValueError(f"faces: expected integer vertex indices, got {faces.dtype}")
-    if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(f"faces: expected at least one face, with indices in [0, {len(vertices)}), got another")
+    vertices, faces, points = checked_places(vertices, faces, points)
     if not has_area(vertices[faces]).any():
         raise ValueError("faces: expected at least one face with an area, got flat ones only; check the mesh")
     if not len(points):
         return np.zeros(0)
     tree = igl.winding_number if accuracy is None or accuracy < _TREE_ERROR else igl.fast_winding_number
-    return np.asarray(tree(vertices, faces.astype(np.int64, order="C"), points))
+    return np.asarray(tree(vertices, faces, points))
+
+
+def checked_places(
+    vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """The vertices of a mesh, its faces and points, in double precision and 64 bits.
+
+    Raises:
+        ValueError: a shape, an index or a value of an argument is invalid.
+    """
+    at, index, where = np.asarray(vertices, np.float64), np.asarray(faces), np.asarray(points, np.float64)
+    for name, array in (("vertices", at), ("faces", index), ("points", where)):
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise ValueError(f"{name}: expected shape (n, 3), got {array.shape}")
+    for name, array in (("vertices", at), ("points", where)):
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name}: expected finite coordinates, got NaN or infinity; remove those rows")
+    if not np.issubdtype(index.dtype, np.integer):
+        raise ValueError(f"faces: expected integer vertex indices, got {index.dtype}")
+    if len(index) == 0 or index.min() < 0 or index.max() >= len(at):
+        raise ValueError(f"faces: expected at least one face, with indices in [0, {len(at)}), got another")
+    return at, np.array(index, np.int64, order="C"), where

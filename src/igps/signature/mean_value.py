@@ -22,6 +22,7 @@ from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.distance import cdist
 
 from igps._threads import Team
+from igps.mesh.winding import checked_places
 from igps.signature._far_field import Clusters, Surface
 from igps.signature._spatial_order import spatial_order
 
@@ -260,22 +261,12 @@ def _scaled(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
 ) -> tuple[Floats, Integers, Floats]:
     """Check the arguments; vertices and points on the mesh's scale, and the faces."""
-    vertices, faces, points = np.asarray(vertices, np.float64), np.asarray(faces), np.asarray(points, np.float64)
-    for name, array in (("vertices", vertices), ("faces", faces), ("points", points)):
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise ValueError(f"{name}: expected shape (n, 3), got {array.shape}")
-    for name, array in (("vertices", vertices), ("points", points)):
-        if not np.isfinite(array).all():
-            raise ValueError(f"{name}: expected finite coordinates, got NaN or infinity; remove those rows")
-    if not np.issubdtype(faces.dtype, np.integer):
-        raise ValueError(f"faces: expected integer vertex indices, got {faces.dtype}")
-    if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(f"faces: expected at least one face, with indices in [0, {len(vertices)}), got another")
+    vertices, faces, points = checked_places(vertices, faces, points)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     centre, scale = (low + high) / 2, np.linalg.norm(high - low) / 2
     if not scale > 0:
         raise ValueError("vertices: expected distinct vertices, got one place for all; check the mesh")
-    return (vertices - centre) / scale, np.array(faces, np.int64, order="C"), (points - centre) / scale
+    return (vertices - centre) / scale, faces, (points - centre) / scale
 
 
 def _normalised(values: NDArray[np.floating], totals: NDArray[np.floating]) -> NDArray[np.floating]:

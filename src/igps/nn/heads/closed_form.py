@@ -69,11 +69,7 @@ class WhitenedHead(Head):
     prior_share: Tensor
 
     def __init__(
-        self,
-        n_directions: int = 64,
-        shrinkage: float = 0.3,
-        prior: Head | None = None,
-        prior_share: float = 1 / 3,
+        self, n_directions: int = 64, shrinkage: float = 0.3, prior: Head | None = None, prior_share: float = 1 / 3
     ) -> None:
         super().__init__()
         check_directions(n_directions, shrinkage)
