@@ -74,6 +74,16 @@ def test_vectors_count_a_small_difference_in_size_as_distances_do(signatures: di
     assert float(descriptor.distances(body, other)) == pytest.approx(float((body - other).norm()), rel=1e-2)
 
 
+def test_short_vectors_keep_the_numbers_of_size_and_side(signatures: dict[str, Signature]) -> None:
+    descriptor = igps.descriptor("pretrained+side+size")
+    vectors = descriptor(collate(list(signatures.values())))
+    short = descriptor.short(vectors)
+    assert short.shape[1] == 256 + 20
+    torch.testing.assert_close(short[:, -20:], vectors[:, -20:])
+    with pytest.raises(ValueError, match="short: expected a descriptor of vectors"):
+        igps.descriptor("rich+size").short(vectors)
+
+
 @pytest.mark.parametrize("name", ["interior", "rich"])
 def test_a_mirror_image_is_the_body_unless_it_is_distinct(name: str, signatures: dict[str, Signature]) -> None:
     same, distinct = from_body(name, signatures), from_body(f"{name}+side", signatures)
@@ -194,5 +204,6 @@ def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_
     model.save(tmp_path / "mine.safetensors")
     batch = dataset.batch(range(8))
     loaded = igps.descriptor(tmp_path / "mine.safetensors")
+    assert igps.descriptor(f"{tmp_path}/mine.safetensors+size", mirror="distinct").name == loaded.name
     torch.testing.assert_close(loaded(batch), model(batch))
     torch.testing.assert_close(loaded.distances(loaded(batch), loaded(batch)), model.distances(*[model(batch)] * 2))

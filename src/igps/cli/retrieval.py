@@ -22,7 +22,7 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
-from igps.descriptors.individual import Mirror, Size
+from igps.descriptors.individual import IndividualDescriptor, Mirror, Size
 from igps.gallery.gallery import Gallery
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
@@ -109,7 +109,9 @@ def extract(
         suffixes = ", ".join(SUFFIXES if wide else (*SUFFIXES, ".npz"))
         raise ValueError(f"out: expected a file{' of a wide table' * wide} ending in one of {suffixes}, got {out}.")
     source = Folder(meshes[0]) if len(meshes) == 1 and meshes[0].is_dir() else meshes
-    if short and not isinstance(descriptor_of(descriptor.partition("+")[0]), EmbeddedDescriptor):
+    chosen = descriptor_of(descriptor)
+    plain = chosen.descriptor if isinstance(chosen, IndividualDescriptor) else chosen
+    if short and not isinstance(plain, EmbeddedDescriptor):
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {descriptor!r}.")
     dataset, descriptions, failures, name = described(source, descriptor, **reading)
     features = (descriptor_of(name).short(descriptions) if short else descriptions).numpy()

@@ -111,7 +111,14 @@ def descriptor(
     with_side = SIDE in marks or mirror == "distinct"
     if not (with_size or with_side):
         return plain
-    return IndividualDescriptor(plain, size=with_size, side=with_side).eval()
+    scale = plain.scale
+    if isinstance(plain, IndividualDescriptor):  # of a file
+        with_size, with_side, plain = (
+            with_size or plain.keeps_size,
+            with_side or plain.twists is not None,
+            plain.descriptor,
+        )
+    return IndividualDescriptor(plain, size=with_size, side=with_side, scale=scale).eval()
 
 
 def _plain(which: str | Path | Descriptor) -> Descriptor:
