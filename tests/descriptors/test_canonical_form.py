@@ -9,10 +9,11 @@ import trimesh
 from one_body import of_mesh
 from scipy.spatial.distance import cdist
 from scipy.stats import special_ortho_group
+from shortest_paths import geodesic_distances
 from sklearn.manifold import smacof
 
 from conftest import as_mesh
-from igps.descriptors._geodesics import farthest_points, geodesic_distances
+from igps.descriptors._geodesics import farthest_points
 from igps.descriptors.canonical_form import (
     CanonicalForm,
     classical_scaling,

@@ -7,9 +7,9 @@ import trimesh
 from one_body import of_mesh
 from scipy.special import eval_legendre
 from scipy.stats import special_ortho_group
+from shortest_paths import geodesic_distances
 
 from conftest import as_mesh
-from igps.descriptors._geodesics import geodesic_distances
 from igps.descriptors.geodesic_spectral import GeodesicSpectral, affinity_eigenvalues
 from igps.mesh.mesh import Mesh
 

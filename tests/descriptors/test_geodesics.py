@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.distance import cdist
+from shortest_paths import geodesic_distances
 
 from conftest import as_mesh
-from igps.descriptors._geodesics import farthest_points, geodesic_distances
+from igps.descriptors._geodesics import farthest_points
 from igps.mesh.mesh import Mesh
 
 
@@ -151,12 +152,6 @@ def test_all_vertices_can_be_sampled() -> None:
     cube = unit_cube(1)
     n_vertices = len(cube.vertices)
     assert sorted(farthest_points(cube, n_vertices).vertices) == list(range(n_vertices))
-
-
-@pytest.mark.parametrize("sources", [[], [-1], [642], [0.5], [[0, 1]]])
-def test_sources_are_checked(blob: Mesh, sources: list) -> None:  # type: ignore[type-arg]
-    with pytest.raises(ValueError, match="sources"):
-        geodesic_distances(blob, sources)
 
 
 def test_counts_are_checked(blob: Mesh) -> None:

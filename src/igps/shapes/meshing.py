@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from igps.mesh import surface
+from igps.mesh.mesh import Mesh, MeshError
 from igps.shapes.skeleton import Placed
 from igps.shapes.solids import Array
 
@@ -57,17 +58,13 @@ def defect(vertices: Array, faces: Faces, genus: int, n_vertices: int, min_angle
     count = len(vertices)
     if abs(count / n_vertices - 1.0) > _VERTEX_TOLERANCE:
         return f"{count} vertices"
-    start, end = surface.directed_edges(faces)
-    forward, backward = start * count + end, end * count + start
-    if len(np.unique(forward)) < len(forward) or not np.array_equal(np.sort(forward), np.sort(backward)):
-        return "not a closed, oriented manifold"
-    components, _ = surface.components(faces, count)
-    if components != 1:
-        return f"{components} components"
-    found = surface.genus(faces, count)
-    if found != genus:
-        return f"genus {found} in place of {genus}"
-    if np.linalg.det(vertices[faces]).sum() <= 0.0:
+    try:
+        body = Mesh(vertices, faces)
+    except MeshError as error:
+        return str(error)
+    if body.genus != genus:
+        return f"genus {body.genus} in place of {genus}"
+    if body.notes:
         return "inside out"
     angle = _smallest_angle(vertices, faces)
     if angle < min_angle:
