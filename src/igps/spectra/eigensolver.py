@@ -23,11 +23,9 @@ Lewis & Simon 1994):
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
 
 import numpy as np
 import torch
@@ -77,14 +75,14 @@ def eigenpairs(
     n_eigenpairs: int,
     *,
     positions: np.ndarray | None = None,
-    method: Literal["lanczos", "eigsh"] = "lanczos",
     tolerance: float = 1e-7,
     seed: int = 0,
 ) -> Spectrum:
     """The ``n_eigenpairs`` smallest non-zero eigenpairs of ``L φ = λ M φ`` on a connected closed surface.
 
     None is missing: their number is proved by inertia. The residual of each pair, ‖L φ − λ M φ‖ / λ in the norm of M⁻¹,
-    is at most the tolerance, or as small as rounding allows, and then at most RESIDUAL_LIMIT. Within a multiplet the
+    is at most the tolerance, or as small as rounding allows, and then at most RESIDUAL_LIMIT. Small matrices go to a
+    dense solver; where a solver fails, ARPACK follows, with a logged warning and the same proof. Within a multiplet the
     basis is arbitrary. The result is the same for the same seed, to the bit with any number of threads.
 
     The matrices may come from any library, with the sign that makes the stiffness positive semi-definite.
@@ -103,9 +101,6 @@ def eigenpairs(
         mass: (V,) lumped vertex areas, length², or a diagonal (V, V) sparse matrix of them.
         n_eigenpairs: how many, the zero mode not counted.
         positions: (V, 3) vertex positions, any unit. They only guide the elimination order; without them it is slower.
-        method: "lanczos" as in the module's docstring, with a dense solver for small matrices; or "eigsh", ARPACK
-            by `scipy.sparse.linalg.eigsh` without proof or check, to compare with. Where the former fails, it falls
-            back, with a logged warning, to ARPACK with proof and check.
         tolerance: largest residual, relative to the eigenvalue. An eigenvalue's error is about its square.
         seed: of the random start vectors.
 
@@ -118,18 +113,11 @@ def eigenpairs(
     stiffness = checked_stiffness(stiffness, mass, n_eigenpairs)
     if positions is not None and (positions.shape != (len(mass), 3) or not np.isfinite(positions).all()):
         raise ValueError(f"positions must be finite and ({len(mass)}, 3), got {positions.shape}")
-    if method not in ("lanczos", "eigsh"):
-        raise ValueError(f"method must be 'lanczos' or 'eigsh', got {method!r}")
 
     area = mass.sum()
     scale = np.sqrt(area / mass)
     matrix = stiffness.copy()
     matrix.data *= scale.repeat(np.diff(matrix.indptr)) * scale[matrix.indices]
-    if method == "eigsh":
-        eigenvalues, eigenfunctions = _arpack(stiffness, mass, n_eigenpairs, seed)
-        residual, _ = _residual(matrix, eigenvalues * area, eigenfunctions * np.sqrt(mass)[:, None], math.inf)
-        return Spectrum(eigenvalues, eigenfunctions, mass, residual)
-
     eigenvalues, vectors, residual = _solve(matrix, stiffness, mass, n_eigenpairs, positions, tolerance, seed)
     vectors /= np.sqrt(mass)[:, None]
     return Spectrum(eigenvalues / area, vectors, mass, residual)
