@@ -81,6 +81,16 @@ def fit(
     Held-out scores are of folds that neither the fit nor the choice of the head has seen; the head that is returned is
     fitted to all bodies.
 
+    Example:
+        >>> import tempfile
+        >>> from igps.shapes import ArticulatedShapes
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = ArticulatedShapes(n_classes=2, n_per_class=4, n_vertices=600).write(f"{folder}/shapes")
+        ...     dataset = SignatureDataset(f"{folder}/shapes", cache_dir=f"{folder}/cache", descriptor="interior")
+        ...     model = fit(dataset, "interior", head="whitened", n_workers=1)
+        >>> model.name, sorted(model.card["classes"].values())
+        ('interior_whitened', [4, 4])
+
     Args:
         dataset: labelled bodies.
         descriptor: of histograms; or one with a metric, which is the prior.

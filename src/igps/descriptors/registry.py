@@ -59,6 +59,14 @@ def is_file(which: str | Path) -> bool:
 def load(path: str | Path) -> Descriptor:
     """A descriptor that `Descriptor.save` or `igps fit` wrote, in evaluation mode, with its `card`. No code runs.
 
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     descriptor("interior").save(f"{folder}/mine.safetensors", {"author": "me"})
+        ...     loaded = load(f"{folder}/mine.safetensors")
+        >>> loaded.name, dict(loaded.card)
+        ('interior', {'author': 'me'})
+
     Raises:
         FileNotFoundError: no such file.
         ValueError: it is another file, or a damaged one.
