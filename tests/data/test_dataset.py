@@ -386,7 +386,7 @@ def test_an_attribute_is_added_to_cached_signatures_without_new_eigenpairs(
     for again in range(2):
         one = with_image(image)
         assert one.precompute(n_workers=1, progress=False) == []
-        assert image.read == 8  # of interior and surface of four bodies, once
+        assert image.read == 4  # of each body once
         for i, item in enumerate(one):
             for samples in (item.signature.interior, item.signature.surface):
                 expected = 2 * samples.points[:, 2] + (100 if i > 1 else 0)

@@ -108,11 +108,12 @@ class SignatureDataset(Dataset[LabelledSignature]):
         transform: Callable[[Signature], Signature] | None = None,
     ) -> None:
         config, reading = config or SignatureConfig(), reading or LoadOptions()
+        given = dict(attributes or {})
         if descriptor is not None:
-            config = requirements_of(descriptor).apply_to(config)
+            requirements = requirements_of(descriptor)
+            config, given = requirements.apply_to(config), {**requirements.sources, **given}
         self.bodies = _bodies(root_or_paths, labels, reading).classed(classes or "folder")
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
-        given = dict(attributes or {})
         sources = {name: one for name, one in given.items() if isinstance(one, AttributeSource)}
         self._functions: dict[str, PointFunction] = {
             name: one for name, one in given.items() if not isinstance(one, AttributeSource)

@@ -13,6 +13,8 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from igps._parallel import Failed, MachineError, attempt
 from igps.data.attributes import ROOMS, AttributeSource, with_attribute
 from igps.data.cache import AttributeCache, SignatureCache
@@ -146,7 +148,10 @@ class SignaturePipeline:
         """What serves a body whose Signature in the cache is known, with its attributes; None if one is missing."""
         if not self.attributes or self.pre_transform is not None:
             return hit
-        keys = {name: self._attribute_key(body, hit.key, name) for name in self.attributes}
+        try:
+            keys = {name: self._attribute_key(body, hit.key, name) for name in self.attributes}
+        except MeshError:  # computing it will say why
+            return None
         cache = AttributeCache(self.cache_dir)
         return replace(hit, attributes=keys) if all(key in cache for key in keys.values()) else None
 
@@ -234,7 +239,9 @@ class SignaturePipeline:
         values = cache.get(key)
         if values is not None:
             return with_attribute(signature, name, values)
-        found = {room: self.attributes[name](body, getattr(signature, room).points) for room in ROOMS}
+        points = [getattr(signature, room).points for room in ROOMS]
+        rows = self.attributes[name](body, np.concatenate(points))
+        found = dict(zip(ROOMS, np.split(rows, [len(points[0])]), strict=True))
         signature = with_attribute(signature, name, found)
         cache.put(key, {room: getattr(signature, room).attributes[name] for room in ROOMS})
         return signature

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import torch
 from torch import nn
 
+from igps.data.attributes import AttributeSource
 from igps.data.batch import SignatureBatch
 from igps.signature.attributes import AttributeName
 from igps.signature.signature import SignatureConfig
@@ -23,12 +24,14 @@ class Requirements:
         attributes: of the samples, see `SignatureConfig`.
         mesh: whether the surface itself.
         whole_spectrum: whether it takes all eigenpairs that there are: with more it would be another descriptor.
+        sources: of further attributes of the samples, by name; those that a Dataset is given itself come first.
     """
 
     n_eigenpairs: int = 0
     attributes: tuple[AttributeName, ...] = ()
     mesh: bool = False
     whole_spectrum: bool = False
+    sources: Mapping[str, AttributeSource] = field(default_factory=dict, hash=False)
 
     def __or__(self, other: Requirements) -> Requirements:
         """What both need."""
@@ -37,6 +40,7 @@ class Requirements:
             tuple(dict.fromkeys((*self.attributes, *other.attributes))),
             self.mesh or other.mesh,
             self.whole_spectrum or other.whole_spectrum,
+            {**self.sources, **other.sources},
         )
 
     def apply_to(self, config: SignatureConfig) -> SignatureConfig:
@@ -55,7 +59,7 @@ class Requirements:
     def check_config(self, config: SignatureConfig) -> None:
         """Raise a ValueError that names what Signatures of this configuration lack, if they lack anything."""
         self._check_eigenpairs(config.n_kept)
-        self._check_attributes(config.attributes)
+        self._check_attributes((*config.attributes, *self.sources))
 
     def check(self, batch: SignatureBatch) -> None:
         """Raise a ValueError that names what the batch lacks, if it lacks anything."""
@@ -69,7 +73,7 @@ class Requirements:
             )
 
     def _check_attributes(self, found: Collection[str]) -> None:
-        if missing := [name for name in self.attributes if name not in found]:
+        if missing := [name for name in (*self.attributes, *self.sources) if name not in found]:
             raise ValueError(
                 f"attributes: this descriptor needs signatures with {', '.join(missing)}, got {sorted(found)}. Compute "
                 "them with SignatureDataset(..., descriptor=...), or with SignatureConfig(attributes=...)."

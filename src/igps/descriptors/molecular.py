@@ -6,8 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from igps.data.batch import SignatureBatch
+from igps.data.requirements import Requirements
 from igps.nn.axes import Attribute, InteriorDistance, PointAxis
-from igps.nn.axes.points import largest_members
+from igps.nn.axes.points import attribute_requirements, largest_members
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
@@ -48,6 +49,10 @@ class Shares(PointAxis):
     def n_classes(self) -> int:
         """C."""
         return self._n_classes
+
+    def requirements(self, embedding: nn.Module) -> Requirements:
+        """The attribute, if it is one of residues."""
+        return attribute_requirements(self.name)
 
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """(N, P, C) of the samples.

@@ -106,7 +106,7 @@ class Gallery:
         Raises:
             MeshError: the mesh cannot be used.
         """
-        dataset = SignatureDataset([mesh], self.config, cache_dir, reading=self.reading)
+        dataset = SignatureDataset([mesh], self.config, cache_dir, descriptor=self.descriptor, reading=self.reading)
         descriptions = describe(dataset, self.descriptor, n_workers=1)
         return self.nearest(descriptions, top=top, exact=exact, rerank=rerank)[0]
 

@@ -32,6 +32,16 @@ def read_gifti(path: Path, options: LoadOptions, part: str | None) -> list[RawBo
     return [RawBody(arrays[_POINTS].astype(np.float64), arrays[_TRIANGLES].astype(np.int64), unit="mm")]
 
 
+def gifti_values(path: Path, options: LoadOptions) -> dict[str, NDArray[np.generic]]:
+    """The arrays of values at vertices of a GIFTI file, by their names."""
+    found = {}
+    for number, element in enumerate(_xml.parse(path.read_bytes()).iter("DataArray"), 1):
+        if element.get("Intent") not in (_POINTS, _TRIANGLES):
+            names = [one.findtext("Value") for one in element.iter("MD") if one.findtext("Name") == "Name"]
+            found[(names or [None])[0] or f"array {number}"] = _array(element, path, options)
+    return found
+
+
 def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.generic]:
     shape = [int(element.get(f"Dim{i}", "0")) for i in range(int(element.get("Dimensionality", "2")))]
     kind = np.dtype(_TYPES[element.get("DataType", "")])

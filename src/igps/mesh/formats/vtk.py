@@ -7,6 +7,8 @@ promises too much.
 from __future__ import annotations
 
 import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 from xml.etree.ElementTree import Element
@@ -36,6 +38,15 @@ _CELLS = {"POLYGONS": _vtk_cells.POLYGON, "TRIANGLE_STRIPS": _vtk_cells.STRIP}
 _POLYS = {"Polys": _vtk_cells.POLYGON, "Strips": _vtk_cells.STRIP}
 _COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
 Cells = tuple[NDArray[np.int64], NDArray[np.int64]]  # corners laid end to end, and how many each cell has
+
+
+@dataclass(frozen=True, eq=False)
+class PointValues:
+    """Points (V, 3) of a file, tetrahedra (T, 4) between them, and arrays (V,) or (V, C) by name."""
+
+    vertices: NDArray[np.float64]
+    tetrahedra: NDArray[np.int64]
+    values: Mapping[str, NDArray[np.generic]]
 
 
 class _Legacy:
@@ -95,24 +106,80 @@ class _Legacy:
         is_corner[np.cumsum(counts + 1) - counts - 1] = False
         return row[is_corner], counts
 
+    def geometry(self) -> tuple[NDArray[np.float64], list[tuple[Cells, NDArray[np.int64]]], str]:
+        """Points, cells with their kinds, and the first line behind them."""
+        vertices = np.zeros((0, 3))
+        cells: list[tuple[Cells, NDArray[np.int64]]] = []
+        while (words := self.line().split()) and words[0].upper() not in ("POINT_DATA", "CELL_DATA"):
+            word = words[0].upper()
+            if word == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
+                raise ValueError(f"a data set of the kind {words[1]}; surfaces are POLYDATA or UNSTRUCTURED_GRID")
+            if word == "POINTS":
+                vertices = self.numbers(3 * int(words[1]), words[2]).astype(np.float64).reshape(-1, 3)
+            elif word in ("POLYGONS", "TRIANGLE_STRIPS", "CELLS", "VERTICES", "LINES"):
+                found = self.cells(int(words[1]), int(words[2]))
+                cells.append((found, np.full(len(found[1]), _CELLS.get(word, 0), dtype=np.int64)))
+            elif word == "CELL_TYPES" and cells:
+                cells[-1] = (cells[-1][0], self.numbers(int(words[1]), "int").astype(np.int64))
+        return vertices, cells, " ".join(words).upper()
+
+    def arrays(self, heading: str, n_points: int) -> dict[str, NDArray[np.generic]]:
+        """Those of points, by name; `heading` is the line before."""
+        found: dict[str, NDArray[np.generic]] = {}
+        is_of_points, n = heading.startswith("POINT_DATA"), n_points
+        while words := self.line().split():
+            word = words[0].upper()
+            if word in ("POINT_DATA", "CELL_DATA"):
+                is_of_points, n = word == "POINT_DATA", int(words[1])
+                continue
+            rows = [(words[1], 3, n, words[2])] if word in ("VECTORS", "NORMALS") else []
+            if word == "SCALARS":
+                rows = [(words[1], int(words[3]) if len(words) > 3 else 1, n, words[2])]
+                before = self._at
+                if not self.line().upper().startswith("LOOKUP_TABLE"):
+                    self._at = before
+            for number in range(int(words[2]) if word == "FIELD" else len(rows)):
+                if word == "FIELD":
+                    name, width, length, kind = self.line().split()
+                    rows.append((name, int(width), int(length), kind))
+                name, n_columns, n_rows, kind = rows[number]
+                values = self.numbers(n_columns * n_rows, kind).reshape(n_rows, n_columns)
+                if is_of_points and n_rows == n_points:
+                    found[name] = values[:, 0] if n_columns == 1 else values
+        return found
+
 
 def read_legacy(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The surface of a legacy file of polygons or cells."""
-    file = _Legacy(path.read_bytes())
-    vertices = np.zeros((0, 3))
-    cells: list[tuple[Cells, NDArray[np.int64]]] = []
-    while (words := file.line().split()) and words[0].upper() not in ("POINT_DATA", "CELL_DATA"):
-        word = words[0].upper()
-        if word == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
-            raise ValueError(f"a data set of the kind {words[1]}; surfaces are POLYDATA or UNSTRUCTURED_GRID")
-        if word == "POINTS":
-            vertices = file.numbers(3 * int(words[1]), words[2]).astype(np.float64).reshape(-1, 3)
-        elif word in ("POLYGONS", "TRIANGLE_STRIPS", "CELLS", "VERTICES", "LINES"):
-            found = file.cells(int(words[1]), int(words[2]))
-            cells.append((found, np.full(len(found[1]), _CELLS.get(word, 0), dtype=np.int64)))
-        elif word == "CELL_TYPES" and cells:
-            cells[-1] = (cells[-1][0], file.numbers(int(words[1]), "int").astype(np.int64))
+    vertices, cells, _ = _Legacy(path.read_bytes()).geometry()
     return [_body(vertices, cells)]
+
+
+def point_values(path: Path, options: LoadOptions) -> PointValues:
+    """What a file of VTK knows of its points; of several pieces laid end to end."""
+    if path.suffix.lower() == ".vtk":
+        legacy = _Legacy(path.read_bytes())
+        vertices, cells, heading = legacy.geometry()
+        return PointValues(vertices, _tetrahedra(cells), legacy.arrays(heading, len(vertices)))
+    file = _Xml(path, options)
+    pieces = list(file.root.iter("Piece"))
+    if len(pieces) != 1:
+        raise ValueError(f"{len(pieces)} pieces; one expected")
+    vertices, cells = file.geometry(pieces[0])
+    arrays: dict[str, NDArray[np.generic]] = {}
+    for element in pieces[0].findall("PointData/DataArray"):
+        values = file.array(element).reshape(len(vertices), -1)
+        arrays[element.get("Name") or f"array {len(arrays) + 1}"] = values[:, 0] if values.shape[1] == 1 else values
+    return PointValues(vertices, _tetrahedra(cells), arrays)
+
+
+def _tetrahedra(cells: list[tuple[Cells, NDArray[np.int64]]]) -> NDArray[np.int64]:
+    found = [np.zeros((0, 4), dtype=np.int64)]
+    for (corners, n_corners), kinds in cells:
+        if len(kinds) == len(n_corners) and (n_corners >= 0).all() and n_corners.sum() == len(corners):
+            starts = np.cumsum(n_corners) - n_corners
+            found.append(corners[starts[(kinds == _vtk_cells.TETRAHEDRON) & (n_corners == 4), None] + np.arange(4)])
+    return np.concatenate(found)
 
 
 def read_xml(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
@@ -146,21 +213,25 @@ class _Xml:
         self._compressor = None if name is None else _COMPRESSORS[name]
 
     def body(self, piece: Element, part: str | None = None) -> RawBody:
+        return _body(*self.geometry(piece), part)
+
+    def geometry(self, piece: Element) -> tuple[NDArray[np.float64], list[tuple[Cells, NDArray[np.int64]]]]:
+        """Points, and cells with their kinds."""
         points = piece.find("Points/DataArray")
         if points is None:
             raise ValueError("no points in it")
-        vertices = self._array(points).astype(np.float64).reshape(-1, 3)
+        vertices = self.array(points).astype(np.float64).reshape(-1, 3)
         cells: list[tuple[Cells, NDArray[np.int64]]] = []
         for group in (*_POLYS, "Cells"):
-            arrays = {one.get("Name"): self._array(one) for one in piece.findall(f"{group}/DataArray")}
+            arrays = {one.get("Name"): self.array(one) for one in piece.findall(f"{group}/DataArray")}
             if len(arrays) >= 2:
                 offsets = arrays["offsets"].astype(np.int64)
                 n_corners = np.asarray(np.diff(offsets, prepend=0), dtype=np.int64)
                 kinds = arrays.get("types", np.full(len(n_corners), _POLYS.get(group, 0)))
                 cells.append(((arrays["connectivity"].astype(np.int64), n_corners), kinds.astype(np.int64)))
-        return _body(vertices, cells, part)
+        return vertices, cells
 
-    def _array(self, element: Element) -> NDArray[np.generic]:
+    def array(self, element: Element) -> NDArray[np.generic]:
         name = element.get("type", "")
         kind = np.dtype(f"{'f' if name.startswith('F') else name[0].lower()}{int(name.lstrip('UIntFloa')) // 8}")
         kind = kind.newbyteorder(self._order)

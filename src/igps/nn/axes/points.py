@@ -11,12 +11,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
+from igps.data.attribute_sources import ResidueAttribute
 from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn.axes.centres import OrderedCentres, middles
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import barycentroid_potential
 from igps.nn.specification import Specified
 from igps.signature.attributes import AttributeName
+from igps.signature.residue_attributes import RESIDUE_ATTRIBUTES
 
 
 class PointAxis(Specified, ABC):
@@ -175,8 +177,8 @@ class Attribute(PointAxis):
         self.name = name
 
     def requirements(self, embedding: nn.Module) -> Requirements:
-        """The attribute, if it is one that Signatures are computed with."""
-        return Requirements(attributes=tuple(name for name in get_args(AttributeName) if name == self.name))
+        """The attribute, if it is one that Signatures are computed with, or one of residues."""
+        return attribute_requirements(self.name)
 
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """(N, P) of the attribute.
@@ -191,6 +193,13 @@ class Attribute(PointAxis):
 
     def extra_repr(self) -> str:
         return repr(self.name)
+
+
+def attribute_requirements(name: str) -> Requirements:
+    """What a sample's attribute needs of a body: nothing where it is one of your own."""
+    if name in RESIDUE_ATTRIBUTES:
+        return Requirements(sources={name: ResidueAttribute(name)})
+    return Requirements(attributes=tuple(one for one in get_args(AttributeName) if one == name))
 
 
 def soft_memberships(values: Tensor, centres: Tensor) -> Tensor:

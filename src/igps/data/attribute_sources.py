@@ -1,0 +1,321 @@
+"""Sources of attributes: images and grids, values at vertices or in tetrahedra, residues of a molecule.
+
+A value that is not known at some samples is taken from the nearest sample that has one, which the log tells; where more
+than a tenth is not known, the body is refused. Not known is what lies outside of an image by more than half a voxel,
+what is not finite, and what is so large that it stands for nothing (10¹⁵).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
+
+from igps.data.attributes import AttributeSource
+from igps.mesh.formats import images, vertex_values
+from igps.mesh.formats.molecules import Molecule, MoleculeBodies, is_structure, read_molecule
+from igps.mesh.loading import BodyRef, load_mesh, read_surface
+from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
+from igps.signature.mean_value import extend
+from igps.signature.residue_attributes import RESIDUE_ATTRIBUTES, residue_attributes
+
+logger = logging.getLogger(__name__)
+
+Values = NDArray[np.float64]
+
+# A value beyond stands for none, such as the 7e18 at the border of some grids.
+_LARGEST = 1e15
+_MOST_MISSING = 0.1
+_TETRAHEDRA = (".vtu",)
+# A point this far outside of a tetrahedron, in its heights, belongs to it: rounding, and curved surfaces.
+_OUTSIDE = 0.05
+
+
+@dataclass(frozen=True)
+class ResidueAttribute:
+    """An attribute of the residues of a molecule, see `igps.signature.residue_attributes.RESIDUE_ATTRIBUTES`."""
+
+    name: str
+
+    def __post_init__(self) -> None:
+        if self.name not in RESIDUE_ATTRIBUTES:
+            raise ValueError(f"attribute: expected one of {', '.join(RESIDUE_ATTRIBUTES)}, got {self.name!r}.")
+
+    def cache_tag(self, body: BodyRef) -> str:
+        """The name alone: the molecule is the body's file."""
+        return f"residues 1 {self.name}"
+
+    def __call__(self, body: BodyRef, points: Values) -> Values:
+        """(P,) or (P, C) at points (P, 3), Å.
+
+        Raises:
+            MeshError: the body is no molecule, or its residues have no such value.
+        """
+        if not is_structure(body.path):
+            raise MeshError(
+                f"{body}: has no atoms, which {self.name!r} is known of. Give a PDB, mmCIF or PQR file, or choose "
+                "another descriptor."
+            )
+        values = residue_attributes(_molecule(body, os.stat(body.path).st_mtime_ns), points, [self.name])[self.name]
+        return completed(values.astype(np.float64), points, f"{body}: {self.name}")
+
+
+@lru_cache(maxsize=2)
+def _molecule(body: BodyRef, changed: int) -> Molecule:
+    """That whose surface the body is."""
+    part = body.part or ""
+    how: MoleculeBodies = "chains" if "chain" in part else "assembly" if "assembly" in part else "models"
+    found = {one.name.removeprefix(str(body.path)).strip() or "model": one for one in read_molecule(body.path, how)}
+    if part in found:
+        return found[part]
+    first, *others = read_molecule(body.path, "models")
+    for other in others:  # a body of all of them
+        first = replace(
+            first,
+            positions=np.concatenate([first.positions, other.positions]),
+            radii=np.concatenate([first.radii, other.radii]),
+            charges=np.concatenate([first.charges, other.charges]),
+            residue_of=np.concatenate([first.residue_of, other.residue_of + len(first.residue_names)]),
+            residue_names=(*first.residue_names, *other.residue_names),
+            residue_positions=np.concatenate([first.residue_positions, other.residue_positions]),
+            b_factors=np.concatenate([first.b_factors, other.b_factors]),
+        )
+    return first
+
+
+@dataclass(frozen=True)
+class FileAttribute(ABC):
+    """An attribute from a file that is found by a pattern.
+
+    Args:
+        path: in it {stem} stands for the name of the body's file without suffixes, {file} for its path below `root`,
+            and {part} for the name of the body in its file. Behind a # stands the name of the array, where the file has
+            several. What the braces stand for leads out of no folder.
+        root: from where a relative path leads; the folder of the body's file if None.
+    """
+
+    path: str
+    root: Path | None = None
+
+    def cache_tag(self, body: BodyRef) -> str:
+        """The kind of source, the array's name, and the content of the file.
+
+        Raises:
+            MeshError: there is no such file.
+        """
+        file, name = self.file(body)
+        with file.open("rb") as content:
+            return f"{type(self).__name__} 1 {name} {hashlib.file_digest(content, 'sha256').hexdigest()}"
+
+    def __call__(self, body: BodyRef, points: Values) -> Values:
+        """(P,) or (P, C) at points (P, 3).
+
+        Raises:
+            MeshError: the file cannot be used, or knows too few of the points.
+        """
+        file, name = self.file(body)
+        try:
+            values = self.values(body, file, name, points)
+        except (MeshError, MemoryError):
+            raise
+        except Exception as error:  # readers of many formats raise whatever they like
+            raise MeshError(
+                f"{body}: its attribute's file {file} is not readable ({type(error).__name__}: {error}). Check that "
+                "it is complete, and of the format that its name tells."
+            ) from error
+        return completed(values, points, f"{body}: {file}")
+
+    @abstractmethod
+    def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
+        """(P,) or (P, C) at points (P, 3), NaN where they are not known."""
+
+    def file(self, body: BodyRef) -> tuple[Path, str]:
+        """The file of a body, and the name of the array in it, which may be "".
+
+        Raises:
+            MeshError: there is none, or the pattern leads out of the folder.
+        """
+        pattern, _, name = self.path.partition("#")
+        root = body.path.parent if self.root is None else self.root
+        if Path(pattern).is_absolute():
+            root = Path(pattern.partition("{")[0]).parent if "{" in pattern else Path(pattern).parent
+        try:
+            below = body.path.resolve().relative_to(root.resolve()).as_posix()
+        except ValueError:
+            below = body.path.name
+        words = {"{stem}": body.path.name.partition(".")[0], "{file}": below, "{part}": body.part or ""}
+        for word, value in words.items():
+            pattern = pattern.replace(word, value)
+        path = root / pattern
+        if not path.resolve().is_relative_to(root.resolve()):
+            raise MeshError(f"{body}: its attribute's file {path} lies outside of {root}. Put it into that folder.")
+        if not path.is_file():
+            raise MeshError(f"{body}: its attribute's file {path} does not exist. Check the pattern {self.path!r}.")
+        return path, name
+
+
+@dataclass(frozen=True)
+class ImageAttribute(FileAttribute):
+    """Values of an image or grid, linear between the centres of voxels.
+
+    NIfTI, MGH, NRRD and MetaImage in world coordinates (RAS, millimetres); OpenDX, MRC and CCP4 in ångström.
+    """
+
+    def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
+        """See `FileAttribute.values`."""
+        grid, affine = images.read(file, os.stat(file).st_mtime_ns)
+        at = (points - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
+        size = np.array(grid.shape)
+        inside = ((at > -0.5) & (at < size - 0.5)).all(axis=1)
+        found = np.full(len(points), np.nan)
+        if inside.any():
+            # No more of a large image is changed than what is needed.
+            low = np.clip(np.floor(at[inside].min(axis=0)).astype(int), 0, size - 1)
+            high = np.clip(np.ceil(at[inside].max(axis=0)).astype(int), 0, size - 1)
+            block = grid[tuple(map(slice, low, high + 1))].astype(np.float64)
+            known = _is_known(block)
+            where = np.ascontiguousarray((at[inside] - low).T)
+            weight = map_coordinates(known.astype(np.float64), where, order=1, mode="nearest")
+            sums = map_coordinates(np.where(known, block, 0.0), where, order=1, mode="nearest")
+            found[inside] = np.where(weight > 0.5, sums / np.maximum(weight, 0.5), np.nan)
+        return found
+
+
+class GridAttribute(ImageAttribute):
+    """The same, by the name of what molecules have."""
+
+
+@dataclass(frozen=True)
+class VertexAttribute(FileAttribute):
+    """Values at the vertices of the body's file, carried inside by mean value coordinates as the eigenfunctions are.
+
+    PLY, VTK (.vtk, .vtp), GIFTI (.shape.gii, .func.gii), FreeSurfer (lh.thickness, lh.curv): one row for each vertex of
+    the body as its file has it. Where the mesh was mended, a new vertex has the value of the nearest place of the old
+    surface.
+    """
+
+    def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
+        """See `FileAttribute.values`."""
+        import igl
+
+        raw = read_surface(body.path, LoadOptions(), part=body.part)
+        given = vertex_values.chosen(vertex_values.read(file), name, file)
+        if len(given) != len(raw.vertices):
+            raise MeshError(
+                f"{body}: {file} has {len(given)} values, its surface {len(raw.vertices)} vertices. Give the values of "
+                "this surface."
+            )
+        columns = completed(given.reshape(len(given), -1), raw.vertices, str(file))
+        mesh = load_mesh(body.path, part=body.part)
+        vertices = mesh.vertices
+        if not np.array_equal(vertices, raw.vertices):
+            faces = np.ascontiguousarray(raw.faces)
+            _, face, nearest = igl.point_mesh_squared_distance(vertices, np.ascontiguousarray(raw.vertices), faces)
+            corners = [np.ascontiguousarray(raw.vertices[faces[face, i]]) for i in range(3)]
+            shares = np.nan_to_num(igl.barycentric_coordinates(np.ascontiguousarray(nearest), *corners), nan=1 / 3)
+            columns = np.einsum("vi,vid->vd", shares, columns[faces[face]])
+        return extend(vertices, mesh.faces, columns, points).reshape(len(points), *given.shape[1:])
+
+
+@dataclass(frozen=True)
+class TetAttribute(FileAttribute):
+    """Values at the points of a mesh of tetrahedra (.vtu), linear in each."""
+
+    def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
+        """See `FileAttribute.values`."""
+        vertices, tetrahedra, arrays = vertex_values.read_tetrahedra(file)
+        given = vertex_values.chosen(arrays, name, file)
+        corners = vertices[tetrahedra]
+        edges = corners[:, 1:] - corners[:, :1]
+        solid = np.abs(np.linalg.det(edges)) > 0
+        corners, tetrahedra, edges = corners[solid], tetrahedra[solid], edges[solid]
+        inverse = np.linalg.inv(edges)
+        best, shares, owner = np.full(len(points), -np.inf), np.zeros((len(points), 4)), np.zeros(len(points), int)
+        # A point lies within the largest distance of a corner from a centre.
+        centres = corners.mean(axis=1)
+        tree = cKDTree(centres)
+        reach = np.linalg.norm(corners - centres[:, None], axis=2).max()
+        for i, near in enumerate(tree.query_ball_point(points, reach * (1 + _OUTSIDE))):
+            if near:
+                three = np.einsum("td,tde->te", points[i] - corners[near, 0], inverse[near])
+                four = np.column_stack([1 - three.sum(axis=1), three])
+                one = int(np.argmax(four.min(axis=1)))
+                best[i], shares[i], owner[i] = four[one].min(), four[one], near[one]
+        found = np.einsum("pi,pi...->p...", shares, given[tetrahedra[owner]].astype(np.float64))
+        found[best < -_OUTSIDE] = np.nan
+        return found
+
+
+def attribute_source(path: str, root: Path | None = None) -> AttributeSource:
+    """The source that a pattern of paths asks for, by its suffix; see `FileAttribute`.
+
+    Args:
+        path: such as ``images/{stem}.nii.gz``; or the name of an attribute of residues, such as ``charge``.
+        root: from where a relative path leads.
+    """
+    name = path.partition("#")[0].lower()
+    if path in RESIDUE_ATTRIBUTES:
+        return ResidueAttribute(path)
+    if name.endswith(images.SUFFIXES):
+        return ImageAttribute(path, root)
+    return (TetAttribute if name.endswith(_TETRAHEDRA) else VertexAttribute)(path, root)
+
+
+def attribute_sources(given: Sequence[str], root: Path | None) -> dict[str, AttributeSource]:
+    """Sources by name, of words such as ``ct=images/{stem}.nii.gz``.
+
+    Raises:
+        ValueError: a word without a name or a path.
+    """
+    found = {}
+    for word in given:
+        name, _, path = word.partition("=")
+        if not name.isidentifier() or not path:
+            raise ValueError(f"attribute: expected such as ct=images/{{stem}}.nii.gz, got {word!r}.")
+        found[name] = attribute_source(path, root)
+    return found
+
+
+def completed(values: Values, points: Values, what: str) -> Values:
+    """The values with those that are not known taken from the nearest point that has one, which is logged.
+
+    Args:
+        values: (P,) or (P, C), NaN where they are not known.
+        points: (P, 3).
+        what: for messages.
+
+    Raises:
+        MeshError: more than a tenth is not known.
+    """
+    known = np.asarray(_is_known(values.reshape(len(points), -1)).all(axis=1))
+    n_missing = int((~known).sum())
+    if n_missing > _MOST_MISSING * len(known):
+        low, high = (", ".join(f"{x:.4g}" for x in end) for end in (points.min(axis=0), points.max(axis=0)))
+        raise MeshError(
+            f"{what}: has no value at {n_missing} of {len(known)} places of the body, which reaches from ({low}) to "
+            f"({high}); at most {_MOST_MISSING:.0%} may lack one. Give values of this body, in the coordinates of its "
+            "file."
+        )
+    if n_missing:
+        logger.warning("%s: %d of %d values are those of the nearest place", what, n_missing, len(known))
+        nearest = cKDTree(points[known]).query(points[~known])[1]
+        values = values.copy()
+        values[~known] = values[known][nearest]
+    return values
+
+
+def _is_known(values: NDArray[Any]) -> NDArray[np.bool_]:
+    return np.isfinite(values) & (np.abs(values) < _LARGEST)
+

@@ -1,0 +1,322 @@
+"""What a body brings along: images, grids, values at vertices and in tetrahedra, residues; and what is refused."""
+
+from __future__ import annotations
+
+import gzip
+import logging
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from bodies_on_disk import write_body
+
+import igps.data.pipeline as pipeline_module
+from igps.data.attribute_sources import (
+    FileAttribute,
+    ImageAttribute,
+    ResidueAttribute,
+    TetAttribute,
+    VertexAttribute,
+    attribute_source,
+    attribute_sources,
+    completed,
+)
+from igps.data.dataset import SignatureDataset
+from igps.mesh.loading import BodyRef
+from igps.mesh.mesh import MeshError
+from igps.signature.signature import SignatureConfig
+
+CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
+SLOPE = np.array([0.7, -1.3, 2.1])
+# Turned, of unlike sides, and shifted: nothing agrees with the axes.
+TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+AFFINE = np.eye(4)
+AFFINE[:3, :3], AFFINE[:3, 3] = TURN * [0.31, 0.23, 0.4], TURN @ [-3.1, -3.0, -3.3]
+SHAPE = (22, 27, 17)
+INSIDE = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
+
+
+def linear(points: np.ndarray) -> np.ndarray:
+    return points @ SLOPE + 0.4
+
+
+def image() -> np.ndarray:
+    """The linear function at the centres of all voxels."""
+    index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
+    return linear(index @ AFFINE[:3, :3].T + AFFINE[:3, 3])
+
+
+def write_nifti(path: Path, values: np.ndarray) -> None:
+    nibabel = pytest.importorskip("nibabel")
+    made = nibabel.Nifti1Image(values, AFFINE)
+    made.header.set_xyzt_units("mm")
+    nibabel.save(made, path)
+
+
+def write_itk(path: Path, values: np.ndarray) -> None:
+    itk = pytest.importorskip("SimpleITK")
+    made = itk.GetImageFromArray(np.ascontiguousarray(values.T))
+    to_lps = np.diag([-1.0, -1.0, 1.0])
+    spacing = np.linalg.norm(AFFINE[:3, :3], axis=0)
+    made.SetSpacing(spacing.tolist())
+    made.SetDirection((to_lps @ AFFINE[:3, :3] / spacing).ravel().tolist())
+    made.SetOrigin((to_lps @ AFFINE[:3, 3]).tolist())
+    itk.WriteImage(made, str(path))
+
+
+@pytest.fixture
+def body(tmp_path: Path) -> BodyRef:
+    write_body(tmp_path / "egg.off", 1.1, 1.3)
+    return BodyRef(tmp_path / "egg.off")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "write"), [(".nii.gz", write_nifti), (".nii", write_nifti), (".nrrd", write_itk), (".mha", write_itk)]
+)
+def test_an_image_gives_a_linear_function_wherever_it_lies(
+    body: BodyRef, suffix: str, write: Callable[[Path, np.ndarray], None]
+) -> None:
+    write(body.path.with_name(f"egg{suffix}"), image())
+    source = attribute_source(f"{{stem}}{suffix}")
+    np.testing.assert_allclose(source(body, INSIDE), linear(INSIDE), atol=1e-5)
+
+
+@pytest.mark.parametrize("suffix", [".dx", ".mrc"])
+def test_a_grid_gives_a_linear_function(body: BodyRef, suffix: str) -> None:
+    grids = pytest.importorskip("gridData")
+    index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
+    delta, origin = np.array([0.5, 0.25, 0.5]), np.array([-5.0, -3.0, -4.0])
+    grids.Grid(linear(index * delta + origin), origin=origin, delta=delta).export(
+        str(body.path.with_name(f"a{suffix}"))
+    )
+    np.testing.assert_allclose(attribute_source(f"a{suffix}")(body, INSIDE), linear(INSIDE), atol=1e-4)
+
+
+def write_ply(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
+    rows = "\n".join(" ".join(map(repr, map(float, row))) for row in np.column_stack([mesh.vertices, values]))
+    faces = "\n".join("3 " + " ".join(map(str, face)) for face in mesh.faces)
+    names = "\n".join(f"property double {name}" for name in ("x", "y", "z", "height"))
+    path.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex {len(mesh.vertices)}\n{names}\nelement face {len(mesh.faces)}\n"
+        f"property list uchar int vertex_indices\nend_header\n{rows}\n{faces}\n"
+    )
+
+
+def write_vtk(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
+    meshio = pytest.importorskip("meshio")
+    arrays = {"height": values, "other": np.zeros((len(values), 3))}
+    meshio.Mesh(mesh.vertices, [("triangle", mesh.faces)], point_data=arrays).write(path)
+
+
+def write_gifti(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
+    nibabel = pytest.importorskip("nibabel")
+    array = nibabel.gifti.GiftiDataArray(
+        values.astype(np.float32), intent="NIFTI_INTENT_SHAPE", meta={"Name": "height"}
+    )
+    nibabel.save(nibabel.gifti.GiftiImage(darrays=[array]), path)
+
+
+def write_freesurfer(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
+    nibabel = pytest.importorskip("nibabel")
+    nibabel.freesurfer.write_morph_data(str(path), values.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("a.ply#height", write_ply),
+        ("a.vtk#height", write_vtk),
+        ("a.vtu#height", write_vtk),
+        ("a.shape.gii#height", write_gifti),
+        ("lh.thickness", write_freesurfer),
+    ],
+)
+def test_values_at_vertices_give_the_same_linear_function_inside(
+    body: BodyRef, name: str, write: Callable[[Path, trimesh.Trimesh, np.ndarray], None]
+) -> None:
+    mesh = trimesh.load(body.path, process=False)
+    write(body.path.with_name(name.partition("#")[0]), mesh, linear(mesh.vertices))
+    values = VertexAttribute(name)(body, INSIDE)
+    np.testing.assert_allclose(values, linear(INSIDE), atol=1e-3)
+    write(body.path.with_name(name.partition("#")[0]), mesh.subdivide(), linear(mesh.subdivide().vertices))
+    with pytest.raises(MeshError, match=r"has 642 values, its surface 162 vertices"):
+        VertexAttribute(name)(body, INSIDE)
+
+
+def test_values_at_vertices_survive_mending(tmp_path: Path) -> None:
+    """A ball with a triangle missing: the hole is closed, and a linear function stays one."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    open_ball = trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False)
+    write_ply(tmp_path / "ball.ply", open_ball, linear(open_ball.vertices))
+    found = VertexAttribute("{file}#height")(BodyRef(tmp_path / "ball.ply"), INSIDE)
+    np.testing.assert_allclose(found, linear(INSIDE), atol=1e-2)
+
+
+def test_tetrahedra_give_a_linear_function_inside_and_nothing_far_outside(body: BodyRef) -> None:
+    meshio = pytest.importorskip("meshio")
+    from scipy.spatial import Delaunay
+
+    points = np.random.default_rng(2).uniform(-1, 1, (300, 3))
+    points = np.concatenate([points, np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T])
+    cells = [("tetra", Delaunay(points).simplices)]
+    meshio.Mesh(points, cells, point_data={"stress": linear(points)}).write(body.path.with_name("a.vtu"))
+    source = attribute_source("a.vtu")
+    assert isinstance(source, TetAttribute)
+    np.testing.assert_allclose(source(body, INSIDE), linear(INSIDE), atol=1e-5)
+    with pytest.raises(MeshError, match="has no value at 200 of 200 places"):
+        source(body, INSIDE + 5)
+
+
+def test_what_is_missing_is_taken_from_beside_and_told_or_refused(caplog: pytest.LogCaptureFixture) -> None:
+    points = np.arange(40.0)[:, None] * [1, 0, 0]
+    values = np.arange(40.0)
+    for fill in (np.nan, np.inf, 7e18):
+        given = values.copy()
+        given[[10, 39]] = fill
+        with caplog.at_level(logging.WARNING):
+            found = completed(given, points, "here")
+        assert found[39] == 38
+        assert found[10] in (9, 11)
+        np.testing.assert_array_equal(np.delete(found, [10, 39]), np.delete(values, [10, 39]))
+        assert "here: 2 of 40 values are those of the nearest place" in caplog.text
+        given[:5] = fill
+        with pytest.raises(
+            MeshError, match=r"here: has no value at 7 of 40 places .* from \(0, 0, 0\) to \(39, 0, 0\)"
+        ):
+            completed(given, points, "here")
+
+
+def test_voxels_without_a_value_do_not_leak_into_their_neighbours(body: BodyRef) -> None:
+    values = image()
+    values[:, :, :6] = 7e18
+    values[:6] = np.nan
+    write_nifti(body.path.with_name("egg.nii"), values)
+    source = ImageAttribute("egg.nii")
+    found = source.values(body, body.path.with_name("egg.nii"), "", INSIDE)
+    known = np.isfinite(found)
+    assert 0 < known.sum() < len(known)
+    index = (INSIDE - AFFINE[:3, 3]) @ np.linalg.inv(AFFINE[:3, :3]).T
+    whole = (index[:, 0] > 6) & (index[:, 2] > 6)
+    np.testing.assert_allclose(found[whole], linear(INSIDE)[whole], atol=1e-5)
+    assert known[whole].all()
+    assert np.abs(found[known]).max() < 10
+
+
+def test_an_image_of_another_subject_and_a_grid_beside_the_body_are_refused(body: BodyRef) -> None:
+    write_nifti(body.path.with_name("egg.nii"), image())
+    with pytest.raises(MeshError, match=r"egg\.nii: has no value at 200 of 200 places of the body, which reaches from"):
+        ImageAttribute("{stem}.nii")(body, INSIDE + 100)
+    with pytest.raises(MeshError, match=r"has no value at \d+ of 200 places"):
+        ImageAttribute("{stem}.nii")(body, INSIDE + np.array([3.0, 0, 0]))
+
+
+@pytest.mark.parametrize("suffix", [".nii.gz", ".nrrd", ".dx", ".mrc", ".ply", ".vtk", ".vtu", ".gii", ".thickness"])
+def test_files_cut_short_are_one_sentence(body: BodyRef, suffix: str) -> None:
+    path = body.path.with_name(f"a{suffix}")
+    mesh = trimesh.load(body.path, process=False)
+    if suffix == ".nii.gz":
+        write_nifti(path, image())
+    elif suffix == ".nrrd":
+        write_itk(path, image())
+    elif suffix in (".dx", ".mrc"):
+        grids = pytest.importorskip("gridData")
+        grids.Grid(image(), origin=[-5, -5, -5], delta=[0.5] * 3).export(str(path))
+    else:
+        write = {".ply": write_ply, ".gii": write_gifti, ".thickness": write_freesurfer}.get(suffix, write_vtk)
+        write(path, mesh, linear(mesh.vertices))
+    content = path.read_bytes()
+    for share in (0, 0.02, 0.4, 0.7):
+        path.write_bytes(content[: int(share * len(content))])
+        with pytest.raises(MeshError, match=r"a\."):
+            attribute_source(path.name)(body, INSIDE)
+
+
+def test_patterns_name_the_file_and_lead_out_of_no_folder(tmp_path: Path) -> None:
+    write_body(tmp_path / "root" / "ball" / "one.scan.off", 1, 1)
+    body = BodyRef(tmp_path / "root" / "ball" / "one.scan.off", "../../x")
+    for place in ("images/one.nii", "ct/ball/one.scan.off.nii", "ball/x.nii"):
+        (tmp_path / "root" / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "root" / place).write_text("")
+    (tmp_path / "x.nii").write_text("")
+    root = tmp_path / "root"
+
+    def file(pattern: str, root: Path | None = root) -> str:
+        return FileAttribute.file(ImageAttribute(pattern, root), body)[0].relative_to(tmp_path).as_posix()
+
+    assert file("images/{stem}.nii") == file(f"{root}/images/{{stem}}.nii", None) == "root/images/one.nii"
+    assert file("ct/{file}.nii") == "root/ct/ball/one.scan.off.nii"
+    assert file("x.nii", None) == "root/ball/x.nii"
+    for pattern in ("../x.nii", "images/{part}.nii", "ct/{part}.nii"):
+        with pytest.raises(MeshError, match=r"lies outside of .*root. Put it into that folder"):
+            file(pattern)
+    with pytest.raises(MeshError, match=r"none\.nii does not exist. Check the pattern 'none.nii'"):
+        file("none.nii")
+
+
+def test_words_of_the_command_line_become_sources() -> None:
+    found = attribute_sources(["ct=a/{stem}.nii.gz", "q=charge", "t={file}#t", "e=a.vtu"], Path("root"))
+    assert found == {
+        "ct": ImageAttribute("a/{stem}.nii.gz", Path("root")),
+        "q": ResidueAttribute("charge"),
+        "t": VertexAttribute("{file}#t", Path("root")),
+        "e": TetAttribute("a.vtu", Path("root")),
+    }
+    assert pickle.loads(pickle.dumps(found)) == found
+    for wrong in ("ct", "=a.nii", "a b=c.nii", "ct="):
+        with pytest.raises(ValueError, match="attribute: expected such as ct=images"):
+            attribute_sources([wrong], None)
+
+
+def test_an_image_is_added_to_a_cached_collection_without_eigenpairs_and_again_when_it_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("one", "two"):
+        write_body(tmp_path / "bodies" / f"{name}.off", 1.1, 1.3)
+        write_nifti(tmp_path / "bodies" / f"{name}.nii.gz", image())
+
+    def dataset(**options: object) -> SignatureDataset:
+        files = [tmp_path / "bodies" / f"{name}.off" for name in ("one", "two")]
+        return SignatureDataset(files, CONFIG, tmp_path / "cache", **options)  # type: ignore[arg-type]
+
+    dataset().precompute(n_workers=1, progress=False)
+    monkeypatch.setattr(pipeline_module, "compute_signature", lambda *_: pytest.fail("eigenpairs are computed"))
+    source = {"ct": ImageAttribute("{stem}.nii.gz")}
+    assert dataset(attributes=source).precompute(n_workers=1, progress=False) == []
+    for samples in (dataset(attributes=source)[0].signature.interior, dataset(attributes=source)[1].signature.surface):
+        np.testing.assert_allclose(samples.attributes["ct"], linear(samples.points), atol=1e-5)
+    first = dataset(attributes=source).cached_keys()
+    write_nifti(tmp_path / "bodies" / "one.nii.gz", image() + 1)
+    assert dataset(attributes=source).cached_keys() == [None, first[1]]
+    (tmp_path / "bodies" / "two.nii.gz").unlink()
+    changed = dataset(attributes=source)
+    (failure,) = changed.precompute(n_workers=1, progress=False)
+    assert (failure.id, "two.nii.gz does not exist" in failure.error) == ("two.off", True)
+    found = changed[0].signature.interior
+    np.testing.assert_allclose(found.attributes["ct"], linear(found.points) + 1, atol=1e-5)
+
+
+def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path: Path) -> None:
+    pytest.importorskip("gemmi")
+    line = "ATOM  {:5d} {:<4} {:3} {}{:4d}    {:8.3f}{:8.3f}{:8.3f}  1.00 {:5.2f}           {}\n"
+    rows = [("N", 0.0, 1.4), ("CA", 0.0, 0.0), ("C", 1.5, 0.0), ("O", 2.0, 1.0)]
+    text = ""
+    for chain, names in (("A", ["LYS"] * 6), ("B", ["ASP"] * 6)):
+        for i, name in enumerate(names):
+            for j, (atom, x, y) in enumerate(rows):
+                text += line.format(j, f" {atom}", name, chain, i, x + 3.8 * i, y, 30.0 * (chain == "B"), 10.0, atom[0])
+    for path, content in ((tmp_path / "a.pdb", text.encode()), (tmp_path / "b.pdb.gz", gzip.compress(text.encode()))):
+        path.write_bytes(content)
+        points = np.array([[5.0, 0, 0], [8.0, 0, 0]])
+        charge = ResidueAttribute("charge")
+        np.testing.assert_allclose(charge(BodyRef(path, "chain A"), points), 1.0, atol=1e-6)
+        np.testing.assert_allclose(charge(BodyRef(path, "chain B"), points), -1.0, atol=1e-6)
+        np.testing.assert_allclose(charge(BodyRef(path, "model"), points), 1.0, atol=1e-6)
+        np.testing.assert_allclose(charge(BodyRef(path), points + np.array([0, 0, 30])), -1.0, atol=1e-6)
+    write_body(tmp_path / "egg.off", 1, 1)
+    with pytest.raises(MeshError, match=r"egg\.off: has no atoms, which 'charge' is known of"):
+        charge(BodyRef(tmp_path / "egg.off"), points)
+    with pytest.raises(ValueError, match=r"attribute: expected one of charge, .*, got 'mood'"):
+        ResidueAttribute("mood")
