@@ -50,6 +50,7 @@ DISTRIBUTIONS = {
     "igl": "libigl",
     "ot": "POT",
     "skimage": "scikit-image",
+    "gridData": "GridDataFormats",
     "sklearn": "scikit-learn",
     "yaml": "PyYAML",
 }

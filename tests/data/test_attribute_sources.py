@@ -191,15 +191,15 @@ def test_what_is_missing_is_taken_from_beside_and_told_or_refused(caplog: pytest
 
 def test_voxels_without_a_value_do_not_leak_into_their_neighbours(body: BodyRef) -> None:
     values = image()
-    values[:, :, :6] = 7e18
-    values[:6] = np.nan
+    values[:, :, :8] = 7e18
+    values[:10] = np.nan
     write_nifti(body.path.with_name("egg.nii"), values)
     source = ImageAttribute("egg.nii")
     found = source.values(body, body.path.with_name("egg.nii"), "", INSIDE)
     known = np.isfinite(found)
     assert 0 < known.sum() < len(known)
     index = (INSIDE - AFFINE[:3, 3]) @ np.linalg.inv(AFFINE[:3, :3]).T
-    whole = (index[:, 0] > 6) & (index[:, 2] > 6)
+    whole = (index[:, 0] > 10) & (index[:, 2] > 8)
     np.testing.assert_allclose(found[whole], linear(INSIDE)[whole], atol=1e-5)
     assert known[whole].all()
     assert np.abs(found[known]).max() < 10
@@ -210,7 +210,7 @@ def test_an_image_of_another_subject_and_a_grid_beside_the_body_are_refused(body
     with pytest.raises(MeshError, match=r"egg\.nii: has no value at 200 of 200 places of the body, which reaches from"):
         ImageAttribute("{stem}.nii")(body, INSIDE + 100)
     with pytest.raises(MeshError, match=r"has no value at \d+ of 200 places"):
-        ImageAttribute("{stem}.nii")(body, INSIDE + np.array([3.0, 0, 0]))
+        ImageAttribute("{stem}.nii")(body, INSIDE + TURN @ [3.4, 0, 0])
 
 
 @pytest.mark.parametrize("suffix", [".nii.gz", ".nrrd", ".dx", ".mrc", ".ply", ".vtk", ".vtu", ".gii", ".thickness"])
@@ -228,7 +228,7 @@ def test_files_cut_short_are_one_sentence(body: BodyRef, suffix: str) -> None:
         write = {".ply": write_ply, ".gii": write_gifti, ".thickness": write_freesurfer}.get(suffix, write_vtk)
         write(path, mesh, linear(mesh.vertices))
     content = path.read_bytes()
-    for share in (0, 0.02, 0.4, 0.7):
+    for share in (0, 0.02, 0.4, 0.6):  # of a PLY file all values are in the first 0.69
         path.write_bytes(content[: int(share * len(content))])
         with pytest.raises(MeshError, match=r"a\."):
             attribute_source(path.name)(body, INSIDE)
@@ -293,7 +293,8 @@ def test_an_image_is_added_to_a_cached_collection_without_eigenpairs_and_again_w
     (tmp_path / "bodies" / "two.nii.gz").unlink()
     changed = dataset(attributes=source)
     (failure,) = changed.precompute(n_workers=1, progress=False)
-    assert (failure.id, "two.nii.gz does not exist" in failure.error) == ("two.off", True)
+    assert failure.path.name == "two.off"
+    assert "two.nii.gz does not exist" in failure.error
     found = changed[0].signature.interior
     np.testing.assert_allclose(found.attributes["ct"], linear(found.points) + 1, atol=1e-5)
 

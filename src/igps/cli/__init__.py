@@ -26,7 +26,7 @@ from igps.cli.fit import classify, fit
 from igps.cli.groups import groups
 from igps.cli.index import index_add, index_build, index_merge
 from igps.cli.precompute import precompute
-from igps.cli.reading import FLAGS, Verdict
+from igps.cli.reading import FLAGS, LISTS, Verdict
 from igps.cli.report import report
 from igps.cli.retrieval import extract, query, retrieve
 
@@ -70,6 +70,10 @@ def main(commands: Commands | None = None, program: str = "igps") -> None:
     parser = command_parser(commands, program)
     command, options = _chosen(parser.instantiate(parser.parse_args()), commands)
     as_json = options.pop(JSON, False)
+    if taken_in := "".join(f"+{word}" for word in options.pop("with", None) or ()):
+        name = "descriptors" if "descriptors" in options else "descriptor"
+        given = options[name] or "pretrained"
+        options[name] = given + taken_in if isinstance(given, str) else [one + taken_in for one in given]
     try:
         # With --json, what a reader is told goes where progress goes
         with one_thread(), contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
@@ -141,9 +145,12 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
     switches = {name: meanings.get(name) for name in parameters if kinds[name] is bool}
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
         switches = {**FLAGS, **switches}
+        for several, meaning in LISTS.items():
+            if several != "with" or {"descriptor", "descriptors"} & set(parameters):
+                parser.add_argument(f"--{several}", nargs="+", help=meaning)
     if kinds["return"] is not type(None):
         switches[JSON] = "print what the table tells as JSON, and all else to standard error"
-    by_hand: set[str | int] = set(switches)
+    by_hand: set[str | int] = {*switches, *LISTS}
     for place, (name, parameter) in enumerate(parameters.items()):
         replaceable = name == "root" and parameter.default is None
         positional = place == 0 and (parameter.default is parameter.empty or replaceable)

@@ -18,6 +18,7 @@ from igps.data.dataset import Failure
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import Mirror, Size
+from igps.nn.description import fit_centres
 from igps.report.sources import write_sources
 from igps.report.tables import comparison_table
 from igps.retrieval import precision_recall_curve
@@ -55,6 +56,8 @@ def compare(
     chosen = [descriptor_of(name) for name in wanted]
     dataset, failures = signatures(Folder(root, labelled=True), chosen, n_workers=n_workers, strict=strict, **reading)
     chosen = [descriptor_of(sized(name, size, dataset)) for name in wanted]
+    for one in chosen:
+        fit_centres(one, dataset)
     results: list[Result] = []
     for result in compare_descriptors(dataset, chosen, n_workers=n_workers, strict=strict):
         results.append(result)

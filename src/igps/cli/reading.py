@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from igps._parallel import Limits
+from igps.data.attribute_sources import attribute_sources
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, ClassRule, find_bodies, labelled_bodies
@@ -28,6 +29,13 @@ FLAGS = {
     "strict": "stop at the first mesh that cannot be used instead of skipping it",
 }
 """Switches of every command that passes its `**reading` on to `signatures`, and what they do."""
+
+LISTS = {
+    "attribute": "what bodies bring along, such as ct=images/{stem}.nii.gz: an image, a grid, values at vertices or in "
+    "tetrahedra, below the folder; {stem}, {file} and {part} stand for the body's",
+    "with": "attributes that the descriptor takes in, such as ct, or ct=0.5 with half the weight of form",
+}
+"""Options of several words, of the same commands."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +130,7 @@ def chosen_dataset(
     threshold: float = 0.5,
     cavities: Cavities = "fill",
     max_unpacked: int = MAX_UNPACKED,
+    attribute: list[str] | None = None,
 ) -> SignatureDataset:
     """The dataset that the options tell; nothing is computed.
 
@@ -140,6 +149,7 @@ def chosen_dataset(
         threshold: a voxel of at least this probability belongs to the body, in volumes of probabilities.
         cavities: fill takes a hollow body for the full one, keep lets the surfaces of its hollows bound it, too.
         max_unpacked: bytes that a compressed file may unpack to.
+        attribute: see `LISTS`.
         paper, allow_open: see `FLAGS`.
 
     Raises:
@@ -156,10 +166,14 @@ def chosen_dataset(
         if source.labelled and dataset.bodies.labels is None:
             raise ValueError(f"{source.root}: expected signatures with classes. Export those of a labelled folder.")
         return dataset
+    root = source.root if isinstance(source, Folder) else None
+    attributes = attribute_sources(attribute or (), root)
     if isinstance(source, Folder):
         find = labelled_bodies if source.labelled else find_bodies
         source, classes = find(source.root, reading, classes=classes or "folder"), None
-    return SignatureDataset(source, config, cache_dir, descriptor=needs, classes=classes, reading=reading)
+    return SignatureDataset(
+        source, config, cache_dir, descriptor=needs, classes=classes, reading=reading, attributes=attributes
+    )
 
 
 def mending_summary(dataset: SignatureDataset, n_given: int) -> str:

@@ -21,10 +21,10 @@ from igps.cli.report import report as write_report
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.fingerprint import cache_tag
+from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.individual import IndividualDescriptor, Mirror, Size
 from igps.gallery.gallery import Gallery
-from igps.nn.description import describe
+from igps.nn.description import describe, fit_centres
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.report.sources import write_sources
 from igps.report.tables import scores_table
@@ -50,7 +50,8 @@ def retrieve(
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
         descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
         out: folder for scores.json, ranking.csv, distances.npz, meshes.json that tells where the meshes lie, and
-            failures.csv if a mesh could not be used.
+            failures.csv if a mesh could not be used; and descriptor.safetensors where the descriptor has centres that
+            are the collection's, so that a query takes the same.
         report: make a page of the results in that folder, report.html, see `igps report`
         rerank: score the distances that the whole collection has set right by its neighbourhoods, too, in a table of
             their own (diffusion and k-reciprocal re-ranking, without labels); distances.npz has them as "reranked".
@@ -70,11 +71,13 @@ def retrieve(
         print(f"\nre-ranked by the whole collection, without its labels\n{scores_table(scores_reranked)}")
     if failures:
         print(f"{len(failures)} of {len(failures) + len(dataset)} meshes could not be used.")
-    summary = _summary(dataset, str(name), scores, failures)
+    summary = _summary(dataset, name_of(name), scores, failures)
     if scores_reranked is not None:
         summary["reranked"] = scores_reranked.mean()
     if out is not None:
         _write_retrieval(out, dataset, summary, distances, failures, reranked)
+        if isinstance(name, Descriptor):  # its centres are the collection's
+            name.save(out / "descriptor.safetensors")
         print(f"written to {out}")
         if report:
             write_report(out, n_workers=n_workers)
@@ -230,6 +233,8 @@ def described(
     if isinstance(descriptor, str):
         descriptor = sized(descriptor, size, dataset)
     module = descriptor_of(descriptor)
+    if fit_centres(module, dataset):  # which no name tells
+        descriptor = module
     failures: list[Failure] = []
     descriptions = describe(
         dataset,

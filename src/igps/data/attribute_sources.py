@@ -318,4 +318,3 @@ def completed(values: Values, points: Values, what: str) -> Values:
 
 def _is_known(values: NDArray[Any]) -> NDArray[np.bool_]:
     return np.isfinite(values) & (np.abs(values) < _LARGEST)
-

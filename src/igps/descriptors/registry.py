@@ -22,6 +22,8 @@ from igps.descriptors.rich import rich
 from igps.descriptors.shape_dna import ShapeDNA
 from igps.descriptors.spectral_gw import SpectralGromovWasserstein
 from igps.descriptors.volume_shape_dna import VolumeShapeDNA
+from igps.descriptors.with_attributes import WithAttributes
+from igps.descriptors.written import written
 from igps.nn.descriptor import Descriptor
 from igps.nn.specification import load_module
 
@@ -45,7 +47,9 @@ NAMES: tuple[str, ...] = tuple(_MAKERS)
 """The names of the library's descriptors of any body."""
 
 _MARKED = re.compile(r"(\+size|\+side)+$")
-_NAME = re.compile(r"\w{1,100}(\+side)?(\+size)?")
+_NAME = re.compile(r"\w{1,100}(\+\w{1,40}(=[\d.e-]{1,10})?){0,9}")
+_WITH = re.compile(r"\+(\w+)(?:=([\d.]+))?")
+_WRITTEN = (".yaml", ".yml")
 
 # Descriptors of bodies that bring attributes of their own.
 _OF_ATTRIBUTES: Mapping[str, Callable[[], Descriptor]] = {"molecular": molecular}
@@ -53,11 +57,13 @@ _OF_ATTRIBUTES: Mapping[str, Callable[[], Descriptor]] = {"molecular": molecular
 
 def is_file(which: str | Path) -> bool:
     """Whether a descriptor is asked for by its file."""
-    return str(which).endswith(".safetensors")
+    return str(which).endswith((".safetensors", *_WRITTEN))
 
 
 def load(path: str | Path) -> Descriptor:
     """A descriptor that `Descriptor.save` or `igps fit` wrote, in evaluation mode, with its `card`. No code runs.
+
+    Or one that is written in YAML, see `igps.descriptors.written`.
 
     Example:
         >>> import tempfile
@@ -71,6 +77,8 @@ def load(path: str | Path) -> Descriptor:
         FileNotFoundError: no such file.
         ValueError: it is another file, or a damaged one.
     """
+    if str(path).endswith(_WRITTEN):
+        return written(path)
     module, card = load_module(path)
     if not isinstance(module, Descriptor):
         raise ValueError(f"{path}: expected a descriptor, got {type(module).__name__}.")
@@ -99,7 +107,7 @@ def descriptor(
     Args:
         which: one of `NAMES`, or "molecular"; or a file, see `load`; or "package.module:NAME", where NAME is a
             descriptor of your own or makes one when called; or a descriptor. "+size" behind a name keeps size, "+side"
-            tells mirror images apart.
+            tells mirror images apart, "+ct" or "+ct=0.5" adds an attribute, see `WithAttributes`.
         size: "keep" lets differences in size count, see `IndividualDescriptor`; "auto" where all bodies have a unit of
             length.
         mirror: "distinct" tells a body from its mirror image.
@@ -135,6 +143,11 @@ def _plain(which: str | Path | Descriptor) -> Descriptor:
     if is_file(which):
         return load(which)
     which = str(which)
+    base, *words = re.split(r"(?=\+)", which)
+    found = [_WITH.fullmatch(word) for word in words]
+    if words and all(found):
+        attributes, weights = zip(*((one[1], float(one[2] or 1)) for one in found if one), strict=True)
+        return WithAttributes(_plain(base), attributes, weights).eval()
     if maker := _MAKERS.get(which) or _OF_ATTRIBUTES.get(which):
         return maker().eval()
     module, colon, name = which.partition(":")
@@ -144,13 +157,13 @@ def _plain(which: str | Path | Descriptor) -> Descriptor:
             f"your own, got {which!r}."
         )
     try:
-        found = getattr(importlib.import_module(module), name)
+        own = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
         raise ValueError(
             f"descriptor: expected package.module:NAME to be importable, got {which!r} ({error}). Check the spelling, "
             "and that its folder is on the Python path."
         ) from error
-    made = found if isinstance(found, Descriptor) or not callable(found) else found()
+    made = own if isinstance(own, Descriptor) or not callable(own) else own()
     if not isinstance(made, Descriptor):
         raise ValueError(
             f"descriptor: expected {which} to be or to make an igps.Descriptor, got {type(made).__name__}."

@@ -19,6 +19,7 @@ from igps.data.cache import DescriptionCache
 from igps.data.dataset import Failure, SignatureDataset
 from igps.mesh.mesh import MeshError
 from igps.nn._evaluation import evaluation_mode
+from igps.nn.axes import Attribute
 from igps.nn.descriptor import BodyDescriptor, Descriptor
 
 logger = logging.getLogger(__name__)
@@ -105,6 +106,32 @@ def describe(
     if not found:
         raise MeshError(failed[0].error)
     return torch.from_numpy(np.stack([found[i] for i in sorted(found)]))
+
+
+def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
+    """Give axes whose centres are quantiles those of a collection's samples; what has its centres keeps them.
+
+    Of each body as many samples count, the first 500.
+
+    Returns:
+        Whether there were any.
+
+    Raises:
+        ValueError: the samples have no such attribute.
+    """
+    axes = [one for one in descriptor.modules() if isinstance(one, Attribute) and not one.is_fitted]
+    values: list[list[NDArray[np.float32]]] = [[] for _ in axes]
+    for signature in dataset.signatures() if axes else ():
+        for axis, found in zip(axes, values, strict=True):
+            if axis.name not in signature.interior.attributes:
+                raise ValueError(
+                    f"attributes: expected {axis.name!r} of each body, got {sorted(signature.interior.attributes)}. "
+                    f"Give it as --attribute {axis.name}=..., or as SignatureDataset(attributes=...)."
+                )
+            found.append(signature.interior.attributes[axis.name][:500])
+    for axis, found in zip(axes, values, strict=True):
+        axis.fit(torch.from_numpy(np.concatenate(found)))
+    return bool(axes)
 
 
 def _on_threads(

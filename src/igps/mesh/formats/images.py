@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -36,7 +38,7 @@ def read(path: Path, changed: int) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """
     name = path.name.lower()
     if name.endswith(_GRIDS):
-        return _grid(path, "dx" if name.endswith(".dx") else "mrc")
+        return (_dx if name.endswith(".dx") else _map)(path)
     readers = [suffix for suffix in _volume_files.READERS if name.endswith(suffix)]
     if not readers:
         raise MeshError(f"{path}: not an image that is read. Convert it to one of {', '.join(SUFFIXES)}.")
@@ -44,19 +46,39 @@ def read(path: Path, changed: int) -> tuple[NDArray[Any], NDArray[np.float64]]:
     return volume.layers[0], volume.affine
 
 
-def _grid(path: Path, kind: str) -> tuple[NDArray[Any], NDArray[np.float64]]:
+def _dx(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
+    """Of an OpenDX file, as APBS writes it; GridDataFormats does not return from one that is cut short."""
+    text = path.read_bytes()
+    head, _, rest = text.partition(b"data follows")
+    number = rb"\s+(\S+)\s+(\S+)\s+(\S+)"
+    counts, origin = re.search(rb"gridpositions\s+counts" + number, head), re.search(rb"origin" + number, head)
+    deltas = re.findall(rb"delta" + number, head)
+    if counts is None or origin is None or len(deltas) != 3:
+        raise MeshError(f"{path}: expected counts, origin and three deltas of an OpenDX grid. Export it again.")
+    sizes = [int(n) for n in counts.groups()]
+    needed = math.prod(sizes)
+    if min(sizes) < 2 or needed > len(rest):  # a number has a digit
+        raise MeshError(f"{path}: announces {sizes} values, and has {len(rest)} bytes of them. Export it again.")
+    words = rest.split(None, needed)[:needed]
+    if len(words) < needed:
+        raise MeshError(f"{path}: {len(words)} of {needed} values are there. Export it again.")
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = np.array(deltas, dtype=float).T, np.array(origin.groups(), dtype=float)
+    return np.array(words, dtype=np.float32).reshape(sizes), affine
+
+
+def _map(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
+    """Of an MRC or CCP4 file."""
     try:
         from gridData import Grid
     except ImportError as error:
-        raise ImportError('Grids need GridDataFormats: pip install "interior-gps[molecules]".') from error
-    if kind == "mrc":
-        head = np.fromfile(path, "<i4", 4)
-        head = head.byteswap() if len(head) == 4 and not 0 <= head[3] < 256 else head
-        sizes = [int(n) for n in head[:3]]
-        needed = 1024 + (sizes[0] * sizes[1] * sizes[2] * _MODES.get(int(head[3]), 1) if len(head) == 4 else 0)
-        if len(head) < 4 or min(sizes) < 1 or path.stat().st_size < needed:
-            raise MeshError(f"{path}: {path.stat().st_size} of the {needed} bytes that its header announces.")
-    grid = Grid(str(path), file_format=kind)
+        raise ImportError('Maps need GridDataFormats: pip install "interior-gps[molecules]".') from error
+    head = np.fromfile(path, "<i4", 4)
+    head = head.byteswap() if len(head) == 4 and not 0 <= head[3] < 256 else head
+    needed = 1024 + (math.prod(map(int, head[:3])) * _MODES.get(int(head[3]), 1) if len(head) == 4 else 0)
+    if len(head) < 4 or min(head[:3]) < 1 or path.stat().st_size < needed:
+        raise MeshError(f"{path}: {path.stat().st_size} of the {needed} bytes that its header announces.")
+    grid = Grid(str(path), file_format="mrc")
     affine = np.eye(4)
     affine[:3, :3], affine[:3, 3] = np.diag(grid.delta), grid.origin
     return np.asarray(grid.grid), affine

@@ -76,7 +76,7 @@ def _ply(path: Path) -> dict[str, NDArray[np.generic]]:
     raw: dict[str, dict[str, Any]] = next((one for one in raws if one), {})
     rows = raw.get("vertex", {})
     usual = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
-    values = rows.get("data")
+    values: Any = rows.get("data")
     names = [name for name in rows.get("properties", ()) if name not in usual]
     columns = {name: np.asarray(values[name]).reshape(len(geometry.vertices), -1) for name in names}
     return {name: column[:, 0] if column.shape[1] == 1 else column for name, column in columns.items()}

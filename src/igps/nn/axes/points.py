@@ -168,13 +168,46 @@ class Attribute(PointAxis):
 
     Args:
         name: of the attribute.
-        centres: of the classes, ascending, in the attribute's unit.
+        centres: of the classes, ascending, in the attribute's unit; None with `quantiles`.
+        quantiles: so many classes, whose centres are quantiles of a collection, see `fit_centres`; they are saved.
         soft, learnable: see `PointAxis`.
+
+    Raises:
+        ValueError: not one of centres and quantiles.
     """
 
-    def __init__(self, name: str, centres: Sequence[float], *, soft: bool = False, learnable: bool = False) -> None:
-        super().__init__(centres, soft, learnable)
-        self.name = name
+    fitted: Tensor
+
+    def __init__(
+        self,
+        name: str,
+        centres: Sequence[float] | None = None,
+        *,
+        quantiles: int | None = None,
+        soft: bool = False,
+        learnable: bool = False,
+    ) -> None:
+        if (centres is None) == (quantiles is None) or (quantiles is not None and quantiles < 2):
+            raise ValueError(f"{name}: expected centres, or at least 2 quantiles, got {centres} and {quantiles}.")
+        super().__init__([float(i) for i in range(quantiles or 0)] if centres is None else centres, soft, learnable)
+        self.name, self.quantiles = name, quantiles
+        if quantiles is not None:
+            self.register_buffer("fitted", torch.tensor(False))
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether its centres are known."""
+        return self.quantiles is None or bool(self.fitted)
+
+    def fit(self, values: Tensor) -> None:
+        """Take for centres the quantiles of values (P,) at (i + 1/2) / n; equal ones are moved apart a little."""
+        n = len(self.centres.start)
+        centres = torch.quantile(values.double(), (torch.arange(n, dtype=torch.float64) + 0.5) / n)
+        least = max(float(values.double().std()), float(values.abs().max()), 1e-12) * 1e-4
+        for i in range(1, n):
+            centres[i] = max(centres[i], centres[i - 1] + least)
+        self.centres.start.copy_(centres)
+        self.fitted.fill_(True)
 
     def requirements(self, embedding: nn.Module) -> Requirements:
         """The attribute, if it is one that Signatures are computed with, or one of residues."""
@@ -186,6 +219,11 @@ class Attribute(PointAxis):
         Raises:
             ValueError: the samples have no such attribute, or it is a direction.
         """
+        if not self.is_fitted:
+            raise ValueError(
+                f"{self.name}: expected centres, got {self.quantiles} quantiles of no collection. Call "
+                "igps.nn.fit_centres(descriptor, dataset), or take the file descriptor.safetensors of its results."
+            )
         values = features.attribute(self.name)
         if values.ndim != 2:
             raise ValueError(f"attributes: expected a scalar to split by, but {self.name!r} is a direction.")

@@ -1,0 +1,79 @@
+"""Any descriptor, and beside it what bodies are like inside: attributes of their own, by interior distance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from igps.data.batch import SignatureBatch
+from igps.descriptors.individual import SCALES, scale_of
+from igps.nn.axes import Attribute, InteriorDistance
+from igps.nn.descriptor import Descriptor, HistogramDescriptor
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histograms.pairs import PairHistogram
+from igps.retrieval import chi_square
+
+_N_SAMPLES = 2000
+
+
+class WithAttributes(Descriptor):
+    """A descriptor and joint histograms of attributes and interior distances: `NAME+ATTRIBUTE`, or `NAME+ATTRIBUTE=w`.
+
+    With d the distance of the descriptor and s its scale between bodies of one class, that of the bodies is
+    d + w·s/t·c: c the χ² distance of the attributes' histograms, and t the scale of `interior`, which is of that kind.
+    So a weight of 1 lets form and attributes count alike. Classes of an attribute are four quantiles of the collection.
+
+    Args:
+        descriptor: any whose scale is known.
+        attributes: names of scalars.
+        weights: of each attribute; 1 if None.
+
+    Raises:
+        ValueError: the descriptor's scale is not known, or a weight is not positive.
+    """
+
+    def __init__(
+        self, descriptor: Descriptor, attributes: Sequence[str], weights: Sequence[float] | None = None
+    ) -> None:
+        super().__init__()
+        weights = [1.0] * len(attributes) if weights is None else weights
+        scale = scale_of(descriptor)
+        if scale is None or not all(0 < weight < float("inf") for weight in weights):
+            raise ValueError(
+                f"with: expected positive weights and a descriptor whose distances are known, got {weights} and "
+                f"{descriptor.name!r}. Set its attribute `scale` to the median of its distances within a class."
+            )
+        self.descriptor, self.scale = descriptor, scale
+        self.weights = tuple(weight * scale / SCALES["interior"] for weight in weights)
+        embedding = SpectralEmbedding(n_eigenpairs=50)
+        self.inside = HistogramDescriptor(
+            [
+                PairHistogram(
+                    [Attribute(name, quantiles=4, soft=True), InteriorDistance(16)], embedding, n_samples=_N_SAMPLES
+                )
+                for name in attributes
+            ]
+        )
+        marks = (f"+{name}" + f"={weight:g}" * (weight != 1) for name, weight in zip(attributes, weights, strict=True))
+        self.name, self.source = descriptor.name + "".join(marks), f"{descriptor.source}; Rustamov 2010, section 4"
+        self.invariant_to = descriptor.invariant_to
+        self.requirements = descriptor.requirements | self.inside.requirements
+
+    def describe(self, batch: SignatureBatch) -> Tensor:
+        """(N, D + cells)."""
+        inside = self.inside(batch).flatten(1) * len(self.weights)
+        return torch.cat([self.descriptor(batch).flatten(1), inside], dim=1)
+
+    def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
+        """(Q, G)."""
+        sizes = list(self.inside.part_cells)
+        (form, *own), (forms, *others) = (
+            torch.split(one, [one.shape[1] - sum(sizes), *sizes], dim=1) for one in (queries, gallery)
+        )
+        shape = self.descriptor.description_shape
+        found = self.descriptor.distances(form.unflatten(1, shape), forms.unflatten(1, shape))
+        for weight, one, other in zip(self.weights, own, others, strict=True):
+            found = found + weight * chi_square(one, other)
+        return found

@@ -1,0 +1,197 @@
+"""Descriptors written in YAML, and attributes that join one: the same numbers, quantiles kept, textures told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import igps
+from igps.data.attribute_sources import ImageAttribute
+from igps.data.dataset import SignatureDataset
+from igps.descriptors.pretrained.descriptor import pretrained_parts
+from igps.descriptors.registry import descriptor
+from igps.descriptors.with_attributes import WithAttributes
+from igps.nn import fit_centres
+from igps.nn.description import describe
+from igps.retrieval import chi_square, retrieval_scores
+
+INTERIOR = """
+name: mine
+invariant_to: [motion, scale, pose]
+parts:
+  - eigenpairs: 250
+    axes:
+      - potential: {n_classes: 4}
+      - interior_distance: {n_bins: 64}
+"""
+
+PRETRAINED = """
+parts:
+  - {samples: surface, eigenpairs: 64, axes: [potential, interior_distance]}
+  - {eigenpairs: 16, n_samples: 1000, axes: [interior_distance: {n_bins: 6, reach: 3.0}, embedded_pair_cosines]}
+  - samples: surface
+    eigenpairs: 50
+    n_samples: 1000
+    axes: [euclidean_distance: {n_bins: 6, reach: 1.0}, pair_cosines]
+  - samples: surface
+    eigenpairs: 50
+    n_samples: 1000
+    axes: [interior_distance: {n_bins: 8, reach: 3.0}, pair_cosines]
+  - {histogram: axial, eigenpairs: 16}
+  - histogram: points
+    eigenpairs: 16
+    axes:
+      - ball_radius: {side: inside, smallest: 0.022, largest: 0.25}
+      - ball_radius: {side: outside, smallest: 0.03, largest: 1.5}
+      - potential: {n_classes: 6, reach: 0.9, eigenpairs: 4, soft: true}
+      - potential: {n_classes: 6, reach: 0.96, soft: true}
+  - {histogram: branches, eigenpairs: 16, n_samples: 1000}
+  - {histogram: pieces, eigenpairs: 16, n_samples: 1000}
+  - {histogram: spectrum, n_eigenpairs: 64}
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    (folder / "mine.yaml").write_text(text)
+    return folder / "mine.yaml"
+
+
+@pytest.fixture
+def bodies(tmp_path: Path) -> SignatureDataset:
+    for i, stretch in enumerate(((1, 1, 1.7), (1, 1.3, 2.2), (1, 1, 1))):
+        ball = trimesh.creation.icosphere(subdivisions=3)
+        ball.vertices *= stretch
+        ball.export(tmp_path / f"{i}.off")
+    needs = igps.descriptor("interior").requirements | igps.descriptor("pretrained").requirements
+    return SignatureDataset(tmp_path, cache_dir=tmp_path / "cache", descriptor=needs)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"), [(INTERIOR, lambda: igps.descriptor("interior")), (PRETRAINED, pretrained_parts)]
+)
+def test_a_descriptor_of_the_library_written_down_gives_the_same_numbers(
+    bodies: SignatureDataset, tmp_path: Path, text: str, named: object
+) -> None:
+    own, theirs = igps.descriptor(write(tmp_path, text)), named().eval()  # type: ignore[operator]
+    found, expected = describe(bodies, own), describe(bodies, theirs)
+    assert torch.equal(found.flatten(1), expected.flatten(1))
+    assert own.name == "mine"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("parts: [{axes: [colour]}]", r"axes: expected one of potential, .*, or an attribute with centres.*'colour'"),
+        ("parts: [{axes: [interior_distance], bins: 4}]", r"pairs: expected axes, samples, .*eigenpairs, got 'bins'"),
+        ("parts: [{axes: [interior_distance: {bins: 4}]}]", r"interior_distance: expected n_bins, reach.*, got 'bins'"),
+        ("parts: [{histogram: cloud}]", "histogram: expected one of pairs, points, axial, .*, got 'cloud'"),
+        ("parts: [5]", "histogram: expected one of pairs, .* got '5'"),
+        ("part: []", "a descriptor: expected parts, name, .*, got 'part'"),
+        ("name: x", "expected a list of `parts`"),
+        ("parts: []", "expected at least one in each part"),
+        ("parts: [{axes: [interior_distance: {n_bins: 100000000}]}]", "numbers of at most 10000, got 100000000"),
+        ("parts: [{axes: [ct: {quantiles: 1}, interior_distance]}]", "ct: expected centres, or at least 2 quantiles"),
+        ("!!python/object/apply:os.system ['touch hacked']", "could not determine a constructor"),
+        ("parts: [", "while parsing"),
+    ],
+)
+def test_what_is_no_descriptor_is_told_with_what_there_is(tmp_path: Path, text: str, sentence: str) -> None:
+    with pytest.raises(ValueError, match=rf"mine\.yaml: expected a descriptor \(.*{sentence}.*"):
+        igps.descriptor(str(write(tmp_path, text)))
+    assert not Path("hacked").exists()
+    with pytest.raises(FileNotFoundError, match=r"none\.yaml: no such file"):
+        igps.descriptor("none.yaml")
+
+
+def test_quantiles_are_those_of_the_collection_and_travel_with_the_descriptor(tmp_path: Path) -> None:
+    for i in range(2):
+        trimesh.creation.icosphere(subdivisions=2, radius=1 + i).export(tmp_path / f"{i}.off")
+    text = "parts: [{eigenpairs: 20, axes: [height: {quantiles: 4, soft: true}, interior_distance: {n_bins: 8}]}]"
+    own = igps.descriptor(write(tmp_path, text))
+    heights = {"height": lambda points: points[:, 2]}
+    files = [tmp_path / f"{i}.off" for i in range(2)]
+    dataset = SignatureDataset(files, cache_dir=tmp_path / "cache", descriptor=own, attributes=heights)
+    with pytest.raises(ValueError, match="height: expected centres, got 4 quantiles of no collection"):
+        own(dataset.batch([0]))
+    assert fit_centres(own, dataset)
+    values = np.concatenate([one.interior.attributes["height"][:500] for one in dataset.signatures()])
+    centres = own.histograms[0].axes[0].centres()
+    np.testing.assert_allclose(centres, np.quantile(values, [0.125, 0.375, 0.625, 0.875]), rtol=1e-5)
+    described = describe(dataset, own)
+    assert not fit_centres(own, dataset[[0]])
+    own.save(tmp_path / "kept.safetensors")
+    again = igps.descriptor(tmp_path / "kept.safetensors")
+    assert torch.equal(describe(dataset[[0]], again), described[:1])
+    bare = SignatureDataset(files, cache_dir=tmp_path / "cache", descriptor=own)
+    with pytest.raises(
+        ValueError, match=r"attributes: expected 'height' of each body, got \[\]. Give it as --attribute"
+    ):
+        fit_centres(igps.descriptor(write(tmp_path, text)), bare)
+
+
+def texture(kind: str, generator: np.random.Generator, points: np.ndarray) -> np.ndarray:
+    """Graded, layered, mottled or with a core, in a direction and with a phase of its own."""
+    direction = generator.normal(size=3)
+    along = points @ (direction / np.linalg.norm(direction))
+    if kind == "graded":
+        return along
+    if kind == "layered":
+        return np.sin(9 * along + generator.uniform(0, 2 * np.pi))
+    if kind == "mottled":
+        waves = generator.normal(size=(20, 3)) * 9
+        return np.cos(points @ waves.T + generator.uniform(0, 2 * np.pi, 20)).sum(axis=1) / 3
+    return 2 * np.exp(-np.square(points).sum(axis=1) / 0.3) - 0.5
+
+
+def test_attributes_tell_textures_of_one_shape_apart_and_form_alone_does_not(tmp_path: Path) -> None:
+    nibabel = pytest.importorskip("nibabel")
+    generator = np.random.default_rng(0)
+    affine = np.diag([0.1, 0.1, 0.1, 1.0])
+    affine[:3, 3] = -1.5
+    voxels = np.stack(np.meshgrid(*[np.arange(31)] * 3, indexing="ij"), axis=-1) * 0.1 - 1.5
+    for kind in ("graded", "layered", "mottled", "core"):
+        for i in range(4):
+            body = trimesh.creation.icosphere(subdivisions=3)
+            body.vertices *= np.array([1, 0.8, 1.3]) * generator.uniform(0.98, 1.02, 3)
+            (tmp_path / "root" / kind).mkdir(parents=True, exist_ok=True)
+            body.export(tmp_path / "root" / kind / f"{i}.off")
+            values = texture(kind, generator, voxels.reshape(-1, 3)).reshape(31, 31, 31)
+            place = tmp_path / "root" / "ct" / kind / f"{i}.off.nii.gz"
+            place.parent.mkdir(parents=True, exist_ok=True)
+            nibabel.save(nibabel.Nifti1Image(values.astype(np.float32), affine), place)
+    images = {"ct": ImageAttribute("ct/{file}.nii.gz", tmp_path / "root")}
+    found = {}
+    files = [
+        tmp_path / "root" / kind / f"{i}.off" for kind in ("graded", "layered", "mottled", "core") for i in range(4)
+    ]
+    labels = [path.parent.name for path in files]
+    for name in ("interior", "interior+ct"):
+        chosen = igps.descriptor(name)
+        dataset = SignatureDataset(files, cache_dir=tmp_path / "cache", descriptor=chosen, attributes=images)
+        fit_centres(chosen, dataset)
+        described = describe(dataset, chosen)
+        found[name] = float(retrieval_scores(chosen.distances(described, described), labels).mean()["nn"])
+    assert found["interior+ct"] >= 0.95
+    assert found["interior"] < 0.6
+
+
+def test_an_attribute_adds_its_histograms_with_its_weight(bodies: SignatureDataset, tmp_path: Path) -> None:
+    files = [tmp_path / f"{i}.off" for i in range(3)]
+    heights = {"height": lambda points: points[:, 2]}
+    whole = igps.descriptor("pretrained+height=0.5")
+    assert isinstance(whole, WithAttributes)
+    dataset = SignatureDataset(files, cache_dir=tmp_path / "cache", descriptor=whole, attributes=heights)
+    fit_centres(whole, dataset)
+    described = describe(dataset, whole)
+    form = describe(dataset, descriptor("pretrained"))
+    inside = describe(dataset, whole.inside)
+    np.testing.assert_allclose(inside.sum(dim=1), 1, rtol=1e-5)
+    expected = descriptor("pretrained").distances(form, form) + 0.5 * 0.093 / 0.017 * chi_square(inside, inside)
+    np.testing.assert_allclose(whole.distances(described, described), expected, atol=1e-5)
+    assert igps.descriptor("pretrained+height=0.5+size").name == "pretrained+height=0.5+size"
+    with pytest.raises(ValueError, match="with: expected positive weights"):
+        igps.descriptor("interior+height=0")
