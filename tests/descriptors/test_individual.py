@@ -115,8 +115,8 @@ def test_names_carry_the_choice() -> None:
 def test_what_cannot_be_weighed_is_refused() -> None:
     with pytest.raises(ValueError, match=r"size: expected .* the units of the bodies beside \"auto\""):
         igps.descriptor("gps", size="auto")
-    with pytest.raises(ValueError, match=r"expected one of interior, .*got 'gps\+colour'"):
-        igps.descriptor("gps+colour")
+    with pytest.raises(ValueError, match=r"expected one of interior, .*got 'gps\+colour=red'"):
+        igps.descriptor("gps+colour=red")
     with pytest.raises(ValueError, match="expected a descriptor that ignores size by itself, got 'molecular'"):
         igps.descriptor("molecular", size="keep")
     own = igps.descriptor("gps")

@@ -145,9 +145,9 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
     switches = {name: meanings.get(name) for name in parameters if kinds[name] is bool}
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
         switches = {**FLAGS, **switches}
-        for several, meaning in LISTS.items():
+        for several, told in LISTS.items():
             if several != "with" or {"descriptor", "descriptors"} & set(parameters):
-                parser.add_argument(f"--{several}", nargs="+", help=meaning)
+                parser.add_argument(f"--{several}", nargs="+", help=told)
     if kinds["return"] is not type(None):
         switches[JSON] = "print what the table tells as JSON, and all else to standard error"
     by_hand: set[str | int] = {*switches, *LISTS}

@@ -46,7 +46,7 @@ _MAKERS: Mapping[str, Callable[[], Descriptor]] = {
 NAMES: tuple[str, ...] = tuple(_MAKERS)
 """The names of the library's descriptors of any body."""
 
-_MARKED = re.compile(r"(\+size|\+side)+$")
+_MARK = re.compile(r"\+(?:size|side)(?=\+|$)")
 _NAME = re.compile(r"\w{1,100}(\+\w{1,40}(=[\d.e-]{1,10})?){0,9}")
 _WITH = re.compile(r"\+(\w+)(?:=([\d.]+))?")
 _WRITTEN = (".yaml", ".yml")
@@ -85,7 +85,8 @@ def load(path: str | Path) -> Descriptor:
     if not _NAME.fullmatch(module.name):  # files are called after it
         raise ValueError(f"{path}: expected a descriptor's name of letters, digits and _, got {module.name[:80]!r}.")
     module.card = card
-    module.scale = card.get("scale")
+    if "scale" in card:
+        module.scale = card["scale"]
     return module
 
 
@@ -120,8 +121,7 @@ def descriptor(
         raise ValueError('size: expected "keep" or "ignore", or the units of the bodies beside "auto", got none.')
     marks = ""
     if isinstance(which, str):
-        found = _MARKED.search(which)
-        marks, which = (found[0], which[: found.start()]) if found else ("", which)
+        marks, which = "".join(_MARK.findall(which)), _MARK.sub("", which)
     plain = _plain(which)
     with_size = SIZE in marks or (size == "keep" if units is None else keeps_size(size, units)[0])
     with_side = SIDE in marks or mirror == "distinct"
