@@ -48,7 +48,8 @@ def molecular_surface(
     """The closed surface of a molecule, in ångström; hollows inside that it does not open to are filled.
 
     At a spacing of 0.5 the area and volume of the excluded surface are within 1 % of closed forms, before vertices are
-    taken away; afterwards the volume still is.
+    taken away; afterwards the volume still is. A neck of radius less than about half the spacing is lost, and a bar
+    joins the pieces: two balls with a neck of 0.12 have 4 % too much area at 0.5, and 0.3 % at 0.25.
 
     Example:
         >>> at, none = np.zeros((1, 3)), np.zeros(1)
