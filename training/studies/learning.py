@@ -10,10 +10,10 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
-from torchmetrics.classification import BinaryAUROC
+from torchmetrics.functional.classification import binary_auroc, multiclass_calibration_error
 
 import igps
-from igps.analysis.fitting import Goal, calibration_error, classify, fit, histograms_and_prior
+from igps.analysis.fitting import Goal, classify, fit, histograms_and_prior
 from igps.data.datamodule import SignatureDataModule
 from igps.data.splits import Split, SplitProtocol, split_seen, split_unseen
 from igps.descriptors.fingerprint import cache_tag
@@ -144,12 +144,13 @@ def _fitted(dataset: igps.SignatureDataset, descriptor: str, goal: Goal, n_train
         return found
     told, labels = classify(test, model), test.labels
     found["accuracy"] = float((told.probabilities.argmax(dim=1) == labels).float().mean())
-    found["calibration_error"] = calibration_error(told.probabilities, labels)
+    n_classes = told.probabilities.shape[1]
+    found["calibration_error"] = float(multiclass_calibration_error(told.probabilities, labels, n_classes, 10))
     areas = []
     for label in labels.unique():
         rest = train.subset(torch.nonzero(train.labels != label).flatten().tolist())
         strange = classify(test, _classifier(rest, descriptor)).strangeness
-        areas.append(float(BinaryAUROC()(strange, (labels == label).long())))
+        areas.append(float(binary_auroc(strange, (labels == label).long())))
     return {**found, "unknown_auc": mean(areas)}
 
 

@@ -192,14 +192,6 @@ def classify(
     )
 
 
-def calibration_error(probabilities: Tensor, labels: Tensor) -> float:
-    """Expected calibration error of (N, C) probabilities against labels (N,), in ten bins (Naeini et al. 2015)."""
-    sure, taken_for = probabilities.max(dim=1)
-    bins = (sure * _N_BINS).ceil().long()
-    gaps = torch.zeros(_N_BINS + 1).index_add_(0, bins, sure - (taken_for == labels).float())
-    return float(gaps.abs().sum() / len(labels))
-
-
 def _histograms(
     dataset: SignatureDataset,
     base: Descriptor,
@@ -246,6 +238,8 @@ def _scores(
     fitted: Callable[..., Head | None],
 ) -> dict[str, float]:
     """Means over held-out folds: of retrieval, and of a classifier what it is worth as such."""
+    from torchmetrics.functional.classification import binary_auroc, multiclass_calibration_error
+
     found: list[dict[str, float]] = []
     said, truth, known, strange = [], [], [], []
     classes = labels.unique()
@@ -269,13 +263,11 @@ def _scores(
     if said:
         probabilities, right = torch.cat(said), torch.cat(truth)
         means["accuracy"] = float((probabilities.argmax(dim=1) == right).float().mean())
-        means["calibration_error"] = calibration_error(probabilities, right)
+        n_classes = probabilities.shape[1]
+        means["calibration_error"] = float(multiclass_calibration_error(probabilities, right, n_classes, _N_BINS))
     if strange:
-        means["unknown_auc"] = fmean(_auc(one, other) for one, other in zip(strange, known, strict=True))
+        means["unknown_auc"] = fmean(
+            float(binary_auroc(torch.cat([new, old]), torch.cat([torch.ones(len(new)), torch.zeros(len(old))]).long()))
+            for new, old in zip(strange, known, strict=True)
+        )
     return means
-
-
-def _auc(positive: Tensor, negative: Tensor) -> float:
-    """Area under the curve: how often a positive is above a negative, ties by half (Mann and Whitney 1947)."""
-    above = (positive[:, None] > negative).float() + 0.5 * (positive[:, None] == negative).float()
-    return float(above.mean())

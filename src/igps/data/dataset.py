@@ -32,7 +32,7 @@ from igps.data.sources import Bodies, ClassRule, find_bodies, given_bodies
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
-from igps.signature.signature import Samples, Signature, SignatureConfig
+from igps.signature.signature import Signature, SignatureConfig
 
 logger = logging.getLogger(__name__)
 
@@ -289,7 +289,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
             change: what is done to each before it is kept, such as `FewerSamples`, of which more fit.
         """
         chosen = copy.copy(self)
-        chosen._at_hand = [_owned(one if change is None else change(one)) for one in self.signatures()]
+        chosen._at_hand = [copy.deepcopy(one if change is None else change(one)) for one in self.signatures()]
         if change is not None:  # no description of what is in the cache
             chosen._hits = (None,) * len(self)
         chosen._numbers = tuple(range(len(self)))
@@ -452,18 +452,3 @@ def _bodies(
     if isinstance(given, str | Path):
         return find_bodies(given, reading) if Path(given).is_dir() else given_bodies([given], labels, reading)
     return given_bodies(given, labels, reading)
-
-
-def _owned(signature: Signature) -> Signature:
-    """The same with arrays of its own."""
-
-    def owned(samples: Samples) -> Samples:
-        attributes = {name: values.copy() for name, values in samples.attributes.items()}
-        return Samples(samples.points.copy(), samples.eigenfunctions.copy(), attributes)
-
-    return replace(
-        signature,
-        eigenvalues=signature.eigenvalues.copy(),
-        interior=owned(signature.interior),
-        surface=owned(signature.surface),
-    )
