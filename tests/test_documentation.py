@@ -205,8 +205,9 @@ def check_fine_tuning(printed: str, folder: Path) -> None:
 
 
 def check_anatomy(printed: str, folder: Path) -> None:
-    assert int(printed.split("%")[0]) >= 75  # by guessing: 50
-    assert len(list((folder / "kidneys").rglob("*.ply"))) == 12
+    organs = [re.findall(r"s(\d)/\w+\.nii\.gz#(\w+)", line) for line in printed.splitlines()]
+    assert len(organs) == len(list((folder / "segmentations").rglob("*.nii.gz"))) == 9
+    assert all(body[0] != other[0] and body[1] == other[1] for body, other in organs)
 
 
 CHECKS = {

@@ -157,7 +157,7 @@ def test_the_thinnest_part_is_measured_in_voxels(thickness: int) -> None:
 def test_a_body_that_is_not_in_its_file_is_told(tmp_path: Path) -> None:
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     nibabel.save(nibabel.Nifti1Image(np.ones((9, 9, 9), dtype=np.uint8), np.eye(4)), tmp_path / "x.nii")
-    (tmp_path / "labels.csv").write_text("file,body,label\nx.nii,1,a\nx.nii,liver,b\n")
+    (tmp_path / "labels.csv").write_text("file,body,label\nx.nii,x,a\nx.nii,liver,b\n")
     found = findings(tmp_path)
-    assert found["x.nii#1"].error is None
+    assert found["x.nii#x"].error is None
     assert "has no such body" in str(found["x.nii#liver"].error)

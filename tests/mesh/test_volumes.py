@@ -209,6 +209,14 @@ def test_names_come_from_the_header_and_a_given_table_goes_first(tmp_path: Path)
     assert [body.name for body in given.bodies] == ["3", "spleen"]
 
 
+def test_a_mask_without_names_is_called_by_its_file(tmp_path: Path) -> None:
+    write_nibabel(tmp_path / "left.kidney.nii.gz", (two_boxes() == 3).astype(np.uint8))
+    volume = read_label_volume(tmp_path / "left.kidney.nii.gz")
+    assert label_bodies(volume) == [(1, "left.kidney", 384)]
+    (tmp_path / "left.kidney.csv").write_text("label,name\n1,kidney\n")
+    assert label_bodies(read_label_volume(tmp_path / "left.kidney.nii.gz")) == [(1, "kidney", 384)]
+
+
 def test_probabilities_are_cut_at_the_threshold(tmp_path: Path) -> None:
     ball = np.linalg.norm(np.indices((20, 20, 20)) - 9.5, axis=0)
     nibabel.save(nibabel.Nifti1Image(np.clip(1.5 - ball / 8, 0, 1).astype(np.float32), np.eye(4)), tmp_path / "x.nii")

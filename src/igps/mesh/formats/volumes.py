@@ -157,7 +157,8 @@ def read_label_volume(path: str | Path, options: VolumeOptions = VolumeOptions()
     """Read a label volume: `.nii`, `.nii.gz`, `.mgh`, `.mgz`, `.nrrd`, `.mha`, `.mhd`, `.dcm` (SEG), `.tif`, `.tiff`.
 
     Names of labels come from `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, extensions of NIfTI), else
-    from a table beside it (see `names_beside`); without one a label is its number.
+    from a table beside it (see `names_beside`); without one a label is its number, and the only label 1 of a mask has
+    the name of the file.
 
     Raises:
         MeshError: the file is missing, cut short, too large, or holds no labels in three axes.
@@ -250,6 +251,8 @@ def _labelled(raw: RawVolume, path: Path, options: VolumeOptions) -> LabelVolume
         names = read_label_names(options.names)
     elif not names:
         names = names_beside(path)
+        if not names and not raw.segments and layers[0].max(initial=0) == 1:  # a mask is called by its file
+            names = {1: path.name[: -len(_suffix(path))]}
     return LabelVolume(layers, raw.affine, str(path), names, segments, raw.unit, tuple(dict.fromkeys(notes)))
 
 

@@ -1,0 +1,195 @@
+"""Closed forms as voxels: what surfaces of labels make of them, in volume, area and description.
+
+Balls, ellipsoids, tori, capsules, rods and plates are turned and moved at random and sampled at the centres of voxels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import elliprg
+
+from igps import Mesh, SignatureConfig, collate, compute_signature
+from igps.data.requirements import Requirements
+from igps.descriptors import descriptor
+from igps.mesh.label_surface import voxel_surface
+
+Array = NDArray[np.float64]
+KINDS = ("ball", "ellipsoid", "torus", "capsule", "rod", "plate")
+AXES = np.array([1, 1.3, 2])  # of an ellipsoid
+SIDES = np.array([3, 4, 1])  # of a plate
+RING = 2.5  # of a torus, over the radius of its tube
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A body about the origin: which points (..., 3) it holds, half its box, its volume, area and handles."""
+
+    holds: Callable[[Array], NDArray[np.bool_]]
+    half: Array
+    volume: float
+    area: float
+    genus: int = 0
+
+
+def solid(kind: str, thickness: float) -> Solid:
+    """The solid of a kind that is so thick where it is thinnest; rods are four times as long, capsules three times."""
+    r = thickness / 2
+    if kind in ("ball", "ellipsoid"):
+        axes = r * (AXES if kind == "ellipsoid" else np.ones(3))
+        a, b, c = axes
+        area = 4 * np.pi * float(elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2))
+        return Solid(lambda p: ((p / axes) ** 2).sum(-1) < 1, axes, 4 / 3 * np.pi * axes.prod(), area)
+    if kind == "torus":
+        ring = RING * r
+        return Solid(
+            lambda p: (np.hypot(p[..., 0], p[..., 1]) - ring) ** 2 + p[..., 2] ** 2 < r**2,
+            np.array([ring + r, ring + r, r]), 2 * np.pi**2 * ring * r**2, 4 * np.pi**2 * ring * r, 1,
+        )  # fmt: skip
+    if kind == "capsule":
+        return Solid(
+            lambda p: np.hypot(p[..., 0], p[..., 1]) ** 2 + np.maximum(abs(p[..., 2]) - 2 * r, 0) ** 2 < r**2,
+            np.array([r, r, 3 * r]), (4 + 4 / 3) * np.pi * r**3, (8 + 4) * np.pi * r**2,
+        )  # fmt: skip
+    if kind == "rod":
+        return Solid(
+            lambda p: (np.hypot(p[..., 0], p[..., 1]) < r) & (abs(p[..., 2]) < 4 * r),
+            np.array([r, r, 4 * r]), 8 * np.pi * r**3, 18 * np.pi * r**2,
+        )  # fmt: skip
+    half = r * SIDES
+    a, b, c = half
+    return Solid(lambda p: (abs(p) < half).all(-1), half, 8 * a * b * c, 8 * (a * b + b * c + a * c))
+
+
+def edges_of(kind: str, thickness: float) -> float:
+    """The length of the edges of a solid, at which two faces meet in a right angle."""
+    r = thickness / 2
+    return {"rod": 4 * np.pi * r, "plate": 8 * r * float(SIDES.sum())}.get(kind, 0.0)
+
+
+def exact_mesh(kind: str, thickness: float) -> Mesh:
+    """The surface of a solid in a few thousand triangles."""
+    r = thickness / 2
+    if kind == "torus":
+        surface = trimesh.creation.torus(RING * r, r, major_sections=120, minor_sections=40)
+    elif kind == "plate":
+        surface = trimesh.creation.box(2 * r * SIDES)
+        for _ in range(4):
+            surface = surface.subdivide()
+    elif kind in ("capsule", "rod"):
+        angle = np.linspace(0, np.pi / 2, 16)
+        end = r * np.stack([np.sin(angle), 2 + np.cos(angle)], 1)
+        if kind == "rod":
+            end = np.concatenate([np.stack([np.linspace(0, r, 12), np.full(12, 4 * r)], 1)])
+        side = np.stack([np.full(58, r), np.linspace(end[-1, 1], -end[-1, 1], 60)[1:-1]], 1)
+        surface = trimesh.creation.revolve(np.concatenate([end, side, end[::-1] * [1, -1]]), sections=48)
+    else:
+        surface = trimesh.creation.icosphere(subdivisions=4)
+        surface.vertices *= r * (AXES if kind == "ellipsoid" else np.ones(3))
+    return Mesh(np.asarray(surface.vertices), np.asarray(surface.faces), name=kind)
+
+
+def voxels(body: Solid, matrix: Array, rng: np.random.Generator) -> tuple[NDArray[np.bool_], Array]:
+    """The body, turned and moved at random, at the centres of voxels: (X, Y, Z), and the affine (4, 4)."""
+    turn = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+    size = np.linalg.norm(body.half)
+    reach = np.ceil(np.linalg.norm(np.linalg.inv(matrix), axis=1) * size).astype(int) + 1
+    index = np.stack(np.meshgrid(*(np.arange(2 * n + 1) for n in reach), indexing="ij"), axis=-1)
+    affine = np.eye(4)
+    affine[:3, :3] = matrix
+    affine[:3, 3] = -matrix @ (reach + rng.uniform(-0.5, 0.5, 3))
+    mask = body.holds((index @ matrix.T + affine[:3, 3]) @ turn)
+    affine[:3, 3] += (100, -50, 20)
+    return mask, affine
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Of the surface of a voxelised solid: relative errors of volume and area, signed, and how far each description is
+    from that of the exact mesh, over the median distance between exact meshes of two kinds."""
+
+    kind: str
+    n_voxels: int
+    length: float
+    volume: float
+    area: float
+    distances: dict[str, float]
+
+
+def measure(
+    n_voxels: Sequence[int] = (16,),
+    lengths: Sequence[float] = (1, 3, 6),
+    descriptors: Sequence[str] = (),
+    n_turns: int = 1,
+    seed: int = 0,
+) -> list[Measured]:
+    """Make the surfaces of all kinds of solids and compare them with the solids.
+
+    Args:
+        n_voxels: thicknesses, in the longest side of the voxels.
+        lengths: the longest side of the voxels; the others are 1.
+        descriptors: names of those that describe the surfaces.
+        n_turns: orientations and places of each.
+        seed: of these.
+    """
+    modules = {name: descriptor(name) for name in descriptors}
+    needs = Requirements()
+    for module in modules.values():
+        needs = needs | module.requirements
+    config = needs.apply_to(SignatureConfig())
+
+    def described(mesh: Mesh) -> dict[str, torch.Tensor]:
+        batch = collate([compute_signature(mesh, config)])
+        with torch.inference_mode():
+            return {name: module(batch) for name, module in modules.items()}
+
+    exact = {kind: described(exact_mesh(kind, 1.0)) for kind in KINDS} if modules else {}
+    between = {
+        name: float(
+            np.median([float(one.distances(exact[a][name], exact[b][name])) for a, b in combinations(KINDS, 2)])
+        )
+        for name, one in modules.items()
+    }
+    rng, found = np.random.default_rng(seed), []
+    for kind in KINDS:
+        for size in n_voxels:
+            for length in lengths:
+                for _ in range(n_turns):
+                    body = solid(kind, size * length)
+                    mask, affine = voxels(body, np.diag(rng.permutation([1, 1, length])).astype(float), rng)
+                    mesh = Mesh(*voxel_surface(mask, affine)[:2], name=kind)
+                    away = described(mesh) if modules else {}
+                    distances = {
+                        name: float(module.distances(away[name], exact[kind][name])) / between[name]
+                        for name, module in modules.items()
+                    }
+                    volume, area = mesh.volume / body.volume - 1, mesh.area / body.area - 1
+                    found.append(Measured(kind, size, length, volume, area, distances))
+    return found
+
+
+def main() -> None:
+    """Print the medians of each kind, in percent."""
+    for n_voxels in ((4,), (8, 12), (16,)):
+        found = measure(n_voxels, descriptors=("pretrained", "interior") if n_voxels == (16,) else ())
+        for kind in (*KINDS, "all"):
+            rows = [one for one in found if kind in (one.kind, "all")]
+            told = [
+                f"{name} {100 * np.median([abs(getattr(one, name)) for one in rows]):.2f}"
+                for name in ("volume", "area")
+            ]
+            told += [
+                f"{name} {100 * np.median([one.distances[name] for one in rows]):.1f}" for name in rows[0].distances
+            ]
+            print(f"{n_voxels} voxels, {kind}: {', '.join(told)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
