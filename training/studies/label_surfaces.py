@@ -46,7 +46,7 @@ def solid(kind: str, thickness: float) -> Solid:
         axes = r * (AXES if kind == "ellipsoid" else np.ones(3))
         a, b, c = axes
         area = 4 * np.pi * float(elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2))
-        return Solid(lambda p: ((p / axes) ** 2).sum(-1) < 1, axes, 4 / 3 * np.pi * axes.prod(), area)
+        return Solid(lambda p: np.asarray(((p / axes) ** 2).sum(-1) < 1), axes, 4 / 3 * np.pi * axes.prod(), area)
     if kind == "torus":
         ring = RING * r
         return Solid(
@@ -65,7 +65,7 @@ def solid(kind: str, thickness: float) -> Solid:
         )  # fmt: skip
     half = r * SIDES
     a, b, c = half
-    return Solid(lambda p: (abs(p) < half).all(-1), half, 8 * a * b * c, 8 * (a * b + b * c + a * c))
+    return Solid(lambda p: np.asarray((abs(p) < half).all(-1)), half, 8 * a * b * c, 8 * (a * b + b * c + a * c))
 
 
 def edges_of(kind: str, thickness: float) -> float:
