@@ -43,7 +43,7 @@ def test_a_row_for_each_body_tells_what_is_known_of_it(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     extract(monkeypatch, root, tmp_path / "features.csv")
-    assert "4 descriptions of shape (10, 64)" in capsys.readouterr().out
+    assert "4 descriptions of shape (642,)" in capsys.readouterr().out
     table = pd.read_csv(tmp_path / "features.csv", dtype={"age": str}, keep_default_na=False)
     assert table["name"].tolist() == ["1.nii.gz#liver", "1.nii.gz#spleen", "2.nii.gz#liver", "2.nii.gz#spleen"]
     assert table["file"].tolist() == ["1.nii.gz"] * 2 + ["2.nii.gz"] * 2
@@ -57,8 +57,8 @@ def test_a_row_for_each_body_tells_what_is_known_of_it(
     extract(monkeypatch, root, tmp_path / "features.npz")
     with np.load(tmp_path / "features.npz") as archive:
         vectors = archive["features"].reshape(4, -1)
-    columns = [f"v{i}" for i in range(640)]
-    assert table.columns.tolist()[-640:] == columns
+    columns = [f"v{i}" for i in range(642)]  # the last two are of size, as there is a unit
+    assert table.columns.tolist()[-642:] == columns
     assert np.array_equal(table[columns].to_numpy(np.float32), vectors)
 
 
@@ -73,7 +73,7 @@ def test_a_wide_table_has_a_row_for_each_file(
     extract(monkeypatch, root, tmp_path / f"wide.{suffix}", "--wide")
     long, wide = read(tmp_path / f"long.{suffix}"), read(tmp_path / f"wide.{suffix}")
     assert wide.columns.tolist()[:6] == ["file", "label", "age", "unit", "liver.volume", "liver.area"]
-    assert len(wide.columns) == 4 + 2 * (2 + 640)
+    assert len(wide.columns) == 4 + 2 * (2 + 642)
     assert wide["label"].tolist() == ["well", "ill"]
     for part in ("liver", "spleen"):
         rows = long[long["part"] == part]

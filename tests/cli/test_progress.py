@@ -27,8 +27,12 @@ def root(tmp_path: Path) -> Path:
 
 
 def bars(text: str) -> dict[str, tuple[int, int]]:
-    """Of each bar by name, where it stood last and where it ends."""
-    return {name.strip(): (int(done), int(total)) for name, _, done, total in BAR.findall(text)}
+    """Of the longest bar of each name, where it stood last and where it ends."""
+    found: dict[str, tuple[int, int]] = {}
+    for name, _, done, total in BAR.findall(text):
+        if int(total) >= found.get(name.strip(), (0, 0))[1]:
+            found[name.strip()] = (int(done), int(total))
+    return found
 
 
 @pytest.mark.parametrize(

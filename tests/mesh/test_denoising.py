@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from training.graded.grammar import GrammarShapes
 from training.studies.disturbances import noise
 
 from igps.mesh import denoising
@@ -12,7 +13,6 @@ from igps.mesh.denoising import denoised, is_noisy, noise_over_edge
 from igps.mesh.mending import mend, mended_by
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors
-from igps.shapes import ArticulatedShapes
 
 
 def bumpy() -> Mesh:
@@ -197,7 +197,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("index", [0, 3, 7, 12, 20])
 def test_coarse_bodies_are_told_apart_from_noisy_ones(index: int) -> None:
     """Of about 1,500 vertices, where an edge is long and the surface bends within it."""
-    body = ArticulatedShapes(index + 1, 1, seed=2, n_vertices=1500)[index]
+    body = GrammarShapes(index + 1, 1, seed=2, n_vertices=1500)[index]
     mesh = Mesh(body.vertices, body.faces)
     assert not is_noisy(mesh.vertices, mesh.faces)
     edge = np.linalg.norm(np.diff(mesh.vertices[mesh.faces], axis=1), axis=2).mean()

@@ -28,8 +28,8 @@ def report(
         meshes: the folder of the meshes, if they were moved since.
         n_workers: processes that make the pictures; all cores if not given.
     """
-    found = read_results(results)
     dataset = read_sources(results, meshes)
+    found = read_results(results)
     if dataset is None:
         surfaces = read_surfaces(results / SURFACES)
     else:
