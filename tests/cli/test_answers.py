@@ -86,3 +86,35 @@ def test_groups_refuses_three_of_a_group(
     igps(monkeypatch, root, "groups", tmp_path, "--group", "ill", *OWN, "--out", tmp_path / "out")
     assert "not tested (10 no, 3 yes): yes has 3: fewer than 5" in capsys.readouterr().out
     assert not (tmp_path / "out" / "groups.png").exists()
+
+
+def test_outliers_lists_the_short_egg_among_the_long_first(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    igps(monkeypatch, root, "outliers", root, *OWN, "--top", "2", "--out", tmp_path)
+    printed = capsys.readouterr().out
+    rows = table(tmp_path / "outliers.csv")
+    assert len(rows) == 13
+    assert rows[0]["body"] == "long6.off"
+    assert "lies among short" in rows[0]["reason"]
+    assert "long6.off" in printed.splitlines()[1]
+    assert [float(row["score"]) for row in rows] == sorted((float(row["score"]) for row in rows), reverse=True)
+    assert imread(tmp_path / "outliers.png").std() > 0.02
+
+
+@pytest.mark.parametrize("is_group", [False, True])
+def test_explain_writes_shares_that_add_up(
+    is_group: bool, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    what = ["explain", root] if is_group else ["explain", root / "short0.off", root / "long3.off"]
+    igps(monkeypatch, root, *what, *OWN, "--out", tmp_path)
+    printed = capsys.readouterr().out
+    (part,) = table(tmp_path / "explain.csv")
+    shares = [float(row["share"]) for row in table(tmp_path / "explain_samples.csv")]
+    if is_group:
+        assert "cells differ by more than chance" in printed
+        assert float(part["share"]) > 0
+    else:
+        assert sum(shares) == pytest.approx(float(part["share"]), rel=1e-6)
+        assert f"short0.off and {root}/long3.off: {float(part['share']):.4g}" in printed
+    assert imread(tmp_path / "explain.png").std() > 0.02

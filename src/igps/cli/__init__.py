@@ -22,9 +22,11 @@ from igps.cli.completion import completion
 from igps.cli.demo import demo
 from igps.cli.doctor import doctor
 from igps.cli.duplicates import distance, duplicates
+from igps.cli.explain import explain
 from igps.cli.fit import classify, fit
 from igps.cli.groups import groups
 from igps.cli.index import index_add, index_build, index_merge
+from igps.cli.outliers import outliers
 from igps.cli.precompute import precompute
 from igps.cli.reading import FLAGS, LISTS, Verdict
 from igps.cli.report import report
@@ -49,6 +51,8 @@ COMMANDS: Commands = {
     "compare": compare,
     "doctor": doctor,
     "groups": groups,
+    "explain": explain,
+    "outliers": outliers,
     "report": report,
     "completion": completion,
 }

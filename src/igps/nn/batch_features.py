@@ -15,6 +15,9 @@ from igps.nn.embedding import barycentroid_potential
 
 SampleKind = Literal["interior", "surface"]
 
+WEIGHT = "weight"
+"""An attribute of samples: how much each counts in histograms, all alike where there is none."""
+
 # Where padded targets are put: farther than any, and its square can be told.
 _FAR = 1e18
 # For the direction to the surface in the embedding.
@@ -70,6 +73,10 @@ class SampleFeatures:
                 "to SignatureDataset(attributes=...)."
             )
         return self.samples.attributes[name]
+
+    def weights(self) -> Tensor | None:
+        """(N, P) how much each sample counts, None where all count alike; derivatives by them tell shares."""
+        return self.samples.attributes.get(WEIGHT)
 
     def ball_radii(self) -> Tensor:
         """(N, P, 2) `ball_radii` of surface samples, over √area; 1 where padded.

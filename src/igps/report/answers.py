@@ -6,12 +6,17 @@ import csv
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from igps.analysis.groups import GroupTest
-from igps.report.drawing import PALETTE, new_figure
+from igps.analysis.outliers import Outlier
+from igps.mesh.mesh import Mesh
+from igps.report.drawing import PALETTE, new_figure, paint
+from igps.report.gallery import draw_body, seen_from_the_front
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,4 +66,34 @@ def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:
     return figure
 
 
+def outliers_figure(pictured: Sequence[tuple[Outlier, Mesh]]) -> Figure:
+    """Bodies with their scores and reasons, four in a row."""
+    n_rows = -(-len(pictured) // 4)
+    figure = new_figure(9, 2.6 * n_rows)
+    all_axes = list(figure.subplots(n_rows, 4, squeeze=False).flat)
+    for axes in all_axes:
+        axes.set_axis_off()
+    for axes, (one, mesh) in zip(all_axes, pictured, strict=False):
+        draw_body(axes, mesh)
+        title = f"{one.score:.1f}  {mesh.name}\n" + "\n".join(wrap(one.reason, 38))
+        axes.set_title(title, fontsize=6, color=_FOUND if one.is_outlier else "#000000")
+    return figure
+
+
+def explanation_figure(painted: Sequence[tuple[Mesh, NDArray[np.float64]]]) -> Figure:
+    """Bodies from the front and from behind, in red what each face (F,) has of the difference, blue if less."""
+    figure = new_figure(7, 3.4 * len(painted))
+    all_axes = figure.subplots(len(painted), 2, squeeze=False)
+    for row, (mesh, values) in zip(all_axes, painted, strict=True):
+        largest = np.quantile(np.abs(values), 0.98) or 1.0
+        shares = np.clip(values / largest, -1, 1)[:, None]
+        colours = np.where(shares > 0, _WHITE + shares * (_RED - _WHITE), _WHITE - shares * (_BLUE - _WHITE))
+        turned = seen_from_the_front(mesh.vertices)
+        for axes, turn, side in zip(row, ([1, 1, 1], [-1, 1, -1]), ("front", "back"), strict=True):
+            paint(axes, turned * turn, mesh.faces, colours)
+            axes.set_title(f"{mesh.name}, {side}", fontsize=7)
+    return figure
+
+
+_WHITE, _RED, _BLUE = (np.array(one) for one in ((0.9, 0.9, 0.9), (0.84, 0.25, 0.0), (0.0, 0.35, 0.7)))
 _INTERVAL = ("effect", "effect_low", "effect_high")

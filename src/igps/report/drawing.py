@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +21,16 @@ PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 """They stay apart for every kind of colour vision (Okabe and Ito 2008)."""
 
 
-def paint(axis: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int64], colour: Colour) -> None:
-    """Draw a surface, lit from the upper right, as seen from +z."""
+def paint(axis: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int64], colour: Any) -> None:
+    """Draw a surface, lit from the upper right, as seen from +z, in a colour (3,) or one of each face (F, 3)."""
     from matplotlib.collections import PolyCollection
 
     normals = unit(area_vectors(vertices, faces))
     front = np.nonzero(normals[:, 2] > 0)[0]
     front = front[np.argsort(vertices[faces[front], 2].mean(axis=1))]  # the painter's algorithm: far faces first
     light = normals[front] @ np.array([0.35, 0.45, 0.82])
-    colours = np.outer(np.clip(0.35 + 0.6 * light, 0, 1), colour)
+    of_faces = np.broadcast_to(colour, (len(faces), 3))[front]
+    colours = np.clip(0.35 + 0.6 * light, 0, 1)[:, None] * of_faces
     polygons = list(vertices[faces[front], :2])
     axis.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=colours, linewidths=0.3))
     low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from igps.mesh.loading import load_mesh
-from igps.mesh.mesh import MeshError
+from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 from igps.mesh.simplification import simplify
 from igps.report.drawing import GREY, new_figure, paint
@@ -65,13 +65,18 @@ def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progre
 
 def draw_mesh(axis: Axes, path: Path) -> None:
     """Draw a mesh, shaded and seen along its thinnest principal axis."""
-    mesh = load_mesh(path, LoadOptions(allow_open=True))
+    draw_body(axis, load_mesh(path, LoadOptions(allow_open=True)))
+
+
+def draw_body(axis: Axes, mesh: Mesh) -> None:
+    """Draw a mesh that is at hand, see `draw_mesh`."""
     with contextlib.suppress(MeshError):  # drawn in full, it only takes longer
         mesh = simplify(mesh, _THUMBNAIL_VERTICES)
-    paint(axis, _seen_from_the_front(mesh.vertices), mesh.faces, GREY)
+    paint(axis, seen_from_the_front(mesh.vertices), mesh.faces, GREY)
 
 
-def _seen_from_the_front(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+def seen_from_the_front(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same, turned so that the thinnest principal axis is z, and the longest y."""
     centred = vertices - vertices.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
     # The slender end up, the wider side left, so that poses of one body are drawn alike.

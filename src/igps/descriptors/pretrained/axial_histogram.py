@@ -76,14 +76,16 @@ class AxialHistogram(SampleHistogram):
         """(N, 3, ...) histograms of some samples of N shapes."""
         potential = barycentroid_potential(features.embedded(self.embedding))
         positions, directions = features.positions(), features.attribute("surface_direction")
+        weights = features.weights()
+        weights = torch.ones_like(potential) if weights is None else weights
         return torch.stack(
             [
-                self._of_shape(positions[i, real], directions[i, real], potential[i, real])
+                self._of_shape(positions[i, real], directions[i, real], potential[i, real], weights[i, real])
                 for i, real in enumerate(present(features))
             ]
         )
 
-    def _of_shape(self, points: Tensor, directions: Tensor, potential: Tensor) -> Tensor:
+    def _of_shape(self, points: Tensor, directions: Tensor, potential: Tensor, own: Tensor) -> Tensor:
         if not (torch.isfinite(points).all() and torch.isfinite(directions).all() and torch.isfinite(potential).all()):
             raise ValueError("AxialHistogram: expected finite values, got NaN or infinity.")
         with torch.no_grad():
@@ -102,7 +104,9 @@ class AxialHistogram(SampleHistogram):
             # towards the nearer end of the axis: so a body and its mirror image agree
             away = torch.where(along < 0, -of_direction, of_direction)
             direction = [soft_memberships(away, self.cosine), soft_memberships(outward, self.outward)]
-            found.append(counted(joint(place), joint(direction), torch.tensor(len(points))).view(self.n_bins))
+            found.append(
+                counted(joint(place) * own[:, None], joint(direction), torch.tensor(len(points))).view(self.n_bins)
+            )
         return torch.stack(found) / 3
 
 

@@ -61,16 +61,30 @@ class BranchHistogram(SampleHistogram):
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, B) histograms of some samples of N shapes."""
         heights, neighbours = features.log_potential(self.embedding), features.neighbours(self.embedding)
+        weights = features.weights()
         return torch.stack(
-            [self._of_shape(heights[i, real], neighbours[i]) for i, real in enumerate(present(features))]
+            [
+                self._of_shape(heights[i, real], neighbours[i], None if weights is None else weights[i, real])
+                for i, real in enumerate(present(features))
+            ]
         )
 
-    def _of_shape(self, heights: Tensor, neighbours: Tensor) -> Tensor:
+    def _of_shape(self, heights: Tensor, neighbours: Tensor, weights: Tensor | None) -> Tensor:
         tree = merge_tree(heights, neighbours)
-        lengths = (heights[tree.peaks] - heights[tree.saddles]).sort(descending=True).values[: self.n_branches]
+        lengths, longest = (heights[tree.peaks] - heights[tree.saddles]).sort(descending=True)
+        lengths = lengths[: self.n_branches]
         found = heights.new_zeros(self.n_branches)
         if not lengths[0] > 0:  # a body that is the same everywhere has one branch, of no length
             found[0] = 1
             return found
-        found[: len(lengths)] = lengths / lengths.sum()
+        shares = lengths / lengths.sum()
+        if weights is not None:  # a limb counts as its samples do: those of the piece that joins no other yet
+            places = torch.argsort(torch.argsort(heights, descending=True, stable=True))
+            counts = sorted({max(1, int(places[saddle])) for saddle in tree.saddles[longest[: len(lengths)]]})
+            pieces = dict(zip(counts, merge_tree(heights, neighbours, counts).pieces, strict=True))
+            limbs = [
+                pieces[max(1, int(places[tree.saddles[one]]))] == tree.peaks[one] for one in longest[: len(lengths)]
+            ]
+            shares = shares * torch.stack([weights[limb].mean() for limb in limbs])
+        found[: len(lengths)] = shares
         return found

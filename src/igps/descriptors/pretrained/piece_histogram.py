@@ -81,22 +81,24 @@ class PieceHistogram(SampleHistogram):
         """(N, L, ...) histograms of some samples of N shapes."""
         heights, positions = features.log_potential(self.embedding), features.positions()
         neighbours = features.neighbours(self.embedding)
+        weights = features.weights()
+        weights = torch.ones_like(heights) if weights is None else weights
         return torch.stack(
             [
-                self._of_shape(heights[i, real], positions[i, real], neighbours[i])
+                self._of_shape(heights[i, real], positions[i, real], neighbours[i], weights[i, real])
                 for i, real in enumerate(present(features))
             ]
         )
 
-    def _of_shape(self, heights: Tensor, points: Tensor, neighbours: Tensor) -> Tensor:
+    def _of_shape(self, heights: Tensor, points: Tensor, neighbours: Tensor, weights: Tensor) -> Tensor:
         if not torch.isfinite(points).all():
             raise ValueError("PieceHistogram: expected finite places, got NaN or infinity.")
         counts = [max(1, round(share * len(heights))) for share in self.levels]
         tree = merge_tree(heights, neighbours, counts)
-        found = torch.stack([self._of_level(points, pieces) for pieces in tree.pieces])
+        found = torch.stack([self._of_level(points, pieces, weights) for pieces in tree.pieces])
         return found / sum(counts)
 
-    def _of_level(self, points: Tensor, pieces: Tensor) -> Tensor:
+    def _of_level(self, points: Tensor, pieces: Tensor, weights: Tensor) -> Tensor:
         """(S, T) numbers of samples by the size and the length of their pieces."""
         left = pieces >= 0
         _, piece, counts = pieces[left].unique(return_inverse=True, return_counts=True)
@@ -114,4 +116,5 @@ class PieceHistogram(SampleHistogram):
         lengths = (12 * spread / sizes).clamp_min(torch.finfo(points.dtype).tiny).log2() / 2
         of_sizes = soft_memberships(sizes.log2(), self.sizes)
         of_lengths = soft_memberships(lengths, self.lengths)
-        return (of_sizes * counts[:, None]).T @ of_lengths
+        weighed = torch.zeros_like(counts).index_add(0, piece, weights[left].to(counts.dtype))
+        return (of_sizes * weighed[:, None]).T @ of_lengths

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from igps.data.requirements import Requirements
-from igps.nn.batch_features import BatchFeatures
+from igps.nn.batch_features import WEIGHT, BatchFeatures
 from igps.nn.histograms.base import DescriptionPart
 
 
@@ -57,4 +57,10 @@ class SpectrumShares(DescriptionPart):
         batch = features.batch
         numbers = torch.arange(2, self.n_eigenpairs + 1, device=batch.eigenvalues.device)
         over_number = batch.eigenvalues[:, 1 : self.n_eigenpairs] / numbers
-        return (over_number / over_number.sum(dim=1, keepdim=True)).to(batch.surface.eigenfunctions.dtype)
+        shares = (over_number / over_number.sum(dim=1, keepdim=True)).to(batch.surface.eigenfunctions.dtype)
+        weights = batch.surface.attributes.get(WEIGHT)
+        if weights is None:
+            return shares
+        # Where an eigenfunction is large, the surface decides on its eigenvalue (Hadamard 1908)
+        densities = batch.surface.eigenfunctions[:, :, 1 : self.n_eigenpairs].square()
+        return shares * (densities * weights[:, :, None]).sum(dim=1) / densities.sum(dim=1)

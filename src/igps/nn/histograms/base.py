@@ -18,8 +18,11 @@ from igps.nn.specification import Specified
 class DescriptionPart(Specified, ABC):
     """A module that makes one part of a description: non-negative numbers of sum 1 for each body.
 
-    A part of your own defines `shape`, `requirements` and `of_features`.
+    A part of your own defines `shape`, `requirements` and `of_features`, and, where it heeds the `weights` of samples,
+    `degree`: a part is as many times as large, to that power, where all samples weigh as many times as much.
     """
+
+    degree: int = 1
 
     @property
     @abstractmethod

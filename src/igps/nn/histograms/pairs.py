@@ -51,6 +51,8 @@ class PairHistogram(SampleHistogram):
         ValueError: an unknown axis or kind of samples, no axis of pairs, or too few samples to form a pair.
     """
 
+    degree = 2
+
     def __init__(
         self,
         axes: Sequence[PointAxis | PairAxis | str] = ("potential", "interior_distance"),
@@ -105,6 +107,8 @@ class PairHistogram(SampleHistogram):
             classes = (classes.unsqueeze(3) * axis.n_classes + own.unsqueeze(2)).flatten(2)
             weights = (weights.unsqueeze(3) * shares.unsqueeze(2)).flatten(2)
             n_classes *= axis.n_classes
+        if (own_weights := features.weights()) is not None:
+            weights = weights * own_weights.unsqueeze(2)
         return count_pairs(classes, weights, n_classes, pairs, mask)
 
 

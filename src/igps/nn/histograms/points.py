@@ -77,8 +77,10 @@ class PointHistogram(SampleHistogram):
             memberships.append(axis.memberships(torch.where(real, values, 0)))
         first, *others = memberships
         rest = joint(others) if others else torch.ones_like(first[..., :1])
+        weights = features.weights()
+        counts = mask if weights is None else mask * weights
         return (
-            counted(first * mask.unsqueeze(2), rest, mask.sum(dim=1))
+            counted(first * counts.unsqueeze(2), rest, mask.sum(dim=1))
             .unflatten(2, self.shape[1:] or (1,))
             .view(len(mask), *self.shape)
         )

@@ -1,0 +1,248 @@
+"""Where two bodies differ: their distance, shared out among the parts of the description and the samples of each."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from igps.data.batch import SampleBatch, SignatureBatch
+from igps.nn.batch_features import WEIGHT, BatchFeatures, SampleKind
+from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.histograms.base import DescriptionPart, SampleHistogram
+
+KINDS: tuple[SampleKind, ...] = ("interior", "surface")
+# Nodes of the integral along the line between two descriptions, and of what share of the distance it may miss
+_NODES, _MISSED = (16, 64, 256, 1024), 1e-8
+# Samples that a point of the surface takes its value from
+_NEIGHBOURS = 12
+
+Shares = Mapping[SampleKind, NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A distance, shared out. Shares may be negative: what makes the bodies alike.
+
+    Args:
+        distance: by the descriptor.
+        parts: of each histogram, by what it counts, its share; they sum to the distance.
+        samples: of the one and the other body, of each kind of samples (P,) their shares; all together sum to the
+            distance.
+    """
+
+    distance: float
+    parts: Mapping[str, float]
+    samples: tuple[Shares, Shares]
+
+    def told(self, most: int = 3) -> str:
+        """The largest shares in words."""
+        if not self.distance:
+            return "no difference"
+        largest = sorted(self.parts.items(), key=lambda one: -abs(one[1]))[:most]
+        return ", ".join(f"{share / self.distance:.0%} {name}" for name, share in largest)
+
+
+def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) -> Explanation:
+    """Share the distance of two bodies out among the histograms, and among the samples of both.
+
+    A cell's share is that of Aumann and Shapley (1974): its derivative of the distance, in mean along the straight line
+    on which the square roots of both descriptions come apart from their midpoint, times how far the cell's root comes.
+    Of χ² this is the cell's own term, of a squared Euclidean distance behind a linear head the product of its two
+    factors; and of a nonlinear head, as that of `pretrained`, too, the shares sum to the distance. A cell's share, over
+    the difference of the two bodies in it, is what a unit of its contents counts, positive in one body and negative in
+    the other. So it goes to the pairs in the cell, from each pair to its two samples in halves, and from a limb, a
+    piece or an eigenvalue to the samples that make it.
+
+    Args:
+        descriptor: of histograms, such as interior or rich, alone or under a head, such as pretrained.
+        one, other: a body each.
+
+    Raises:
+        ValueError: a descriptor of another kind, or not one body each.
+    """
+    if len(one) != 1 or len(other) != 1:
+        raise ValueError(f"one, other: expected a body each, got {len(one)} and {len(other)}.")
+    descriptor = copy.deepcopy(descriptor).double().eval()
+    histograms = _histograms(descriptor)
+    pair = (_doubled(one), _doubled(other))
+    cells = torch.cat([histograms(batch).detach().flatten(1) for batch in pair])
+    units, distance = unit_shares(descriptor, cells[0], cells[1])
+    parts, samples = _shared(histograms, pair[0], units)
+    others, samples_of_other = _shared(histograms, pair[1], -units)
+    return Explanation(
+        distance, {name: share + others[name] for name, share in parts.items()}, (samples, samples_of_other)
+    )
+
+
+def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Tensor, float]:
+    """What a unit of each cell's contents counts, positive in the one and negative in the other body, and the distance.
+
+    Args:
+        descriptor: see `explain`, in double precision.
+        one, other: (cells,) histograms.
+    """
+    roots = torch.stack([one, other]).double().sqrt()
+    middle, half = roots.mean(dim=0), (roots[0] - roots[1]) / 2
+
+    def distances(ends: Tensor) -> Tensor:
+        rows = (one.square().view(len(one), -1) for one in ends)
+        if isinstance(descriptor, EmbeddedDescriptor):
+            rows = (descriptor.head(one) for one in rows)
+        return descriptor.distances(*rows).diagonal()
+
+    with torch.no_grad():
+        distance = float(distances(roots[:, None]))
+    gradient = torch.zeros_like(middle)
+    for n_nodes in _NODES if distance else ():
+        gradient.zero_()
+        nodes, weights = np.polynomial.legendre.leggauss(n_nodes)
+        steps = zip(torch.tensor(nodes).split(16), torch.tensor(weights).split(16), strict=True)
+        for places, parts in steps:
+            away = (places[:, None] + 1) / 2 * half
+            ends = torch.stack([middle + away, middle - away]).requires_grad_()
+            (found,) = torch.autograd.grad(distances(ends) @ (parts / 2), ends)
+            gradient += (found[0] - found[1]).sum(dim=0) / 2
+        if abs(float(gradient @ half) * 2 - distance) <= _MISSED * distance:
+            break
+    total = roots.sum(dim=0)
+    return torch.where(total > 0, gradient / total.clamp_min(torch.finfo(total.dtype).tiny), 0), distance
+
+
+def on_surface(shares: Shares, samples: Mapping[SampleKind, NDArray[np.float64]], points: NDArray[np.float64]) -> Any:
+    """(V,) what the body has of the difference about each point: 1 where it is as everywhere, if the sum were 1.
+
+    Args:
+        shares: of the samples of each kind, (P,).
+        samples: their places, (P, 3).
+        points: (V, 3), such as vertices.
+    """
+    found = np.zeros(len(points))
+    for kind, values in shares.items():
+        if np.any(values):
+            _, nearest = cKDTree(samples[kind]).query(points, min(_NEIGHBOURS, len(values)))
+            found += len(values) * values[nearest].reshape(len(points), -1).mean(axis=1)
+    return found
+
+
+def _histograms(descriptor: Descriptor) -> HistogramDescriptor:
+    found = descriptor.descriptor if isinstance(descriptor, EmbeddedDescriptor) else descriptor
+    if not isinstance(found, HistogramDescriptor):
+        raise ValueError(
+            f"descriptor: expected histograms of samples, such as interior, rich or pretrained, whose cells know their "
+            f"samples, got {descriptor.name!r}."
+        )
+    return found
+
+
+def _doubled(batch: SignatureBatch) -> SignatureBatch:
+    """In double precision, and with weights of the samples that have a gradient."""
+
+    def doubled(samples: SampleBatch) -> SampleBatch:
+        samples = samples.map(lambda values: values.double() if values.is_floating_point() else values)
+        weights = torch.ones_like(samples.points[..., 0]).requires_grad_()
+        return replace(samples, attributes={**samples.attributes, WEIGHT: weights})
+
+    return replace(batch, interior=doubled(batch.interior), surface=doubled(batch.surface))
+
+
+def _shared(histograms: HistogramDescriptor, batch: SignatureBatch, units: Tensor) -> tuple[dict[str, float], Shares]:
+    """What each histogram, and each sample, of a body has of the distance."""
+    weights = [getattr(batch, kind).attributes[WEIGHT] for kind in KINDS]
+    totals = [torch.zeros_like(one) for one in weights]
+    features, parts, first = BatchFeatures(batch, False), dict[str, float](), 0
+    for group in histograms.parts:
+        for part in group:
+            share = 1 / (len(histograms.parts) * len(group)) if len(histograms.histograms) > 1 else 1.0
+            values = share * part.of_features(features).flatten() @ units[first : first + part.n_cells]
+            first += part.n_cells
+            name = told_of(part)
+            parts[name] = parts.get(name, 0.0) + float(values.detach())
+            if not values.requires_grad:
+                raise ValueError(
+                    f"descriptor: {type(part).__name__} does not heed weights of samples, see DescriptionPart."
+                )
+            found = torch.autograd.grad(values, weights, allow_unused=True, retain_graph=True)
+            for total, gradient in zip(totals, found, strict=True):
+                total += 0 if gradient is None else gradient / part.degree
+    return parts, {kind: total[0].detach().numpy() for kind, total in zip(KINDS, totals, strict=True)}
+
+
+_AXES = {
+    "InteriorDistance": "interior distances", "EuclideanDistance": "distances in space", "PairCosines": "directions",
+    "EmbeddedPairCosines": "directions to the surface", "BallRadius": "thickness", "Attribute": "attributes",
+    "AxialHistogram": "place along the axes", "BranchHistogram": "lengths of limbs",
+    "PieceHistogram": "sizes of pieces", "SpectrumShares": "spectrum",
+}  # fmt: skip
+
+
+def told_of(part: DescriptionPart) -> str:
+    """What a part of a description counts, in words."""
+    axes = [type(axis).__name__ for axis in getattr(part, "axes", [part])]
+    words = list(dict.fromkeys(_AXES.get(name, name) for name in axes if name != "Potential" or len(axes) == 1))
+    place = f" ({part.samples})" if isinstance(part, SampleHistogram) else ""
+    return " and ".join(words) + place
+
+
+def held(one: Tensor, other: Tensor, *, level: float = 0.05, n_permutations: int = 1000, seed: int = 0) -> Tensor:
+    """(cells,) in which the means of two groups differ by more than chance, any false one with probability `level`.
+
+    A permutation test of the largest difference in standard deviations (Westfall and Young 1993).
+
+    Args:
+        one, other: (N, cells) square roots of histograms of two groups.
+        level: of the family of all cells.
+        n_permutations: of the bodies between the groups.
+        seed: of these.
+    """
+    rows, n = torch.cat([one, other]).double(), len(one)
+    rows = rows - rows.mean(dim=0)
+    scale = rows.std(dim=0)
+    rows = torch.where(scale > 1e-12, rows / scale.clamp_min(1e-12), 0)
+    signs = torch.full((n_permutations + 1, len(rows)), -1 / len(other), dtype=torch.float64)
+    random = torch.Generator().manual_seed(seed)
+    for i in range(n_permutations + 1):
+        signs[i, torch.arange(n) if i == 0 else torch.randperm(len(rows), generator=random)[:n]] = 1 / n
+    differences = (signs @ rows).abs()
+    return differences[0] > differences.max(dim=1).values.quantile(1 - level)
+
+
+def explain_groups(
+    descriptor: Descriptor, one: Tensor, other: Tensor, batches: Sequence[SignatureBatch], **test: Any
+) -> tuple[Explanation, Tensor]:
+    """Share the distance of two groups' mean descriptions out, on a body of each, by cells that a test holds alone.
+
+    The distance is what is left of it in those cells, see `held`; the two bodies' shares sum to it where their own
+    descriptions are the means.
+
+    Args:
+        descriptor: see `explain`.
+        one, other: (N, ...) descriptions of its histograms (for a head, those that the head is given).
+        batches: two bodies to be painted, one of each group.
+        test: see `held`.
+
+    Returns:
+        the explanation, and the (cells,) that are held.
+    """
+    descriptor = copy.deepcopy(descriptor).double().eval()
+    rows = [group.double().flatten(1) for group in (one, other)]
+    kept = held(rows[0].sqrt(), rows[1].sqrt(), **test)
+    means = [group.mean(dim=0) for group in rows]
+    units, _ = unit_shares(descriptor, *means)
+    units = torch.where(kept, units, 0)
+    histograms = _histograms(descriptor)
+    shared = [_shared(histograms, _doubled(b), sign * units) for b, sign in zip(batches, (1, -1), strict=True)]
+    parts, first = dict[str, float](), 0
+    for part in (part for group in histograms.parts for part in group):
+        own = slice(first, first + part.n_cells)
+        first += part.n_cells
+        share = float(units[own] @ (means[0] - means[1])[own])
+        parts[told_of(part)] = parts.get(told_of(part), 0.0) + share
+    return Explanation(sum(parts.values()), parts, (shared[0][1], shared[1][1])), kept

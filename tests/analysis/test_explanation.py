@@ -1,0 +1,138 @@
+"""The shares of an explanation add up to the distance, and lie where the bodies differ."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from conftest import as_mesh
+from igps.analysis.explanation import explain, explain_groups, held, on_surface, unit_shares
+from igps.data.batch import SignatureBatch
+from igps.data.collation import collate
+from igps.descriptors import descriptor
+from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.heads.closed_form import WhitenedHead
+from igps.nn.histograms import PairHistogram
+from igps.signature.signature import Signature, SignatureConfig, compute_signature
+
+CONFIG = SignatureConfig(n_eigenpairs=250, resolution=12, min_samples=0, n_surface_samples=300)
+
+
+def signed(bump: float, name: str) -> Signature:
+    """Of an egg with a bump at its side."""
+    body = trimesh.creation.icosphere(subdivisions=4)
+    swell = 1 + bump * np.exp(-12 * ((body.vertices - [1, 0, 0]) ** 2).sum(axis=1))
+    body.vertices *= np.array([0.6, 0.7, 1.2]) * swell[:, None]
+    config = descriptor(name).requirements.apply_to(CONFIG)
+    return compute_signature(as_mesh(body), config)
+
+
+@pytest.fixture(scope="module")
+def signatures() -> list[Signature]:
+    return [signed(bump, "rich") for bump in (0.0, 1.2)]
+
+
+@pytest.fixture(scope="module")
+def batches(signatures: list[Signature]) -> list[SignatureBatch]:
+    return [collate([one]) for one in signatures]
+
+
+def described_by(name: str) -> Descriptor:
+    if name != "whitened":
+        return descriptor(name)
+    histograms = HistogramDescriptor([PairHistogram(), PairHistogram(["interior_distance"])])
+    cells = torch.rand(12, 704).pow(4)
+    return EmbeddedDescriptor(histograms, WhitenedHead().fit(cells, torch.arange(12) // 3, histograms.part_cells))
+
+
+@pytest.mark.parametrize("name", ["interior", "gps", "rich", "multiscale", "pretrained", "whitened"])
+def test_all_shares_add_up_to_the_distance(name: str, batches: list[SignatureBatch]) -> None:
+    chosen = described_by(name)
+    with torch.no_grad():
+        distance = float(chosen.distances(*(chosen(batch) for batch in batches)))
+    found = explain(chosen, *batches)
+    assert distance > 1e-5
+    assert found.distance == pytest.approx(distance, rel=1e-3)  # there in single precision
+    of_samples = sum(values.sum() for of_body in found.samples for values in of_body.values())
+    assert of_samples == pytest.approx(found.distance, rel=1e-6)
+    assert sum(found.parts.values()) == pytest.approx(found.distance, rel=1e-6)
+    assert "%" in found.told()
+
+
+def test_shares_of_chi_square_are_those_of_a_loop_over_all_pairs(batches: list[SignatureBatch]) -> None:
+    """Interior distances alone: each pair falls into two bins, and gives each of its ends half of what it counts."""
+    chosen = HistogramDescriptor(PairHistogram(["interior_distance"]))
+    found = explain(chosen, *batches)
+    cells = [chosen(batch).flatten().double().numpy() for batch in batches]
+    units = np.where(sum(cells) > 0, (cells[0] - cells[1]) / np.maximum(sum(cells), 1e-300) / 2, 0)
+    for batch, sign, shares in zip(batches, (1, -1), found.samples, strict=True):
+        points = (batch.interior.eigenfunctions[0] / batch.eigenvalues[0].sqrt()).double()
+        away = torch.cdist(points, points).numpy()
+        place = np.clip(away / (4.0 / 64) - 0.5, 0, 63)
+        counts = np.interp(place, np.arange(64), sign * units)
+        np.fill_diagonal(counts, 0)
+        n = len(points)
+        np.testing.assert_allclose(shares["interior"], counts.sum(axis=1) / (n * (n - 1)), atol=2e-8)
+        assert not shares["surface"].any()
+
+
+def test_shares_of_a_squared_euclidean_distance_are_products(batches: list[SignatureBatch]) -> None:
+    class Squared(HistogramDescriptor):
+        def distances(self, queries: torch.Tensor, gallery: torch.Tensor) -> torch.Tensor:
+            matrix = torch.linspace(-1, 2, queries.flatten(1).shape[1] * 3, dtype=queries.dtype).view(-1, 3)
+            return torch.cdist(queries.flatten(1).sqrt() @ matrix, gallery.flatten(1).sqrt() @ matrix) ** 2
+
+    one, other = torch.tensor([[0.1, 0.4, 0.5, 0.0], [0.3, 0.0, 0.2, 0.5]], dtype=torch.float64)
+    units, distance = unit_shares(Squared(PairHistogram()), one, other)
+    matrix = torch.linspace(-1, 2, 12, dtype=torch.float64).view(4, 3)
+    apart = one.sqrt() - other.sqrt()
+    shares = apart * (matrix @ matrix.T @ apart)
+    torch.testing.assert_close(units * (one - other), shares)
+    assert distance == pytest.approx(float(shares.sum()))
+
+
+@pytest.mark.parametrize("name", ["interior", "rich"])
+def test_a_bump_is_painted_where_it_is(name: str, signatures: list[Signature], batches: list[SignatureBatch]) -> None:
+    found = explain(descriptor(name), *batches)
+    places = {kind: getattr(signatures[1], kind).points for kind in ("interior", "surface")}
+    points = places["surface"]
+    values = on_surface(found.samples[1], places, points)  # type: ignore[arg-type]
+    at_bump = np.linalg.norm(points - points[points[:, 0].argmax()], axis=1) < 0.25
+    assert values[at_bump].mean() > 2 * abs(values[~at_bump].mean())
+
+
+def test_bodies_that_are_alike_have_nothing_to_share(batches: list[SignatureBatch]) -> None:
+    found = explain(descriptor("interior"), batches[0], batches[0])
+    assert found.distance == 0
+    assert not any(values.any() for of_body in found.samples for values in of_body.values())
+    assert found.told() == "no difference"
+
+
+def test_what_knows_no_samples_is_refused(batches: list[SignatureBatch]) -> None:
+    with pytest.raises(ValueError, match="whose cells know their samples, got 'd2'"):
+        explain(descriptor("d2"), *batches)
+
+
+def test_chance_holds_no_cell_but_one_time_in_twenty() -> None:
+    random = torch.Generator().manual_seed(0)
+    any_held = [
+        bool(held(*torch.rand(2, 12, 30, generator=random), n_permutations=99, seed=i).any()) for i in range(400)
+    ]
+    assert 0.02 <= np.mean(any_held) <= 0.08
+    rows = torch.rand(2, 12, 30, generator=random)
+    rows[1, :, 7] += 2
+    assert held(*rows, n_permutations=999).nonzero().flatten().tolist() == [7]
+
+
+def test_groups_are_explained_by_the_cells_that_are_held(batches: list[SignatureBatch]) -> None:
+    chosen = descriptor("interior")
+    rows = torch.cat([chosen(batch) for batch in batches]).flatten(1)
+    noise = 1 + 0.05 * torch.rand(2, 8, rows.shape[1], generator=torch.Generator().manual_seed(1))
+    groups = rows[:, None] * noise
+    found, kept = explain_groups(chosen, groups[0], groups[1], batches, n_permutations=199)
+    assert 0 < kept.sum() < len(kept)
+    means = groups.double().mean(dim=1)
+    terms = (means[0] - means[1]) ** 2 / (means[0] + means[1]).clamp_min(1e-300) / 2
+    assert found.distance == pytest.approx(float(terms[kept].sum()), rel=1e-6)
