@@ -14,8 +14,10 @@ import trimesh
 import igps
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
+from igps.data.sources import find_bodies
 from igps.descriptors.fingerprint import fingerprint
 from igps.gallery.gallery import Gallery
+from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
@@ -114,6 +116,21 @@ def test_adding_and_merging_are_building(dataset: SignatureDataset, root: Path, 
     (first, *_) = changed.query(root / "ball" / "1.off", cache_dir=tmp_path / "cache")
     assert first.name == "ball/1.off"
     assert first.distance < 1e-6
+
+
+def test_bodies_of_one_file_are_entries_of_their_own(tmp_path: Path) -> None:
+    boxes = [trimesh.creation.box(extents=(1, 1, length)) for length in (1.0, 2.0, 4.0)]
+    for i, one in enumerate(boxes):
+        one.apply_translation((3 * i, 0, 0))
+    trimesh.Scene({f"part {i}": one for i, one in enumerate(boxes)}).export(tmp_path / "plate.glb")
+    bodies = find_bodies(tmp_path, LoadOptions(bodies="objects"))
+    dataset = SignatureDataset(bodies, CONFIG, tmp_path / "cache", reading=LoadOptions(bodies="objects"))
+    for make in (Gallery.build, Gallery.add):
+        gallery, _ = make(tmp_path / "plate.igps", dataset, INTERIOR, n_workers=1)
+        assert len(gallery) == 3
+    found = gallery.nearest(describe(dataset, small_interior()), top=1)
+    assert [one.name for (one,) in found] == list(bodies.names)
+    assert {one.path for (one,) in found} == {(tmp_path / "plate.glb").resolve()}
 
 
 def test_what_cannot_be_described_is_told(root: Path, tmp_path: Path) -> None:

@@ -190,7 +190,7 @@ def given_bodies(
         raise ValueError("paths: expected at least one mesh file, got none.")
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
-    split = [_named(path) for path in files]
+    split = [file_and_part(path) for path in files]
     files = tuple(path for path, _ in split)
     found = [
         (i, part)
@@ -205,7 +205,7 @@ def given_bodies(
     )
 
 
-def _named(path: Path) -> tuple[Path, str | None]:
+def file_and_part(path: Path) -> tuple[Path, str | None]:
     """The file and the part of ``FILE#PART``; no part where a file has this name, or none has what stands before."""
     file, mark, part = str(path).partition("#")
     return (Path(file), part) if mark and part and not path.exists() and Path(file).is_file() else (path, None)

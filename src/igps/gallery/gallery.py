@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from igps.data.dataset import Failure, SignatureDataset
+from igps.data.sources import file_and_part
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import fingerprint, name_of
 from igps.descriptors.registry import is_file
+from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
@@ -128,7 +130,7 @@ class Gallery:
             found = self.search(descriptions, top=top, exact=exact)
         return [
             [
-                Match(entry.name, entry.label, Path(entry.id), distance)
+                Match(entry.name, entry.label, file_and_part(Path(entry.id))[0], distance)
                 for entry, distance in zip(self.index.entries(indices.numpy()), distances.tolist(), strict=True)
             ]
             for indices, distances in zip(found.indices, found.distances, strict=True)
@@ -196,7 +198,7 @@ class Gallery:
         failures: list[Failure] = []
         index = VectorIndex(path)
         check_alike(index, about)
-        known = index.marks([_id(one) for one in dataset.bodies.paths])
+        known = index.marks([_id(one) for one in dataset.bodies])
         batches = _batches(dataset, chosen, known, failures, n_workers, strict, progress)
         extend_index(path, about, batches, progress=progress)
         return cls(path, descriptor), failures
@@ -248,13 +250,14 @@ def _batches(
         for start in range(0, len(dataset), _AT_ONCE):
             part = dataset.subset(range(start, min(start + _AT_ONCE, len(dataset))))
             keys = [_key(part, i) for i in range(len(part))]
-            paths, names, labels = part.bodies.paths, part.bodies.names, part.bodies.labels or (None,) * len(part)
-            new = [i for i, path in enumerate(paths) if keys[i] is None or known.get(_id(path)) != keys[i]]
+            ids, names = [_id(one) for one in part.bodies], part.bodies.names
+            labels = part.bodies.labels or (None,) * len(part)
+            new = [i for i, one in enumerate(ids) if keys[i] is None or known.get(one) != keys[i]]
             descriptions, failed = _described(part.subset(new), descriptor, n_workers, strict)
             if len(new) > len(failed):
                 lost = {failure.id for failure in failed}
                 left = [i for i in new if names[i] not in lost]
-                yield descriptions, [Entry(_id(paths[i]), names[i], labels[i], keys[i] or "") for i in left]
+                yield descriptions, [Entry(ids[i], names[i], labels[i], keys[i] or "") for i in left]
             failures += failed
             bar.update(len(part))
 
@@ -280,5 +283,5 @@ def _key(dataset: SignatureDataset, i: int) -> str | None:
         return None
 
 
-def _id(path: Path) -> str:
-    return str(path.resolve())
+def _id(body: BodyRef) -> str:
+    return str(replace(body, path=body.path.resolve()))
