@@ -188,6 +188,18 @@ def test_handles_tell_bodies_apart_however_near_they_are(tmp_path: Path) -> None
     assert grouped(duplicates(dataset, n_workers=1).groups) == {frozenset({"ring.off", "turned.off", "cut.off"})}
 
 
+def test_washers_with_other_holes_are_no_copies(tmp_path: Path) -> None:
+    """Of 128 vertices each, numbered alike: coarseness explains what lies between vertices, not where they are."""
+    for name, hole in (("one", 0.5), ("half", 0.5025), ("whole", 0.505)):
+        trimesh.creation.annulus(hole, 1.0, 0.3, sections=32).export(tmp_path / f"{name}.off")
+    mirrored = trimesh.creation.annulus(0.5, 1.0, 0.3, sections=32)
+    mirrored.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9])))
+    mirrored.apply_scale([-2, 2, 2])
+    mirrored.export(tmp_path / "mirrored.off")
+    found = duplicates(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"), n_workers=1)
+    assert grouped(found.groups) == {frozenset({"one.off", "mirrored.off"})}
+
+
 def test_coarseness_of_a_ball_falls_with_the_area_of_its_triangles(tmp_path: Path) -> None:
     """The middle of its neighbours lies off a vertex by the square of their distance: a quarter with edges of half."""
     for subdivisions in (3, 4, 5):

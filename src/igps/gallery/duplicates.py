@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from igps._parallel import on_threads
 from igps.data.dataset import Failure, SignatureDataset
-from igps.data.sources import Bodies
+from igps.data.sources import Bodies, file_and_part
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import Size, keeps_size
 from igps.gallery._alignment import surface_distance
@@ -311,5 +311,6 @@ def _files_of(gallery: Gallery, cache_dir: str | Path | None) -> SignatureDatase
     names = tuple(one.name for one in entries)
     if len(set(names)) < len(names):  # of several folders
         names = tuple(one.id for one in entries)
-    files = Bodies(tuple(Path(one.id) for one in entries), names, None)
+    paths, parts = zip(*(file_and_part(Path(one.id)) for one in entries), strict=True)
+    files = Bodies(paths, names, None, parts)
     return SignatureDataset(files, gallery.config, cache_dir, reading=gallery.reading)

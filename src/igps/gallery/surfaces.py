@@ -16,6 +16,7 @@ from functools import lru_cache, partial
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.linalg import orthogonal_procrustes
 from torch import Tensor
 from tqdm import tqdm
 
@@ -23,6 +24,7 @@ from igps._parallel import Failed, on_threads
 from igps.data.dataset import Failure, SignatureDataset
 from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
 from igps.gallery.calibration import Calibration
+from igps.mesh.loading import load_mesh
 from igps.mesh.mending import Step, mended_by
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import mean_of_neighbours
@@ -36,6 +38,9 @@ _NORMALS: AttributeName = "surface_direction"
 _MOST_STRETCHED = 0.15
 # A tenth of this is much between copies.
 _HOPELESS = 0.03
+
+# How far rounding of coordinates in a file moves a vertex at most, over √area.
+_ROUNDED = 5e-4
 
 # What is done to a mesh that leaves its handles as they are.
 _KEEP_HANDLES: set[Step] = {"welded", "smoothed", "subdivided"}
@@ -64,6 +69,7 @@ class Surfaces:
         self._last = lru_cache(_SURFACES)(self.samples)
         self._last_triangles = lru_cache(_TRIANGLES)(self._triangles)
         self._frame = lru_cache(None)(self._origin_and_area)
+        self._numbered = lru_cache(_TRIANGLES)(self._as_numbered)
         self._known = lru_cache(None)(self._coarseness_and_handles)
 
     def samples(self, i: int) -> SurfaceSamples:
@@ -107,10 +113,12 @@ class Surfaces:
     def limit(self, i: int, j: int, calibration: Calibration) -> float:
         """How far two may be apart and the same, see `Calibration.limit`; raises as `coarseness` does.
 
-        Not at all if one has more handles than the other.
+        Not at all if one has more handles than the other, or if their vertices are numbered alike and lie elsewhere.
         """
         (coarseness, handles), (of_other, handles_of_other) = self._known(i), self._known(j)
         if None not in (handles, handles_of_other) and handles != handles_of_other:
+            return 0.0
+        if self._numbered_alike_elsewhere(i, j):
             return 0.0
         return calibration.limit(max(coarseness, of_other))
 
@@ -142,6 +150,20 @@ class Surfaces:
             with contextlib.suppress(MeshError):
                 handles = mesh.genus
         return offset_in_place(self._last(i), blurred), handles
+
+    def _numbered_alike_elsewhere(self, i: int, j: int) -> bool:
+        """Where faces join the same vertices, no level of detail explains a vertex that has moved."""
+        (one, faces), (other, faces_of_other) = self._numbered(i), self._numbered(j)
+        if faces.shape != faces_of_other.shape or not np.array_equal(faces, faces_of_other):
+            return False
+        rotation, _ = orthogonal_procrustes(one, other)
+        return bool(np.linalg.norm(one @ rotation - other, axis=1).max() > _ROUNDED)
+
+    def _as_numbered(self, i: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """The vertices about their mean, over √area, as they are in the file; and the faces, turned or not."""
+        body, reading = self._dataset.bodies[i], self._dataset.pipeline.reading
+        mesh = load_mesh(body.path, reading, part=body.part)
+        return (mesh.vertices - mesh.vertices.mean(axis=0)) / math.sqrt(mesh.area), np.sort(mesh.faces, axis=1)
 
     def _triangles(self, i: int) -> TriangleSurface:
         mesh = self._mesh(i)
