@@ -54,7 +54,7 @@ def test_ranked_results_show_each_class_with_hits_and_misses(root: Path, monkeyp
 def test_turned_body_is_drawn_alike() -> None:
     body = trimesh.creation.cone(radius=0.4, height=2.0, sections=24)
     turned = body.vertices @ trimesh.transformations.rotation_matrix(2.0, [1, 2, 3])[:3, :3].T
-    straight, back = gallery._seen_from_the_front(body.vertices), gallery._seen_from_the_front(turned)
+    straight, back = gallery.seen_from_the_front(body.vertices), gallery.seen_from_the_front(turned)
     np.testing.assert_allclose(np.ptp(back, axis=0)[1], np.ptp(straight, axis=0)[1], rtol=1e-6)
     for view in (straight, back):
         tip = view[np.argmax(np.linalg.norm(view - view.mean(axis=0), axis=1))]
@@ -63,5 +63,5 @@ def test_turned_body_is_drawn_alike() -> None:
 
 def test_view_is_no_mirror_image() -> None:
     points = np.random.default_rng(0).random((50, 3)) * [1, 2, 3]
-    frame = np.linalg.lstsq(points, gallery._seen_from_the_front(points), rcond=None)[0]
+    frame = np.linalg.lstsq(points, gallery.seen_from_the_front(points), rcond=None)[0]
     assert np.linalg.det(frame) == pytest.approx(1)
