@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import os
+import pydoc
 import re
 import shlex
 import subprocess
@@ -291,6 +292,11 @@ def anchors(text: str) -> set[str]:
     """Ids of the headings, as GitHub and MkDocs make them of plain words."""
     headings = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), flags=re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("name", re.findall(r"^::: (\S+)", TEXT["docs/api.md"], re.MULTILINE))
+def test_the_reference_names_what_is_there(name: str) -> None:
+    assert pydoc.locate(name) is not None, f"docs/api.md: nothing is called {name}"
 
 
 @pytest.mark.parametrize("page", TEXT)
