@@ -2,9 +2,9 @@
 
 A class has bodies, and a body has poses, which bend the one surface that it has at rest. Each module uses only those
 before it: polygons, plates, limbs, creatures, artefacts, grammar, kinds (the classes), skinning, rods (how a body is
-bent), crossing, bodies, scans (what else happens to a surface), shapes.
+bent), crossing, bodies, individuals, scans (what else happens to a surface), shapes.
 """
 
-from training.graded.shapes import GradedShape, GradedShapes, body_of, family_of, looks_alike
+from training.graded.shapes import GradedShape, GradedShapes, body_of, family_of, individual_of, looks_alike
 
-__all__ = ["GradedShape", "GradedShapes", "body_of", "family_of", "looks_alike"]
+__all__ = ["GradedShape", "GradedShapes", "body_of", "family_of", "individual_of", "looks_alike"]

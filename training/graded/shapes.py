@@ -20,12 +20,13 @@ from igps.shapes.files import is_whole_off, off_text, write_whole
 from igps.shapes.meshing import Faces
 from igps.shapes.solids import Array
 from training.graded.bodies import Body, Pose, draw_body, draw_pose
+from training.graded.individuals import individual
 from training.graded.kinds import LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, BodyClass, body_classes
 from training.graded.scans import Scan
 
 _VERSION = 2  # raised whenever the same arguments would give other meshes
 _MAX_ATTEMPTS = 6
-_KIN, _BODY, _POSE = 10, 11, 12  # what a random stream is for: keeps the streams of one seed apart
+_KIN, _BODY, _POSE, _INDIVIDUAL = 10, 11, 12, 13  # what a random stream is for: keeps the streams of one seed apart
 _SIBLINGS = 2  # bodies in a row with one skeleton, whose likeness makes bodies hard to tell apart
 BODIES_FILE = "bodies.csv"
 
@@ -55,7 +56,7 @@ class GradedShape:
 
 
 class GradedShapes:
-    """A deterministic benchmark of two levels: classes of bodies, and bodies in poses.
+    """A deterministic benchmark of levels: classes of bodies, perhaps individuals of each, and all in poses.
 
     A class is a kind of body; its bodies differ in proportions, thickness, details and whatever else the class leaves
     open, but every second is a sibling of the one before it, with the same skeleton in other proportions. The poses of
@@ -63,8 +64,8 @@ class GradedShapes:
     same in every pose. Every pose has triangles of its own, and some are simplified, noisy, mirrored or made
     watertight.
 
-    A shape depends on its class, body, pose, ``seed``, ``n_vertices`` and ``look_alikes`` alone, so that shapes may be
-    made in any order and by many processes, and more of them later.
+    A shape depends on its class, body, individual, pose, ``seed``, ``n_vertices`` and ``look_alikes`` alone, so that
+    shapes may be made in any order and by many processes, and more of them later.
 
     Args:
         n_classes: number of classes. The first twelve are named templates (`kinds.LOOK_ALIKE_TEMPLATES`).
@@ -74,6 +75,7 @@ class GradedShapes:
         n_vertices: the least and the greatest number of vertices, each kept within a third.
         look_alikes: with the templates, and the families, that resemble classes of SHREC'07 (see `kinds`);
             without, other classes take their places.
+        n_individuals: of each body, nearly alike, each in ``n_poses`` poses (see `individuals`); 0 for the body itself.
 
     Raises:
         ValueError: an argument is out of range, or (on access) a shape cannot be made at this resolution.
@@ -88,12 +90,14 @@ class GradedShapes:
         *,
         n_vertices: tuple[int, int] = (2400, 5000),
         look_alikes: bool = True,
+        n_individuals: int = 0,
     ) -> None:
         for name, value, least in (
             ("n_classes", n_classes, 1),
             ("n_bodies", n_bodies, 1),
             ("n_poses", n_poses, 1),
             ("seed", seed, 0),
+            ("n_individuals", n_individuals, 0),
         ):
             if operator.index(value) < least:
                 raise ValueError(f"{name}: expected at least {least}, got {value}.")
@@ -102,19 +106,21 @@ class GradedShapes:
                              f"got {n_vertices}.")  # fmt: skip
         self.n_classes, self.n_bodies, self.n_poses = n_classes, n_bodies, n_poses
         self.seed, self.n_vertices, self.look_alikes = seed, n_vertices, look_alikes
+        self.n_individuals = n_individuals
         classes = body_classes(seed, look_alikes)
         if n_classes > len(classes):
             raise ValueError(f"n_classes: expected at most {len(classes)}, which are all there are, got {n_classes}.")
         self._classes: list[BodyClass] = classes[:n_classes]
         self._last: tuple[tuple[int, int], Body | ValueError] | None = None
+        self._last_individual: tuple[tuple[int, int, int], Body] | None = None
 
     def __len__(self) -> int:
-        return self.n_classes * self.n_bodies * self.n_poses
+        return self.n_classes * self.n_bodies * max(self.n_individuals, 1) * self.n_poses
 
     def __repr__(self) -> str:
         return (
             f"GradedShapes({self.n_classes}, {self.n_bodies}, {self.n_poses}, seed={self.seed}, "
-            f"n_vertices={self.n_vertices}, look_alikes={self.look_alikes})"
+            f"n_vertices={self.n_vertices}, look_alikes={self.look_alikes}, n_individuals={self.n_individuals})"
         )
 
     @property
@@ -125,7 +131,7 @@ class GradedShapes:
     @property
     def labels(self) -> list[str]:
         """The class of every shape."""
-        return [name for name in self.class_names for _ in range(self.n_bodies * self.n_poses)]
+        return [name for name in self.class_names for _ in range(len(self) // self.n_classes)]
 
     @property
     def bodies(self) -> list[str]:
@@ -134,11 +140,12 @@ class GradedShapes:
 
     @property
     def names(self) -> list[str]:
-        """The unique name of every shape, ``class/body/pose``."""
+        """The unique name of every shape, ``class/body/pose``, or ``class/body/individual/pose``."""
         return [
-            f"{name}/{body:02d}/{pose:02d}"
+            f"{name}/{body:02d}/{one}{pose:02d}"
             for name in self.class_names
             for body in range(self.n_bodies)
+            for one in [f"{i:02d}/" for i in range(self.n_individuals)] or [""]
             for pose in range(self.n_poses)
         ]
 
@@ -149,15 +156,15 @@ class GradedShapes:
             IndexError: there is no such shape.
             ValueError: it cannot be made; names the shape and what went wrong.
         """
-        body_class, number, pose = self._numbers(index)
+        body_class, number, one, pose = self._numbers(index)
         name = self.names[operator.index(index)]
         try:
-            body = self._body(body_class, number)
+            body = self._individual(body_class, number, one)
         except ValueError as error:
             raise self._impossible(name, str(error)) from error
         found = ""
         for attempt in range(_MAX_ATTEMPTS):
-            rng = np.random.default_rng([self.seed, _POSE, body_class, number, pose, attempt])
+            rng = self._draws_of_pose(body_class, number, one, pose, attempt)
             scan = Scan.draw(rng, self.n_vertices)
             try:
                 posed = draw_pose(body, rng, scan.target)
@@ -176,10 +183,10 @@ class GradedShapes:
 
         Of the first attempt at the shape, which is the shape's own unless that had to be made again.
         """
-        body_class, number, pose = self._numbers(index)
-        rng = np.random.default_rng([self.seed, _POSE, body_class, number, pose, 0])
+        body_class, number, one, pose = self._numbers(index)
+        rng = self._draws_of_pose(body_class, number, one, pose, 0)
         scan = Scan.draw(rng, self.n_vertices)
-        return draw_pose(self._body(body_class, number), rng, scan.target)
+        return draw_pose(self._individual(body_class, number, one), rng, scan.target)
 
     def write(self, root: str | os.PathLike[str], progress: bool = False, n_workers: int | None = 1) -> None:
         """Write every shape to ``root/<class>/<body>/<pose>.off``, leaving out what is there already.
@@ -205,6 +212,7 @@ class GradedShapes:
                 "seed": self.seed,
                 "n_vertices": list(self.n_vertices),
                 "look_alikes": self.look_alikes,
+                **({"individuals": True} if self.n_individuals else {}),
             }
         )
         manifest = folder / "shapes.json"
@@ -223,7 +231,7 @@ class GradedShapes:
         # A body at a time, so that it is drawn once for all its poses.
         jobs: dict[int, list[int]] = {}
         for i in missing:
-            jobs.setdefault(i // self.n_poses, []).append(i)
+            jobs.setdefault(i // (self.n_poses * max(self.n_individuals, 1)), []).append(i)
         failed = []
         with (
             tqdm(total=len(names), initial=len(names) - len(missing), desc="shapes", unit="shape",
@@ -237,13 +245,28 @@ class GradedShapes:
         if failed:
             raise ValueError(f"{len(failed)} of {len(jobs)} bodies were not written whole: {failed[0]}")
 
-    def _numbers(self, index: int) -> tuple[int, int, int]:
+    def _draws_of_pose(self, body_class: int, number: int, one: int, pose: int, attempt: int) -> np.random.Generator:
+        which = [_INDIVIDUAL, one] if self.n_individuals else []
+        return np.random.default_rng([self.seed, _POSE, body_class, number, pose, attempt, *which])
+
+    def _numbers(self, index: int) -> tuple[int, int, int, int]:
         position = operator.index(index)
         if not -len(self) <= position < len(self):
             raise IndexError(f"index: expected one in [{-len(self)}, {len(self)}), got {index}.")
         rest, pose = divmod(position % len(self), self.n_poses)
+        rest, one = divmod(rest, max(self.n_individuals, 1))
         body_class, body = divmod(rest, self.n_bodies)
-        return body_class, body, pose
+        return body_class, body, one, pose
+
+    def _individual(self, body_class: int, number: int, one: int) -> Body:
+        body = self._body(body_class, number)
+        if not self.n_individuals:
+            return body
+        place = (body_class, number, one)
+        if self._last_individual is None or self._last_individual[0] != place:
+            drawn = individual(body, np.random.default_rng([self.seed, _INDIVIDUAL, *place]))
+            self._last_individual = place, drawn
+        return self._last_individual[1]
 
     def _body(self, body_class: int, number: int) -> Body:
         if self._last is None or self._last[0] != (body_class, number):
@@ -271,11 +294,16 @@ class GradedShapes:
         self.__init__(**state)  # type: ignore[misc]
 
 
-_ARGUMENTS = ("n_classes", "n_bodies", "n_poses", "seed", "n_vertices", "look_alikes")
+_ARGUMENTS = ("n_classes", "n_bodies", "n_poses", "seed", "n_vertices", "look_alikes", "n_individuals")
 
 
 def body_of(name: str) -> str:
-    """The body of a shape by its name or its file's, ``class/body/pose``."""
+    """The body of a shape by its name or its file's, ``class/body/pose`` or ``class/body/individual/pose``."""
+    return "/".join(name.split("/")[:2])
+
+
+def individual_of(name: str) -> str:
+    """The individual of a shape by its name or its file's; the body where there are no individuals."""
     return name.rsplit("/", 1)[0]
 
 

@@ -1,0 +1,62 @@
+"""Individuals of generated bodies differ by as much as they say, in shape, and are bodies themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from training.graded import GradedShapes, body_of, individual_of
+from training.graded.individuals import SHARES
+
+N_INDIVIDUALS = 3
+
+
+@pytest.fixture(scope="module")
+def shapes() -> GradedShapes:
+    return GradedShapes(2, 1, 2, seed=3, n_vertices=(1500, 1800), n_individuals=N_INDIVIDUALS)
+
+
+def test_individuals_are_changed_by_a_hundredth_to_a_twentieth_of_the_root_of_the_area(shapes: GradedShapes) -> None:
+    """On a grid of their own; and no motion and scale, found by trimesh, takes the change back."""
+    for number in range(2):
+        body = shapes._body(number, 0)
+        vertices, faces = body.surface(3000, np.eye(3))
+        before = body.warp(vertices)
+        size = trimesh.Trimesh(before, faces, process=False).area ** 0.5
+        found = []
+        for one in range(N_INDIVIDUALS):
+            after = shapes._individual(number, 0, one).warp(vertices)
+            found.append(after)
+            step = np.linalg.norm(after - before, axis=1).max() / size
+            assert SHARES[0] * 0.95 < step < SHARES[1] * 1.05
+            _, aligned, _ = trimesh.registration.procrustes(after, before, reflection=False)
+            left = np.linalg.norm(aligned - before, axis=1).max() / size
+            assert 0.7 * step < left < 1.3 * step
+        between = [np.linalg.norm(found[i] - found[j], axis=1).max() / size for i, j in ((0, 1), (0, 2), (1, 2))]
+        assert min(between) > SHARES[0] * 0.5
+        assert max(between) < 2.1 * SHARES[1]
+
+
+def test_poses_of_individuals_are_bodies_that_names_tell_apart(shapes: GradedShapes) -> None:
+    assert len(shapes) == 2 * N_INDIVIDUALS * 2 == len(set(shapes.names)) == len(shapes.labels)
+    for index in (0, 3, 11):
+        made = shapes[index]
+        surface = trimesh.Trimesh(made.vertices, made.faces, process=False)
+        assert surface.is_watertight
+        assert surface.volume > 0
+        assert 1 - surface.euler_number // 2 == made.genus
+        assert (made.name, made.body) == (shapes.names[index], body_of(made.name))
+        assert shapes.labels[index] == made.label == made.name.split("/")[0]
+    assert [individual_of(name) for name in shapes.names][::2] == [
+        f"{name}/00/{one:02d}" for name in shapes.class_names for one in range(N_INDIVIDUALS)
+    ]
+    assert len({body_of(name) for name in shapes.names}) == 2
+    more = GradedShapes(3, 2, 3, seed=3, n_vertices=(1500, 1800), n_individuals=5)[7]  # whatever else there is
+    assert (more.name, made.name) == (shapes.names[5], shapes.names[11])
+    assert np.array_equal(shapes[5].vertices, more.vertices)
+
+
+def test_without_individuals_shapes_are_what_they_were() -> None:
+    plain = GradedShapes(1, 1, 1, seed=3, n_vertices=(1500, 1800))
+    assert plain.names == [f"{plain.class_names[0]}/00/00"]
+    assert individual_of(plain.names[0]) == body_of(plain.names[0]) == f"{plain.class_names[0]}/00"
