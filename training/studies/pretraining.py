@@ -8,15 +8,17 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from safetensors.torch import load_file
 from torch import Tensor
 
 import igps
-from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained_parts, save_pretrained, two_levels
+from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained_head, pretrained_parts, save_pretrained
 from igps.nn.description import describe
-from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
+from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
 from training.graded import GradedShapes, body_of, family_of, looks_alike
-from training.studies.transfer import curve, few_labels, report, two_level_scores
+from training.studies.individuals import dealt, fit_individuals, numbers, usable
+from training.studies.transfer import curve, few_labels, level_scores, report
 
 # Of two classes each part has a single direction, and its vectors are signs, which may cancel.
 _FEWEST = 3
@@ -30,9 +32,11 @@ def pretrain(
     n_parts: int = 3,
     n_scored: int = 12,
     seed: int = 0,
+    individuals: tuple[int, int, int, int] = (27, 2, 3, 3),
+    keep: Path | None = None,
     out: Path = PRETRAINED,
     cache_dir: Path | None = None,
-    plain: Sequence[str] = ("gps", "interior", "multiscale", "rich"),
+    plain: Sequence[str] = ("gps", "interior", "multiscale", "rich", "shape_dna"),
     data: Path | None = None,
     figures: Path = Path("build"),
     n_workers: int | None = None,
@@ -40,11 +44,13 @@ def pretrain(
     """Generate shapes, check the metric on families that it was not fitted to, fit it to all, and save it.
 
     Args:
-        root: folder of the generated meshes.
+        root: folder of the generated meshes; those of individuals lie beside it, in ``ROOT-individuals``.
         n_classes, n_bodies, n_poses, seed: of `GradedShapes`.
         n_parts: into how many parts the families are dealt, by the seed. A class of a family that was fitted to is much
             easier to tell than what a user has, so that whole families are held out.
         n_scored: classes of each part to score, drawn by the seed.
+        individuals: classes, bodies of each, individuals of each and poses of each, for the level of individuals.
+        keep: parameters whose levels of classes and bodies stay: only that of individuals is checked and fitted.
         out: the file of parameters.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
         plain: descriptors to score on the same classes beside the metric.
@@ -53,29 +59,47 @@ def pretrain(
         n_workers: processes; all cores if not given.
     """
     figures.mkdir(parents=True, exist_ok=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = pretrained_parts().eval()
+
+    def save(head: TwoLevelHead) -> TwoLevelHead:
+        """The head with a level of individuals, as it is saved."""
+        beside = root.with_name(f"{root.name}-individuals")
+        whole = fit_individuals(head, descriptor, individuals, beside, n_parts, seed, plain, cache_dir, n_workers)
+        save_pretrained(EmbeddedDescriptor(descriptor, whole), out)
+        print(f"written: {out}")
+        return whole
+
+    if keep is not None:
+        kept = EmbeddedDescriptor(descriptor, pretrained_head(individuals=False))
+        names = kept.state_dict()
+        kept.load_state_dict({name: tensor.float() for name, tensor in load_file(keep).items() if name in names})
+        assert isinstance(kept.head, TwoLevelHead)
+        save(kept.head)
+        return
+
     shapes = GradedShapes(n_classes, n_bodies, n_poses, seed)
     try:
         shapes.write(root, progress=True, n_workers=n_workers)
     except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
         print(error)
-    descriptor = pretrained_parts().eval()
-    generated = _usable(root, descriptor, cache_dir, n_workers)
+    generated = usable(root, descriptor, cache_dir, n_workers)
     histograms, labels = describe(generated, descriptor, progress=True, n_workers=n_workers), generated.labels
-    bodies = _numbers([body_of(name) for name in generated.bodies.names])
-    parts = _dealt([family_of(name) for name in generated.classes], n_parts, seed)
+    bodies = numbers([body_of(name) for name in generated.bodies.names])
+    parts = dealt([family_of(name) for name in generated.classes], n_parts, seed)
 
     def fit(n: int, seed: int, among: Tensor) -> TwoLevelHead:
         """The metric, of n classes drawn by the seed."""
         chosen = torch.isin(labels, torch.tensor(_drawn(among.tolist(), n, seed)))
-        return two_levels().fit(histograms[chosen], labels[chosen], descriptor.part_cells, bodies=bodies[chosen])
+        return pretrained_head(individuals=False).fit(
+            histograms[chosen], labels[chosen], descriptor.part_cells, bodies=bodies[chosen]
+        )
 
     scored = [torch.isin(labels, torch.tensor(_drawn(part.tolist(), n_scored, seed))) for part in parts]
     others = [torch.cat([*parts[:i], *parts[i + 1 :]]) for i in range(n_parts)]
 
     def score(name: str, distances: Sequence[Tensor]) -> None:
-        two_level_scores(
-            name, [(d, labels[chosen], bodies[chosen]) for d, chosen in zip(distances, scored, strict=True)]
-        )
+        level_scores(name, [(d, bodies[chosen], labels[chosen]) for d, chosen in zip(distances, scored, strict=True)])
 
     print(f"{n_parts} parts of the families, each scored by a metric that was fitted to the others:")
     alike = torch.tensor([looks_alike(name) for name in generated.classes])
@@ -90,7 +114,7 @@ def pretrain(
         other = igps.descriptor(name)
         described = [
             describe(
-                _usable(root, other, cache_dir, n_workers, torch.nonzero(where).flatten().tolist()),
+                usable(root, other, cache_dir, n_workers, torch.nonzero(where).flatten().tolist()),
                 other,
                 n_workers=n_workers,
             )
@@ -100,13 +124,12 @@ def pretrain(
 
     everything = torch.arange(len(generated.classes))
     head = fit(len(everything), seed, everything)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    save_pretrained(EmbeddedDescriptor(descriptor, head), out)
-    print(f"fitted to all {len(everything)} classes: {out}")
+    print(f"fitted to all {len(everything)} classes")
+    head = save(head)
     if data is None:
         return
 
-    real = _usable(data, descriptor, cache_dir, n_workers)
+    real = usable(data, descriptor, cache_dir, n_workers)
     found, classes = describe(real, descriptor, progress=True, n_workers=n_workers), real.labels
     report(str(data), found, classes, head)
     unlike = everything[~alike]
@@ -121,35 +144,8 @@ def pretrain(
         few_labels(n, found, classes, head, descriptor.part_cells)
 
 
-def _usable(
-    root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None, some: list[int] | None = None
-) -> igps.SignatureDataset:
-    """The dataset of the meshes, or some of them, whose signatures could be computed; those that could not are told."""
-    data = igps.SignatureDataset(root, descriptor=descriptor, cache_dir=cache_dir)
-    if some is not None:
-        data = data.subset(some)
-    failures = data.precompute(n_workers=n_workers)
-    for failure in failures:
-        print(failure)
-    return data.usable(failures)
-
-
-def _dealt(families: Sequence[str], n_parts: int, seed: int) -> list[Tensor]:
-    """Numbers of the classes in each part, whole families at a time."""
-    names = sorted(set(families))
-    random.Random(seed).shuffle(names)
-    return [
-        torch.tensor([i for i, family in enumerate(families) if family in names[k::n_parts]]) for k in range(n_parts)
-    ]
-
-
 def _drawn(classes: Sequence[int], n: int, seed: int) -> list[int]:
     return random.Random(seed).sample(sorted(classes), min(n, len(classes)))
-
-
-def _numbers(names: Sequence[str]) -> Tensor:
-    number = {name: i for i, name in enumerate(sorted(set(names)))}
-    return torch.tensor([number[name] for name in names])
 
 
 def _distances(head: TwoLevelHead, histograms: Tensor) -> Tensor:

@@ -71,13 +71,15 @@ def few_labels(n: int, histograms: Tensor, labels: Tensor, pretrained: Head, par
     print(f"{n} labels a class: {rows}")
 
 
-def two_level_scores(name: str, parts: Sequence[tuple[Tensor, Tensor, Tensor]]) -> None:
-    """Print the mean scores of parts, each its distances, classes and bodies: by the bodies, and by the classes.
+def level_scores(name: str, parts: Sequence[tuple[Tensor, ...]]) -> None:
+    """Print the mean scores of parts, each its distances, then the labels of each level: individuals, bodies, classes.
 
-    Beside the first tier stands how far the parts differ, as a standard deviation.
+    The last levels are given, of two the bodies and classes. Beside the first tier stands how far the parts differ, as
+    a standard deviation.
     """
     rows = []
-    for level, place in (("body", 2), ("class", 1)):
+    names = ("individual", "body", "class")[4 - len(parts[0]) :]
+    for place, level in enumerate(names, 1):
         found = [retrieval_scores(part[0], part[place]).mean() for part in parts]
         words = [f"{key.upper()} {100 * mean(one[key] for one in found):.1f}" for key in ("nn", "ft", "dcg")]
         words[1] += f" ± {100 * stdev(one['ft'] for one in found):.1f}"

@@ -16,11 +16,12 @@ from igps.data.dataset import SignatureDataset
 from igps.descriptors.pretrained.descriptor import (
     BODY_PARTS,
     CLASS_PARTS,
+    INDIVIDUAL_PARTS,
     PRETRAINED,
     pretrained,
+    pretrained_head,
     pretrained_parts,
     save_pretrained,
-    two_levels,
 )
 from igps.descriptors.rich import rich
 from igps.nn.description import describe
@@ -101,16 +102,18 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
             )
         ]
         if of_level["lengths"]:
-            (vectors,) = projected
+            vectors = torch.cat(projected, dim=1)
             return torch.cat([vectors, (1 - vectors.square().sum(dim=1, keepdim=True)).sqrt()], dim=1)
         return normalize(torch.cat([normalize(one) for one in projected], dim=1))
 
     classes = level("class_head", CLASS_PARTS)
     bodies = [level(f"body_heads.{k}", (part,)) for k, part in enumerate(BODY_PARTS)]
-    share, scales = (stored[f"head.{name}"] for name in ("share", "scales"))
-    root = (share / len(bodies)).sqrt()
+    individuals = level("individual_head", INDIVIDUAL_PARTS)
+    share, scales, weight = (stored[f"head.{name}"] for name in ("share", "scales", "weight"))
+    root = (0.9 * share / len(bodies)).sqrt()
     found = describe(part, module)
-    expected = torch.cat([(1 - share).sqrt() * classes, *(root * one for one in bodies)], dim=1)
+    levels = [(0.9 * (1 - share)).sqrt() * classes, *(root * one for one in bodies), 0.1**0.5 * individuals]
+    expected = torch.cat(levels, dim=1)
     torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=0)
     compared = [one[:, :-1] for one in bodies]
     from_mean = torch.stack([one.square().sum(dim=1) for one in compared]).mean(dim=0).sqrt()
@@ -118,7 +121,9 @@ def test_pretrained_is_what_its_parameters_say(dataset: SignatureDataset) -> Non
     apart = torch.zeros(4, 4, dtype=torch.float64)
     for one, scale in zip(compared, scales, strict=True):
         apart += (torch.cdist(one, one, compute_mode="donot_use_mm_for_euclid_dist") * shorter / scale) ** 10
-    distances = (1 - classes @ classes.T) * (1 - torch.exp(-apart))
+    between = torch.cdist(individuals[:, :-1], individuals[:, :-1], compute_mode="donot_use_mm_for_euclid_dist")
+    of_individuals = weight * (1 - torch.exp(-((between / 0.3) ** 2)))
+    distances = (1 - weight) * (1 - classes @ classes.T) * (1 - torch.exp(-apart)) + of_individuals
     torch.testing.assert_close(module.distances(found, found).double(), distances, atol=2e-3, rtol=0)
 
 
@@ -160,7 +165,8 @@ def test_a_head_of_ones_own_is_stored_and_loaded(dataset: SignatureDataset, tmp_
     dataset = dataset.subset(range(20))
     descriptor = pretrained_parts().eval()
     described = describe(dataset, descriptor)
-    head = two_levels().fit(described, dataset.labels, descriptor.part_cells)
+    head = pretrained_head().fit(described, dataset.labels, descriptor.part_cells)
+    head.fit_individuals(described, dataset.labels, descriptor.part_cells)
     save_pretrained(EmbeddedDescriptor(descriptor, head), tmp_path / "head.safetensors")
     loaded = pretrained(tmp_path / "head.safetensors")
     assert not loaded.training

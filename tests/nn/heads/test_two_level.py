@@ -127,6 +127,58 @@ def test_the_distance_is_that_of_the_classes_where_any_body_head_tells_two_bodie
     assert ((shorter < 0.95) | (shorter > 1.05)).double().mean() > 0.5
 
 
+def test_individuals_have_a_small_part_of_the_distance(collection: tuple[Tensor, Tensor, Tensor]) -> None:
+    """Written down from the vectors of the two heads; the other levels, and short vectors, stay what they are."""
+    histograms, classes, bodies = collection
+    plain = TwoLevelHead().fit(histograms, classes, bodies=bodies)
+    individual_head = WCCNHead((1,), n_directions=6, lengths=True)
+    head = TwoLevelHead(individual_head=individual_head, weight=0.2)
+    head.load_state_dict({**head.state_dict(), **plain.state_dict()})
+    assert head.fit_individuals(histograms, bodies // 2, (15, 25)) is head
+    vectors, of_two = head(histograms), plain(histograms)
+    torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-5, rtol=0)
+    x = individual_head(histograms)
+    products = 0.9 * of_two @ of_two.T + 0.1 * x @ x.T
+    torch.testing.assert_close(vectors @ vectors.T, products, atol=1e-5, rtol=0)
+    apart = torch.cdist(x[:, :-1].double(), x[:, :-1].double(), compute_mode="donot_use_mm_for_euclid_dist")
+    expected = 0.8 * plain.distances(of_two, of_two).double() + 0.2 * (1 - torch.exp(-((apart / 0.3) ** 2)))
+    found = head.distances(vectors, vectors).double()
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+    torch.testing.assert_close(head.distances(vectors[:7], vectors[3:]).double(), found[:7, 3:], atol=1e-5, rtol=0)
+    torch.testing.assert_close(head.short(vectors), plain.short(of_two), atol=1e-5, rtol=0)
+    other = TwoLevelHead(individual_head=WCCNHead((1,), lengths=True))
+    other.load_state_dict(head.state_dict())
+    torch.testing.assert_close(other.distances(other(histograms), vectors), found.float(), atol=1e-5, rtol=0)
+
+
+def test_individuals_that_bodies_do_not_tell_apart_are_ordered() -> None:
+    """Poses move the first cells, individuals the last, less than bodies differ; of classes that are not fitted to."""
+    generator = torch.Generator().manual_seed(1)
+    shape = (12, 2, 3, 4)  # classes, bodies, individuals, poses
+    kinds = torch.randn(12, 1, 1, 1, N_CELLS, generator=generator)
+    of_bodies = torch.randn(12, 2, 1, 1, 4, generator=generator) @ torch.randn(4, N_CELLS, generator=generator)
+    of_poses, of_individuals = torch.zeros(*shape, N_CELLS), torch.zeros(*shape, N_CELLS)
+    of_poses[..., :10] = torch.randn(*shape, 10, generator=generator)
+    of_individuals[..., 30:] = torch.randn(12, 2, 3, 1, 10, generator=generator)
+    cells = (0.8 * kinds + 0.3 * of_bodies + 0.3 * of_poses + 0.05 * of_individuals).exp().flatten(0, 3)
+    histograms = cells / cells.sum(dim=1, keepdim=True)
+    individuals = torch.arange(72).repeat_interleave(4)
+    bodies, classes = individuals // 3, individuals // 6
+    seen = classes < 6
+    two = TwoLevelHead().fit(histograms[seen], classes[seen], bodies=bodies[seen])
+    three = TwoLevelHead(individual_head=WCCNHead(n_directions=20, lengths=True))
+    three.load_state_dict({**three.state_dict(), **two.state_dict()})
+    three.fit_individuals(histograms[seen], individuals[seen])
+    found = []
+    for head in (two, three):
+        vectors = head(histograms[~seen])
+        distances = head.distances(vectors, vectors)
+        found.append([retrieval_scores(distances, one[~seen]).mean()["ft"] for one in (individuals, bodies, classes)])
+    assert found[1][0] > found[0][0] + 0.1
+    assert found[1][1] > found[0][1] - 0.02
+    assert found[1][2] > found[0][2] - 0.02
+
+
 def test_short_vectors_are_the_best_of_so_many_numbers(
     collection: tuple[Tensor, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -209,8 +261,14 @@ def test_what_cannot_be_fitted_is_named(collection: tuple[Tensor, Tensor, Tensor
         TwoLevelHead(scales=[0.1, 0.2])
     with pytest.raises(ValueError, match=r"one between 0 and 1, got \(0.1,\) and 1"):
         TwoLevelHead(share=1)
-    with pytest.raises(ValueError, match="body_heads: expected heads with lengths"):
+    with pytest.raises(ValueError, match="body_heads, individual_head: expected heads with lengths"):
         TwoLevelHead(body_heads=[WCCNHead()])
+    with pytest.raises(ValueError, match="body_heads, individual_head: expected heads with lengths"):
+        TwoLevelHead(individual_head=WCCNHead())
+    with pytest.raises(ValueError, match="weight: expected a number between 0 and 1, got 1"):
+        TwoLevelHead(weight=1)
+    with pytest.raises(ValueError, match="individual_head: expected a head to fit, got None"):
+        TwoLevelHead().fit_individuals(histograms, classes)
     with pytest.raises(RuntimeError, match="TwoLevelHead: expected to be fitted first"):
         TwoLevelHead().short(histograms)
     fitted = TwoLevelHead().fit(histograms, classes)

@@ -23,6 +23,8 @@ PRETRAINED = Path(__file__).with_name("pretrained.safetensors")
 
 # Of `pretrained_parts`: what bending leaves alone tells bodies, all others tell classes
 BODY_PARTS, CLASS_PARTS = (0, 5, 8), (1, 2, 3, 4, 5, 6, 7)
+# Balls are too rough to tell individuals apart
+INDIVIDUAL_PARTS = (0, 8)
 # Of the body heads: the median distance of training shapes is 0.5
 _SCALES = (0.125, 0.21, 0.125)
 
@@ -60,15 +62,21 @@ def pretrained_parts() -> HistogramDescriptor:
     )
 
 
-def two_levels() -> TwoLevelHead:
-    """The head of `pretrained`, not fitted."""
+def pretrained_head(*, individuals: bool = True) -> TwoLevelHead:
+    """The head of `pretrained`, not fitted; without the level of individuals if not `individuals`."""
     surface, balls, spectrum = BODY_PARTS
     body_heads = [
         WCCNHead([surface], n_directions=90, shrinkage=0.3, lengths=True),
         WCCNHead([balls], n_directions=20, shrinkage=0.3, lengths=True),
         WCCNHead([spectrum], n_directions=60, shrinkage=1.0, lengths=True),
     ]
-    return TwoLevelHead(WCCNHead(CLASS_PARTS, n_directions=150, shrinkage=0.1), body_heads, scales=_SCALES)
+    individual_head = WCCNHead(INDIVIDUAL_PARTS, n_directions=60, shrinkage=0.3, lengths=True)
+    return TwoLevelHead(
+        WCCNHead(CLASS_PARTS, n_directions=150, shrinkage=0.1),
+        body_heads,
+        scales=_SCALES,
+        individual_head=individual_head if individuals else None,
+    )
 
 
 def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
@@ -87,7 +95,7 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
     """
     module = EmbeddedDescriptor(
         pretrained_parts(),
-        two_levels(),
+        pretrained_head(),
         name="pretrained",
         source="nine histograms, fitted to generated shapes",
         invariant_to=("motion", "scale", "pose"),
@@ -100,7 +108,7 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
 
 
 def save_pretrained(module: EmbeddedDescriptor, path: str | Path) -> None:
-    """Write a fitted `pretrained_parts` under `two_levels` to a safetensors file, the head in half precision."""
+    """Write a fitted `pretrained_parts` under `pretrained_head` to a safetensors file, the head in half precision."""
     state = {
         name: (tensor.half() if name.startswith("head.") and tensor.is_floating_point() else tensor).contiguous()
         for name, tensor in module.state_dict().items()

@@ -1,0 +1,102 @@
+"""The level of individuals of the descriptor `pretrained`: its check on held-out families, and its fit."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import igps
+from igps.descriptors.pretrained.descriptor import pretrained_head
+from igps.nn.description import describe
+from igps.nn.descriptor import Descriptor, HistogramDescriptor
+from igps.nn.heads.two_level import TwoLevelHead
+from training.graded import GradedShapes, body_of, family_of, individual_of
+from training.studies.transfer import level_scores
+
+_N_VERTICES = (2000, 3600)
+
+
+def fit_individuals(
+    head: TwoLevelHead,
+    descriptor: HistogramDescriptor,
+    counts: tuple[int, int, int, int],
+    root: Path,
+    n_parts: int,
+    seed: int,
+    plain: Sequence[str],
+    cache_dir: Path | None,
+    n_workers: int | None,
+) -> TwoLevelHead:
+    """The head with a level of individuals, after a check of that level on families that it was not fitted to.
+
+    Args:
+        head: of classes and bodies.
+        descriptor: of what it describes.
+        counts: classes, bodies of each, individuals of each, and poses of each.
+        root: folder of the meshes.
+        n_parts, seed, plain, cache_dir, n_workers: see `pretrain`.
+    """
+    n_classes, n_bodies, n_individuals, n_poses = counts
+    shapes = GradedShapes(n_classes, n_bodies, n_poses, seed, n_vertices=_N_VERTICES, n_individuals=n_individuals)
+    try:
+        shapes.write(root, progress=True, n_workers=n_workers)
+    except ValueError as error:
+        print(error)
+    data = usable(root, descriptor, cache_dir, n_workers)
+    histograms = describe(data, descriptor, progress=True, n_workers=n_workers)
+    individuals, bodies = (numbers([of(name) for name in data.bodies.names]) for of in (individual_of, body_of))
+
+    def fitted(chosen: Tensor) -> TwoLevelHead:
+        whole = pretrained_head()
+        whole.load_state_dict({**whole.state_dict(), **head.state_dict()})
+        return whole.fit_individuals(histograms[chosen], individuals[chosen], descriptor.part_cells)
+
+    parts = [torch.isin(data.labels, part) for part in dealt([family_of(name) for name in data.classes], n_parts, seed)]
+
+    def score(name: str, distances: Sequence[Tensor]) -> None:
+        """Of each part, the distances."""
+        levels = [(individuals[part], bodies[part], data.labels[part]) for part in parts]
+        level_scores(name, [(one, *labels) for one, labels in zip(distances, levels, strict=True)])
+
+    print(f"{n_parts} parts of the families, each scored by a level of individuals that was fitted to the others:")
+    everything = torch.ones(len(data), dtype=torch.bool)
+    for name, heads in (("pretrained", [fitted(~part) for part in parts]), ("two levels", [head] * n_parts)):
+        vectors = [one(histograms[part]) for one, part in zip(heads, parts, strict=True)]
+        score(name, [one.distances(vector, vector) for one, vector in zip(heads, vectors, strict=True)])
+    for name in plain:
+        other = igps.descriptor(name)
+        described = describe(usable(root, other, cache_dir, n_workers), other, n_workers=n_workers)
+        if len(described) == len(data):
+            score(name, [other.distances(described[part], described[part]) for part in parts])
+    return fitted(everything)
+
+
+def usable(
+    root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None, some: list[int] | None = None
+) -> igps.SignatureDataset:
+    """The dataset of the meshes, or some of them, whose signatures could be computed; those that could not are told."""
+    data = igps.SignatureDataset(root, descriptor=descriptor, cache_dir=cache_dir)
+    if some is not None:
+        data = data.subset(some)
+    failures = data.precompute(n_workers=n_workers)
+    for failure in failures:
+        print(failure)
+    return data.usable(failures)
+
+
+def dealt(families: Sequence[str], n_parts: int, seed: int) -> list[Tensor]:
+    """Numbers of the classes in each part, whole families at a time."""
+    names = sorted(set(families))
+    random.Random(seed).shuffle(names)
+    return [
+        torch.tensor([i for i, family in enumerate(families) if family in names[k::n_parts]]) for k in range(n_parts)
+    ]
+
+
+def numbers(names: Sequence[str]) -> Tensor:
+    number = {name: i for i, name in enumerate(sorted(set(names)))}
+    return torch.tensor([number[name] for name in names])
