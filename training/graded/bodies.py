@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,7 +73,7 @@ class Body:
     rig: Rig
     genus: int
     motion: Motion
-    warp: Warp
+    warp: Callable[[Array], Array]
     relief: tuple[float, float, int]
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,19 +45,20 @@ class Change:
     def draw(cls, rng: np.random.Generator, vertices: Array, faces: Faces) -> Change:
         """Draw a change of a surface, its largest step a share of the root of the area between `SHARES`."""
         size = float(np.sqrt(face_areas(vertices, faces).sum()))
-        radii = size * np.exp(rng.uniform(*np.log(_RADII), _LOCAL))
+        low, high = np.log(_RADII)
+        radii = size * np.exp(rng.uniform(low, high, _LOCAL))
         centres, axes = np.empty((_LOCAL, 3)), np.empty((_LOCAL, 3))
         for i, near in enumerate(rng.integers(len(vertices), size=_LOCAL)):
             place = vertices[np.linalg.norm(vertices - vertices[near], axis=1) < radii[i]]
             centres[i] = place.mean(axis=0)
             axis = np.linalg.svd(place - centres[i], full_matrices=False)[2][0]
             axes[i] = axis * np.where(axis @ (centres[i] - vertices.mean(axis=0)) < 0.0, -1.0, 1.0)
-        strengths = rng.normal(size=(2, _LOCAL)) * rng.uniform(0.2, 1.0, (2, 1))
+        swells, grows = rng.normal(size=(2, _LOCAL)) * rng.uniform(0.2, 1.0, (2, 1))
         waves = Warp.draw(rng, 2.0 * size, 0.5 * rng.uniform(0.2, 1.0))
-        change = cls(waves, centres, axes, radii, *strengths, np.zeros(7), 1.0)
+        change = cls(waves, centres, axes, radii, swells, grows, np.zeros(7), 1.0)
         columns = _columns(vertices)
         steps = change(vertices) - vertices
-        fitted = np.linalg.lstsq(columns.reshape(-1, 7), steps.reshape(-1), rcond=None)[0]
+        fitted = np.linalg.lstsq(columns.reshape(-1, 7), steps.reshape(-1), rcond=None)[0].astype(np.float64)
         change = replace(change, similarity=fitted)
         largest = float(np.linalg.norm(change(vertices) - vertices, axis=1).max())
         return replace(change, step=size * float(np.exp(rng.uniform(*np.log(SHARES)))) / largest)
@@ -80,7 +82,7 @@ class Change:
 class ChangedWarp:
     """One change after another."""
 
-    first: Warp
+    first: Callable[[Array], Array]
     second: Change
 
     def __call__(self, points: Array) -> Array:

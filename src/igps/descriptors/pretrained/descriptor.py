@@ -83,7 +83,7 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
     """Unit vectors, in evaluation mode: `pretrained_parts` under a head that was fitted to generated shapes.
 
     It needs no label of the shapes that it compares: by the head's distance, other poses of a body come first, then
-    other bodies of its class. The head's `short` makes vectors of 256 numbers of its 1,089. The model card is in the
+    other bodies of its class. The head's `short` makes vectors of 256 numbers of its 1,210. The model card is in the
     documentation.
 
     Args:
