@@ -24,7 +24,7 @@ SIZE, SIDE = "+size", "+side"
 """Behind the name of a descriptor that keeps size, and of one that tells a body from its mirror image."""
 
 SCALES: Mapping[str, float] = {
-    "interior": 0.017, "gps": 0.017, "multiscale": 0.03, "rich": 0.026, "pretrained": 0.093, "d2": 0.035,
+    "interior": 0.017, "gps": 0.017, "multiscale": 0.03, "rich": 0.026, "pretrained": 0.1, "d2": 0.035,
     "shape_dna": 17, "volume_shape_dna": 23, "local_diameter_centricity": 0.14, "inner_distance": 0.004,
     "canonical_form": 0.066, "geodesic_spectral": 0.0014, "spectral_gw": 0.0014,
 }  # fmt: skip
