@@ -190,7 +190,7 @@ def test_an_attribute_adds_its_histograms_with_its_weight(bodies: SignatureDatas
     form = describe(dataset, descriptor("pretrained"))
     inside = describe(dataset, whole.inside)
     np.testing.assert_allclose(inside.sum(dim=1), 1, rtol=1e-5)
-    expected = descriptor("pretrained").distances(form, form) + 0.5 * 0.093 / 0.017 * chi_square(inside, inside)
+    expected = descriptor("pretrained").distances(form, form) + 0.5 * 0.1 / 0.017 * chi_square(inside, inside)
     np.testing.assert_allclose(whole.distances(described, described), expected, atol=1e-5)
     assert igps.descriptor("pretrained+height=0.5+size").name == "pretrained+height=0.5+size"
     with pytest.raises(ValueError, match="with: expected positive weights"):
