@@ -102,6 +102,12 @@ def broken_mesh(seed: int, number: int) -> Broken:
     return Broken(f"{number:06d}.{suffix}", content, arrays, f"{kind}: {', '.join(story) or 'nothing'}")
 
 
+def broken_bytes(generator: Generator, content: bytes) -> tuple[str, bytes]:
+    """Any file with a fault that needs no knowledge of its format, and what it is."""
+    fault = str(generator.choice(["bytes", "tokens"]))
+    return fault, _ON_FILES[fault](generator, content, "")
+
+
 def written(vertices: NDArray[np.float64], faces: NDArray[np.int64], kind: str) -> bytes:
     """A file of any arrays, even such as no exporter would write."""
     points = [" ".join(repr(float(x)) for x in row) for row in vertices]

@@ -80,6 +80,11 @@ def test_holes_that_touch_are_filled_one_by_one(sphere: Mesh, seed: int) -> None
     assert (counts == 2).all()
 
 
+def test_no_faces_have_no_holes() -> None:
+    none = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    assert with_small_holes_filled(*none, [])[1] is none[1]
+
+
 def test_a_patch_has_as_many_vertices_as_its_rim_asks_for(sphere: Mesh) -> None:
     """Those of a disc of radius r = n / 2π steps that are one step apart: about π r² = n² / 4π."""
     away = np.linalg.norm(sphere.vertices - sphere.vertices[0], axis=1)

@@ -127,10 +127,10 @@ def test_models_and_chains_are_bodies_of_their_own(tmp_path: Path) -> None:
     path = written(tmp_path, models)
     of_models = read_molecule(path, "models")
     assert [len(molecule.radii) for molecule in of_models] == [15] * 20
-    assert of_models[19].name == f"{path} model 20"
+    assert of_models[19].name == f"{path}#model 20"
     of_chains = read_molecule(path)
     assert [len(molecule.radii) for molecule in of_chains] == [10, 5] * 20
-    assert of_chains[1].name == f"{path} model 1 chain B"
+    assert of_chains[1].name == f"{path}#model 1 chain B"
 
 
 def test_an_assembly_is_built_by_its_operators(tmp_path: Path) -> None:
@@ -248,8 +248,8 @@ def test_a_chain_without_atoms_costs_no_other_chain(tmp_path: Path, caplog: pyte
     path = written(tmp_path, residue(1) + lost)
     with caplog.at_level(logging.WARNING):
         (molecule,) = read_molecule(path)
-    assert molecule.name == f"{path} chain A"
-    assert f"{path} chain B: no atoms of a polymer, left out" in caplog.text
+    assert molecule.name == f"{path}#chain A"
+    assert f"{path}#chain B: no atoms of a polymer, left out" in caplog.text
 
 
 def test_b_factors_are_means_over_residues(tmp_path: Path) -> None:

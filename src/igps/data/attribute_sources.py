@@ -77,7 +77,7 @@ def _molecule(body: BodyRef, changed: int) -> Molecule:
     """That whose surface the body is."""
     part = body.part or ""
     how: MoleculeBodies = "chains" if "chain" in part else "assembly" if "assembly" in part else "models"
-    found = {one.name.removeprefix(str(body.path)).strip() or "model": one for one in read_molecule(body.path, how)}
+    found = {one.name.removeprefix(str(body.path)).lstrip("#") or "model": one for one in read_molecule(body.path, how)}
     if part in found:
         return found[part]
     first, *others = read_molecule(body.path, "models")

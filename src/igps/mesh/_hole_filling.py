@@ -39,7 +39,7 @@ def _loops(faces: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     are left out.
     """
     end, start = directed_edges(faces)
-    _, edge_of_side = undirected_edges(faces, int(faces.max()) + 1)
+    _, edge_of_side = undirected_edges(faces, int(faces.max(initial=-1)) + 1)
     free = np.nonzero(np.bincount(edge_of_side)[edge_of_side] == 1)[0]
     onward: dict[int, list[tuple[int, int]]] = {}
     backward: dict[int, list[tuple[int, int]]] = {}

@@ -47,10 +47,10 @@ def surfaces(path: Path, options: LoadOptions, content: bytes | None = None) -> 
 
 
 def objects(path: Path, options: LoadOptions, content: bytes | None = None, **loading: Any) -> list[RawBody]:
-    """A body for each place of a scene where a geometry stands, with the scene's unit."""
-    kind = path.suffix.lower().lstrip(".")
+    """A body for each place of a scene where a geometry stands; `loading` is for trimesh."""
+    loading = {"file_type": path.suffix.lower().lstrip("."), **loading}
     stream = BytesIO(path.read_bytes() if content is None else content)
-    scene = trimesh.load_scene(stream, file_type=kind, resolver=_Beside(path.parent), process=False, **loading)
+    scene = trimesh.load_scene(stream, resolver=_Beside(path.parent), process=False, **loading)
     nodes = [(node, *scene.graph.get(node)) for node in scene.graph.nodes_geometry]
     sizes = {name: _n_bytes(geometry) for name, geometry in scene.geometry.items()}
     check_unpacked(sum(sizes[name] for _, _, name in nodes), path, options.max_unpacked)

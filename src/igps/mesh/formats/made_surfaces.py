@@ -71,7 +71,7 @@ def _molecules(path: Path, options: LoadOptions) -> dict[str, Molecule]:
 
     how = options.bodies if options.bodies in ("chains", "models", "assembly") else "models"
     found = read_molecule(path, how)
-    return {molecule.name.removeprefix(str(path)).strip() or "model": molecule for molecule in found}
+    return {molecule.name.removeprefix(str(path)).lstrip("#") or "model": molecule for molecule in found}
 
 
 def _body(

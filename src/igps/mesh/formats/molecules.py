@@ -160,18 +160,18 @@ def _parts(
     """The name of each body, its chains, and notes."""
     gemmi = gemmi_module()
     for model in structure:
-        name = f"{path} model {model.num}" if len(structure) > 1 else str(path)
+        of = f"model {model.num} " if len(structure) > 1 else ""
         if bodies == "chains":
             # A chain may come in several pieces.
             for label in dict.fromkeys(chain.name for chain in model):
-                yield f"{name} chain {label or 'without name'}", [c for c in model if c.name == label], []
+                yield f"{path}#{of}chain {label or 'without name'}", [c for c in model if c.name == label], []
         elif bodies == "assembly" and len(structure.assemblies):
             first = structure.assemblies[0]
             made = gemmi.make_assembly(first, model, gemmi.HowToNameCopiedChain.AddNumber)
-            yield f"{name} assembly {first.name}", list(made), []
+            yield f"{path}#{of}assembly {first.name}", list(made), []
         else:
             notes = ["the file names no assembly: the model was taken as it is"] if bodies == "assembly" else []
-            yield name, list(model), notes
+            yield f"{path}#{of}".strip("# "), list(model), notes
 
 
 class _Builder:

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
+import tempfile
 import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct, pieces
 from igps.mesh.formats._trimesh import objects
+from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.mesh.surface import signed_volume
 
 # How far triangles may be from a curved face, over the length of its edges, and the angle between two, radians.
 _DEFLECTION, _ANGLE = 0.005, 0.2
+_CONVERT = (
+    "import sys, cascadio; cascadio.step_to_glb(*sys.argv[1:], "
+    f"tol_linear={_DEFLECTION}, tol_relative=True, tol_angular={_ANGLE}, merge_primitives=True)"
+)
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
@@ -30,13 +39,26 @@ def read_gltf(path: Path, options: LoadOptions, part: str | None) -> list[RawBod
 
 def read_step(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The solids of a STEP file, in millimetres, each with the name of the part that it belongs to."""
-    parts = objects(path, options, tol_linear=_DEFLECTION, tol_relative=True, tol_angular=_ANGLE)
+    parts = objects(path, options, _converted(path), file_type="glb", merge_primitives=True)
     solids = [(str(part.part), solid) for part in parts for solid in _solids(part)]
     names = distinct(name for name, _ in solids)
     return [
         replace(solid, vertices=1000 * solid.vertices, part=name, unit="mm")
         for name, (_, solid) in zip(names, solids, strict=True)
     ]
+
+
+def _converted(path: Path) -> bytes:
+    """The glTF scene of a STEP file, made in a process of its own: OpenCASCADE crashes on some damaged files."""
+    import cascadio  # noqa: F401  # missing, it is told as such
+
+    with tempfile.TemporaryDirectory() as folder:
+        step, scene = Path(folder) / "x.step", Path(folder) / "x.glb"
+        shutil.copyfile(path, step)
+        subprocess.run([sys.executable, "-c", _CONVERT, str(step), str(scene)], capture_output=True, check=False)
+        if not scene.is_file():
+            raise MeshError(f"{path}: OpenCASCADE finds no solid in it. Check that it is complete, or export it again.")
+        return scene.read_bytes()
 
 
 def _solids(part: RawBody) -> list[RawBody]:

@@ -1,0 +1,442 @@
+"""Label volumes, molecules, scenes and images beside bodies, whole or with a fault, each by a number."""
+
+from __future__ import annotations
+
+import gzip
+import sys
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import gemmi
+import nibabel
+import numpy as np
+import tifffile
+import trimesh
+from mutator import Generator, broken_bytes
+from numpy.typing import NDArray
+
+sys.path.append(str(Path(__file__).parents[2]))
+from tests.mesh.step_files import write_step
+
+Array = NDArray[Any]
+
+REFUSED, AS_IT_IS = "refused", "as it is"
+
+
+@dataclass(frozen=True)
+class BodyFile:
+    """A file of bodies, with what lies beside it.
+
+    Args:
+        kind: "volume", "molecule", "scene" or "image".
+        files: their contents by name, that of the bodies first.
+        expected: `REFUSED` as a whole; or by the name of a body its volume, `REFUSED`, or `AS_IT_IS` if it is that of
+            the file without a fault; None where whatever is read must hold against a second reader.
+        story: what was done to it.
+        options: how it is read, of `LoadOptions`.
+    """
+
+    kind: str
+    files: dict[str, bytes]
+    expected: Any
+    story: str = "nothing"
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Of the file of the bodies."""
+        return next(iter(self.files))
+
+
+def body_file(seed: int, number: int) -> BodyFile:
+    """The file of this number; kinds take turns, and faults are drawn."""
+    generator = np.random.default_rng([seed, number])
+    make = (_volume, _molecule, _image, _volume, _molecule, _scene)[number % 6]
+    return make(generator)
+
+
+def _drawn(generator: Generator, faults: Iterable[str]) -> str:
+    return str(generator.choice(list(faults)))
+
+
+def _damaged(generator: Generator, given: BodyFile, packed: bool) -> BodyFile:
+    """With bytes or words that are others, or cut off; inside the compression or outside."""
+    name, content = given.name, given.files[given.name]
+    inside = packed and generator.random() < 0.5
+    if inside:
+        content = gzip.decompress(content)
+    fault, content = broken_bytes(generator, content)
+    if inside:
+        content = gzip.compress(content, mtime=0)
+    return replace(given, files={**given.files, name: content}, expected=None, story=fault)
+
+
+# Label volumes.
+
+AFFINE = np.array([[-0.8, -0.9, 0.1, 30], [-0.6, 1.2, 0, -20], [0, 0, 2.5, 10], [0, 0, 0, 1]])
+SHAPE = (24, 22, 14)
+LABELS = {1: "liver", 4: "spleen", 9: "kidney"}
+_VOLUMES = ("nii", "nii.gz", "mgz", "nrrd", "mha", "tif")
+
+
+@cache
+def labels() -> Array:
+    """Three ellipsoids, two of which touch, and one at the border."""
+    x, y, z = np.indices(SHAPE)
+    found = np.zeros(SHAPE, dtype=np.int16)
+    for label, (cx, cy, cz), (a, b, c) in (
+        (1, (7, 7, 7), (6, 6, 5)),
+        (4, (17, 7, 7), (5, 5, 4)),
+        (9, (12, 19, 6), (8, 5, 5)),
+    ):
+        found[(found == 0) & (((x - cx) / a) ** 2 + ((y - cy) / b) ** 2 + ((z - cz) / c) ** 2 < 1)] = label
+    return found
+
+
+def _volume(generator: Generator) -> BodyFile:
+    suffix, values, affine = str(generator.choice(_VOLUMES)), labels().copy(), AFFINE.copy()
+    fault = _drawn(generator, _ON_VOLUMES) if generator.random() < 0.7 else "damage"
+    if fault == "damage":
+        whole = BodyFile("volume", {f"x.{suffix}": written_volume(suffix, values, affine)}, None)
+        return _damaged(generator, whole, suffix in ("nii.gz", "mgz"))
+    cell = 1.0 if suffix == "tif" else abs(np.linalg.det(affine[:3, :3]))
+    expected: Any = {str(label): cell * float((values == label).sum()) for label in LABELS}
+    beside, options = {}, {}
+    if (change := _ON_VOLUMES[fault]) is not None:
+        values, affine, refused = change(generator, values, affine)
+        expected = REFUSED if refused else expected
+    if fault == "seven voxels":
+        values[0, 0, :7] = 20
+        expected["20"] = REFUSED
+    elif fault == "probabilities":
+        values, expected = (labels() == 4) * 0.75, {"x": expected["4"]}
+    elif fault in ("names", "names repeat", "names of others"):
+        given = {"names": LABELS, "names repeat": dict.fromkeys(LABELS, "liver"), "names of others": {77: "heart"}}[
+            fault
+        ]
+        beside["x.csv"] = "\n".join(["label,name", *(f"{label},{name}" for label, name in given.items())]).encode()
+        expected = REFUSED if fault == "names repeat" else {given.get(int(k), k): v for k, v in expected.items()}
+    elif fault in ("no names", "no such names"):
+        options["names"] = "names.csv" if fault == "no names" else "none.csv"
+        beside = {"names.csv": b"nothing is named here\n"} if fault == "no names" else {}
+        expected = "refused, the table is named"
+    if fault in ("complex", "colours"):  # of the formats that have them
+        suffix = "nii"
+    if fault in ("singular", "axis without length"):
+        suffix = suffix if suffix in ("nii", "nii.gz") else "nii"
+    if suffix == "mgz":
+        values = values.astype(np.float32 if values.dtype.kind == "f" else np.int32)
+    if suffix == "tif" and values.ndim == 4:
+        suffix = "nrrd"
+    content = _promising(generator, suffix) if fault == "promises" else written_volume(suffix, values, affine)
+    expected = REFUSED if fault == "promises" else expected
+    return BodyFile("volume", {f"x.{suffix}": content, **beside}, expected, f"{suffix}: {fault}", options)
+
+
+def written_volume(suffix: str, values: Array, affine: Array) -> bytes:
+    """The file of any array."""
+    if suffix in ("nii", "nii.gz"):
+        image = nibabel.Nifti1Image(values, None, dtype=values.dtype)
+        for row, words in zip("xyz", affine, strict=False):
+            image.header[f"srow_{row}"] = words
+        image.header["sform_code"] = 1
+        content = image.to_bytes()
+        return gzip.compress(content, mtime=0) if suffix == "nii.gz" else content
+    if suffix == "mgz":
+        return gzip.compress(nibabel.MGHImage(values, affine).to_bytes(), mtime=0)
+    if suffix == "tif":
+        with tempfile.NamedTemporaryFile(suffix=".tif") as file:
+            tifffile.imwrite(file.name, np.ascontiguousarray(values.T), photometric="minisblack")
+            return Path(file.name).read_bytes()
+    lps = np.diag([-1, -1, 1, 1]) @ affine
+    raw = np.asfortranarray(values).tobytes(order="F")
+    sizes = " ".join(map(str, values.shape))
+    ways = lps[:3, :3].T
+    if suffix == "mha":
+        kinds = {"int16": "MET_SHORT", "float32": "MET_FLOAT", "float64": "MET_DOUBLE"}
+        sides = np.linalg.norm(ways, axis=1)
+        more = [0.0] * (values.ndim - 3)
+        turn = np.eye(values.ndim)
+        turn[:3, :3] = ways / sides[:, None]
+        rows = (
+            f"ObjectType = Image\nNDims = {values.ndim}\nBinaryData = True\nBinaryDataByteOrderMSB = False\n"
+            f"TransformMatrix = {_words(turn.ravel())}\nOffset = {_words([*lps[:3, 3], *more])}\n"
+            f"ElementSpacing = {_words([*sides, *(1 + x for x in more)])}\nDimSize = {sizes}\n"
+            f"ElementType = {kinds[str(values.dtype)]}\nElementDataFile = LOCAL\n"
+        )
+        return rows.encode() + raw
+    kinds = {"int16": "short", "float32": "float", "float64": "double"}
+    directions = " ".join(f"({','.join(map(str, way))})" for way in ways) + " none" * (values.ndim - 3)
+    rows = (
+        f"NRRD0004\ntype: {kinds[str(values.dtype)]}\ndimension: {values.ndim}\nspace: left-posterior-superior\n"
+        f"sizes: {sizes}\nspace directions: {directions}\nkinds:{' domain' * 3}{' list' * (values.ndim - 3)}\n"
+        f"endian: little\nencoding: gzip\nspace origin: ({','.join(map(str, lps[:3, 3]))})\n\n"
+    )
+    return rows.encode() + gzip.compress(raw, mtime=0)
+
+
+def _words(numbers: Iterable[float]) -> str:
+    return " ".join(repr(float(x)) for x in numbers)
+
+
+def _promising(generator: Generator, suffix: str) -> bytes:
+    """A header of 10^13 voxels and more, and a few."""
+    content = written_volume(suffix, labels(), AFFINE)
+    if suffix in ("nrrd", "mha"):
+        return content.replace(b" ".join(b"%d" % n for n in SHAPE), b"100000 100000 100000")
+    if suffix == "tif":
+        return content.replace(np.array(SHAPE[0], "<u2").tobytes(), b"\xff\xff", 1).replace(
+            b"\x16\0\0\0", b"\xff\xff\xff\x7f"
+        )
+    packed = suffix != "nii"
+    head = bytearray(gzip.decompress(content) if packed else content)
+    if suffix == "mgz":
+        head[4:16] = np.array([100_000] * 3, dtype=">i4").tobytes()
+    else:
+        head[42:48] = np.array([32767] * 3, dtype="<i2").tobytes()
+    return gzip.compress(bytes(head), mtime=0) if packed else bytes(head)
+
+
+def _refusing(
+    change: Callable[[Generator, Array, Array], tuple[Array, Array]],
+) -> Callable[..., tuple[Array, Array, bool]]:
+    return lambda generator, values, affine: (*change(generator, values, affine), True)
+
+
+def _poked(values: Array, kind: Any, value: Any) -> Array:
+    values = values.astype(kind)
+    values[5, 5, 5] = value
+    return values
+
+
+def _colours(values: Array) -> Array:
+    colours = np.zeros(values.shape, dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")])
+    colours["R"] = values
+    return colours
+
+
+_ON_VOLUMES: dict[str, Callable[..., tuple[Array, Array, bool]] | None] = {
+    "nothing": None,
+    "promises": None,
+    "seven voxels": None,
+    "names": None,
+    "names repeat": None,
+    "names of others": None,
+    "no names": None,
+    "no such names": None,
+    "probabilities": None,
+    "whole numbers as floats": lambda g, v, a: (v.astype(np.float32), a, False),
+    "four axes": _refusing(lambda g, v, a: (np.stack([v, v], axis=-1), a)),
+    "colours": _refusing(lambda g, v, a: (_colours(v), a)),
+    "complex": _refusing(lambda g, v, a: (v.astype(np.complex64), a)),
+    "not finite": _refusing(lambda g, v, a: (_poked(v, np.float32, g.choice([np.nan, np.inf])), a)),
+    "negative": _refusing(lambda g, v, a: (_poked(v, np.int16, -3), a)),
+    "fractional": _refusing(lambda g, v, a: (_poked(v, np.float32, 2.5), a)),
+    "too large": _refusing(lambda g, v, a: (_poked(v, np.float32, 1e30), a)),
+    "an image": _refusing(lambda g, v, a: (g.integers(0, 30000, (64, 64, 20)).astype(np.int16), a)),
+    "singular": _refusing(lambda g, v, a: (v, a[:, [0, 0, 2, 3]])),
+    "axis without length": _refusing(lambda g, v, a: (v, a * [1, 1, 0, 1])),
+    "one slice": _refusing(lambda g, v, a: (v[:, :, :1], a)),
+    "no label": _refusing(lambda g, v, a: (0 * v, a)),
+}  # fmt: skip
+
+
+# Molecules.
+
+
+@cache
+def helices() -> tuple[str, ...]:
+    """The lines of a PDB file of two helices, A and B, without hydrogens."""
+    lines, serial = [], 0
+    for chain, n, x in (("A", 12, 0.0), ("B", 9, 14.0)):
+        for i in range(n):
+            residue = ("ALA", "LEU", "SER", "GLU", "GLY")[i % 5]
+            atoms = (
+                ("N", 1.55, 0, 0.0),
+                ("CA", 2.29, 28, 0.85),
+                ("C", 1.66, 55, 1.85),
+                ("O", 2.0, 60, 3.05),
+                ("CB", 3.3, 20, 0.2),
+            )
+            for name, radius, turn, up in atoms[: 4 if residue == "GLY" else 5]:
+                serial += 1
+                angle = np.radians(100 * i + turn)
+                at = (x + radius * np.cos(angle), radius * np.sin(angle), 1.5 * i + up)
+                lines.append(atom_line(serial, name, residue, chain, i + 1, at))
+        lines.append("TER")
+    return tuple(lines)
+
+
+def atom_line(
+    serial: int, name: str, residue: str, chain: str, number: int, at: Iterable[float], *, element: str | None = None,
+    altloc: str = " ", occupancy: float = 1.0, record: str = "ATOM",
+) -> str:  # fmt: skip
+    """Of a PDB file."""
+    place = "".join(f"{x:8.3f}"[:8] for x in at)
+    return (
+        f"{record:<6}{serial:>5} {f' {name}':<4}{altloc}{residue:>3} {chain}{number:>4}    {place}"
+        f"{occupancy:6.2f}{20:6.2f}          {element or name[0]:>2}"
+    )
+
+
+def _molecule(generator: Generator) -> BodyFile:
+    lines = list(helices())
+    suffix = str(generator.choice(["pdb", "pdb.gz", "cif", "ent"]))
+    fault = _drawn(generator, _ON_MOLECULES) if generator.random() < 0.65 else "damage"
+    expected: Any = {"chain A": AS_IT_IS, "chain B": AS_IT_IS}
+    if fault != "damage":
+        lines, changed = _ON_MOLECULES[fault](generator, lines)
+        expected = {**expected, **changed} if isinstance(changed, dict) else changed
+    if fault in ("nowhere", "all nowhere"):  # stars are words of a PDB file alone
+        suffix = "pdb"
+    text = "\n".join(lines) + "\n"
+    content = gemmi.read_pdb_string(text).make_mmcif_document().as_string() if suffix == "cif" else text
+    packed = suffix.endswith(".gz")
+    whole = BodyFile(
+        "molecule", {f"x.{suffix}": gzip.compress(content.encode(), mtime=0) if packed else content.encode()},
+        expected, f"{suffix}: {fault}",
+    )  # fmt: skip
+    return _damaged(generator, whole, packed) if fault == "damage" else whole
+
+
+Change = tuple[list[str], Any]
+
+
+def _each_atom(lines: list[str], change: Callable[[str, int], str | None]) -> list[str]:
+    """The atoms changed or, where it is None, left out."""
+    found = [change(line, i) if line.startswith("ATOM") else line for i, line in enumerate(lines)]
+    return [line for line in found if line is not None]
+
+
+def _of_chain_a(change: Callable[[str], str], last: int = 10**6) -> Callable[[Generator, list[str]], list[str]]:
+    return lambda g, lines: _each_atom(lines, lambda line, i: change(line) if line[21] == "A" and i <= last else line)
+
+
+def _numbered(line: str, number: int) -> str:
+    return f"{line[:22]}{number:>4}{line[26:]}"
+
+
+def _placed(line: str, at: Iterable[float]) -> str:
+    return line[:30] + "".join(f"{x:8.3f}"[:8] for x in at) + line[54:]
+
+
+def _alternatives(generator: Generator, lines: list[str]) -> Change:
+    found = []
+    for line in lines:
+        if line.startswith("ATOM") and generator.random() < 0.2:
+            found.append(f"{line[:16]}A{line[17:54]}  0.60{line[60:]}")
+            found.append(_placed(f"{line[:16]}B{line[17:54]}  0.40{line[60:]}", generator.normal(size=3) * 5))
+        else:
+            found.append(line)
+    return found, {}
+
+
+_ON_MOLECULES: dict[str, Callable[[Generator, list[str]], Change]] = {
+    "nothing": lambda g, lines: (lines, {}),
+    "alternatives": _alternatives,
+    "negative numbers": lambda g, lines: (_each_atom(lines, lambda line, i: _numbered(line, int(line[22:26]) - 6)), {}),
+    "repeated numbers": lambda g, lines: (
+        _each_atom(lines, lambda line, i: _numbered(line, (int(line[22:26]) + 1) // 2)), {}
+    ),
+    "repeated serials": lambda g, lines: (_each_atom(lines, lambda line, i: f"{line[:6]}    1{line[11:]}"), {}),
+    "serials of letters": lambda g, lines: (_each_atom(lines, lambda line, i: f"{line[:6]}***** {line[12:]}"), {}),
+    "unknown residues": lambda g, lines: (
+        _each_atom(lines, lambda line, i: line if line[17:20] == "GLY" else f"{line[:17]}XQZ{line[20:]}"), {}
+    ),
+    "no elements": lambda g, lines: (_each_atom(lines, lambda line, i: line[:76]), {}),
+    "hydrogens": lambda g, lines: (
+        [*lines[:3], atom_line(900, "H", "ALA", "A", 1, (0, 0, 30)), *lines[3:]], {}
+    ),
+    "water": lambda g, lines: (
+        [*lines, *(atom_line(900 + i, "O", "HOH", "C", i, (i, 40, 0), record="HETATM") for i in range(9))], {}
+    ),
+    "other ends of lines": lambda g, lines: ([line + "\r" for line in lines], {}),
+    "remarks": lambda g, lines: (["HEADER    NONE", "REMARK   2 é", *lines, "CONECT    1    2"], {}),
+    "unknown elements": lambda g, lines: (_of_chain_a(lambda line: f"{line[:76]} Q", 5)(g, lines), {"chain A": None}),
+    "nowhere": lambda g, lines: (
+        _of_chain_a(lambda line: f"{line[:30]}********{line[38:]}", 5)(g, lines), {"chain A": None}
+    ),
+    "far away": lambda g, lines: (
+        _of_chain_a(lambda line: _placed(line, (9999, 9999, 9999)), 0)(g, lines), {"chain A": REFUSED}
+    ),
+    "all in one place": lambda g, lines: (
+        _of_chain_a(lambda line: _placed(line, (1, 2, 3)))(g, lines), {"chain A": None}
+    ),
+    "no atoms": lambda g, lines: (["HEADER    NONE", "END"], REFUSED),
+    "water alone": lambda g, lines: (
+        [atom_line(i, "O", "HOH", "A", i, (3 * i, 0, 0), record="HETATM") for i in range(9)], REFUSED
+    ),
+    "all nowhere": lambda g, lines: (_each_atom(lines, lambda line, i: f"{line[:30]}{'*' * 24}{line[54:]}"), REFUSED),
+    "one line": lambda g, lines: (lines[:1], None),
+}  # fmt: skip
+
+
+# Scenes and CAD files.
+
+
+def _scene(generator: Generator) -> BodyFile:
+    boxes = {"shaft": (1.0, 2.0, 3.0), "wheel": (2.0, 2.0, 1.0), "plate": (4.0, 3.0, 0.5)}
+    step = generator.random() < 0.4
+    fault = str(
+        generator.choice(["nothing", "damage", "damage"] if step else ["nothing", "not finite", "repeat", "damage"])
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / ("x.step" if step else "x.glb")
+        if step:
+            write_step(path, {name: [((0, 0, 0), side)] for name, side in boxes.items()})
+        else:
+            scene = trimesh.Scene()
+            for i, (name, sides) in enumerate(boxes.items()):
+                mesh = trimesh.creation.box(sides)
+                if fault == "not finite" and name == "wheel":
+                    mesh.vertices[3, 2] = np.nan
+                scene.add_geometry(mesh, node_name=name, geom_name=name, transform=np.diag([(-1) ** i, 1, 1, 1]))
+            if fault == "repeat":
+                scene.add_geometry(scene.geometry["shaft"], node_name="shaft again", geom_name="shaft")
+            scene.export(path)
+        content = path.read_bytes()
+    expected: Any = {name: float(np.prod(sides)) for name, sides in boxes.items()}
+    if fault == "not finite":
+        expected["wheel"] = REFUSED
+    if fault == "repeat":
+        expected["shaft again"] = expected["shaft"]
+    whole = BodyFile("scene", {path.name: content}, expected, f"{path.suffix}: {fault}", {"bodies": "objects"})
+    return _damaged(generator, whole, False) if fault == "damage" else whole
+
+
+# Images beside bodies.
+
+
+def field_at(points: Array) -> Array:
+    """What the image says at points (P, 3)."""
+    return 100 + points @ np.array([2.0, -3.0, 1.0])
+
+
+def _image(generator: Generator) -> BodyFile:
+    suffix = str(generator.choice(["nii.gz", "nrrd", "mha", "nii"]))
+    fault = _drawn(generator, ("nothing", "some holes", "border", "half", "of another", "not finite", "damage"))
+    affine = np.diag([-0.5, 0.6, 0.4, 1.0])
+    shape = np.array([24, 20, 30])
+    affine[:3, 3] = -affine[:3, :3] @ ((shape - 1) / 2)
+    if fault in ("half", "of another"):
+        affine[0, 3] += 6 if fault == "half" else 1000
+    index = np.stack(np.indices(tuple(shape)), axis=-1)
+    values = field_at(index @ affine[:3, :3].T + affine[:3, 3]).astype(np.float32)
+    if fault == "some holes":
+        values[tuple((shape * [0.5, 0.6, 0.5]).astype(int))] = generator.choice([np.nan, np.inf, 7e18])
+    elif fault == "border":
+        values[[0, -1]] = values[:, [0, -1]] = values[:, :, [0, -1]] = 7e18
+    elif fault == "not finite":
+        values[:, ::2] = np.nan
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=3.0)
+    beside = {f"x.{suffix}": written_volume(suffix, values, affine)}
+    expected = REFUSED if fault in ("half", "of another", "not finite") else {"linear": 0.0}
+    if fault == "damage":
+        broken = _damaged(generator, BodyFile("image", beside, None), suffix == "nii.gz")
+        beside, expected = broken.files, None
+    body = trimesh.exchange.off.export_off(ball, digits=9).encode()
+    return BodyFile("image", {"x.off": body, **beside}, expected, f"{suffix}: {fault}")

@@ -1,0 +1,223 @@
+"""Broken volumes, molecules, scenes and images end in a sentence with a remedy, or in right bodies.
+
+`python tests/campaign/broken_bodies.py --case 123` repeats one file and keeps it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import numpy as np
+import SimpleITK
+import trimesh
+from body_files import AS_IT_IS, REFUSED, BodyFile, body_file, field_at, helices
+from broken_meshes import MEMORY, SECONDS, Verdict
+from outcome import Row
+from scipy import ndimage
+
+from igps import LoadOptions, Mesh, MeshError
+from igps._parallel import Failed, Limits, run
+from igps.data.attribute_sources import attribute_source
+from igps.mesh.loading import BodyRef, each_body, list_bodies
+
+SEED = 17
+# The surface of a label encloses the volume of its voxels, and that of a scene is exact.
+VOLUME, EXACT = 5e-3, 1e-5
+# A sentence, and then what to do.
+_REMEDY = re.compile(r"[.;:] [A-Z][^.]*.*[.)]$", re.DOTALL)
+
+
+def examine(job: tuple[int, int]) -> Verdict:
+    """Read the bodies of the file of a number, in a folder that is removed."""
+    with tempfile.TemporaryDirectory(prefix="igps-campaign-") as folder:
+        return judge(body_file(*job), Path(folder))
+
+
+def judge(given: BodyFile, folder: Path) -> Verdict:
+    """What becomes of the file."""
+    for name, content in given.files.items():
+        (folder / name).write_bytes(content)
+    path = folder / given.name
+    options = dict(given.options)
+    table = folder / options["names"] if "names" in options else path
+    if "names" in options:
+        options["names"] = str(table)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            if given.kind == "image":
+                return _judge_image(given, path)
+            read = LoadOptions(**options)
+            bodies = {str(ref.part): (ref, body) for ref, body in each_body(path, read)}
+            listed = [str(ref.part) for ref in list_bodies(path, read)]
+        except MeshError as error:
+            expected = given.expected if isinstance(given.expected, str) else None
+            if given.expected is not None and expected is None:
+                return Verdict("wrong", f"refused, and bodies were expected: {error}")
+            return _refused(error, table, folder)
+        except Exception as error:
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            return Verdict(
+                "wrong", f"a traceback of {type(error).__name__} from {where.filename}:{where.lineno}: {error}"
+            )
+        if listed != list(bodies):
+            return Verdict("wrong", f"listed are {listed}, read were {list(bodies)}")
+        if isinstance(given.expected, str):
+            return Verdict("wrong", f"read as {list(bodies)}, and a refusal was expected")
+        return _judge_bodies(given, path, bodies)
+
+
+def _refused(error: Exception, named: Path | str, folder: Path) -> Verdict:
+    text = str(error)
+    if str(named) not in text:
+        return Verdict("wrong", f"{named} is not named: {text}")
+    if not _REMEDY.search(text):
+        return Verdict("wrong", f"no remedy: {text}")
+    return Verdict("refused", text.replace(str(folder), "FOLDER"))
+
+
+def _judge_bodies(given: BodyFile, path: Path, bodies: dict[str, tuple[BodyRef, Mesh | MeshError]]) -> Verdict:
+    expected = given.expected
+    if expected is not None and set(expected) != set(bodies):
+        return Verdict("wrong", f"{sorted(bodies)} were read, {sorted(expected)} expected")
+    bounds = _bounds(path) if given.kind == "volume" and expected is None else {}
+    said = []
+    for part, (ref, body) in bodies.items():
+        wanted = None if expected is None else expected[part]
+        if isinstance(body, MeshError):
+            verdict = _refused(body, str(ref), path.parent)
+            if wanted not in (None, REFUSED):
+                return Verdict("wrong", f"{part}: refused, {wanted} expected: {body}")
+            if verdict.kind == "wrong":
+                return verdict
+            said.append(verdict.reason)
+            continue
+        if wanted == REFUSED:
+            return Verdict("wrong", f"{part}: read, and a refusal was expected")
+        surface = trimesh.Trimesh(body.vertices, body.faces, process=False)
+        if not surface.is_watertight or not surface.volume > 0:
+            return Verdict("wrong", f"{part}: closed {surface.is_watertight}, volume {surface.volume}")
+        if wanted == AS_IT_IS:
+            wanted = _clean()[part]
+        low, high = bounds.get(part, (0.0, np.inf))
+        if wanted is not None:
+            error = EXACT if given.kind != "volume" else VOLUME
+            low, high = wanted * (1 - error), wanted * (1 + error)
+        if not low <= surface.volume <= high:
+            return Verdict("wrong", f"{part}: volume {surface.volume}, between {low} and {high} expected")
+    return Verdict("refused" if said else "confirmed", "; ".join(said), ("bodies",) * (len(bodies) - len(said)))
+
+
+def _bounds(path: Path) -> dict[str, tuple[float, float]]:
+    """What the volume of each label lies between, by another reader: pieces of some size, and all with holes filled."""
+    if path.name.endswith(("nii", "gz", "mgz")):
+        image: Any = nibabel.load(path)
+        values, affine = np.asanyarray(image.dataobj).squeeze(), np.array(image.affine)
+        scale = {"meter": 1e3, "micron": 1e-3}
+        cell = abs(np.linalg.det(affine[:3, :3]))
+        if path.name.endswith(("nii", "nii.gz")):
+            cell *= scale.get(image.header.get_xyzt_units()[0], 1.0) ** 3
+    elif path.suffix in (".nrrd", ".mha"):
+        image = SimpleITK.ReadImage(str(path))
+        values = SimpleITK.GetArrayFromImage(image)
+        cell = abs(np.prod(image.GetSpacing()) * np.linalg.det(np.reshape(image.GetDirection(), (3, 3))))
+    else:
+        return {}
+    found = {}
+    for value in np.unique(values).tolist():
+        mask = values == value
+        label, n_pieces = ndimage.label(mask, np.ones((3, 3, 3)))
+        sizes = np.bincount(label.ravel())[1:] if n_pieces else np.zeros(1)
+        least, most = sizes[sizes >= 0.02 * sizes.sum()].sum(), ndimage.binary_fill_holes(mask).sum()
+        found[str(int(value))] = (
+            cell * least * (1 - VOLUME),
+            cell * most * 1.05,
+        )  # voxels join pieces that share a corner
+    return found
+
+
+@cache
+def _clean() -> dict[str, float]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "x.pdb"
+        path.write_text("\n".join(helices()) + "\n")
+        return {str(ref.part): body.volume for ref, body in each_body(path) if isinstance(body, Mesh)}
+
+
+def _judge_image(given: BodyFile, path: Path) -> Verdict:
+    image = next(name for name in given.files if name != given.name)
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points *= 2.5 / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 2.5)
+    body = BodyRef(path)
+    source = attribute_source(image)
+    try:
+        source.cache_tag(body)
+        values = source(body, points)
+    except MeshError as error:
+        if isinstance(given.expected, dict):
+            return Verdict("wrong", f"refused, and values were expected: {error}")
+        return _refused(error, path, path.parent)
+    if given.expected == REFUSED:
+        return Verdict("wrong", "values were made up")
+    if not np.isfinite(values).all() or np.abs(values).max() > 1e15:
+        return Verdict("wrong", f"values up to {np.abs(values).max()}")
+    if given.expected is not None:
+        far = np.abs(values - field_at(points))
+        if np.quantile(far, 0.9) > 1e-2 or far.max() > 3:  # next to a hole it is that of a neighbour
+            return Verdict("wrong", f"values are off by {np.quantile(far, 0.9)}, at most {far.max()}")
+    return Verdict("confirmed", "", ("values",))
+
+
+def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
+    """Read so many files."""
+    start = time.monotonic()
+    jobs = [(SEED, number) for number in range(n_cases)]
+    kinds: Counter[str] = Counter()
+    reasons: Counter[str] = Counter()
+    missed = []
+    for place, verdict in run(examine, jobs, n_workers=n_workers, limits=Limits(SECONDS, MEMORY)):
+        number = jobs[place][1]
+        if isinstance(verdict, Failed):
+            verdict = Verdict("wrong", verdict.reason)
+        kinds[verdict.kind] += 1
+        reasons[" ".join(word for word in verdict.reason.split() if word.isalpha())[:60]] += verdict.kind == "refused"
+        if verdict.kind == "wrong":
+            missed.append(f"--case {number} ({body_file(SEED, number).story}): {verdict.reason}"[:400])
+    return [
+        Row(
+            "broken bodies",
+            "volumes, molecules, scenes and images beside bodies",
+            n_cases,
+            "a sentence that names file, body and remedy, or right bodies; no fault of one loses another",
+            f"{kinds['refused']} refused, {kinds['confirmed']} confirmed, {kinds['wrong']} wrong",
+            missed=sorted(missed),
+            details={"kinds": dict(kinds), "refusals": dict(reasons.most_common(40))},
+            seconds=time.monotonic() - start,
+        )
+    ]
+
+
+def main() -> None:
+    """Repeat one case and say what became of it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--case", type=int, required=True, help="number of the file")
+    parser.add_argument("--out", type=Path, default=Path("build/campaign"), help="folder that keeps the file")
+    arguments = parser.parse_args()
+    given = body_file(SEED, arguments.case)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    print(arguments.out / given.name, given.story, given.expected, sep="\n")
+    print(judge(given, arguments.out))
+
+
+if __name__ == "__main__":
+    main()
