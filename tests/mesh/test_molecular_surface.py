@@ -46,14 +46,28 @@ def test_where_the_saddle_crosses_itself_two_balls_are_apart_with_a_cusp_each(ap
     assert (mesh.area, mesh.volume) == pytest.approx((area / 2, volume / 2), rel=0.01)
 
 
-def test_far_balls_are_joined_by_a_bar_or_the_larger_is_kept() -> None:
-    two = molecule([0 * ASLANT, 9 * ASLANT], [1.7, 2.5])
-    kept = molecular_surface(two, spacing=0.5, pieces="largest")
+@pytest.mark.parametrize("radii", [(1.7, 1.7), (1.9, 1.5)])
+@pytest.mark.parametrize("apart", [5.2, 5.35, 5.5, 5.8, 6.2])
+def test_where_the_neck_is_too_thin_for_the_grid_or_none_a_thread_adds_hardly_any_area(
+    radii: tuple[float, float], apart: float
+) -> None:
+    mesh = molecular_surface(molecule([0.3 * ASLANT, (0.3 + apart) * ASLANT], radii), spacing=0.5)
+    closed_form = excluded_of_two(*radii, apart, PROBE) if apart < 6 else np.add(ball(radii[0]), ball(radii[1]))
+    assert (mesh.area, mesh.volume) == pytest.approx(tuple(closed_form), rel=0.01)
+    assert mesh.genus == 0
+
+
+def test_far_balls_are_joined_by_threads_or_the_largest_is_kept() -> None:
+    radii = [1.7, 2.5, 2.0]
+    apart = molecule([0 * ASLANT, 9 * ASLANT, [20, 0, 0]], radii)
+    kept = molecular_surface(apart, spacing=0.5, pieces="largest")
     assert (kept.area, kept.volume) == pytest.approx(ball(2.5), rel=0.01)
-    assert any("the largest of 2 pieces" in note for note in kept.notes)
-    whole = molecular_surface(two, spacing=0.5)
-    assert whole.volume > ball(2.5)[1] + ball(1.7)[1]
-    assert any("joined 2 pieces" in note for note in whole.notes)
+    assert any("the largest of 3 pieces" in note for note in kept.notes)
+    whole = molecular_surface(apart, spacing=0.5, max_vertices=600)
+    assert (whole.area, whole.volume) == pytest.approx(np.sum([ball(r) for r in radii], axis=0).tolist(), rel=0.01)
+    assert whole.genus == 0
+    assert len(whole.vertices) < 620
+    assert any("joined 3 pieces by threads" in note for note in whole.notes)
 
 
 @pytest.mark.parametrize("apart", [2.0, 2.8, 4.0, 5.0])

@@ -18,7 +18,7 @@ LEAST = 0.02
 # Radius of the bars between pieces.
 _BAR = 0.9
 # Pieces of less than this share of the volume are specks.
-_SPECK_VOLUME = 2e-3
+SPECK_VOLUME = 2e-3
 
 
 def level_set(
@@ -90,7 +90,7 @@ def joined(field: NDArray[np.float32], notes: list[str]) -> NDArray[np.float32]:
         return field
     volume = np.bincount(label.ravel(), minlength=count + 1)
     volume[0] = 0
-    small = volume < _SPECK_VOLUME * volume.sum()
+    small = volume < SPECK_VOLUME * volume.sum()
     dropped = np.nonzero(small)[0][1:]
     if len(dropped) and volume[dropped].sum() < 0.05 * volume.sum():
         gone = np.isin(label, dropped)

@@ -1,0 +1,73 @@
+"""Closed surfaces made one by threads so thin that hardly any area is added."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from igps.mesh.surface import face_areas
+
+Surface = tuple[NDArray[np.float64], NDArray[np.int64]]
+
+# A thread takes no more of a triangle than this share of its sides.
+_MOST = 0.5
+
+
+def joined_by_threads(parts: Sequence[Surface], share: float) -> Surface:
+    """The parts as one closed surface; those that are nearest to each other are joined.
+
+    A thread is a tube of triangular section between two triangles, the largest at the nearest vertices.
+
+    Args:
+        parts: vertices (V, 3) and faces (F, 3) of each, closed and outward, none within another.
+        share: of the whole area that all threads may add.
+    """
+    starts = np.cumsum([0, *(len(points) for points, _ in parts)])
+    vertices = np.concatenate([points for points, _ in parts])
+    faces = np.concatenate([triangles + start for (_, triangles), start in zip(parts, starts, strict=False)])
+    links = [(starts[i] + a, starts[j] + b) for i, j, a, b in _nearest([points for points, _ in parts])]
+    length = sum(float(np.linalg.norm(vertices[a] - vertices[b])) for a, b in links)
+    girth = share * float(face_areas(vertices, faces).sum()) / max(length, 1e-300)
+    for a, b in links:
+        vertices, faces = _with_thread(vertices, faces, int(a), int(b), girth)
+    return vertices, faces
+
+
+def _nearest(parts: Sequence[NDArray[np.float64]]) -> list[tuple[int, int, int, int]]:
+    """Two parts and a vertex of each, for every link of the shortest tree that joins them all."""
+    trees, links = [cKDTree(points) for points in parts], []
+    best = dict.fromkeys(range(1, len(parts)), (np.inf, 0, 0, 0))
+    new = 0
+    while best:
+        for j in best:
+            away, at = trees[new].query(parts[j])
+            if away.min() < best[j][0]:
+                best[j] = (float(away.min()), new, int(at[away.argmin()]), int(away.argmin()))
+        new = min(best, key=lambda j: best[j][0])
+        _, old, a, b = best.pop(new)
+        links.append((old, new, a, b))
+    return links
+
+
+def _with_thread(vertices: NDArray[np.float64], faces: NDArray[np.int64], a: int, b: int, girth: float) -> Surface:
+    """With a tube of this girth between the largest triangles at two vertices."""
+    areas = face_areas(vertices, faces)
+    ends = [int(at[areas[at].argmax()]) for at in (np.flatnonzero((faces == v).any(axis=1)) for v in (a, b))]
+    rims, new = [], []
+    for number, face in enumerate(ends):
+        corners = vertices[faces[face]]
+        centre, around = corners.mean(axis=0), np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
+        vertices = np.concatenate([vertices, centre + min(girth / around, _MOST) * (corners - centre)])
+        rims.append(len(vertices) - 3 + np.arange(3))
+        for i, k in ((0, 1), (1, 2), (2, 0)):
+            c, d, e, f = faces[face][i], faces[face][k], rims[number][k], rims[number][i]
+            new += [(c, d, e), (c, e, f)]
+    # The rims run in opposite directions, as they face each other.
+    turned = [np.roll(rims[1][::-1], k) for k in range(3)]
+    other = min(turned, key=lambda rim: float(np.linalg.norm(vertices[rims[0]] - vertices[rim], axis=1).sum()))
+    for i, k in ((0, 1), (1, 2), (2, 0)):
+        new += [(rims[0][i], rims[0][k], other[k]), (rims[0][i], other[k], other[i])]
+    return vertices, np.concatenate([np.delete(faces, ends, axis=0), np.array(new, dtype=np.int64)])
