@@ -12,9 +12,11 @@ import pytest
 from matplotlib.image import imread
 
 from igps.analysis.groups import group_test, vectors_of
+from igps.analysis.map import body_map
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.nn.description import describe
+from igps.retrieval import chi_square
 from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, small_interior, write_egg
 
@@ -118,3 +120,52 @@ def test_explain_writes_shares_that_add_up(
         assert sum(shares) == pytest.approx(float(part["share"]), rel=1e-6)
         assert f"short0.off and {root}/long3.off: {float(part['share']):.4g}" in printed
     assert imread(tmp_path / "explain.png").std() > 0.02
+
+
+@pytest.mark.parametrize("words", [["clusters"], ["figure", "clusters"]])
+def test_clusters_are_the_two_kinds_of_eggs(
+    words: list[str], root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    out = [] if words[0] == "figure" else ["--out", "figures"]
+    igps(monkeypatch, root, *words, root, *OWN, "--n_clusters", "2", *out)
+    printed = capsys.readouterr().out
+    rows = table(tmp_path / "figures" / "clusters.csv")
+    clusters = {row["body"]: row["cluster"] for row in rows}
+    assert [clusters[f"short{i}.off"] for i in range(6)] == [clusters["long6.off"]] * 6 == ["1"] * 6
+    assert [clusters[f"long{i}.off"] for i in range(6)] == ["2"] * 6
+    assert "(6 short, 1 long)" in printed
+    assert "2 of 2 clusters are stable" in printed
+    assert imread(tmp_path / "figures" / "clusters.png").std() > 0.02
+    assert "long6.off" in (tmp_path / "figures" / "clusters.json").read_text()
+
+
+@pytest.mark.parametrize("colour", ["class", "cluster", "volume", "age", "scanner"])
+def test_the_map_has_the_distances_of_the_descriptor_and_its_colours(
+    colour: str, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    igps(monkeypatch, root, "figure", "map", root, *OWN, "--colour", colour, "--out", tmp_path)
+    rows = table(tmp_path / "map.csv")
+    dataset = SignatureDataset(root, CONFIG, root.parent / "cache")
+    found = body_map(chi_square(*2 * [describe(dataset, small_interior())]).numpy())
+    assert np.array([[row["x"], row["y"]] for row in rows], dtype=float) == pytest.approx(found.points, abs=1e-5)
+    assert f"stress {found.stress:.2f}" in capsys.readouterr().out
+    first = {
+        "class": "short",
+        "cluster": "1",
+        "volume": str(dataset[0].signature.volume),
+        "age": "50.0",
+        "scanner": "x",
+    }
+    assert rows[0]["body"] == "short0.off"
+    assert rows[0][colour] == first[colour]
+    assert imread(tmp_path / "map.png").std() > 0.02
+    assert (tmp_path / "map.svg").read_text().startswith("<?xml")
+
+
+def test_a_colour_that_is_no_column_is_refused(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="1"):
+        igps(monkeypatch, root, "figure", "map", root, *OWN, "--colour", "weight")
+    assert "weight: no such column of labels.csv; further columns: scanner, age" in capsys.readouterr().err

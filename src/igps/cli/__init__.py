@@ -9,6 +9,7 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from docstring_parser import parse
@@ -17,6 +18,7 @@ from jsonargparse import ArgumentParser, Namespace
 from igps._parallel import MachineError, is_machines, machines_words
 from igps._threads import one_thread
 from igps.cli.cache import cache_export
+from igps.cli.clusters import clusters, map_bodies
 from igps.cli.compare import compare
 from igps.cli.completion import completion
 from igps.cli.demo import demo
@@ -53,12 +55,14 @@ COMMANDS: Commands = {
     "groups": groups,
     "explain": explain,
     "outliers": outliers,
+    "clusters": clusters,
+    "figure": {"map": map_bodies, "clusters": clusters, "groups": groups, "explain": explain, "outliers": outliers},
     "report": report,
     "completion": completion,
 }
 """What follows `igps`: a function, or the commands of a group by name.
 
-A command that prints a table returns what it tells, for `--json`.
+A command that prints a table returns what it tells, for `--json`. Those of `figure` write to `figures` if not told.
 """
 
 
@@ -72,8 +76,11 @@ def main(commands: Commands | None = None, program: str = "igps") -> None:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     commands = COMMANDS if commands is None else commands
     parser = command_parser(commands, program)
-    command, options = _chosen(parser.instantiate(parser.parse_args()), commands)
+    parsed = parser.instantiate(parser.parse_args())
+    command, options = _chosen(parsed, commands)
     as_json = options.pop(JSON, False)
+    if parsed.subcommand == "figure" and options.get("out", ...) is None:
+        options["out"] = Path("figures")
     if taken_in := "".join(f"+{word}" for word in options.pop("with", None) or ()):
         name = "descriptors" if "descriptors" in options else "descriptor"
         given = options[name] or "pretrained"

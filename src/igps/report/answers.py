@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.analysis.clusters import STABLE, Clusters
 from igps.analysis.groups import GroupTest
+from igps.analysis.map import BodyMap
 from igps.analysis.outliers import Outlier
 from igps.mesh.mesh import Mesh
 from igps.report.drawing import PALETTE, new_figure, paint
@@ -95,5 +97,41 @@ def explanation_figure(painted: Sequence[tuple[Mesh, NDArray[np.float64]]]) -> F
     return figure
 
 
+def map_figure(found: BodyMap, values: Sequence[str] | Sequence[float], title: str) -> Figure:
+    """Bodies as points: of words, each has a colour and a mark; of numbers, a scale of colours."""
+    figure = new_figure(7, 5.5)
+    axes = figure.add_subplot()
+    x, y = found.points.T
+    if isinstance(values[0], str):
+        names = sorted(set(map(str, values)))
+        for number, name in enumerate(names):
+            own = [value == name for value in values]
+            mark, colour = _MARKS[number // len(PALETTE) % len(_MARKS)], PALETTE[number % len(PALETTE)]
+            axes.scatter(x[own], y[own], s=20, label=name, linewidths=0.8, marker=mark, color=colour)
+        if any(names):
+            figure.legend(loc="outside right upper", title=title, fontsize=7, ncols=1 + len(names) // 30)
+    else:
+        figure.colorbar(axes.scatter(x, y, s=20, c=values, cmap="viridis"), label=title)
+    axes.set(aspect="equal", xticks=[], yticks=[], xlabel=f"stress {found.stress:.2f}")
+    return figure
+
+
+def clusters_figure(found: Clusters, names: Sequence[str]) -> Figure:
+    """The tree, with the cluster of each body and its stability in brackets."""
+    from scipy.cluster.hierarchy import dendrogram
+
+    figure = new_figure(7, max(2.0, 0.6 + 0.13 * len(names)))
+    axes = figure.add_subplot()
+    leaves = dendrogram(found.tree, orientation="left", ax=axes, link_color_func=lambda _: _OTHER)["leaves"]
+    clusters = found.numbers[leaves]
+    told = [f"{names[i]}  {one + 1} ({found.stability[one]:.2f})" for i, one in zip(leaves, clusters, strict=True)]
+    axes.set_yticks(5 + 10 * np.arange(len(leaves)), told, fontsize=5)
+    for label, one in zip(axes.get_yticklabels(), clusters, strict=True):
+        label.set(color=PALETTE[one % len(PALETTE)], weight="bold" if found.stability[one] >= STABLE else "normal")
+    axes.set_xlabel(f"distance; behind each name its cluster and its stability, bold from {STABLE}", fontsize=7)
+    return figure
+
+
+_MARKS = ("o", "s", "^", "x", "+", "D")
 _WHITE, _RED, _BLUE = (np.array(one) for one in ((0.9, 0.9, 0.9), (0.84, 0.25, 0.0), (0.0, 0.35, 0.7)))
 _INTERVAL = ("effect", "effect_low", "effect_high")

@@ -1,0 +1,98 @@
+"""Bodies in clusters, by their distances alone, and which of these clusters another sample would show again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.analysis.map import Values, checked_distances
+
+Joining = Literal["average", "complete", "single"]
+STABLE = 0.75
+"""A cluster whose stability is less is not to be relied on (Hennig 2007)."""
+_MOST_CLUSTERS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Clusters:
+    """A hierarchical clustering, cut.
+
+    Args:
+        numbers: (N,) the cluster of each body, 0 for the largest.
+        middles: of each cluster, the body with the smallest sum of distances to its others.
+        stability: of each cluster, how much of it comes together again when half of the bodies are clustered alone:
+            mean largest Jaccard index with a cluster of them; NaN where too few were drawn.
+        tree: (N − 1, 4) as of `scipy.cluster.hierarchy.linkage`.
+    """
+
+    numbers: NDArray[np.int64]
+    middles: tuple[int, ...]
+    stability: tuple[float, ...]
+    tree: Values
+
+
+def clusters_of(
+    distances: Values,
+    n_clusters: int | None = None,
+    *,
+    joining: Joining = "average",
+    n_resamples: int = 100,
+    seed: int = 0,
+) -> Clusters:
+    """Cluster bodies.
+
+    Args:
+        distances: (N, N).
+        n_clusters: how many; if None, as many of 2 to 30 as have the largest mean silhouette (Rousseeuw 1987).
+        joining: two clusters are as far apart as their bodies are in mean, at most, or at least.
+        n_resamples: random halves of the bodies, for the stability (Hennig 2007).
+        seed: of these.
+
+    Raises:
+        ValueError: distances that cannot be clustered, or a number of clusters that cannot be had.
+    """
+    from sklearn.metrics import silhouette_score
+
+    if joining not in get_args(Joining):
+        raise ValueError(f"joining: expected one of {', '.join(get_args(Joining))}, got {joining!r}.")
+    found, n = checked_distances(distances), len(distances)
+    tree = _tree(found, joining)
+    if n_clusters is None:
+        cuts = {k: _cut(tree, k) for k in range(2, min(_MOST_CLUSTERS, n - 1) + 1)}
+        scores = {k: silhouette_score(found, cut, metric="precomputed") for k, cut in cuts.items() if cut.max()}
+        n_clusters = max(scores, key=lambda k: scores[k]) if scores else 1
+    if not 1 <= n_clusters <= n:
+        raise ValueError(f"n_clusters: expected 1 to {n}, got {n_clusters}.")
+    numbers = _cut(tree, n_clusters)
+    _, numbers = np.unique(np.argsort(np.argsort(-np.bincount(numbers), kind="stable"))[numbers], return_inverse=True)
+    members = [np.flatnonzero(numbers == one) for one in range(numbers.max() + 1)]
+    middles = tuple(int(own[found[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members)
+    random, shares = np.random.default_rng(seed), np.full((n_resamples, len(members)), np.nan)
+    for row in shares if n > 2 * len(members) else ():
+        drawn = np.sort(random.choice(n, n // 2, replace=False))
+        again = np.eye(n, dtype=np.int64)[_cut(_tree(found[np.ix_(drawn, drawn)], joining), len(members))]
+        first = np.eye(len(members), dtype=np.int64)[numbers[drawn]]
+        both = first.T @ again
+        either = first.sum(axis=0)[:, None] + again.sum(axis=0) - both
+        row[:] = np.where(first.any(axis=0), (both / np.maximum(either, 1)).max(axis=1), np.nan)
+    counted = np.isfinite(shares).sum(axis=0)
+    stability = np.where(counted, np.nansum(shares, axis=0) / np.maximum(counted, 1), np.nan)
+    return Clusters(numbers, middles, tuple(stability.tolist()), tree)
+
+
+def _tree(distances: Values, joining: Joining) -> Values:
+    from scipy.cluster.hierarchy import linkage
+    from scipy.spatial.distance import squareform
+
+    found: Values = linkage(squareform(distances, checks=False), joining)
+    return found
+
+
+def _cut(tree: Values, n_clusters: int) -> NDArray[np.int64]:
+    from scipy.cluster.hierarchy import cut_tree
+
+    found: NDArray[np.int64] = cut_tree(tree, n_clusters).ravel().astype(np.int64)
+    return found

@@ -1,0 +1,119 @@
+"""Bodies as points in the plane, as far from each other as their distances are, as well as that goes."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+Values = NDArray[np.float64]
+Layout = Literal["mds", "umap"]
+
+# Entries of distance matrices that the improvement of a map may go through in all
+_MOST_ENTRIES, _MOST_ROUNDS = 10**9, 300
+
+
+@dataclass(frozen=True, eq=False)
+class BodyMap:
+    """Where bodies lie.
+
+    Args:
+        points: (N, 2), in units of the distances for "mds", in none for "umap".
+        stress: root of the squared errors of all distances over their squares (Kruskal 1964), after the best scaling:
+            0 where the map tells every distance, above 0.2 it distorts much.
+    """
+
+    points: Values
+    stress: float
+
+
+def checked_distances(distances: Values) -> Values:
+    """(N, N) finite, symmetric, zero on the diagonal: the mean of both directions.
+
+    Raises:
+        ValueError: another shape, or entries that are no finite numbers.
+    """
+    found = np.asarray(distances, dtype=float)
+    if found.ndim != 2 or len(found) != found.shape[-1] or len(found) < 3:
+        raise ValueError(f"distances: expected (N, N) between three bodies or more, got {found.shape}.")
+    if not np.isfinite(found).all():
+        raise ValueError("distances: expected finite numbers. Leave out bodies that cannot be compared.")
+    found = np.maximum((found + found.T) / 2, 0)
+    np.fill_diagonal(found, 0)
+    return found
+
+
+def body_map(distances: Values, layout: Layout = "mds", *, seed: int = 0) -> BodyMap:
+    """Lay bodies out in the plane.
+
+    Metric multidimensional scaling: the classical solution (Torgerson 1952), improved by SMACOF (de Leeuw 1977), as far
+    as time allows for thousands of bodies. UMAP (McInnes et al. 2018) keeps neighbours together and lets go of large
+    distances; it needs umap-learn. Axes are principal, with the longer tail on the positive side.
+
+    Args:
+        distances: (N, N).
+        layout: "mds" or "umap".
+        seed: of UMAP.
+
+    Raises:
+        ValueError: distances of which no map can be drawn, or another layout.
+        ImportError: umap-learn is not installed.
+    """
+    if layout not in get_args(Layout):
+        raise ValueError(f"layout: expected one of {', '.join(get_args(Layout))}, got {layout!r}.")
+    wanted = checked_distances(distances)
+    points = _classical(wanted) if layout == "mds" else _umap(wanted, seed)
+    if layout == "mds" and (rounds := min(_MOST_ROUNDS, _MOST_ENTRIES // wanted.size)) and wanted.any():
+        from sklearn.manifold import smacof
+
+        points = smacof(wanted, init=points, n_init=1, max_iter=rounds, eps=1e-6, normalized_stress=False)[0]
+    centred = points - points.mean(axis=0)
+    turned = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
+    turned *= np.where((turned**3).sum(axis=0) < 0, -1, 1)
+    return BodyMap(turned, _stress(wanted, turned))
+
+
+def _classical(distances: Values) -> Values:
+    from scipy.sparse.linalg import LinearOperator, eigsh
+
+    squares, n = distances**2, len(distances)
+    means = squares.mean(axis=0)
+
+    def product(vector: Values) -> Values:
+        vector = vector.ravel()
+        total = vector.sum()
+        rows: Values = squares @ vector - means * total - (means @ vector - means.mean() * total)
+        return -rows / 2
+
+    if n < 8:
+        values, axes = np.linalg.eigh(np.stack([product(one) for one in np.eye(n)]))
+        values, axes = values[-2:], axes[:, -2:]
+    else:
+        values, axes = eigsh(LinearOperator((n, n), product, dtype=float), 2, which="LA", v0=np.sin(np.arange(n) + 1.0))
+    found: Values = axes * np.sqrt(np.maximum(values, 0))
+    return found
+
+
+def _umap(distances: Values, seed: int) -> Values:
+    try:
+        from umap import UMAP
+    except ImportError as error:
+        raise ImportError("layout: umap needs umap-learn. Install it, or take mds.") from error
+    with warnings.catch_warnings():  # of what precomputed distances cannot do afterwards
+        warnings.simplefilter("ignore", UserWarning)
+        chosen = UMAP(n_neighbors=min(15, len(distances) - 1), metric="precomputed", random_state=seed, n_jobs=1)
+        found: Values = chosen.fit_transform(distances).astype(float)
+    return found
+
+
+def _stress(wanted: Values, points: Values) -> float:
+    from scipy.spatial.distance import pdist, squareform
+
+    one, other = squareform(wanted, checks=False), pdist(points)
+    if not one.any():
+        return 0.0
+    other = other * ((one @ other) / max(float(other @ other), 1e-300))
+    return float(np.sqrt(np.square(one - other).sum() / np.square(one).sum()))

@@ -1,0 +1,126 @@
+"""`igps clusters`, and the map of `igps figure map`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from igps.analysis.clusters import STABLE, Joining, clusters_of
+from igps.analysis.comparison import pair_distances
+from igps.analysis.map import Layout, body_map
+from igps.cli.reading import Folder
+from igps.cli.retrieval import described
+from igps.data.dataset import SignatureDataset
+from igps.descriptors import descriptor as descriptor_of
+from igps.report.answers import clusters_figure, map_figure, write_answer
+
+
+def clusters(
+    root: Path,
+    descriptor: str = "pretrained",
+    n_clusters: int | None = None,
+    joining: Joining = "average",
+    n_resamples: int = 100,
+    seed: int = 0,
+    out: Path | None = None,
+    **reading: Any,
+) -> list[dict[str, Any]]:
+    """Find clusters of bodies that are alike, without classes, and tell which of them another sample would show again.
+
+    Hierarchical clustering of the descriptor's distances. Of each cluster: its bodies, the one in its middle, its
+    classes where they are known, and its stability, from 0 to 1: how much of it comes together again when half of the
+    bodies are clustered alone. Below 0.75 it is not to be relied on.
+
+    Args:
+        root: folder of bodies, with or without classes.
+        descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
+        n_clusters: how many; as many as have the largest mean silhouette if not given.
+        joining: two clusters are as far apart as their bodies are in mean (average), at most (complete), or at least
+            (single).
+        n_resamples: random halves of the bodies, for the stability.
+        seed: of these.
+        out: folder for clusters.csv and clusters.json, and the tree as clusters.svg and clusters.png.
+    """
+    dataset, distances, label_of = _compared(root, descriptor, **reading)
+    found = clusters_of(distances, n_clusters, joining=joining, n_resamples=n_resamples, seed=seed)
+    names, told = dataset.bodies.names, list[dict[str, Any]]()
+    print(f"{'cluster':>7}{'bodies':>8}{'stability':>11}  in the middle")
+    for number, (middle, stability) in enumerate(zip(found.middles, found.stability, strict=True)):
+        members = np.flatnonzero(found.numbers == number)
+        classes = Counter(label_of[i] for i in members if label_of[i])
+        told.append(
+            {"cluster": number + 1, "n_bodies": len(members), "stability": stability, "middle": names[middle],
+             "classes": dict(classes.most_common()), "bodies": [names[i] for i in members]}
+        )  # fmt: skip
+        shown = ", ".join(f"{count} {name}" for name, count in classes.most_common(3)) + ", …" * (len(classes) > 3)
+        print(f"{number + 1:>7}{len(members):>8}{stability:>11.2f}  {names[middle]}" + f" ({shown})" * bool(shown))
+    n_stable = sum(one >= STABLE for one in found.stability)
+    print(f"{n_stable} of {len(told)} clusters are stable (at least {STABLE})")
+    if out is not None:
+        rows = [
+            {"body": name, "class": label_of[i], "cluster": int(found.numbers[i]) + 1,
+             "stability": found.stability[found.numbers[i]]}
+            for i, name in enumerate(names)
+        ]  # fmt: skip
+        write_answer(out, "clusters", rows, clusters_figure(found, names))
+        print(f"written to {out}")
+    return told
+
+
+def map_bodies(
+    root: Path,
+    descriptor: str = "pretrained",
+    colour: str = "class",
+    layout: Layout = "mds",
+    seed: int = 0,
+    out: Path | None = None,
+    **reading: Any,
+) -> list[dict[str, Any]]:
+    """Draw bodies as points in the plane, near to each other where their distances are small.
+
+    Args:
+        root: folder of bodies, with or without classes.
+        descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
+        colour: class, cluster, volume, or a column of labels.csv.
+        layout: mds keeps all distances as well as that goes, umap keeps neighbours (needs umap-learn).
+        seed: of umap, and of clusters.
+        out: folder for map.csv, map.json, map.svg and map.png.
+    """
+    dataset, distances, label_of = _compared(root, descriptor, **reading)
+    found = body_map(distances, layout, seed=seed)
+    values: list[str] | list[float]
+    if colour == "class":
+        values = label_of
+    elif colour == "cluster":
+        values = [str(one + 1) for one in clusters_of(distances, n_resamples=0, seed=seed).numbers]
+    elif colour == "volume":
+        values = [dataset[i].signature.volume for i in range(len(dataset))]
+    else:
+        try:
+            values = dataset.bodies.numbers(colour)
+        except ValueError:  # words
+            values = list(dataset.bodies.column(colour))
+    rows = [
+        {"body": name, "x": x, "y": y, "class": label, colour: value}
+        for name, (x, y), label, value in zip(
+            dataset.bodies.names, found.points.tolist(), label_of, values, strict=True
+        )
+    ]
+    print(f"{len(rows)} bodies; stress {found.stress:.2f}: 0 tells every distance, above 0.2 the map distorts much")
+    if out is not None:
+        write_answer(out, "map", rows, map_figure(found, values, colour))
+        print(f"written to {out}")
+    return rows
+
+
+def _compared(root: Path, descriptor: str, **reading: Any) -> tuple[SignatureDataset, NDArray[np.float64], list[str]]:
+    """The bodies, their distances, and the class of each, "" where that is not known."""
+    dataset, descriptions, failures, name = described(Folder(root), descriptor, **reading)
+    if failures:
+        print(f"{len(failures)} bodies could not be used, the first: {failures[0].error}")
+    distances = pair_distances(descriptor_of(name), descriptions, progress=True).double().numpy()
+    return dataset, distances, list(dataset.bodies.labels or [""] * len(dataset))

@@ -1,0 +1,131 @@
+"""Maps keep what distances a plane can keep; clusters are those that were put in, and chance ones are told unstable."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from igps.analysis.clusters import STABLE, clusters_of
+from igps.analysis.map import body_map
+
+
+def blobs(n_each: int, centres: list[list[float]], scatter: float, seed: int = 0) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    return np.concatenate([random.normal(centre, scatter, (n_each, len(centre))) for centre in centres])
+
+
+@pytest.mark.parametrize("n", [5, 60])
+def test_points_of_a_plane_keep_all_their_distances(n: int) -> None:
+    points = np.random.default_rng(0).normal(size=(n, 2)) * [3, 1]
+    distances = cdist(points, points)
+    found = body_map(distances)
+    np.testing.assert_allclose(cdist(found.points, found.points), distances, atol=1e-6)
+    assert found.stress < 1e-6
+    assert found.points[:, 0].var() > found.points[:, 1].var()
+    order = np.random.default_rng(1).permutation(n)
+    np.testing.assert_allclose(body_map(distances[np.ix_(order, order)]).points, found.points[order], atol=1e-5)
+
+
+def test_the_improved_map_has_less_stress_than_the_classical_one() -> None:
+    points = np.random.default_rng(0).normal(size=(40, 6))
+    distances = cdist(points, points)
+    centring = np.eye(40) - 1 / 40
+    values, axes = np.linalg.eigh(-centring @ distances**2 @ centring / 2)
+    classical = axes[:, -2:] * np.sqrt(values[-2:])
+
+    def stress(plane: np.ndarray) -> float:
+        other = cdist(plane, plane)
+        other *= (distances * other).sum() / (other**2).sum()
+        return float(np.sqrt(((distances - other) ** 2).sum() / (distances**2).sum()))
+
+    found = body_map(distances)
+    assert found.stress == pytest.approx(stress(found.points))
+    assert found.stress < stress(classical) - 0.01
+
+
+def test_alike_bodies_lie_in_one_point() -> None:
+    found = body_map(np.zeros((4, 4)))
+    assert not found.points.any()
+    assert found.stress == 0
+
+
+def test_umap_puts_clusters_apart() -> None:
+    pytest.importorskip("umap", reason="umap-learn is not installed")
+    points = blobs(15, [[0, 0, 0], [9, 0, 0]], 0.5)
+    found = body_map(cdist(points, points), "umap").points
+    assert cdist(found[:15], found[:15]).max() < cdist(found[:15], found[15:]).min()
+
+
+def test_without_umap_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "umap", None)
+    with pytest.raises(ImportError, match="umap-learn"):
+        body_map(np.ones((4, 4)), "umap")
+
+
+@pytest.mark.parametrize(
+    ("distances", "match"),
+    [(np.ones((2, 2)), "three bodies"), (np.ones((4, 3)), "got .4, 3"), (np.full((4, 4), np.nan), "finite")],
+)
+def test_what_are_no_distances_is_refused(distances: np.ndarray, match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        body_map(distances)
+    with pytest.raises(ValueError, match=match):
+        clusters_of(distances)
+
+
+def test_words_and_numbers_that_are_none_are_refused() -> None:
+    with pytest.raises(ValueError, match="mds, umap"):
+        body_map(np.ones((4, 4)), "tsne")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="average"):
+        clusters_of(np.ones((4, 4)), joining="ward")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="1 to 4, got 9"):
+        clusters_of(np.ones((4, 4)), 9)
+
+
+@pytest.mark.parametrize("joining", ["average", "complete", "single"])
+def test_clusters_that_were_put_in_are_found_and_stable(joining: str) -> None:
+    points = np.concatenate([blobs(20, [[0, 0, 0]], 0.4), blobs(12, [[9, 0, 0], [0, 9, 0]], 0.4, seed=1)])
+    found = clusters_of(cdist(points, points), joining=joining)  # type: ignore[arg-type]
+    assert found.numbers[:20].tolist() == [0] * 20
+    assert sorted(found.numbers[20:].tolist()) == [1] * 12 + [2] * 12
+    assert np.ptp(found.numbers[20:32]) == np.ptp(found.numbers[32:]) == 0
+    assert min(found.stability) > 0.99
+    for number, middle in enumerate(found.middles):
+        own = points[found.numbers == number]
+        assert np.allclose(points[middle], own[cdist(own, own).sum(axis=1).argmin()])
+
+
+def test_clusters_of_one_cloud_are_told_unstable() -> None:
+    random, found = np.random.default_rng(3), []
+    for _ in range(5):
+        points = random.normal(size=(80, 5))
+        found += clusters_of(cdist(points, points), 6, joining="complete").stability
+    assert len(found) == 30
+    assert np.mean(np.array(found) >= STABLE) < 0.05
+
+
+def test_stability_is_the_mean_largest_jaccard_index_of_halves() -> None:
+    """Against a loop over sets, on the same halves."""
+    from scipy.cluster.hierarchy import fcluster, linkage
+    from scipy.spatial.distance import pdist
+
+    points = np.random.default_rng(4).normal(size=(30, 2)) * [4, 1]
+    found = clusters_of(cdist(points, points), 3, n_resamples=20, seed=5)
+    first = [set(np.flatnonzero(found.numbers == one).tolist()) for one in range(3)]
+    random, shares = np.random.default_rng(5), [[], [], []]  # type: ignore[var-annotated]
+    for _ in range(20):
+        drawn = np.sort(random.choice(30, 15, replace=False))
+        cut = fcluster(linkage(pdist(points[drawn]), "average"), 3, "maxclust")
+        again = [set(drawn[cut == one].tolist()) for one in set(cut)]
+        for own, of in zip(first, shares, strict=True):
+            if left := own & set(drawn.tolist()):
+                of.append(max(len(left & one) / len(left | one) for one in again))
+    assert found.stability == pytest.approx([np.mean(of) for of in shares])
+
+
+def test_too_few_bodies_have_no_stability() -> None:
+    points = np.random.default_rng(6).normal(size=(4, 2))
+    assert np.isnan(clusters_of(cdist(points, points), 3).stability).all()
