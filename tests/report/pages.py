@@ -75,6 +75,28 @@ def retrieval_folder(folder: Path, labels: tuple[str, ...] = LABELS, seed: int =
     return folder
 
 
+def answers_folder(folder: Path) -> Path:
+    """What `igps retrieve`, `groups` and `outliers` write, with columns of labels.csv."""
+    retrieval_folder(folder)
+    bodies = [{"file": name} for name in NAMES]
+    columns = {"age": [str(50 + i) for i in range(len(NAMES) - 1)] + [None], EVIL: ["x", "y"] * 3 + ["x"]}
+    columns["dose"] = [str(i + 0.5) for i in range(len(NAMES))]
+    (folder / "meshes.json").write_text(json.dumps({"meshes": bodies, "columns": columns}))
+    tested = {"permanova_p": 0.001, "permanova_q": 0.002, "kernel_p": 0.01, "kernel_q": 0.02, "effect": 0.25}
+    tested |= {"effect_low": 0.125, "effect_high": 0.375, "auc": 0.875, "refused": None}
+    groups = [
+        {"body": EVIL, "sizes": "a:8 b:9", **tested},
+        {"body": "liver", "sizes": "a:3 b:9", **dict.fromkeys(tested), "refused": "a has 3."},
+    ]
+    (folder / "groups.json").write_text(json.dumps(groups))
+    outliers = [
+        {"body": NAMES[5], "class": EVIL, "score": 7.25, "reason": "its shape is <b>unlike</b> its class"},
+        {"body": "gone.off", "class": "egg", "score": 1.0, "reason": "nothing unusual"},
+    ]
+    (folder / "outliers.json").write_text(json.dumps(outliers))
+    return folder
+
+
 def comparison_folder(folder: Path) -> Path:
     """What `igps compare` writes; the second descriptor does not describe the last mesh."""
     (folder / "distances").mkdir(parents=True)

@@ -21,6 +21,7 @@ from pages import (
     LABELS,
     NAMES,
     NOTE,
+    answers_folder,
     comparison_folder,
     distances_of,
     retrieval_folder,
@@ -30,8 +31,11 @@ from pages import (
 )
 
 from conftest import as_mesh
+from igps.analysis.clusters import clusters_of
+from igps.analysis.map import body_map
 from igps.cli import main
 from igps.mesh.mesh import Mesh
+from igps.report.explanations import Painted
 from igps.report.page import write_page
 from igps.report.results import read_results
 from igps.shapes import ArticulatedShapes
@@ -67,10 +71,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "compare": comparison_folder(root / "compare"),
         "robustness": robustness_folder(root / "robustness"),
         "unlabelled": retrieval_folder(root / "unlabelled", labels=()),
+        "answers": answers_folder(root / "answers"),
     }
     for name, results in made.items():
-        write_page(root / f"{name}.html", read_results(results), pictures)
+        write_page(root / f"{name}.html", read_results(results), pictures, EXPLAINED if name == "answers" else None)
     return root
+
+
+# The first body has all of the difference, its nearest all of the contrary.
+EXPLAINED = {
+    NAMES[0]: Painted(NAMES[1], "60% <i>thickness</i>", (np.full(300, 255, np.uint8), np.zeros(300, np.uint8)))
+}
 
 
 class Visit:
@@ -125,7 +136,7 @@ def retrieval(browser: Any, folder: Path) -> Iterator[Visit]:
         yield visit
 
 
-@pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness", "unlabelled"])
+@pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness", "unlabelled", "answers"])
 def test_every_kind_opens_without_complaint_or_request(browser: Any, folder: Path, kind: str) -> None:
     with Visit(browser, folder / f"{kind}.html") as visit:
         assert len(visit.shown()) == (3 if kind == "robustness" else len(NAMES))
@@ -151,6 +162,167 @@ def test_bodies_of_one_file_are_shown_together_with_part_unit_and_volume(browser
         visit.wait_until(lambda: visit.name() == names[0])
         dialog.locator("#close").click()
         assert visit.open(2).locator("#together").is_hidden()
+
+
+@pytest.fixture
+def answers(browser: Any, folder: Path) -> Iterator[Visit]:
+    with Visit(browser, folder / "answers.html") as visit:
+        yield visit
+
+
+def places_on_the_map(visit: Visit) -> np.ndarray:
+    """(N, 2) centres of the points on the screen."""
+    visit.page.locator("#map-plot").scroll_into_view_if_needed()
+    boxes = [visit.page.locator(f'[data-point="{i}"]').bounding_box() for i in range(len(NAMES))]
+    return np.array([[box["x"] + box["width"] / 2, box["y"] + box["height"] / 2] for box in boxes])
+
+
+def selected(visit: Visit) -> set[int]:
+    return {int(one.get_attribute("data-point")) for one in visit.page.locator('[aria-selected="true"]').all()}
+
+
+def test_the_map_has_the_places_of_the_distances_and_tells_the_one_under_the_mouse(answers: Visit) -> None:
+    places = places_on_the_map(answers)
+    points = body_map(distances_of(0)).points
+    scale = np.ptp(places[:, 0]) / np.ptp(points[:, 0])
+    assert np.diff(places[:, 0]) == pytest.approx(scale * np.diff(points[:, 0]), abs=1)
+    assert np.diff(places[:, 1]) == pytest.approx(-scale * np.diff(points[:, 1]), abs=1)
+    answers.page.mouse.move(*places[1])
+    tip = answers.page.locator("#map-tip")
+    tip.wait_for()
+    assert NAMES[1] in tip.inner_text()
+    answers.wait_until(lambda: tip.locator("canvas.drawn").count() == 1)
+    answers.page.mouse.move(5, 5)
+    tip.wait_for(state="hidden")
+    answers.page.mouse.click(*places[1])
+    answers.wait_until(lambda: answers.page.locator("dialog[open]").count() == 1)
+    assert answers.name() == NAMES[1]
+
+
+def test_a_brush_selects_what_lies_in_it(answers: Visit) -> None:
+    places = places_on_the_map(answers)
+    order = places[:, 0].argsort()
+    middle = (places[order[2], 0] + places[order[3], 0]) / 2
+    mouse, low, high = answers.page.mouse, places.min(axis=0) - 6, places.max(axis=0) + 6
+    mouse.move(*low)
+    mouse.down()
+    mouse.move(middle, high[1], steps=4)
+    mouse.up()
+    assert selected(answers) == set(order[:3].tolist())
+    assert answers.page.locator("#map-chosen").inner_text() == "3 selected"
+    shown = answers.page.locator("#map-selected .name").all_inner_texts()
+    assert sorted(shown) == sorted(NAMES[i] for i in order[:3])
+    answers.page.keyboard.down("Shift")
+    mouse.move(places[order[-1], 0] - 3, low[1])
+    mouse.down()
+    mouse.move(*high, steps=4)
+    mouse.up()
+    answers.page.keyboard.up("Shift")
+    assert selected(answers) >= {*order[:3].tolist(), int(order[-1])}
+    mouse.click(*low)
+    assert selected(answers) == set()
+
+
+def test_the_map_is_walked_through_by_the_keyboard(answers: Visit) -> None:
+    page, places = answers.page, places_on_the_map(answers)
+    assert page.locator('[data-point][tabindex="0"]').count() == 1
+    page.locator('[data-point="0"]').focus()
+    assert NAMES[0] in page.locator("#map-tip").inner_text()
+
+    def here() -> int:
+        return int(page.evaluate("document.activeElement.dataset.point"))
+
+    walked = {here()}
+    for key, axis, sign in 2 * (("ArrowRight", 0, 1), ("ArrowDown", 1, 1), ("ArrowLeft", 0, -1), ("ArrowUp", 1, -1)):
+        while True:
+            before = here()
+            page.keyboard.press(key)
+            if here() == before:
+                break
+            assert sign * (places[here(), axis] - places[before, axis]) > 0
+            walked.add(here())
+    assert len(walked) > 2
+    last = here()
+    page.keyboard.press("Space")
+    assert selected(answers) == {last}
+    page.keyboard.press("Escape")
+    assert selected(answers) == set()
+    page.keyboard.press("Enter")
+    answers.wait_until(lambda: page.locator("dialog[open]").count() == 1)
+    assert answers.name() == NAMES[last]
+    page.keyboard.press("Escape")
+    answers.wait_until(lambda: page.locator("dialog[open]").count() == 0)
+    assert here() == last
+
+
+@pytest.mark.parametrize(
+    ("colour", "legend"),
+    [
+        ("class", [f"{EVIL} 3", "alone 1", "egg 3"]),
+        ("column age", ["50 1", "51 1", "52 1", "53 1", "54 1", "55 1", "not known 1"]),
+        (f"column {EVIL}", ["x 4", "y 3"]),
+        ("cluster", None),
+    ],
+)
+def test_the_map_is_coloured(answers: Visit, colour: str, legend: list[str] | None) -> None:
+    answers.page.locator("#map-colour").select_option(colour)
+    entries = [" ".join(one.split()) for one in answers.page.locator("#map-legend li").all_inner_texts()]
+    if legend is None:
+        found = clusters_of(distances_of(0), n_resamples=50)
+        legend = [
+            f"cluster {i + 1}" + f", stability {one:.2f}" * bool(np.isfinite(one)) + f" {(found.numbers == i).sum()}"
+            for i, one in enumerate(found.stability)
+        ]
+    assert entries == legend
+    assert answers.page.evaluate("window.ran") is None
+    marks = {
+        (mark.get_attribute("class"), mark.get_attribute("d")) for mark in answers.page.locator("[data-point]").all()
+    }
+    assert len(marks) == len(legend)
+
+
+def test_numbers_have_a_scale_of_colours(answers: Visit) -> None:
+    answers.page.locator("#map-colour").select_option("column dose")
+    assert answers.page.locator("#map-legend li").inner_text().split() == ["0.5", "6.5"]
+    colours = [
+        answers.page.locator(f'[data-point="{i}"]').evaluate("mark => getComputedStyle(mark).fill")
+        for i in range(len(NAMES))
+    ]
+    assert colours[0] == "rgb(72, 40, 120)"
+    assert colours[-1] == "rgb(253, 231, 37)"
+    assert len(set(colours)) == len(NAMES)
+
+
+def test_groups_and_outliers_of_the_same_folder_are_told(answers: Visit) -> None:
+    groups = [row.inner_text().split("\t") for row in answers.page.locator("#groups tbody tr").all()]
+    assert groups[0] == [EVIL, "0.0010", "0.0020", "0.0100", "0.0200", "0.250", "0.125 to 0.375", "0.88", "a:8 b:9"]
+    assert groups[1] == ["liver", "not tested: a has 3.", "a:3 b:9"]
+    outliers = answers.page.locator("#outliers tbody tr")
+    assert outliers.all_inner_texts()[1].split("\t") == ["gone.off", "1.0", "egg", "nothing unusual"]
+    assert outliers.locator("a").count() == 1
+    outliers.locator("a").click()
+    answers.wait_until(lambda: answers.page.locator("dialog[open]").count() == 1)
+    assert answers.name() == NAMES[5]
+
+
+def test_the_difference_from_the_nearest_is_painted(answers: Visit) -> None:
+    dialog = answers.open(0)
+    assert dialog.locator("#explained-told").inner_text().startswith("60% <i>thickness</i>. Red")
+    assert NAMES[1] in dialog.locator("#explained-heading").inner_text()
+    assert dialog.locator("#explained-list canvas").count() == 4
+    means = answers.page.evaluate(
+        "() => [...document.querySelectorAll('#explained-list canvas')].map((c) => {"
+        "const p = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; const sum = [0, 0, 0, 0];"
+        "p.forEach((value, i) => { sum[i % 4] += value; }); return sum; })"
+    )
+    for red, _, blue, alpha in means[:2]:
+        assert red > 2 * blue
+        assert alpha > 0
+    for red, _, blue, _ in means[2:]:
+        assert blue > 2 * red
+    dialog.locator("#next").click()
+    answers.wait_until(lambda: answers.name() != NAMES[0])
+    assert dialog.locator("#explained").is_hidden()
 
 
 def test_names_run_nothing(retrieval: Visit) -> None:
@@ -492,7 +664,7 @@ def violations() -> Callable[[Any], list[dict[str, Any]]]:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness", "unlabelled"])
+@pytest.mark.parametrize("kind", ["retrieve", "compare", "robustness", "unlabelled", "answers"])
 def test_nothing_serious_for_accessibility(
     browser: Any, folder: Path, violations: Callable[[Any], list[dict[str, Any]]], scheme: str, kind: str
 ) -> None:

@@ -4,28 +4,33 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from igps.descriptors import descriptor as descriptor_of
+from igps.report.explanations import keep_explanations, read_explanations
 from igps.report.page import write_page
 from igps.report.results import read_results
 from igps.report.sources import read_sources
 from igps.report.surfaces import keep_surfaces, read_surfaces
 
-PAGE, SURFACES = "report.html", "surfaces.npz"
+PAGE, SURFACES, EXPLANATIONS = "report.html", "surfaces.npz", "explanations.npz"
 
 
 def report(
     results: Path,
     out: Path | None = None,
     meshes: Path | None = None,
+    explain: bool = False,
     n_workers: int | None = None,
 ) -> None:
     """Make a page of results, to look at in a browser: one HTML file that needs nothing else.
 
+    It has rankings, scores, a map of the bodies, and what `igps groups` and `igps outliers` wrote to the same folder.
     Small pictures of the meshes are kept in the folder, in surfaces.npz. Meshes that are gone by then have no picture.
 
     Args:
         results: folder that `igps retrieve`, `igps compare` or `python -m training.study robustness` wrote (--out).
         out: the page; report.html in the folder of results if not given.
         meshes: the folder of the meshes, if they were moved since.
+        explain: paint where each body differs from its nearest, kept in explanations.npz; takes seconds for each
         n_workers: processes that make the pictures; all cores if not given.
     """
     dataset = read_sources(results, meshes)
@@ -35,7 +40,17 @@ def report(
     else:
         surfaces = keep_surfaces(results / SURFACES, dataset, n_workers=n_workers)
     page = out or results / PAGE
-    write_page(page, found, surfaces)
+    if explain:
+        if dataset is None or len(found.systems) != 1:
+            raise ValueError("explain: expected results of `igps retrieve`, which tell a descriptor and its meshes.")
+        own = results / "descriptor.safetensors"
+        module = descriptor_of(str(own) if own.is_file() else found.systems[0].name)
+        explanations = keep_explanations(
+            results / EXPLANATIONS, found.systems[0], dataset, module, surfaces, n_workers=n_workers
+        )
+    else:
+        explanations = read_explanations(results / EXPLANATIONS, surfaces)
+    write_page(page, found, surfaces, explanations)
     print(f"page of results: {page}")
 
 

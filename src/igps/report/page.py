@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from igps.report.confusions import N_WORST
+from igps.report.explanations import Painted
 from igps.report.page_data import data_of, letters
 from igps.report.results import Results
 from igps.report.surfaces import Surface
@@ -20,7 +21,9 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 _TEMPLATE = files("igps.report") / "template"
-_SCRIPTS = ("three.min.js", "bodies.js", "tables.js", "page.js")
+_SCRIPTS = ("three.min.js", "bodies.js", "tables.js", "map.js", "page.js")
+N_OUTLIERS = 50
+"""How many of the most unlike bodies the page lists."""
 # Inside the axes of the plot of precision and recall, in units of its drawing.
 _PLOT_WIDTH, _PLOT_HEIGHT = 600, 340
 
@@ -37,24 +40,32 @@ MEANINGS = dict(  # noqa: C408
 """What the scores are, by name."""
 
 
-def write_page(path: Path, results: Results, surfaces: Mapping[str, Surface]) -> None:
+def write_page(
+    path: Path,
+    results: Results,
+    surfaces: Mapping[str, Surface],
+    explanations: Mapping[str, Painted] | None = None,
+) -> None:
     """Write the page of results.
 
     Args:
         path: an HTML file.
         results: of a folder, see `read_results`.
         surfaces: pictures by the name of the mesh; those without have none.
+        explanations: by name, of those whose difference from their nearest is painted.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page_of(results, surfaces), encoding="utf-8")
+    path.write_text(page_of(results, surfaces, explanations), encoding="utf-8")
 
 
-def page_of(results: Results, surfaces: Mapping[str, Surface]) -> str:
+def page_of(
+    results: Results, surfaces: Mapping[str, Surface], explanations: Mapping[str, Painted] | None = None
+) -> str:
     """The page of results as text, for the arguments see `write_page`."""
     from markupsafe import Markup
 
     environment = _templates()
-    data = data_of(results, surfaces)
+    data = data_of(results, surfaces, explanations)
     # A policy that names the page's own scripts and style by content: no other can run, wherever it came from.
     scripts = [(_TEMPLATE / name).read_text(encoding="utf-8").strip() + "\n" for name in _SCRIPTS]
     style = (_TEMPLATE / "page.css").read_text(encoding="utf-8")
@@ -65,7 +76,7 @@ def page_of(results: Results, surfaces: Mapping[str, Surface]) -> str:
         f"default-src 'none'; script-src {' '.join(map(_fingerprint, scripts))}; style-src {_fingerprint(style)}; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
-    classes = data["classes"]
+    classes, places = data["classes"], {name: i for i, name in enumerate(results.names)}
     members: list[list[int]] = [[] for _ in classes] or [[]]
     for i, shape in enumerate(data["shapes"]):
         members[shape["label"] if classes else 0].append(i)
@@ -87,6 +98,7 @@ def page_of(results: Results, surfaces: Mapping[str, Surface]) -> str:
         plot=(_PLOT_WIDTH, _PLOT_HEIGHT),
         config=_flat(results.config),
         disturbances=(results.robustness or {}).get("descriptions", {}),
+        outliers=[{**one, "place": places.get(one["body"])} for one in results.outliers[:N_OUTLIERS]],
         n_repaired=sum(bool(shape["notes"]) for shape in data["shapes"]),
     )
 

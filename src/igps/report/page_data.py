@@ -11,21 +11,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.analysis.clusters import clusters_of
+from igps.analysis.map import body_map
 from igps.report.confusions import worst_confusions
+from igps.report.explanations import Painted
 from igps.report.results import Results, System
 from igps.report.surfaces import Surface
 from igps.retrieval import RetrievalScores
 
 _LEAST_RANKED = 48
 _DECIMALS = 5
+# Fewer are no map; more take too long to lay out, and no browser draws them well
+_LEAST_MAPPED, _MOST_MAPPED = 3, 3000
 
 
-def data_of(results: Results, surfaces: Mapping[str, Surface]) -> dict[str, Any]:
+def data_of(
+    results: Results, surfaces: Mapping[str, Surface], explanations: Mapping[str, Painted] | None = None
+) -> dict[str, Any]:
     """All numbers of the page but the surfaces themselves.
 
     Returns:
-        `classes`: names in alphabetical order; `shapes`: see `_shapes`; `systems`: see `_of_system`; `movements` of a
-        robustness study, by descriptor and disturbance.
+        `classes`: names in alphabetical order; `shapes`: see `_shapes`; `columns`: further values of the shapes by
+        name; `systems`: see `_of_system`; `movements` of a robustness study, by descriptor and disturbance.
     """
     classes = sorted(set(results.labels or ()))
     index = {name: i for i, name in enumerate(results.names)}
@@ -34,7 +41,8 @@ def data_of(results: Results, surfaces: Mapping[str, Surface]) -> dict[str, Any]
     n_ranked = max(_LEAST_RANKED, 2 * max(sizes.values(), default=0))
     return {
         "classes": classes,
-        "shapes": _shapes(results, surfaces, classes),
+        "shapes": _shapes(results, surfaces, classes, explanations or {}),
+        "columns": {name: [of.get(one) for one in results.names] for name, of in results.columns.items()},
         "systems": [_of_system(system, index, classes, n_ranked) for system in results.systems],
         "movements": _finite((results.robustness or {}).get("movements", {})),
     }
@@ -45,10 +53,13 @@ def letters(content: bytes) -> str:
     return base64.b64encode(content).decode("ascii")
 
 
-def _shapes(results: Results, surfaces: Mapping[str, Surface], classes: Sequence[str]) -> list[dict[str, Any]]:
+def _shapes(
+    results: Results, surfaces: Mapping[str, Surface], classes: Sequence[str], explanations: Mapping[str, Painted]
+) -> list[dict[str, Any]]:
     """Of each body its name, class, notes and surface: place among the surfaces and numbers of vertices and faces.
 
-    Of one of several in a file, its part and the others of the file by their numbers.
+    Of one of several in a file, its part and the others of the file by their numbers. Where that is explained, how it
+    differs from its nearest: `other`, `told`, and `values` of the vertices of both surfaces.
     """
     found, place = [], 0
     files: dict[str, list[int]] = {}
@@ -71,6 +82,13 @@ def _shapes(results: Results, surfaces: Mapping[str, Surface], classes: Sequence
             shape["unit"] = one.unit
             shape["potential"] = [_significant(value) for value in one.potential_range]
             place += 1
+        if name in explanations:
+            painted = explanations[name]
+            shape["explained"] = {
+                "other": results.names.index(painted.other),
+                "told": painted.told,
+                "values": [letters(values.tobytes()) for values in painted.values],
+            }
         found.append(shape)
     return found
 
@@ -78,7 +96,7 @@ def _shapes(results: Results, surfaces: Mapping[str, Surface], classes: Sequence
 def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str], n_ranked: int) -> dict[str, Any]:
     """Of a descriptor: `shapes` it describes as numbers among all; for each of them the nearest others, uint32 (N, top)
     `ranked` and float32 (N, top) `distances`; mean scores, those of each class and each query; confusion, curve; the
-    `worst` confusions, see `_worst`."""
+    `worst` confusions, see `_worst`; the `map`, see `_map`."""
     order = system.ranked()
     near = order[:, :n_ranked]
     places = np.array([index[name] for name in system.names])
@@ -97,6 +115,22 @@ def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str],
         "curve": None if curve is None else [_numbers(curve.recall.tolist()), _numbers(curve.precision.tolist())],
         "confusion": None if system.labels is None else _confusion(order, system.labels, classes),
         "worst": None if scores is None else _worst(system, order, scores, places),
+        "map": _map(system),
+    }
+
+
+def _map(system: System) -> dict[str, Any] | None:
+    """Where the shapes lie, (N, 2) `points` and the `stress`; the `cluster` of each, and the `stability` of these."""
+    distances = system.distances.double().numpy()
+    if not _LEAST_MAPPED <= len(distances) <= _MOST_MAPPED or not np.isfinite(distances).all():
+        return None
+    found, clusters = body_map(distances), clusters_of(distances, n_resamples=50)
+    extent = float(np.ptp(found.points, axis=0).max()) or 1.0
+    return {
+        "points": ((found.points - found.points.min(axis=0)) / extent).round(4).tolist(),
+        "stress": round(found.stress, 3),
+        "cluster": clusters.numbers.tolist(),
+        "stability": _numbers(list(clusters.stability)),
     }
 
 

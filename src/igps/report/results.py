@@ -86,6 +86,9 @@ class Results:
         notes: what was done to a mesh, by name.
         config: the parameters.
         parts: of bodies that share their file with others, by name.
+        columns: what else is known of the bodies, by column and name of the body.
+        groups: the table of `igps groups`, where it wrote to the same folder, a line a body.
+        outliers: that of `igps outliers`.
     """
 
     command: str
@@ -98,6 +101,9 @@ class Results:
     notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)
     parts: Mapping[str, str] = field(default_factory=dict)
+    columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)
+    groups: tuple[Mapping[str, Any], ...] = ()
+    outliers: tuple[Mapping[str, Any], ...] = ()
 
 
 def read_results(folder: Path) -> Results:
@@ -114,8 +120,18 @@ def read_results(folder: Path) -> Results:
             "`python -m training.study robustness` write with --out."
         )
     found = readers[max(written, key=lambda name: written[name])](folder)
-    bodies = (_json(folder / "meshes.json") or {}).get("meshes", [])
-    return replace(found, parts={one["file"]: one["part"] for one in bodies if one.get("part")})
+    about = _json(folder / "meshes.json") or {}
+    bodies = about.get("meshes", [])
+    return replace(
+        found,
+        parts={one["file"]: one["part"] for one in bodies if one.get("part")},
+        columns={
+            name: {one["file"]: value for one, value in zip(bodies, values, strict=True)}
+            for name, values in about.get("columns", {}).items()
+        },
+        groups=tuple(_json(folder / "groups.json") or ()),
+        outliers=tuple(_json(folder / "outliers.json") or ()),
+    )
 
 
 def _retrieval(folder: Path) -> Results:

@@ -17,7 +17,7 @@ _FORMAT = "igps-meshes-1"
 
 
 def write_sources(folder: Path, dataset: SignatureDataset) -> None:
-    """Write meshes.json: of each body its name in the results, file and part; reading, signature, and cache folder."""
+    """Write meshes.json: of each body its name in the results, file, part, columns; reading, signature, cache."""
     pipeline, files = dataset.pipeline, dataset.bodies
     summary = {
         "format": _FORMAT,
@@ -25,6 +25,7 @@ def write_sources(folder: Path, dataset: SignatureDataset) -> None:
             {"file": name, "path": str(body.path.resolve()), "part": body.part}
             for name, body in zip(files.names, files, strict=True)
         ],
+        "columns": files.columns,
         "reading": pipeline.reading.as_dict(),
         "signature": asdict(pipeline.config),
         "cache_dir": str(pipeline.cache_dir.resolve()),
@@ -57,9 +58,10 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
         paths = tuple(Path(one["path"]) for one in summary["meshes"])
         if meshes is not None:
             paths = tuple(meshes / file for file in files)
+        columns = {str(name): tuple(values) for name, values in summary.get("columns", {}).items()}
         signature = {**summary["signature"], "attributes": tuple(summary["signature"]["attributes"])}
         return SignatureDataset(
-            Bodies(paths, names, None, parts),
+            Bodies(paths, names, None, parts, columns),
             SignatureConfig(**signature),
             Path(summary["cache_dir"]),
             reading=LoadOptions(**summary["reading"]),

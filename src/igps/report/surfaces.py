@@ -28,7 +28,8 @@ _FORMAT = "igps-surfaces-2"
 _MOST_VERTICES, _LEAST_VERTICES = 1200, 150
 # What the surfaces of a page may take in all, and what a vertex takes: 19 bytes, in letters of six bits.
 _MOST_BYTES, _BYTES_A_VERTEX = 20e6, 19 * 4 / 3
-_STEPS = 2**16 - 1
+STEPS = 2**16 - 1
+"""Into which the cube around a surface is divided along each axis."""
 _NEIGHBOURS = 4  # samples that a vertex takes its potential from
 
 
@@ -127,11 +128,11 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
     weights = 1 / (distances + 1e-6 * mesh.diagonal)
     values = (weights * potential[nearest]).sum(axis=1) / weights.sum(axis=1)
     low, high = float(values.min()), float(values.max())
-    turned = vertices @ _axes(samples)
+    turned = vertices @ axes_of(samples)
     lowest, highest = turned.min(axis=0), turned.max(axis=0)
     in_cube = (turned - (lowest + highest) / 2) / (highest - lowest).max() + 0.5
     return Surface(
-        vertices=np.rint(_STEPS * in_cube).astype(np.uint16),
+        vertices=np.rint(STEPS * in_cube).astype(np.uint16),
         faces=faces.astype(np.uint16),
         potential=np.rint(255 * (values - low) / ((high - low) or 1)).astype(np.uint8),
         potential_range=(low, high),
@@ -246,7 +247,7 @@ def clustered(
     return compact(means, moved[whole][np.sort(first)])
 
 
-def _axes(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def axes_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3, 3) columns x, y, z of a right-handed frame: y along the longest principal axis, x along the next.
 
     The slender end is down and the wider side left, so that poses of one body are seen alike.

@@ -24,15 +24,28 @@ const colourTable = (() => {
   return table;
 })();
 
-// The geometry of [place among the surfaces, vertices, faces], in a box around the origin whose longest side is 1.
-function geometryOf([place, nVertices, nFaces]) {
+// The 256 colours of a difference: blue, grey where there is none, red.
+const differenceTable = (() => {
+  const [less, none, more] = ["#0059b3", "#e6e6e6", "#d64000"].map((colour) => new THREE.Color(colour));
+  const table = new Float32Array(3 * 256);
+  for (let i = 0; i < 256; i++) {
+    const share = Math.max(-1, (i - 128) / 127);
+    none.clone().lerp(share < 0 ? less : more, Math.abs(share)).toArray(table, 3 * i);
+  }
+  return table;
+})();
+
+// The geometry of [place among the surfaces, vertices, faces], in a box around the origin whose longest side is 1;
+// coloured by the potential, or by other values of the vertices.
+function geometryOf([place, nVertices, nFaces], values = null) {
   const { buffer } = bytesOf(packedSurfaces[place]);
   const steps = new Uint16Array(buffer, 0, 3 * nVertices);
   const faces = new Uint16Array(buffer, 6 * nVertices, 3 * nFaces);
   const potential = new Uint8Array(buffer, 6 * (nVertices + nFaces), nVertices);
   const positions = Float32Array.from(steps, (step) => step / 65535 - 0.5);
   const colours = new Float32Array(3 * nVertices);
-  potential.forEach((value, i) => colours.set(colourTable.subarray(3 * value, 3 * value + 3), 3 * i));
+  const table = values ? differenceTable : colourTable;
+  (values ?? potential).forEach((value, i) => colours.set(table.subarray(3 * value, 3 * value + 3), 3 * i));
   const geometry = new THREE.BufferGeometry();
   geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
   geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
@@ -57,9 +70,9 @@ class Stage {
     this.scene.add(this.body);
   }
 
-  show(surface) {
+  show(surface, values = null) {
     this.body.geometry.dispose();
-    this.body.geometry = geometryOf(surface);
+    this.body.geometry = geometryOf(surface, values);
     const { center, radius } = this.body.geometry.boundingSphere;
     this.body.position.copy(center).negate();
     this.distance = radius / Math.sin((FIELD_OF_VIEW * Math.PI) / 360);
@@ -105,6 +118,20 @@ class Pictures {
     if (this.stage && this.shapes[canvas.dataset.shape].surface) {
       this.watcher.observe(canvas);
     }
+  }
+
+  // A canvas that shows a shape with other values of its vertices, from the front or from behind.
+  paint(canvas, shape, values, isBehind) {
+    if (!this.stage) return;
+    this.stage.show(this.shapes[shape].surface, values);
+    if (isBehind) {
+      this.stage.camera.position.multiply({ x: -1, y: 1, z: -1 });
+      this.stage.camera.lookAt(0, 0, 0);
+    }
+    this.stage.draw();
+    canvas.width = canvas.height = this.size;
+    canvas.getContext("2d").drawImage(this.source, 0, 0);
+    canvas.classList.add("drawn");
   }
 
   drawAll() {

@@ -11,6 +11,7 @@ const dialog = byId("shape");
 let turntable = null; // made when the first body is opened
 let system = 0;
 let current = null; // the shape in the window
+const MOST_SELECTED = 120; // pictures beside the map
 let opener = null; // the picture that opened the window, if it is not on the wall
 
 for (const one of systems) {
@@ -67,6 +68,7 @@ function chooseSystem(chosen) {
   if (byId("class-scores")) showClassScores(byId("class-scores"), classes, shapes, one?.per_class ?? []);
   showChosenConfusion();
   showWorst();
+  showMap();
   filter();
 }
 
@@ -170,6 +172,73 @@ function confusion({ query, rank, wrong }) {
   );
 }
 
+// A picture without a button.
+function plainPicture(shape) {
+  const canvas = element("canvas", { "data-shape": shape, width: 1, height: 1 });
+  pictures.watch(canvas);
+  return canvas;
+}
+
+const bodyMap = byId("map")
+  ? new BodyMap(byId("map-plot"), byId("map-tip"), byId("map-legend"), {
+      told: (shape) => shapes[shape].name,
+      open: (shape, mark) => {
+        opener = mark;
+        goTo(shape);
+      },
+      picture: plainPicture,
+      changed: (selected) => {
+        byId("map-chosen").textContent = selected.length ? `${selected.length} selected` : "";
+        byId("map-selected").replaceChildren(...selected.slice(0, MOST_SELECTED).map((shape) => element("li", {}, picture(shape))));
+      },
+    })
+  : null;
+
+function showMap() {
+  if (!bodyMap) return;
+  const one = systems[system];
+  const { points, stress } = one.map ?? { points: [] };
+  byId("map-plot").toggleAttribute("hidden", !one.map);
+  byId("map-stress").textContent = one.map
+    ? `Its stress is ${stress.toFixed(2)}: 0 would tell every distance, above 0.2 much is distorted.`
+    : "There is no map of these shapes.";
+  bodyMap.show(points.map(([x, y], row) => ({ shape: one.shapes[row], x, y })));
+  colourMap();
+}
+
+function colourMap() {
+  const one = systems[system];
+  const kind = byId("map-colour").value;
+  const values = shapes.map((shape, i) => {
+    if (kind === "class") return classes[shape.label];
+    if (kind === "cluster") return one.map?.cluster[one.row.get(i)] ?? null;
+    return kind === "volume" ? (shape.mesh?.[3] ?? null) : data.columns[kind.slice("column ".length)][i];
+  });
+  const stability = (place) => (one.map.stability[place] === null ? "" : `, stability ${one.map.stability[place].toFixed(2)}`);
+  const titles = {
+    cluster: (value) => (value === null ? "" : `cluster ${value + 1}${stability(value)}`),
+    volume: (value) => (value === null ? "" : `volume ${value}`),
+  };
+  bodyMap.colour(values, titles[kind] ?? ((value) => value ?? ""));
+}
+
+// A shape and its nearest, painted from two sides.
+function showExplained(shape) {
+  const { other, told, values } = shapes[shape].explained ?? {};
+  byId("explained").hidden = !told;
+  if (!told) return;
+  byId("explained-heading").textContent = `Where it differs from its nearest, ${shapes[other].name}`;
+  byId("explained-told").textContent = `${told}. Red: it has much there of what the other lacks; blue: it lacks it; grey: alike.`;
+  const painted = [shape, other].flatMap((one, place) =>
+    ["front", "back"].map((side) => {
+      const canvas = element("canvas", { width: 1, height: 1, role: "img", "aria-label": `${shapes[one].name}, ${side}` });
+      pictures.paint(canvas, one, bytesOf(values[place]), side === "back");
+      return element("li", { class: "painted" }, canvas, element("span", { class: "about" }, `${shapes[one].name}, ${side}`));
+    }),
+  );
+  byId("explained-list").replaceChildren(...painted);
+}
+
 function showWorst() {
   if (!byId("worst")) return;
   const worst = systems[system].worst;
@@ -196,6 +265,7 @@ function openShape(shape) {
   const together = shapes[shape].together ?? [];
   byId("together").hidden = !together.length;
   byId("together-list").replaceChildren(...together.map((one) => element("li", {}, picture(one))));
+  showExplained(shape);
   const moves = Object.keys(data.movements).length > 0;
   byId("moved").hidden = !moves;
   if (moves) showMovements(byId("moved-table"), shapes[shape].name, data.movements);
@@ -242,6 +312,8 @@ byId("search").addEventListener("input", filter);
 byId("only").addEventListener("change", filter);
 byId("controls").addEventListener("submit", (event) => event.preventDefault());
 byId("system")?.addEventListener("change", (event) => chooseSystem(Number(event.target.value)));
+byId("map-colour")?.addEventListener("change", colourMap);
+byId("map-controls")?.addEventListener("submit", (event) => event.preventDefault());
 byId("confusion-of")?.addEventListener("change", showChosenConfusion);
 document.addEventListener("click", (event) => {
   const button = event.target.closest("button.shape");
