@@ -49,6 +49,7 @@ DISTRIBUTIONS = {
     "faiss": "faiss-cpu",
     "igl": "libigl",
     "ot": "POT",
+    "umap": "umap-learn",
     "skimage": "scikit-image",
     "gridData": "GridDataFormats",
     "sklearn": "scikit-learn",
