@@ -202,7 +202,8 @@ def test_ablation_prints_every_head_of_every_layout(root: Path) -> None:
 def test_pretraining_saves_a_metric_and_measures_it(root: Path, tmp_path: Path) -> None:
     out = run(
         "pretrain", "--root", tmp_path / "generated", "--n_classes", 27, "--n_bodies", 2, "--n_poses", 2,
-        "--n_parts", 2, "--n_scored", 4, "--cache_dir", root / "cache", "--data", root / "meshes",
+        "--n_parts", 2, "--n_scored", 4, "--individuals", "[4, 2, 2, 2]",
+        "--cache_dir", root / "cache", "--data", root / "meshes",
         "--plain", '["interior"]',
         "--out", tmp_path / "metric.safetensors", "--figures", tmp_path / "figures",
     )  # fmt: skip

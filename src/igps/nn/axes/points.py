@@ -81,7 +81,7 @@ class PointAxis(Specified, ABC):
         if not self.soft or len(centres) == 1:
             classes = torch.bucketize(values.detach(), _boundaries(centres), right=True).unsqueeze(2)
             return classes, torch.ones_like(classes, dtype=values.dtype)
-        below = torch.bucketize(values.detach(), centres.detach()[1:-1], right=True)
+        below = torch.bucketize(values.detach().contiguous(), centres.detach()[1:-1], right=True)
         share = ((values - centres[below]) / centres.diff()[below]).clamp(0, 1)
         return torch.stack([below, below + 1], dim=2), torch.stack([1 - share, share], dim=2)
 
