@@ -27,20 +27,21 @@ def merge(
     place = np.empty(n_points, np.int64)
     for k in range(n_points):
         place[order[k]] = k
-    # of each point the others that name it, one list after the other
-    starts = np.zeros(n_points + 1, np.int64)
+    # of each point the others that name it, one list after the other; while they are filled, point i has place i + 1
+    starts = np.zeros(n_points + 2, np.int64)
     for i in range(n_points):
         for j in range(n_neighbours):
-            starts[neighbours[i, j] + 1] += 1
-    starts = np.cumsum(starts)
-    filled = starts[:-1].copy()
+            starts[neighbours[i, j] + 2] += 1
+    parent = np.empty(n_points, np.int64)
+    for i in range(n_points):
+        starts[i + 1] += starts[i]
+        parent[i] = i
     naming = np.empty(n_points * n_neighbours, np.int64)
     for i in range(n_points):
         for j in range(n_neighbours):
             named = neighbours[i, j]
-            naming[filled[named]] = i
-            filled[named] += 1
-    parent = np.arange(n_points)
+            naming[starts[named + 1]] = i
+            starts[named + 1] += 1
     n_branches = level = 0
     for reached in range(n_points):
         point = order[reached]

@@ -11,6 +11,8 @@ from igps._compiled import compiled
 
 Real = TypeVar("Real", np.float32, np.float64)
 
+_SMALLEST = 2.0**-126  # the smallest normal number of single precision
+
 
 @compiled()
 def bends(points: NDArray[Real], directions: NDArray[Real], tangential: float, found: NDArray[Real]) -> None:
@@ -24,7 +26,7 @@ def bends(points: NDArray[Real], directions: NDArray[Real], tangential: float, f
     n = points.shape[1]
     one = points.dtype.type(1)
     least = one * tangential * tangential
-    smallest = one * np.finfo(np.float32).tiny
+    smallest = one * _SMALLEST
     of_row = np.empty(n, points.dtype)
     for i in range(n):
         x, y, z = points[0, i], points[1, i], points[2, i]

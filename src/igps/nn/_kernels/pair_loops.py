@@ -88,7 +88,9 @@ def count_block(
     shares = np.empty((n_axes, n_columns), values.dtype)
     cells, interval = np.empty(n_columns, np.int32), np.empty(n_columns, np.int32)
     packs = n_axes == 1 and values.itemsize == 4 and n_rows * n_columns <= _MOST_PACKED
-    packs = packs and n_members == 1 and weights.min() == 1
+    packs = packs and n_members == 1
+    for j in range(weights.shape[1]):
+        packs &= weights[0, j] == 1
     packed = np.zeros((n_classes * n_cells if packs else 0) * _LANES, np.int64)
     lowest, highest = no_cells(n_cells, n_members)
     for i in range(n_rows):
@@ -252,13 +254,15 @@ def gaps(centres: NDArray[Any], n_centres: NDArray[np.int64]) -> tuple[NDArray[A
     Where they are, the first is one over their mean.
     """
     n_axes, most_centres = centres.shape
-    inverse = np.ones((n_axes, most_centres - 1), centres.dtype)
-    equal = np.ones(n_axes, np.bool_)
+    inverse = np.empty((n_axes, most_centres - 1), centres.dtype)
+    equal = np.empty(n_axes, np.bool_)
+    epsilon = 2.0**-23 if centres.itemsize == 4 else 2.0**-52
     for k in range(n_axes):
         n = n_centres[k]
         first, last = centres[k, 0], centres[k, n - 1]
         mean = (last - first) / (n - 1)
-        rounding = 8 * np.finfo(centres.dtype).eps * max(abs(first), abs(last))
+        rounding = 8 * epsilon * max(abs(first), abs(last))
+        equal[k] = True
         for q in range(n - 1):
             gap = centres[k, q + 1] - centres[k, q]
             inverse[k, q] = 1 / gap
@@ -437,7 +441,9 @@ def unpack(packed: NDArray[np.int64], sums: NDArray[np.float64]) -> None:
     """Move what was packed to the sums (cells, 2)."""
     for c in range(len(packed) // _LANES):
         pairs = packed[_LANES * c : _LANES * (c + 1)]
-        both = pairs.sum()
+        both = 0
+        for lane in range(_LANES):
+            both += pairs[lane]
         beyond = (both % _PAIR) / _SHARE
         sums[c, 0] = both // _PAIR - beyond
         sums[c, 1] = beyond
