@@ -15,7 +15,9 @@ from igps.signature.signature import SignatureConfig, compute_signature
 from training.graded import GradedShapes
 
 
-def scales(descriptors: list[str] | None = None, n_classes: int = 8, n_bodies: int = 4, seed: int = 77) -> None:
+def scales(
+    descriptors: list[str] | None = None, n_classes: int = 8, n_bodies: int = 4, seed: int = 77, n_individuals: int = 0
+) -> None:
     """Print the scales of descriptors, for `igps.descriptors.individual.SCALES`.
 
     Args:
@@ -23,10 +25,11 @@ def scales(descriptors: list[str] | None = None, n_classes: int = 8, n_bodies: i
         n_classes: classes of generated bodies.
         n_bodies: bodies of each class, in one pose.
         seed: of the bodies.
+        n_individuals: of each body; if there are some, the medians are those between them.
     """
-    generated = GradedShapes(n_classes, n_bodies, 1, seed=seed, n_vertices=(1800, 2600))
+    generated = GradedShapes(n_classes, n_bodies, 1, seed=seed, n_vertices=(1800, 2600), n_individuals=n_individuals)
     shapes = [generated[i] for i in range(len(generated))]
-    labels = [shape.label for shape in shapes]
+    labels = [shape.body if n_individuals else shape.label for shape in shapes]
     same = torch.tensor([[one == other for one in labels] for other in labels]).triu(1)
     modules = [descriptor_of(name) for name in descriptors or NAMES]
     config = reduce(or_, (module.requirements for module in modules)).apply_to(SignatureConfig(n_eigenpairs=250))

@@ -30,9 +30,11 @@ SCALES: Mapping[str, float] = {
 }  # fmt: skip
 """The median distance between generated bodies of one class, by descriptor, as `training.study scales` prints it."""
 
-# Share of that scale which a difference in the other counts by where form is the same; how much more it counts at most;
-# the difference in size of half that; and the difference in twist between poses of one body.
-_SHARE, _MOST, _HALF, _TWIST = 0.25, 5.0, 0.3, 0.002
+# The distance between individuals of a body is a quarter of that, but for `pretrained`, which leaves little of it.
+_SHARE, _NEAR = 0.25, {"pretrained": 0.0043}
+# How much more a distance counts at most where size differs; the difference in size of half that; and the difference
+# in twist between poses of one body.
+_MOST, _HALF, _TWIST = 2.0, 0.3, 0.002
 
 
 class IndividualDescriptor(Descriptor):
@@ -40,10 +42,11 @@ class IndividualDescriptor(Descriptor):
 
     A description is that of the descriptor, then for the side the odd part of a histogram of `PairTwist`, whose signs a
     mirror image turns, then for size log √area and log ∛volume, of millimetres where the unit is known. With d the
-    distance of the descriptor, n a quarter of its scale, t the Euclidean distance of the odd parts and s the sum of the
-    two differences in size, that of the bodies is e + 5 (e + n) s/(0.3 + s) of e = d + t. So where bodies are much the
-    same in form size adds to the distance, and else multiplies it, up to six times; no collection is looked at. The
-    numbers of side and size are written so that Euclidean distances of whole descriptions, too, count them like this.
+    distance of the descriptor, n what is usual between individuals of a body (a quarter of its scale if not known), t
+    the Euclidean distance of the odd parts and s the sum of the two differences in size, that of the bodies is
+    e + 2 (e + n) s/(0.3 + s) of e = d + t. So where bodies are much the same in form size adds to the distance, and
+    else multiplies it, up to three times; no collection is looked at. The numbers of side and size are written so that
+    Euclidean distances of whole descriptions, too, count them like this.
 
     Args:
         descriptor: any.
@@ -68,7 +71,7 @@ class IndividualDescriptor(Descriptor):
                 "attribute `scale` to the median of its distances between bodies of one class."
             )
         self.descriptor, self.scale, self.keeps_size = descriptor, scale, size
-        self._unit = _SHARE * scale
+        self._unit = _NEAR.get(descriptor.name, _SHARE * scale)
         embedding = SpectralEmbedding(n_eigenpairs=16)
         self.twists = (
             PairHistogram([InteriorDistance(6, 3.0), PairTwist()], embedding, n_samples=1000) if side else None
