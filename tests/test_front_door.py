@@ -51,7 +51,6 @@ DISTRIBUTIONS = {
     "ot": "POT",
     "umap": "umap-learn",
     "skimage": "scikit-image",
-    "gridData": "GridDataFormats",
     "sklearn": "scikit-learn",
     "yaml": "PyYAML",
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import inspect
 import logging
 import pickle
 from collections.abc import Callable
@@ -24,6 +25,7 @@ from igps.data.attribute_sources import (
     attribute_sources,
     completed,
 )
+from igps.data.attributes import FunctionAttribute
 from igps.data.dataset import SignatureDataset
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import MeshError
@@ -93,6 +95,21 @@ def test_a_grid_gives_a_linear_function(body: BodyRef, suffix: str) -> None:
         str(body.path.with_name(f"a{suffix}"))
     )
     np.testing.assert_allclose(attribute_source(f"a{suffix}")(body, INSIDE), linear(INSIDE), atol=1e-4)
+
+
+def test_axes_of_a_map_in_another_order_are_put_right(body: BodyRef) -> None:
+    mrcfile = pytest.importorskip("mrcfile")
+    index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
+    delta, start = np.array([0.5, 0.25, 0.5]), np.array([-10, -12, -8])
+    values = linear((index + start) * delta).astype(np.float32)
+    with mrcfile.new(body.path.with_name("a.map")) as file:
+        file.set_data(
+            np.ascontiguousarray(values.transpose(1, 0, 2))
+        )  # columns along z, rows along x, sections along y
+        file.voxel_size = tuple(delta)
+        file.header.mapc, file.header.mapr, file.header.maps = 3, 1, 2
+        file.header.nxstart, file.header.nystart, file.header.nzstart = start[[2, 0, 1]]
+    np.testing.assert_allclose(attribute_source("a.map")(body, INSIDE), linear(INSIDE), atol=1e-4)
 
 
 def write_ply(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
@@ -321,3 +338,43 @@ def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path: Path) -> 
         charge(BodyRef(tmp_path / "egg.off"), points)
     with pytest.raises(ValueError, match=r"attribute: expected one of charge, .*, got 'mood'"):
         ResidueAttribute("mood")
+
+
+def stem_and_height(body: BodyRef, points: np.ndarray) -> np.ndarray:
+    return len(body.path.stem) + points[:, 2]
+
+
+def times(points: np.ndarray, factor: float = 2.0) -> np.ndarray:
+    return factor * points[:, 0]
+
+
+def test_a_function_of_body_and_points_is_a_source_that_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_body(tmp_path / "shapes" / "a.off", 0.8, 0.9)
+    write_body(tmp_path / "shapes" / "bbb.off", 1.2, 0.7)
+    given = {"told": stem_and_height, "x": times}
+    dataset = SignatureDataset(tmp_path / "shapes", CONFIG, tmp_path / "cache", attributes=given)
+    for item, n_letters in zip(dataset, (1, 3), strict=True):
+        points = item.signature.interior.points
+        np.testing.assert_allclose(item.signature.interior.attributes["told"], n_letters + points[:, 2], atol=1e-5)
+        np.testing.assert_allclose(item.signature.interior.attributes["x"], 2 * points[:, 0], atol=1e-5)
+    tag = FunctionAttribute(stem_and_height).cache_tag(None)
+    kept = SignatureDataset(tmp_path / "shapes", CONFIG, tmp_path / "cache", attributes={"told": stem_and_height})
+    monkeypatch.setattr(FunctionAttribute, "__call__", lambda *given: pytest.fail("it is kept"))
+    assert len(list(kept)) == 2
+    monkeypatch.setattr(inspect, "getsource", lambda function: "return points[:, 1]")
+    assert FunctionAttribute(stem_and_height).cache_tag(None) != tag
+
+
+def test_a_function_whose_code_does_not_tell_what_it_does_is_refused(tmp_path: Path) -> None:
+    write_body(tmp_path / "a.off", 0.8, 0.9)
+    factor = 2.0
+    without: dict[str, Callable[..., np.ndarray]] = {}
+    exec("def written(body, points): return points[:, 0]", without)
+    for function, said in (
+        (lambda body, points: factor * points[:, 0], "uses variables of what is around it"),
+        (without["written"], "the source code of written is not known"),
+    ):
+        with pytest.raises(ValueError, match=rf"attributes: .*{said}.*cache_tag"):
+            SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", attributes={"told": function})

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+import hashlib
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -24,6 +26,52 @@ class AttributeSource(Protocol):
 
     def __call__(self, body: BodyRef, points: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
         """Values (P,) or (P, C) at points (P, 3) in the coordinates of the body's file."""
+
+
+@dataclass(frozen=True)
+class FunctionAttribute:
+    """A function `(body, points)` as a source; its name and source code stand for it in the keys of the cache.
+
+    Example:
+        >>> from igps.data import attributes
+        >>> source = FunctionAttribute(attributes.takes_body)  # of any function in a file
+        >>> source.cache_tag(None)[:19]
+        'function takes_body'
+
+    Raises:
+        ValueError: its source code is not known, or does not tell what it does.
+    """
+
+    function: Callable[[BodyRef, NDArray[np.float64]], NDArray[np.floating[Any]]]
+
+    def __post_init__(self) -> None:
+        self.cache_tag(None)
+
+    def cache_tag(self, body: BodyRef | None) -> str:
+        """Of all bodies the same."""
+        name = getattr(self.function, "__qualname__", repr(self.function))
+        remedy = "Give an object with this call and a method cache_tag(body), see igps.data.attributes.AttributeSource."
+        if getattr(self.function, "__closure__", None):
+            raise ValueError(f"attributes: {name} uses variables of what is around it, which no key tells. {remedy}")
+        try:
+            source = inspect.getsource(self.function)
+        except (OSError, TypeError) as error:
+            raise ValueError(f"attributes: the source code of {name} is not known ({error}). {remedy}") from error
+        return f"function {name} {hashlib.sha256(source.encode()).hexdigest()}"
+
+    def __call__(self, body: BodyRef, points: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
+        """Its values."""
+        return self.function(body, points)
+
+
+def takes_body(function: Callable[..., Any]) -> bool:
+    """Whether a function has to be given two things, a body and points."""
+    try:
+        given = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return False
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(one.kind in positional and one.default is one.empty for one in given) == 2
 
 
 def with_attribute(signature: Signature, name: str, values: Mapping[str, ArrayLike]) -> Signature:

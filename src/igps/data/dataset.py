@@ -19,7 +19,7 @@ from torch.utils.data import Dataset
 from tqdm import tqdm
 
 from igps._parallel import Failed, Limits
-from igps.data.attributes import ROOMS, AttributeSource, with_attribute
+from igps.data.attributes import ROOMS, AttributeSource, FunctionAttribute, takes_body, with_attribute
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.collation import collate
@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 _REMEMBERED_AT_ONCE = 1000
 
-PointFunction = Callable[[NDArray[np.float64]], NDArray[np.floating[Any]]]
+PointFunction = Callable[..., NDArray[np.floating[Any]]]
 Index = int | str | slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
 
 
@@ -76,9 +76,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
         labels: classes of the given paths, by name.
         classes: what the class of a body is, see `ClassRule`; as the folder tells it if None.
         reading: how files are read.
-        attributes: further attributes of the samples, by name: an `AttributeSource`, whose values are kept beside the
-            Signatures, which stay; or a function of points, (P, 3) in the file's coordinates, to (P,) or (P, C), which
-            is called at each reading.
+        attributes: further attributes of the samples, by name: an `AttributeSource` or a function `(body, points)`,
+            whose values are kept beside the Signatures, which stay; or a function of points, (P, 3) in the file's
+            coordinates, to (P,) or (P, C), which is called at each reading.
         pre_transform: a change of every Signature, which is kept changed; its `cache_tag` is part of the key.
         transform: a change of a Signature at each reading; see `igps.data.transforms`.
 
@@ -114,10 +114,15 @@ class SignatureDataset(Dataset[LabelledSignature]):
             config, given = requirements.apply_to(config), {**requirements.sources, **given}
         self.bodies = _bodies(root_or_paths, labels, reading).classed(classes or "folder")
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
-        sources = {name: one for name, one in given.items() if isinstance(one, AttributeSource)}
-        self._functions: dict[str, PointFunction] = {
-            name: one for name, one in given.items() if not isinstance(one, AttributeSource)
-        }
+        sources: dict[str, AttributeSource] = {}
+        self._functions: dict[str, PointFunction] = {}
+        for name, one in given.items():
+            if isinstance(one, AttributeSource):
+                sources[name] = one
+            elif takes_body(one):
+                sources[name] = FunctionAttribute(one)
+            else:
+                self._functions[name] = one
         if pre_transform is not None and pre_transform.cache_tag and self._functions:
             raise ValueError("pre_transform: expected attributes with a cache_tag beside it, got a function of points.")
         self.pipeline = SignaturePipeline(

@@ -70,15 +70,22 @@ def _dx(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
 def _map(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """Of an MRC or CCP4 file."""
     try:
-        from gridData import Grid
+        import mrcfile
     except ImportError as error:
-        raise ImportError('Maps need GridDataFormats: pip install "interior-gps[molecules]".') from error
+        raise ImportError('Maps need mrcfile: pip install "interior-gps[molecules]".') from error
     head = np.fromfile(path, "<i4", 4)
     head = head.byteswap() if len(head) == 4 and not 0 <= head[3] < 256 else head
     needed = 1024 + (math.prod(map(int, head[:3])) * _MODES.get(int(head[3]), 1) if len(head) == 4 else 0)
     if len(head) < 4 or min(head[:3]) < 1 or path.stat().st_size < needed:
         raise MeshError(f"{path}: {path.stat().st_size} of the {needed} bytes that its header announces.")
-    grid = Grid(str(path), file_format="mrc")
-    affine = np.eye(4)
-    affine[:3, :3], affine[:3, 3] = np.diag(grid.delta), grid.origin
-    return np.asarray(grid.grid), affine
+    with mrcfile.open(path) as file:
+        header, values = file.header, file.data
+        if values is None or values.ndim != 3 or not np.allclose(header.cellb.item(), 90):
+            raise MeshError(f"{path}: expected a map of three axes at right angles. Resample it.")
+        # Which of x, y and z columns, rows and sections run along; values (sections, rows, columns).
+        along = [int(header[name]) for name in ("mapc", "mapr", "maps")]
+        sides = np.array(file.voxel_size.item(), dtype=float)
+        starts = np.array([int(header[name]) for name in ("nxstart", "nystart", "nzstart")])[np.argsort(along)]
+        affine = np.eye(4)
+        affine[:3, :3], affine[:3, 3] = np.diag(sides), np.array(header.origin.item()) + starts * sides
+        return np.array(values.transpose(np.argsort(along[::-1]))), affine
