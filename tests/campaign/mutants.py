@@ -78,16 +78,16 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         ("src/igps/mesh/_union.py", "_DIRECTIONS, _PLACES_PER_PATCH = 99, 30"),
         ("src/igps/mesh/limits.py", "_OBJ_BYTES, _TEXT_STL_BYTES = 34, 200"),
         (
-            "src/igps/nn/heads/two_level.py",
+            "src/igps/nn/heads/wccn.py",
             "n_directions: int = 59,",
         ),
         # Points whose classes are not side by side only cost time.
         (
-            "src/igps/nn/_kernels/pairs.py",
+            "src/igps/nn/_kernels/count_by_loops.py",
             "key = key * layout.n_classes - torch.where(own[:, k] > 0, classes[:, k], 0)",
         ),
         # Two columns more, which nothing reads.
-        ("src/igps/nn/_kernels/pair_loops.py", "inverse = np.ones((n_axes, most_centres + 1), centres.dtype)"),
+        ("src/igps/nn/_kernels/pair_loops.py", "inverse = np.empty((n_axes, most_centres + 1), centres.dtype)"),
         # No resolution is larger than the finest: one that is asked for is refused before, one that grows is cut.
         ("src/igps/signature/voxels.py", "if min_samples == 0 or resolution == finest:"),
         # Nothing compares two of them.

@@ -10,7 +10,8 @@ from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.base import Head
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
 from igps.nn.heads.learned import BlendedDistance, ProjectionHead
-from igps.nn.heads.two_level import TwoLevelHead, WCCNHead
+from igps.nn.heads.two_level import TwoLevelHead
+from igps.nn.heads.wccn import WCCNHead
 from igps.retrieval import chi_square, hellinger
 from igps.retrieval.distances import euclidean
 

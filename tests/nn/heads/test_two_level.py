@@ -9,7 +9,8 @@ from scipy.linalg import sqrtm
 from torch import Tensor
 
 from igps.nn.heads.base import Head
-from igps.nn.heads.two_level import TwoLevelHead, WCCNHead
+from igps.nn.heads.two_level import TwoLevelHead
+from igps.nn.heads.wccn import WCCNHead
 from igps.retrieval import cosine, retrieval_scores
 
 N_CLASSES, N_BODIES, N_POSES, N_CELLS = 16, 4, 5, 40

@@ -14,6 +14,7 @@ from torch.nn.functional import normalize, one_hot
 
 from conftest import torch_threads
 from igps import _threads as threads
+from igps.nn._kernels import count_by_loops, count_by_torch
 from igps.nn._kernels import pairs as pair_module
 from igps.nn._kernels.pairs import class_pairs
 from igps.nn.axes import PairValues, euclidean_distances, oriented_pairs, pair_twists, point_pair_features
@@ -123,9 +124,9 @@ def test_histogram_is_the_sum_of_hats_over_all_pairs(
     if block is not None:
         n_rows, n_columns = block
         n_values = max(1, sum("cosines" not in kind for kind in layout))
-        monkeypatch.setattr(pair_module, "_MOST_COLUMNS", n_columns)
-        monkeypatch.setattr(pair_module, "_BLOCK", n_rows * n_columns * n_values)
-        monkeypatch.setattr(pair_module, "_DEVICE_BLOCK", n_rows * len(given["points"]) * 4 ** len(layout))
+        monkeypatch.setattr(count_by_loops, "_MOST_COLUMNS", n_columns)
+        monkeypatch.setattr(count_by_loops, "_BLOCK", n_rows * n_columns * n_values)
+        monkeypatch.setattr(count_by_torch, "_BLOCK", n_rows * len(given["points"]) * 4 ** len(layout))
     result = counted(layout, {name: value.to(device) for name, value in given.items()}).cpu()
     axes = [axis for kind in layout for axis in KINDS[kind][1](given)]
     np.testing.assert_allclose(result, pair_histogram_by_loops(given["memberships"], axes), atol=1e-12)
@@ -328,9 +329,9 @@ def test_gradients_equal_those_of_the_dense_definition(
 ) -> None:
     """Also by memberships that are zero, whose gradient is not."""
     if block is not None:
-        monkeypatch.setattr(pair_module, "_MOST_COLUMNS", block[1])
-        monkeypatch.setattr(pair_module, "_BLOCK", math.prod(block))
-        monkeypatch.setattr(pair_module, "_DEVICE_BLOCK", block[0] * 29 * 9 * 2 ** len(layout))
+        monkeypatch.setattr(count_by_loops, "_MOST_COLUMNS", block[1])
+        monkeypatch.setattr(count_by_loops, "_BLOCK", math.prod(block))
+        monkeypatch.setattr(count_by_torch, "_BLOCK", block[0] * 29 * 9 * 2 ** len(layout))
     given = {name: value.to(device).requires_grad_() for name, value in some(29).items()}
     pairs = [KINDS[kind][0](given) for kind in layout]
     leaves, i, j = [given["memberships"]], *torch.triu_indices(29, 29, 1, device=device)

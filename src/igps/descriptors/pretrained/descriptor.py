@@ -14,7 +14,8 @@ from igps.descriptors.pretrained.spectrum_shares import SpectrumShares
 from igps.nn.axes import BallRadius, EmbeddedPairCosines, EuclideanDistance, InteriorDistance, PairCosines, Potential
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.heads.two_level import TwoLevelHead, WCCNHead
+from igps.nn.heads.two_level import TwoLevelHead
+from igps.nn.heads.wccn import WCCNHead
 from igps.nn.histograms.pairs import PairHistogram
 from igps.nn.histograms.points import PointHistogram
 

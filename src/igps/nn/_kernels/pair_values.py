@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -135,3 +135,14 @@ def _twists(rows: Inputs, columns: Inputs) -> Tensor:
 def centres_of(pairs: Sequence[PairValues]) -> list[Tensor]:
     """The centres of all values, in order."""
     return [one for pair in pairs for one in pair.centres]
+
+
+def with_tensors(pairs: Sequence[PairValues], tensors: Sequence[Tensor]) -> list[PairValues]:
+    """The values with other tensors in place of their inputs and centres."""
+    remaining = iter(tensors)
+    return [
+        replace(
+            one, inputs=tuple(next(remaining) for _ in one.inputs), centres=tuple(next(remaining) for _ in one.centres)
+        )
+        for one in pairs
+    ]

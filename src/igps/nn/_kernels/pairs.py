@@ -1,41 +1,23 @@
 """One count of pairs of points, into a product of classes and bins, with two back ends.
 
 `count_pairs` is what every histogram of pairs comes down to. On the CPU it runs in compiled loops, with a gradient of
-their own (`igps.nn._kernels.pair_loops`); on other devices, and where PyTorch traces it for `torch.compile` or
-`torch.export`, in operations of PyTorch, a block of pairs at a time. Both count in double precision, hold no matrix of
+their own (`count_by_loops`); on other devices, and where PyTorch traces it for `torch.compile` or `torch.export`, in
+operations of PyTorch (`count_by_torch`). Both count in double precision, hold no matrix of
 all pairs, and have gradients by all that the values are computed from, by the weights and by the centres.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Sequence
 from itertools import combinations_with_replacement
-from typing import Any, TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
-from torch.utils.checkpoint import checkpoint
 
-from igps._threads import ALONE, Team
-from igps.nn._kernels.pair_loops import COSINES, DISTANCES, VALUES, Axes, count_block, gradient_block
-from igps.nn._kernels.pair_values import (
-    PairValues,
-    centres_of,
-    cosine_factors,
-)
-from igps.nn._precision import full_precision
-
-Result = TypeVar("Result")
-
-# Of a block: on the CPU pairs, whose values stay in a core's second-level cache; elsewhere numbers, which fill it.
-_BLOCK, _MOST_COLUMNS, _DEVICE_BLOCK = 2**18, 2048, 2**24
-# Of the blocks, which threads count side by side; one where counts of its own for each share would take gigabytes
-_SHARES, _MOST_COUNTS = 4, 2**24
+from igps.nn._kernels.count_by_loops import CompiledCount, Layout
+from igps.nn._kernels.count_by_torch import count_by_torch
+from igps.nn._kernels.pair_loops import VALUES
+from igps.nn._kernels.pair_values import PairValues
 
 
 def class_pairs(n_classes: int) -> list[tuple[int, int]]:
@@ -66,9 +48,9 @@ def count_pairs(classes: Tensor, weights: Tensor, n_classes: int, pairs: Sequenc
     tensors = [tensor.to(dtype) for tensor in tensors]
     with torch.autocast(classes.device.type, enabled=False):
         if _is_compiled(dtype, classes.device):
-            counts = _CompiledCount.apply(_Layout(classes, n_classes, tuple(pairs), mask), *tensors)
+            counts = CompiledCount.apply(Layout(classes, n_classes, tuple(pairs), mask), *tensors)
         else:
-            counts = _count_by_torch(classes, n_classes, pairs, mask, *tensors)
+            counts = count_by_torch(classes, n_classes, pairs, mask, *tensors)
         n_points = mask.sum(dim=1).double().view(-1, *[1] * (counts.ndim - 1))
         return (counts / (n_points * (n_points - 1) / 2)).to(dtype)
 
@@ -108,308 +90,3 @@ def check_pairs(pairs: Sequence[PairValues], mask: Tensor) -> None:
                 raise ValueError(
                     "points: expected distances that can be squared, got larger ones; choose a larger unit."
                 )
-
-
-def _with(pairs: Sequence[PairValues], tensors: Sequence[Tensor]) -> list[PairValues]:
-    """The values with other tensors in place of their inputs and centres."""
-    remaining = iter(tensors)
-    return [
-        replace(
-            one, inputs=tuple(next(remaining) for _ in one.inputs), centres=tuple(next(remaining) for _ in one.centres)
-        )
-        for one in pairs
-    ]
-
-
-def _count_by_torch(
-    classes: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: Tensor, weights: Tensor, *tensors: Tensor
-) -> Tensor:
-    """(N, C(C+1)/2, B, ...) float64 counts."""
-    n_shapes, n_points, n_members = classes.shape
-    # What is padded may be anything, and 0 times that no number.
-    clean = [t.masked_fill(~mask.view(*mask.shape, *[1] * (t.ndim - 2)), 0) if t.ndim > 1 else t for t in tensors]
-    weights = weights.masked_fill(~mask[:, :, None], 0)
-    shape = [n_classes * (n_classes + 1) // 2, *(len(centres) for centres in centres_of(pairs))]
-    total = torch.zeros(n_shapes * math.prod(shape), dtype=torch.float64, device=classes.device)
-    n_rows = max(1, _DEVICE_BLOCK // (n_shapes * n_points * n_members**2 * 2 ** (len(shape) - 1)))
-    for first in range(0, n_points - 1, n_rows):
-        task = partial(_count_rows, first, first + n_rows, classes, n_classes, shape, pairs)
-        # What the gradient needs of the pairs is many times what it needs of the points: computed again.
-        differentiable = torch.is_grad_enabled()
-        total = total + (
-            checkpoint(task, weights, *clean, use_reentrant=False) if differentiable else task(weights, *clean)
-        )
-    return total.view(n_shapes, *shape)
-
-
-def _count_rows(
-    first: int,
-    last: int,
-    classes: Tensor,
-    n_classes: int,
-    shape: Sequence[int],
-    pairs: Sequence[PairValues],
-    weights: Tensor,
-    *tensors: Tensor,
-) -> Tensor:
-    """(cells,) counts of the pairs of points from `first` to `last` with those after them."""
-    pairs = _with(pairs, tensors)
-    with full_precision():
-        values = [
-            one.between([x[:, first:last] for x in one.inputs], [x[:, first:] for x in one.inputs]) for one in pairs
-        ]
-    row_of = torch.zeros(n_classes, n_classes, dtype=torch.long, device=classes.device)
-    a, b = torch.triu_indices(n_classes, n_classes, device=classes.device)
-    row_of[a, b] = row_of[b, a] = torch.arange(len(a), device=classes.device)
-    # (N, I, J, M²) where each pair counts and how much, and then (N, I, J, M²·2^K) in each corner of its cell.
-    into = row_of[classes[:, first:last, None, :, None], classes[:, None, first:, None, :]].flatten(3)
-    into = into + shape[0] * torch.arange(len(classes), device=classes.device)[:, None, None, None]
-    weight = (weights[:, first:last, None, :, None] * weights[:, None, first:, None, :]).flatten(3)
-    # Pairs of a point with itself or with one before it weigh nothing.
-    weight = weight * torch.ones_like(weight[0, :, :, 0]).triu(1).unsqueeze(2)
-    shares = []
-    for value, centres in zip(torch.cat(values, dim=1).unbind(1), centres_of(pairs), strict=True):
-        below = torch.bucketize(value.detach(), centres.detach()[1:-1], right=True)
-        shares.append(((value - centres[below]) / (centres[below + 1] - centres[below])).clamp(0, 1))
-        into = into * len(centres) + below.unsqueeze(3)
-    stride = math.prod(shape[1:])
-    for share, n_bins in zip(shares, shape[1:], strict=True):
-        stride //= n_bins
-        beyond = weight * share.unsqueeze(3)
-        # Not weight·(1 − share), nor a difference of sums, which rounding could make negative.
-        weight = torch.cat([weight - beyond, beyond], dim=3)
-        into = torch.cat([into, into + stride], dim=3)
-    total = torch.zeros(len(classes) * math.prod(shape), dtype=torch.float64, device=classes.device)
-    return total.index_add(0, into.flatten(), weight.double().flatten())
-
-
-@dataclass(frozen=True, eq=False)
-class _Layout:
-    """What a count has no gradient by, see `count_pairs`."""
-
-    classes: Tensor
-    n_classes: int
-    pairs: tuple[PairValues, ...]
-    mask: Tensor
-
-
-class _CompiledCount(torch.autograd.Function):
-    """(N, C(C+1)/2, B, ...) float64 counts by compiled loops, from the weights, and inputs and centres of the axes."""
-
-    @staticmethod
-    def forward(ctx: Any, layout: _Layout, weights: Tensor, *tensors: Tensor) -> Tensor:
-        ctx.layout = layout
-        ctx.save_for_backward(weights, *tensors)
-
-        def counts(number: int, team: Team) -> Tensor:
-            shape = _Shape(layout, number, weights, tensors)
-            [total] = _summed(shape, shape.counts, team)
-            return _folded(total, shape.bins)
-
-        return torch.stack(_of_shapes(counts, len(weights)))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        weights, *tensors = ctx.saved_tensors
-        gradients = [torch.zeros_like(tensor) for tensor in (weights, *tensors)]
-
-        def derivatives(number: int, team: Team) -> tuple[Tensor, list[Tensor]]:
-            shape = _Shape(ctx.layout, number, weights, tensors, upstream[number])
-            return shape.order, _summed(shape, shape.gradients, team)
-
-        for number, (order, sums) in enumerate(_of_shapes(derivatives, len(weights))):
-            by_weights, by_centres, *by_inputs = sums
-            along, remaining = iter(by_centres), iter(by_inputs)
-            found = [by_weights.T]
-            for one in ctx.layout.pairs:
-                found += [next(remaining) for _ in one.inputs]
-                found += [next(along)[: len(centres)] for centres in one.centres]
-            for into, gradient in zip(gradients, found, strict=True):
-                if into.ndim == 1:  # centres
-                    into += gradient
-                else:
-                    into[number, order] = gradient.to(into.dtype)
-        return None, *gradients
-
-
-Blocks = Sequence[tuple[int, int]]
-
-
-def _of_shapes(task: Callable[[int, Team], Result], n_shapes: int) -> list[Result]:
-    """What a task finds of each shape: of as many side by side as there are threads, or else with a team for each."""
-    with full_precision(), Team() as team:
-        if n_shapes >= team.n_threads:
-            return team.each(lambda number: task(number, ALONE), range(n_shapes))
-        return [task(number, team) for number in range(n_shapes)]
-
-
-def _summed(shape: _Shape, task: Callable[[Blocks], list[Tensor]], team: Team) -> list[Tensor]:
-    """What a task finds in the blocks of a shape, in sum."""
-    total, *others = team.each(task, shape.shares)
-    # Each share has sums of its own, added in order: how many threads there are changes no bit.
-    for other in others:
-        for into, part in zip(total, other, strict=True):
-            into += part
-    return total
-
-
-class _Shape:
-    """The real points of one shape as the loops want them: those of the same classes side by side.
-
-    Args:
-        layout: see `count_pairs`.
-        number: of the shape.
-        weights: (N, P, M).
-        tensors: inputs and centres of the axes.
-        upstream: (C(C+1)/2, B, ...) derivatives by the counts; None where no gradient is asked for.
-    """
-
-    def __init__(
-        self, layout: _Layout, number: int, weights: Tensor, tensors: Sequence[Tensor], upstream: Tensor | None = None
-    ) -> None:
-        real = layout.mask[number].nonzero().flatten()
-        classes, own = layout.classes[number, real], weights.detach()[number, real].double()
-        key = torch.zeros(len(real), dtype=torch.int64)
-        for k in range(classes.shape[1]):
-            key = key * layout.n_classes + torch.where(own[:, k] > 0, classes[:, k], 0)
-        order = torch.argsort(key, stable=True)
-        self.order = real[order]
-        taken = [t.detach()[number].index_select(0, self.order) if t.ndim > 1 else t.detach() for t in tensors]
-        self.pairs = _with(layout.pairs, taken)
-        centres = centres_of(self.pairs)
-        self.bins, self.dtype = [len(one) for one in centres], centres[0].dtype
-        kinds = [kind for one in self.pairs for kind in one.kinds]
-        self.n_values, self.n_oriented = sum(kind != COSINES for kind in kinds), kinds.count(COSINES)
-        self.centred = [_centred(one.inputs[0]) if DISTANCES in one.kinds else None for one in self.pairs]
-        n_points, n_columns = len(order), min(len(order), _MOST_COLUMNS)
-        n_matrices = self.n_values if upstream is None else self.n_values + 4 * self.n_oriented
-        n_rows = min(max(1, _BLOCK // (n_columns * max(1, n_matrices))), n_columns)
-        self.block = n_rows, n_columns
-        blocks = [(row, column) for row in range(0, n_points, n_rows) for column in range(row, n_points, n_columns)]
-        self.n_counts = layout.n_classes * (layout.n_classes + 1) // 2, math.prod(self.bins) << len(self.bins)
-        n_shares = min(_SHARES, len(blocks)) if math.prod(self.n_counts) <= _MOST_COUNTS else 1
-        self.shares = [blocks[k::n_shares] for k in range(n_shares)]
-        self.upstream = _unfolded(torch.empty(0, 0) if upstream is None else upstream.to(self.dtype)).numpy()
-        norms = torch.zeros(self.n_values, n_points, dtype=self.dtype)
-        into = iter(norms)
-        for one, centred in zip(self.pairs, self.centred, strict=True):
-            for norm in [next(into) for kind in one.kinds if kind != COSINES]:
-                if centred is not None:
-                    torch.sum(centred.square(), dim=1, out=norm)
-        oriented = [one.inputs for one in self.pairs if COSINES in one.kinds]
-        n_dimensions = [points.shape[1] for points, _ in oriented]
-        turned = torch.zeros(len(oriented), 2, max(n_dimensions, default=0), n_points, dtype=self.dtype)
-        for vectors, inputs in zip(turned, oriented, strict=True):
-            for k, values in enumerate(inputs):
-                vectors[k, : values.shape[1]] = values.T
-        padded = torch.zeros(len(centres), max(self.bins), dtype=self.dtype)
-        for place, one_axis in zip(padded, centres, strict=True):
-            place[: len(one_axis)] = one_axis
-        self.axes = Axes(
-            np.array(kinds), norms.numpy(), turned.numpy(), np.array(n_dimensions, np.int64), padded.numpy(),
-            np.array(self.bins),
-        )  # fmt: skip
-        self.members = classes[order].int().T.contiguous().numpy(), own[order].T.contiguous().numpy()
-
-    def counts(self, blocks: Blocks) -> list[Tensor]:
-        """(C(C+1)/2, cells·2^K) float64 counts of some blocks, by the cell below and the corner of it."""
-        total, room = torch.zeros(self.n_counts, dtype=torch.float64), self._room(self.n_values)
-        for row, column in blocks:
-            values = self._part(room, row, column)
-            self._fill(values, row, column)
-            count_block(values.numpy(), self.axes, row, column, *self.members, total.numpy())
-        return [total]
-
-    def gradients(self, blocks: Blocks) -> list[Tensor]:
-        """Derivatives by the weights, by the centres, and by the inputs of each axis."""
-        by_weights = torch.zeros(self.members[1].shape, dtype=torch.float64)
-        by_centres = torch.zeros(self.axes.centres.shape, dtype=torch.float64)
-        found = [[torch.zeros_like(x) for x in one.inputs] for one in self.pairs]
-        room, turn_room = self._room(self.n_values), self._room(4 * self.n_oriented)
-        for row, column in blocks:
-            values, turns = self._part(room, row, column), self._part(turn_room, row, column)
-            self._fill(values, row, column)
-            gradient_block(
-                values.numpy(), self.axes, row, column, *self.members, self.upstream,
-                turns.view(-1, 4, *turns.shape[1:]).numpy(), by_weights.numpy(), by_centres.numpy(),
-            )  # fmt: skip
-            rows, columns = slice(row, row + values.shape[1]), slice(column, column + values.shape[2])
-            remaining, turned = iter(values), iter(turns)
-            for one, centred, into in zip(self.pairs, self.centred, found, strict=True):
-                if centred is not None:
-                    _pull(next(remaining), centred, rows, columns, into[0][:, : centred.shape[1]])
-                    continue
-                n = len(one.inputs)
-                leaves = [x[where].requires_grad_() for where in (rows, columns) for x in one.inputs]
-                with torch.enable_grad():
-                    if COSINES in one.kinds:
-                        factors = zip(cosine_factors(*leaves[:n]), cosine_factors(*leaves[n:]), strict=True)
-                        measured = torch.stack([left @ right.T for (left, _), (_, right) in factors])
-                        upstream = torch.stack([next(turned) for _ in measured])
-                        _pull(next(turned), one.inputs[0], rows, columns, into[0])
-                    else:
-                        [measured] = one.between([x[None] for x in leaves[:n]], [x[None] for x in leaves[n:]])
-                        upstream = torch.stack([next(remaining) for _ in measured])
-                for k, gradient in enumerate(torch.autograd.grad(measured, leaves, upstream)):
-                    into[k % n][rows if k < n else columns] += gradient
-        return [by_weights, by_centres, *(gradient for of_axis in found for gradient in of_axis)]
-
-    def _room(self, n_matrices: int) -> Tensor:
-        return torch.empty(n_matrices * math.prod(self.block), dtype=self.dtype)
-
-    def _part(self, room: Tensor, row: int, column: int) -> Tensor:
-        """As much of a room as a block takes, (R, I, J)."""
-        n_matrices = len(room) // math.prod(self.block)
-        n = [min(most, len(self.order) - first) for most, first in zip(self.block, (row, column), strict=True)]
-        return room[: n_matrices * math.prod(n)].view(n_matrices, *n)
-
-    def _fill(self, values: Tensor, row: int, column: int) -> None:
-        """Write what the loops find the values of a block in."""
-        rows, columns = slice(row, row + values.shape[1]), slice(column, column + values.shape[2])
-        into = iter(values)
-        for one, centred in zip(self.pairs, self.centred, strict=True):
-            if centred is not None:
-                torch.mm(centred[rows], centred[columns].T, out=next(into))
-            elif VALUES in one.kinds:
-                between = one.between([x[None, rows] for x in one.inputs], [x[None, columns] for x in one.inputs])
-                for value in between[0]:
-                    next(into).copy_(value)
-
-
-def _centred(points: Tensor) -> Tensor:
-    """Points (P, D) about their centre, which keeps digits in the squares, without coordinates that are 0 at the end.
-
-    Those that padding left there would only change how products are rounded.
-    """
-    mean = points.mean(dim=0)
-    if not bool(mean[-1:].all()):
-        used = (points != 0).any(dim=0).nonzero().flatten()
-        points = points[:, : int(used[-1]) + 1 if len(used) else 0].contiguous()
-        mean = points.mean(dim=0)
-    return points - mean
-
-
-def _pull(by_squares: Tensor, points: Tensor, rows: slice, columns: slice, into: Tensor) -> None:
-    """Add the derivatives by points (P, D) from those by the squares of the distances of some rows and columns."""
-    x, y = points[rows], points[columns]
-    into[rows] += 2 * (x * by_squares.sum(dim=1, keepdim=True) - by_squares @ y)
-    into[columns] += 2 * (y * by_squares.sum(dim=0).unsqueeze(1) - by_squares.T @ x)
-
-
-def _folded(total: Tensor, bins: Sequence[int]) -> Tensor:
-    """(rows, B, ...) counts from (rows, cells·2^K), by the cell below and the corner of it."""
-    counts = total.view(-1, *bins, *(2,) * len(bins))
-    for axis in range(len(bins)):
-        own, beyond = counts.unbind(1 + len(bins))
-        # Beyond the last cell there is nothing to give, so that nothing is rolled over the end.
-        counts = own + beyond.roll(1, dims=1 + axis)
-    return counts
-
-
-def _unfolded(upstream: Tensor) -> Tensor:
-    """(rows, cells·2^K) derivatives by the counts of all corners, from those (rows, B, ...) of the bins."""
-    n_axes = upstream.ndim - 1
-    for axis in range(n_axes):
-        upstream = torch.stack([upstream, upstream.roll(-1, dims=1 + axis)], dim=-1)
-    return upstream.flatten(1).contiguous()
