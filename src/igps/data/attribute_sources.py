@@ -193,10 +193,6 @@ class ImageAttribute(FileAttribute):
         return found
 
 
-class GridAttribute(ImageAttribute):
-    """The same, by the name of what molecules have."""
-
-
 @dataclass(frozen=True)
 class VertexAttribute(FileAttribute):
     """Values at the vertices of the body's file, carried inside by mean value coordinates as the eigenfunctions are.

@@ -61,7 +61,7 @@ class FileCache(ABC, Generic[T]):
 
     @staticmethod
     @abstractmethod
-    def _encode(value: T) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    def _encode(value: T, /) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         """Arrays and metadata of a value."""
 
     @staticmethod
@@ -139,29 +139,6 @@ class FileCache(ABC, Generic[T]):
         _remove_abandoned(self.directory.glob(f"*/*{_PARTIAL}"))
 
 
-class SignatureCache(FileCache[Signature]):
-    """Signatures by key, see `FileCache`."""
-
-    what = "signature"
-    file_format = "igps-signature-2"
-
-    def notes(self, key: str) -> tuple[str, ...]:
-        """What was done to the mesh of the Signature under `key`, in words; nothing if there is none."""
-        return self._read(key, lambda file, metadata: tuple(json.loads(metadata["notes"]))) or ()
-
-    def unit(self, key: str) -> str | None:
-        """The unit of length of the Signature under `key`; None where it has none, or there is none."""
-        return self._read(key, lambda file, metadata: json.loads(metadata.get("unit", "null")))
-
-    @staticmethod
-    def _encode(value: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        return encode(value)
-
-    @staticmethod
-    def _decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Signature:
-        return decode(tensors, metadata)
-
-
 def encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """The arrays of a Signature by name, and all else as JSON."""
     # A file is written as the arrays lie in memory.
@@ -222,6 +199,24 @@ def decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Si
 def _check_array(name: str, values: np.ndarray, kind: type[np.floating[Any]], shape: tuple[int, ...]) -> None:
     if values.dtype != kind or values.shape != shape:
         raise ValueError(f"{name}: expected {kind.__name__} {shape}, got {values.dtype} {values.shape}")
+
+
+class SignatureCache(FileCache[Signature]):
+    """Signatures by key, see `FileCache`."""
+
+    what = "signature"
+    file_format = "igps-signature-2"
+
+    def notes(self, key: str) -> tuple[str, ...]:
+        """What was done to the mesh of the Signature under `key`, in words; nothing if there is none."""
+        return self._read(key, lambda file, metadata: tuple(json.loads(metadata["notes"]))) or ()
+
+    def unit(self, key: str) -> str | None:
+        """The unit of length of the Signature under `key`; None where it has none, or there is none."""
+        return self._read(key, lambda file, metadata: json.loads(metadata.get("unit", "null")))
+
+    _encode = staticmethod(encode)
+    _decode = staticmethod(decode)
 
 
 class AttributeCache(FileCache[dict[str, NDArray[np.float32]]]):

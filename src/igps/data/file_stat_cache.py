@@ -11,6 +11,7 @@ import sqlite3
 import time
 from collections.abc import Generator, Iterable, Mapping
 
+from igps.data._keys import stamp_of
 from igps.data.cache import SignatureCache
 from igps.data.pipeline import CacheHit, SignaturePipeline
 from igps.mesh.loading import BodyRef
@@ -61,7 +62,7 @@ class FileStatCache:
                     continue
                 *stamp, key, n_bytes, notes = row
                 with contextlib.suppress(OSError):
-                    same = CacheHit.stamp_of(body.path) == tuple(stamp)
+                    same = stamp_of(body.path) == tuple(stamp)
                     if same and os.stat(cache.path(key)).st_size == n_bytes:
                         hit = CacheHit(key, n_bytes, tuple(json.loads(notes)), tuple(stamp))
                         if (whole := self._pipeline.with_attributes(body, hit)) is not None:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import json
-import os
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from igps._parallel import Failed, MachineError, attempt
+from igps.data._keys import BodyFile, digest, parameters
 from igps.data.attributes import ROOMS, AttributeSource, with_attribute
 from igps.data.cache import AttributeCache, SignatureCache
 from igps.mesh.loading import BodyRef, each_body, load_mesh
@@ -57,13 +56,7 @@ class CacheHit:
     @property
     def whole_key(self) -> str:
         """A name for the Signature with its attributes."""
-        return _digest([self.key, sorted(self.attributes.items())]) if self.attributes else self.key
-
-    @staticmethod
-    def stamp_of(path: Path) -> tuple[int, int, int]:
-        """Bytes of a file, and when its content and its name or rights were last changed, in nanoseconds."""
-        found = os.stat(path)
-        return found.st_size, found.st_mtime_ns, found.st_ctime_ns
+        return digest([self.key, sorted(self.attributes.items())]) if self.attributes else self.key
 
 
 @dataclass(frozen=True)
@@ -94,7 +87,7 @@ class SignaturePipeline:
 
     def signature(self, body: BodyRef) -> Signature:
         """The Signature of a body, from the cache where it or a larger one is there, and there afterwards."""
-        return self._made(body, _File.of(body.path))[1]
+        return self._made(body, BodyFile.of(body.path))[1]
 
     def fill(self, bodies: Sequence[BodyRef]) -> list[CacheHit | Failed]:
         """Put the Signatures of bodies of one file into the cache; they are not returned, to spare the way back.
@@ -108,7 +101,7 @@ class SignaturePipeline:
         """
         if len(bodies) == 1:
             return [self.hit(bodies[0])]
-        file = _File.of(bodies[0].path)
+        file = BodyFile.of(bodies[0].path)
         done: dict[BodyRef, CacheHit | Failed] = {}
         for body in bodies:
             if (hit := self._served(body, file)) is not None:
@@ -133,7 +126,7 @@ class SignaturePipeline:
         Raises:
             MeshError: it cannot be used.
         """
-        return self._hit(body, _File.of(body.path))
+        return self._hit(body, BodyFile.of(body.path))
 
     def served(self, bodies: Sequence[BodyRef]) -> list[CacheHit | None]:
         """What in the cache serves each of the bodies of one file, None where nothing does.
@@ -141,7 +134,7 @@ class SignaturePipeline:
         Raises:
             MeshError: the file cannot be read.
         """
-        file = _File.of(bodies[0].path)
+        file = BodyFile.of(bodies[0].path)
         return [self._served(body, file) for body in bodies]
 
     def with_attributes(self, body: BodyRef, hit: CacheHit) -> CacheHit | None:
@@ -186,12 +179,12 @@ class SignaturePipeline:
         Raises:
             MeshError: the file cannot be read.
         """
-        return self._key(body, _File.of(body.path), self.config, mended)
+        return self._key(body, BodyFile.of(body.path), self.config, mended)
 
-    def _hit(self, body: BodyRef, file: _File, mesh: Mesh | None = None) -> CacheHit:
+    def _hit(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> CacheHit:
         return self._served(body, file) or self._made(body, file, mesh)[0]
 
-    def _served(self, body: BodyRef, file: _File) -> CacheHit | None:
+    def _served(self, body: BodyRef, file: BodyFile) -> CacheHit | None:
         cache = SignatureCache(self.cache_dir)
         if self.pre_transform is None:
             key = next(self._cached(body, file), None)
@@ -203,7 +196,7 @@ class SignaturePipeline:
         hit = CacheHit(key, cache.path(key).stat().st_size, cache.notes(key), file.stamp)
         return self.with_attributes(body, hit)
 
-    def _made(self, body: BodyRef, file: _File, mesh: Mesh | None = None) -> tuple[CacheHit, Signature]:
+    def _made(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> tuple[CacheHit, Signature]:
         """The Signature of a body with what serves it, which is in the cache then; computed where it is not."""
         cache = SignatureCache(self.cache_dir)
         hit = self._served(body, file)
@@ -222,7 +215,7 @@ class SignaturePipeline:
             cache.put(key, signature)
         return CacheHit(key, cache.path(key).stat().st_size, tuple(signature.notes), file.stamp, keys), signature
 
-    def _plain(self, body: BodyRef, file: _File, mesh: Mesh | None) -> tuple[str, Signature]:
+    def _plain(self, body: BodyRef, file: BodyFile, mesh: Mesh | None) -> tuple[str, Signature]:
         """The Signature as it is computed, and its key in the cache, where it is then."""
         cache = SignatureCache(self.cache_dir)
         for key in self._cached(body, file):
@@ -246,7 +239,7 @@ class SignaturePipeline:
         cache.put(key, {room: getattr(signature, room).attributes[name] for room in ROOMS})
         return signature
 
-    def _cached(self, body: BodyRef, file: _File) -> Iterator[str]:
+    def _cached(self, body: BodyRef, file: BodyFile) -> Iterator[str]:
         """The keys that the cache has of the Signature of a body and of larger ones, which begin with it."""
         cache = SignatureCache(self.cache_dir)
         for config in (self.config, *self.config.larger()):
@@ -262,63 +255,20 @@ class SignaturePipeline:
                 if of_this_version and (read_alike or "subdivided" not in steps):
                     yield key
 
-    def _key(self, body: BodyRef, file: _File, config: SignatureConfig, mended: bool) -> str:
+    def _key(self, body: BodyRef, file: BodyFile, config: SignatureConfig, mended: bool) -> str:
         # The suffix chooses the reader, so the same bytes under another suffix are another mesh.
         versions = config.ALGORITHM_VERSION, MENDING_VERSION if mended else None
-        parameters = _parameters(body.path.suffix.lower(), body.part, self.reading, config, versions)
-        return hashlib.sha256(parameters + file.digest).hexdigest()
+        how = parameters(body.path.suffix.lower(), body.part, self.reading, config, versions)
+        return hashlib.sha256(how + file.digest).hexdigest()
 
     def _attribute_key(self, body: BodyRef, key: str, name: str) -> str:
-        return _digest(["attribute", key, name, self.attributes[name].cache_tag(body)])
+        return digest(["attribute", key, name, self.attributes[name].cache_tag(body)])
 
     def _changed_key(self, body: BodyRef, key: str) -> str:
         """Of the Signature with its attributes, changed: by all that these depend on."""
         assert self.pre_transform is not None
         attributes = [self._attribute_key(body, key, name) for name in sorted(self.attributes)]
-        return _digest(["changed", key, self.pre_transform.cache_tag, attributes])
-
-
-@dataclass(frozen=True)
-class _File:
-    """What a key needs to know of a file.
-
-    Args:
-        stamp: see `CacheHit.stamp_of`.
-        digest: of its content.
-    """
-
-    stamp: tuple[int, int, int]
-    digest: bytes
-
-    @staticmethod
-    def of(path: Path) -> _File:
-        """
-        Raises:
-            MeshError: the file cannot be read.
-        """
-        try:
-            return _File(CacheHit.stamp_of(path), _content_digest(path))
-        except OSError as error:
-            raise MeshError(f"{path}: cannot be read ({error.strerror}). Check the path.") from error
-
-
-def _content_digest(path: Path) -> bytes:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").digest()
-
-
-def _digest(words: Sequence[object]) -> str:
-    return hashlib.sha256(json.dumps(words).encode()).hexdigest()
-
-
-@lru_cache
-def _parameters(
-    suffix: str, part: str | None, reading: LoadOptions, config: SignatureConfig, versions: tuple[int, int | None]
-) -> bytes:
-    """What a key depends on beside the content of the file, the same for thousands of files."""
-    algorithm, mending = versions
-    how = {"suffix": suffix, "part": part, "reading": reading.as_dict(), "mending_version": mending}
-    return json.dumps([how, {**config.as_dict(), "algorithm_version": algorithm}], sort_keys=True).encode()
+        return digest(["changed", key, self.pre_transform.cache_tag, attributes])
 
 
 def version() -> str:

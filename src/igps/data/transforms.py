@@ -10,10 +10,12 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 
+from igps.data.attributes import ROOMS
 from igps.signature.signature import Samples, Signature
 
 
@@ -114,12 +116,7 @@ class FewerEigenpairs(Transform):
         def fewer(samples: Samples) -> Samples:
             return replace(samples, eigenfunctions=samples.eigenfunctions[:, kept])
 
-        return replace(
-            signature,
-            eigenvalues=signature.eigenvalues[kept],
-            interior=fewer(signature.interior),
-            surface=fewer(signature.surface),
-        )
+        return replace(signature, eigenvalues=signature.eigenvalues[kept], **_both(signature, fewer))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +144,7 @@ class Noise(Transform):
                 values = values + np.float32(self.eigenfunctions / length) * noise
             return replace(samples, points=points, eigenfunctions=values)
 
-        return replace(signature, interior=noisy(signature.interior), surface=noisy(signature.surface))
+        return replace(signature, **_both(signature, noisy))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,8 +176,7 @@ class Scale(Transform):
         return replace(
             signature,
             eigenvalues=signature.eigenvalues / factor**2,
-            interior=scaled(signature.interior),
-            surface=scaled(signature.surface),
+            **_both(signature, scaled),
             area=signature.area * factor**2,
             volume=signature.volume * factor**3,
         )
@@ -196,4 +192,9 @@ class FlipSigns(Transform):
         def flipped(samples: Samples) -> Samples:
             return replace(samples, eigenfunctions=samples.eigenfunctions * signs)
 
-        return replace(signature, interior=flipped(signature.interior), surface=flipped(signature.surface))
+        return replace(signature, **_both(signature, flipped))
+
+
+def _both(signature: Signature, change: Callable[[Samples], Samples]) -> dict[str, Any]:
+    """Interior and surface samples, changed."""
+    return {room: change(getattr(signature, room)) for room in ROOMS}
