@@ -48,8 +48,9 @@ class SignatureDataModule(LightningDataModule):
     Args:
         root: a folder that tells classes, see `find_bodies`.
         protocol: "seen" splits each class, "unseen" splits the classes.
-        n_train: shapes of each class ("seen") or classes ("unseen") in training and validation together.
-        n_validation: how many of those validate.
+        n_train: shapes of each class ("seen") or classes ("unseen") in training and validation together; below 1 a
+            share.
+        n_validation: how many of those validate; below 1 a share.
         n_test: classes to test ("unseen" only); all others if None.
         split_seed: of the split.
         classes_per_batch, shapes_per_class: P and K of a training batch, in each process.
@@ -67,8 +68,8 @@ class SignatureDataModule(LightningDataModule):
         self,
         root: Path,
         protocol: SplitProtocol = "seen",
-        n_train: int = 10,
-        n_validation: int = 2,
+        n_train: int | float = 10,
+        n_validation: int | float = 2,
         n_test: int | None = None,
         split_seed: int = 0,
         classes_per_batch: int = 10,

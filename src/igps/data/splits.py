@@ -27,29 +27,30 @@ class Split:
     test: tuple[int, ...]
 
 
-def split_seen(labels: Tensor, n_train: int, *, n_validation: int = 0, seed: int = 0) -> Split:
+def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed: int = 0) -> Split:
     """Every class in every part: `n_train` shapes of each train, the others test.
 
     Args:
         labels: (N,) integer classes.
-        n_train: shapes of each class in training and validation together.
-        n_validation: how many of those validate.
+        n_train: shapes of each class in training and validation together; below 1 a share of them, which leaves one.
+        n_validation: how many of those validate; below 1 a share, which leaves one to train on.
         seed: of the draw.
 
     Raises:
         ValueError: a class has no more than `n_train` shapes, or `n_validation` leaves none to train on.
     """
-    if not 0 <= n_validation < n_train:
-        raise ValueError(f"n_validation: expected 0 to n_train - 1 = {n_train - 1}, got {n_validation}.")
+    _check_validation(n_validation, n_train)
     generator = torch.Generator().manual_seed(seed)
     parts: tuple[list[int], list[int], list[int]] = ([], [], [])
     for label in labels.unique().tolist():
         members = torch.nonzero(labels == label).flatten()
-        if len(members) <= n_train:
+        n_fit = _count(n_train, len(members))
+        if len(members) <= n_fit:
             raise ValueError(f"n_train: expected fewer than the {len(members)} shapes of class {label}, got {n_train}.")
+        n_held = _count(n_validation, n_fit)
         drawn = members[torch.randperm(len(members), generator=generator)].tolist()
         for part, chosen in zip(
-            parts, (drawn[n_validation:n_train], drawn[:n_validation], drawn[n_train:]), strict=True
+            parts, (drawn[n_held:n_fit], drawn[:n_held], drawn[n_fit:]), strict=True
         ):
             part.extend(chosen)
     train, validation, test = (tuple(sorted(part)) for part in parts)
@@ -57,7 +58,7 @@ def split_seen(labels: Tensor, n_train: int, *, n_validation: int = 0, seed: int
 
 
 def split_unseen(
-    labels: Tensor, n_train: int, *, n_validation: int = 0, n_test: int | None = None, seed: int = 0
+    labels: Tensor, n_train: float, *, n_validation: float = 0, n_test: int | None = None, seed: int = 0
 ) -> Split:
     """No class in two parts: `n_train` classes train, others test.
 
@@ -66,8 +67,8 @@ def split_unseen(
 
     Args:
         labels: (N,) integer classes.
-        n_train: classes in training and validation together.
-        n_validation: how many of those validate.
+        n_train: classes in training and validation together; below 1 a share of them, which leaves one.
+        n_validation: how many of those validate; below 1 a share, which leaves one to train on.
         n_test: classes to test; all others if None.
         seed: of the draw.
 
@@ -75,9 +76,10 @@ def split_unseen(
         ValueError: not so many classes, or `n_validation` leaves none to train on.
     """
     classes = labels.unique()
+    _check_validation(n_validation, n_train)
+    n_train = _count(n_train, len(classes))
+    n_validation = _count(n_validation, n_train)
     n_test = len(classes) - n_train if n_test is None else n_test
-    if not 0 <= n_validation < n_train:
-        raise ValueError(f"n_validation: expected 0 to n_train - 1 = {n_train - 1}, got {n_validation}.")
     if n_test < 1 or n_train + n_test > len(classes):
         raise ValueError(f"n_train, n_test: expected at most {len(classes)} classes together, got {n_train}, {n_test}.")
     drawn = classes[torch.randperm(len(classes), generator=torch.Generator().manual_seed(seed))]
@@ -87,3 +89,16 @@ def split_unseen(
 
     fit = drawn[:n_train]
     return Split(members(fit[n_validation:]), members(fit[:n_validation]), members(drawn[len(drawn) - n_test :]))
+
+
+def _count(wanted: float, n: int) -> int:
+    """A number as it is; of a share that of n, at least one and not all of several."""
+    return min(max(round(wanted * n), 1), max(n - 1, 0)) if 0 < wanted < 1 else int(wanted)
+
+
+def _check_validation(n_validation: float, n_train: float) -> None:
+    for name, value in (("n_train", n_train), ("n_validation", n_validation)):
+        if value >= 1 and value != int(value):
+            raise ValueError(f"{name}: expected a whole number, or a share below 1, got {value}.")
+    if not 0 <= n_validation < (n_train if n_validation >= 1 and n_train >= 1 else 1 if n_train > 0 else 0):
+        raise ValueError(f"n_validation: expected 0 to n_train - 1 = {n_train - 1}, got {n_validation}.")

@@ -145,8 +145,9 @@ class RetrievalLearner(LightningModule):
             _ = self._head
 
     def on_train_start(self) -> None:
-        """Fit the head to the training shapes, or centre its inputs on them."""
-        self._fit(calibrate=False)
+        """Fit the head to the training shapes, or centre its inputs on them; a resumed run has done so."""
+        if self.global_step == 0:
+            self._fit(calibrate=False)
 
     def on_train_epoch_end(self) -> None:
         """A checkpoint of this epoch holds a distance whose parts have one scale, and a head that fits the bins."""
@@ -207,7 +208,8 @@ class RetrievalLearner(LightningModule):
     @one_thread()
     def _log_scores(self, part: str) -> None:
         if not self.trainer.sanity_checking:
-            self.log_dict({f"{part}_{name}": value for name, value in self.scores.compute().items()})
+            for name, value in self.scores.compute().items():
+                self.log(f"{part}_{name}", value, prog_bar=name == "ft")
         self.scores.reset()
 
     @one_thread()
