@@ -1,7 +1,7 @@
 """Classification accuracy over several seeded splits, on fixed or on trained histograms.
 
     python -m training.classify DATA --descriptor rich
-    python -m training.classify DATA --checkpoint build/training/lightning_logs/version_0/checkpoints/X.ckpt
+    python -m training.classify DATA --checkpoint build/training/checkpoints/last.ckpt
 
 With a checkpoint the features are the histograms of its learned bins and filter, on the checkpoint's own split.
 """

@@ -2,7 +2,7 @@
 
     python -m training.evaluate splits DATA --descriptor rich --protocol unseen
     python -m training.evaluate fitted DATA --first_seed 200
-    python -m training.evaluate checkpoint build/training/lightning_logs/version_0/checkpoints/X.ckpt
+    python -m training.evaluate checkpoint build/training/checkpoints/last.ckpt
 
 Nothing is chosen here: the heads are fitted to the training part with fixed parameters, the test part is scored once.
 Of a descriptor with a metric, such as `pretrained`, that is the heads' prior.

@@ -1,4 +1,4 @@
-"""A run of training: a few values in one YAML, a curve as it goes, an early end, and going on where it was interrupted."""
+"""A run of training: a few values in one YAML, a curve, an early end, and going on after an interruption."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+import torch
 from matplotlib.figure import Figure
 from pytorch_lightning import Callback, LightningModule, Trainer, seed_everything
 from pytorch_lightning.callbacks import EarlyStopping, ModelCheckpoint
@@ -23,10 +24,10 @@ class Run(LightningCLI):
     """The command line of training/train.py: what a file leaves out is that of configs/default.yaml.
 
     In the folder of the run are `checkpoints/last.ckpt` and `best.ckpt` (by the validation's FT), `curve.csv`,
-    `curve.svg`, and `config.yaml`. A run that was interrupted and resumed ends with the weights of one that ran through.
+    `curve.svg`, and `config.yaml`. A run that was interrupted and resumed ends with the weights of one that was not.
     """
 
-    def __init__(self, args: list[str] | None = None) -> None:
+    def __init__(self) -> None:
         often = ModelCheckpoint(filename="last", save_on_train_epoch_end=True, enable_version_counter=False)
         best = ModelCheckpoint(
             filename="best", monitor="val_ft", mode="max", save_on_train_epoch_end=False, enable_version_counter=False
@@ -37,9 +38,8 @@ class Run(LightningCLI):
             SignatureDataModule,
             seed_everything_default=0,
             save_config_kwargs={"overwrite": True},
-            parser_kwargs={name: files for name in ("fit", "validate", "test", "predict")},
+            parser_kwargs=dict.fromkeys(("fit", "validate", "test", "predict"), files),
             trainer_defaults={"callbacks": [SeededEpochs(), TrainingCurve(), often, best]},
-            args=args,
         )
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
@@ -68,7 +68,7 @@ class Run(LightningCLI):
             if not Path(config.ckpt_path).is_file():
                 raise FileNotFoundError(f"resume: expected a checkpoint, there is no {config.ckpt_path}.")
         elif config.ckpt_path is None and last.exists():
-            raise FileExistsError(f"out: {last} is of another run. Continue it by --resume last, or name another folder.")
+            raise FileExistsError(f"out: {last} is of another run. Give --resume last, or another folder.")
 
     def before_fit(self) -> None:
         """Checkpoints lie in the folder of the run, whatever the logger."""
@@ -80,34 +80,40 @@ class Run(LightningCLI):
 class SeededEpochs(Callback):
     """Random numbers of each epoch begin anew, from the run's seed and the epoch: those of a resumed run are the same.
 
-    Once before the shapes of the epoch are drawn, and once before its first step, as opening a loader draws numbers too.
+    Once before its shapes are drawn, and once before its first step, as opening a loader draws numbers too. The loader
+    is to be made anew for each epoch, or its sampler would remember. Processes that load (`n_loading_workers`) draw
+    ahead: with them a resumed run goes on with other batches.
     """
 
     def __init__(self) -> None:
-        self.seed: int | None = None
+        self.state = {"seed": -1, "epoch": 0}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The run's seed, and the epoch that comes next."""
+        return self.state
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Those of the run that goes on."""
+        self.state = dict(state_dict)
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Take over the seed of the run."""
-        import torch
-
-        self.seed = torch.initial_seed() % 2**31 if self.seed is None else self.seed
-
-    def state_dict(self) -> dict[str, Any]:
-        """The seed."""
-        return {"seed": self.seed}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """The seed of the run that goes on."""
-        self.seed = state_dict["seed"]
-
-    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """For the order of the shapes."""
-        seed_everything((self.seed or 0) + trainer.current_epoch, verbose=False)
+        if self.state["seed"] < 0:
+            self.state["seed"] = torch.initial_seed() % 2**31
+        self._begin()
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         """For what is drawn in the steps."""
         if batch_idx == 0:
-            seed_everything((self.seed or 0) + trainer.current_epoch, verbose=False)
+            self._begin()
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """For the shapes of the next."""
+        self.state = {**self.state, "epoch": trainer.current_epoch + 1}
+        self._begin()
+
+    def _begin(self) -> None:
+        seed_everything(sum(self.state.values()), verbose=False)
 
 
 class TrainingCurve(Callback):

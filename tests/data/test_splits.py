@@ -34,6 +34,15 @@ def test_unseen_split_shares_no_class() -> None:
     assert len(split.train) == 3 * 6
 
 
+def test_shares_leave_two_of_each_class_to_validate_and_to_test() -> None:
+    labels = torch.arange(3).repeat_interleave(torch.tensor([5, 8, 20]))
+    split = split_seen(labels, 0.75, n_validation=0.25)
+    counts = [torch.bincount(labels[list(part)]).tolist() for part in (split.train, split.validation, split.test)]
+    assert counts == [[1, 4, 11], [2, 2, 4], [2, 2, 5]]
+    of_classes = split_unseen(labels, 0.5, n_validation=0.5)
+    assert [len(set(labels[list(part)].tolist())) for part in (of_classes.train, of_classes.test)] == [1, 1]
+
+
 def test_fewer_training_classes_keep_the_test_classes() -> None:
     many, few = (split_unseen(LABELS, n, n_test=2, seed=5) for n in (6, 3))
     assert many.test == few.test
@@ -59,6 +68,7 @@ def test_splits_depend_on_the_seed_alone() -> None:
     [
         (split_seen, {"n_train": 6}, "n_train"),
         (split_seen, {"n_train": 3, "n_validation": 3}, "n_validation"),
+        (split_seen, {"n_train": 2.5}, "n_train"),
         (split_unseen, {"n_train": 8}, "n_train"),
         (split_unseen, {"n_train": 6, "n_test": 3}, "n_test"),
         (split_unseen, {"n_train": 3, "n_validation": 3}, "n_validation"),

@@ -343,7 +343,7 @@ def test_smoke_configuration_trains_and_its_checkpoint_loads_without_running_cod
     arguments += ["--trainer.default_root_dir", tmp_path]
     monkeypatch.setattr(sys, "argv", ["train.py", *map(str, arguments)])
     runpy.run_path(str(PROJECT / "training/train.py"), run_name="__main__")
-    (checkpoint,) = tmp_path.rglob("*.ckpt")
+    checkpoint = tmp_path / "checkpoints" / "last.ckpt"
     state = torch.load(checkpoint, weights_only=True)["state_dict"]
     assert state["descriptor.histograms.0.embedding.log_gain"].shape == (12,)
     (stored,) = tmp_path.rglob("config.yaml")

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import csv
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 import yaml
+from training.running import Run
 
 from igps.nn.learner import RetrievalLearner
 from igps.shapes import ArticulatedShapes
-from training.running import Run
 
 OWN = Path(__file__).parents[2] / "configs" / "own.yaml"
 
@@ -20,7 +21,7 @@ OWN = Path(__file__).parents[2] / "configs" / "own.yaml"
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("running")
-    ArticulatedShapes(n_classes=3, n_per_class=6, n_vertices=500).write(root / "meshes")
+    ArticulatedShapes(n_classes=3, n_per_class=8, n_vertices=500).write(root / "meshes")
     return root
 
 
@@ -36,7 +37,9 @@ def train(root: Path, out: Path, *more: object, epochs: int = 4) -> None:
         "--trainer.accelerator", "cpu", "--data.shapes_per_class", 2,
         *small, *quiet, *more,
     ]  # fmt: skip
-    Run(["fit", "--config", str(file), *map(str, options)])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["train.py", "fit", "--config", str(file), *map(str, options)])
+        Run()
 
 
 def curve(out: Path) -> list[dict[str, str]]:

@@ -143,7 +143,7 @@ def test_checkpoint_to_table_figure_and_classifier(root: Path) -> None:
         "--data.root", root / "meshes", "--data.cache_dir", root / "cache_plain", "--data.n_train", 4,
         "--data.n_validation", 2, "--data.shapes_per_class", 2, "--trainer.default_root_dir", out,
     )  # fmt: skip
-    (checkpoint,) = out.rglob("*.ckpt")
+    checkpoint = out / "checkpoints" / "last.ckpt"
     table = run("evaluate", "checkpoint", checkpoint, "--out", out / "evaluation")
     printed = rows(table)
     assert list(printed) == ["plain", "learned", "whitened", "kernel"]

@@ -32,26 +32,28 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
 
     Args:
         labels: (N,) integer classes.
-        n_train: shapes of each class in training and validation together; below 1 a share of them, which leaves one.
-        n_validation: how many of those validate; below 1 a share, which leaves one to train on.
+        n_train: shapes of each class in training and validation together; below 1 a share of them,
+            three or more, which leaves two.
+        n_validation: how many of those validate; below 1 a share, two or more, which leaves one to train on.
         seed: of the draw.
 
     Raises:
-        ValueError: a class has no more than `n_train` shapes, or `n_validation` leaves none to train on.
+        ValueError: a class has no more than `n_train` shapes, or for a share fewer than five; or `n_validation`
+            leaves none to train on.
     """
-    _check_validation(n_validation, n_train)
+    _check(n_validation, n_train)
     generator = torch.Generator().manual_seed(seed)
     parts: tuple[list[int], list[int], list[int]] = ([], [], [])
     for label in labels.unique().tolist():
         members = torch.nonzero(labels == label).flatten()
-        n_fit = _count(n_train, len(members))
+        n_fit = _count(n_train, len(members), 3, 2)
+        if isinstance(n_train, float) and len(members) < 5:
+            raise ValueError(f"n_train: a share expects at least 5 shapes of a class, got {len(members)} of {label}.")
         if len(members) <= n_fit:
             raise ValueError(f"n_train: expected fewer than the {len(members)} shapes of class {label}, got {n_train}.")
-        n_held = _count(n_validation, n_fit)
+        n_held = _count(n_validation, n_fit, 2)
         drawn = members[torch.randperm(len(members), generator=generator)].tolist()
-        for part, chosen in zip(
-            parts, (drawn[n_held:n_fit], drawn[:n_held], drawn[n_fit:]), strict=True
-        ):
+        for part, chosen in zip(parts, (drawn[n_held:n_fit], drawn[:n_held], drawn[n_fit:]), strict=True):
             part.extend(chosen)
     train, validation, test = (tuple(sorted(part)) for part in parts)
     return Split(train, validation, test)
@@ -76,29 +78,29 @@ def split_unseen(
         ValueError: not so many classes, or `n_validation` leaves none to train on.
     """
     classes = labels.unique()
-    _check_validation(n_validation, n_train)
-    n_train = _count(n_train, len(classes))
-    n_validation = _count(n_validation, n_train)
-    n_test = len(classes) - n_train if n_test is None else n_test
-    if n_test < 1 or n_train + n_test > len(classes):
+    _check(n_validation, n_train)
+    n_fit = _count(n_train, len(classes), 1)
+    n_held = _count(n_validation, n_fit, 1)
+    n_test = len(classes) - n_fit if n_test is None else n_test
+    if n_test < 1 or n_fit + n_test > len(classes):
         raise ValueError(f"n_train, n_test: expected at most {len(classes)} classes together, got {n_train}, {n_test}.")
     drawn = classes[torch.randperm(len(classes), generator=torch.Generator().manual_seed(seed))]
 
     def members(chosen: Tensor) -> tuple[int, ...]:
         return tuple(torch.nonzero(torch.isin(labels, chosen)).flatten().tolist())
 
-    fit = drawn[:n_train]
-    return Split(members(fit[n_validation:]), members(fit[:n_validation]), members(drawn[len(drawn) - n_test :]))
+    fit = drawn[:n_fit]
+    return Split(members(fit[n_held:]), members(fit[:n_held]), members(drawn[len(drawn) - n_test :]))
 
 
-def _count(wanted: float, n: int) -> int:
-    """A number as it is; of a share that of n, at least one and not all of several."""
-    return min(max(round(wanted * n), 1), max(n - 1, 0)) if 0 < wanted < 1 else int(wanted)
+def _count(wanted: float, n: int, least: int, rest: int = 1) -> int:
+    """A number as it is; of a share that of n, at least so many of them, which leaves a rest."""
+    return min(max(round(wanted * n), least), n - rest) if 0 < wanted < 1 else int(wanted)
 
 
-def _check_validation(n_validation: float, n_train: float) -> None:
+def _check(n_validation: float, n_train: float) -> None:
     for name, value in (("n_train", n_train), ("n_validation", n_validation)):
-        if value >= 1 and value != int(value):
+        if not (0 <= value < 1 or value == int(value)):
             raise ValueError(f"{name}: expected a whole number, or a share below 1, got {value}.")
-    if not 0 <= n_validation < (n_train if n_validation >= 1 and n_train >= 1 else 1 if n_train > 0 else 0):
+    if not 0 <= n_validation < max(n_train, 1 if n_train > 0 else 0):
         raise ValueError(f"n_validation: expected 0 to n_train - 1 = {n_train - 1}, got {n_validation}.")
