@@ -16,9 +16,8 @@ from igps.signature import residue_attributes as module
 from igps.signature.residue_attributes import (
     RESIDUE_ATTRIBUTES,
     RESIDUE_KINDS,
-    residue_attributes,
+    residue_attribute,
     residue_means,
-    residue_shares,
     screened_potential,
     with_residue_attributes,
 )
@@ -58,7 +57,7 @@ def mean_written_out(molecule: Molecule, point: NDArray[np.float64], values: lis
 def test_an_attribute_is_a_gaussian_mean_over_residues(name: str, of_residue) -> None:
     names = ("ASP", "LYS", "ALA", "TRP", "HIS", "GLU", "ARG", "ILE")
     molecule = peptide(*names)
-    found = getattr(module, name)(molecule, points())
+    found = residue_attribute(molecule, points(), name)
     wanted = [mean_written_out(molecule, point, [of_residue(one) for one in names]) for point in points()]
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
 
@@ -66,12 +65,12 @@ def test_an_attribute_is_a_gaussian_mean_over_residues(name: str, of_residue) ->
 def test_b_factors_are_the_molecules_own() -> None:
     molecule = peptide("ALA", "GLY", "SER")
     wanted = [mean_written_out(molecule, point, [0.0, 1.0, 2.0]) for point in points()]
-    np.testing.assert_allclose(module.b_factor(molecule, points()), wanted, rtol=1e-9)
+    np.testing.assert_allclose(residue_attribute(molecule, points(), "b_factor"), wanted, rtol=1e-9)
 
 
 def test_shares_of_kinds_sum_to_one_and_follow_the_names() -> None:
     molecule = peptide("ALA", "DT", "U", "ZN", "DG")
-    shares = residue_shares(molecule, points())
+    shares = residue_attribute(molecule, points(), "residue_shares")
     np.testing.assert_allclose(shares.sum(axis=1), 1)
     weight = [mean_written_out(molecule, point, [0, 1, 1, 0, 0]) for point in points()]
     np.testing.assert_allclose(shares[:, RESIDUE_KINDS.index("U")], weight)
@@ -85,8 +84,10 @@ def test_what_is_not_known_does_not_count_and_is_never_made_up() -> None:
         "known", molecule.positions, molecule.radii, molecule.charges, molecule.residue_of, ("ALA", "ILE"),
         molecule.residue_positions[[0, 2]], molecule.b_factors[[0, 2]],
     )  # fmt: skip
-    np.testing.assert_allclose(module.hydropathy(molecule, points()), module.hydropathy(known, points()))
-    assert np.isnan(module.hydropathy(peptide("QQQ", "ZN"), points())).all()
+    np.testing.assert_allclose(
+        residue_attribute(molecule, points(), "hydropathy"), residue_attribute(known, points(), "hydropathy")
+    )
+    assert np.isnan(residue_attribute(peptide("QQQ", "ZN"), points(), "hydropathy")).all()
 
 
 def test_far_outside_the_nearest_residue_counts() -> None:
@@ -94,7 +95,9 @@ def test_far_outside_the_nearest_residue_counts() -> None:
     far = 1e4 * np.eye(3)
     nearest = np.linalg.norm(far[:, None] - molecule.residue_positions, axis=2).argmin(axis=1)
     np.testing.assert_allclose(
-        module.hydropathy(molecule, far), [HYDROPATHY[molecule.residue_names[i]] for i in nearest], rtol=1e-6
+        residue_attribute(molecule, far, "hydropathy"),
+        [HYDROPATHY[molecule.residue_names[i]] for i in nearest],
+        rtol=1e-6,
     )
 
 
@@ -125,15 +128,14 @@ def test_many_points_in_blocks_are_as_few_at_once(monkeypatch: pytest.MonkeyPatc
     np.testing.assert_allclose(screened_potential(molecule, points(50)), whole[1])
 
 
-def test_several_by_name_are_each_alone() -> None:
+def test_each_attribute_is_known_by_its_name() -> None:
     molecule = peptide("ASP", "ALA", "LYS", "TRP")
-    together = residue_attributes(molecule, points(), RESIDUE_ATTRIBUTES)
-    assert tuple(together) == RESIDUE_ATTRIBUTES
-    for name, values in together.items():
-        assert values.dtype == np.float32
-        np.testing.assert_allclose(values, getattr(module, name)(molecule, points()), rtol=1e-5, atol=1e-6)
+    for name in RESIDUE_ATTRIBUTES:
+        values = residue_attribute(molecule, points(), name)
+        assert values.shape == ((7, len(RESIDUE_KINDS)) if name == "residue_shares" else (7,))
+        assert np.isfinite(values).all()
     with pytest.raises(ValueError, match=r"attributes: expected some of charge, .*, got 'colour'"):
-        residue_attributes(molecule, points(), ["charge", "colour"])
+        residue_attribute(molecule, points(), "colour")
 
 
 def test_a_signature_gets_attributes_and_keeps_its_own() -> None:
@@ -146,6 +148,6 @@ def test_a_signature_gets_attributes_and_keeps_its_own() -> None:
     for samples in (found.interior, found.surface):
         assert set(samples.attributes) == {"surface_direction", "charge"}
         np.testing.assert_allclose(
-            samples.attributes["charge"], module.charge(molecule, samples.points), rtol=1e-5, atol=1e-6
+            samples.attributes["charge"], residue_attribute(molecule, samples.points, "charge"), rtol=1e-5, atol=1e-6
         )
     assert set(signature.interior.attributes) == {"surface_direction"}

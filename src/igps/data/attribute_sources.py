@@ -29,7 +29,7 @@ from igps.mesh.loading import BodyRef, load_mesh, read_surface
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.mean_value import extend
-from igps.signature.residue_attributes import RESIDUE_ATTRIBUTES, residue_attributes
+from igps.signature.residue_attributes import RESIDUE_ATTRIBUTES, residue_attribute
 
 logger = logging.getLogger(__name__)
 
@@ -68,8 +68,8 @@ class ResidueAttribute:
                 f"{body}: has no atoms, which {self.name!r} is known of. Give a PDB, mmCIF or PQR file, or choose "
                 "another descriptor."
             )
-        values = residue_attributes(_molecule(body, os.stat(body.path).st_mtime_ns), points, [self.name])[self.name]
-        return completed(values.astype(np.float64), points, f"{body}: {self.name}")
+        values = residue_attribute(_molecule(body, os.stat(body.path).st_mtime_ns), points, self.name)
+        return completed(values, points, f"{body}: {self.name}")
 
 
 @lru_cache(maxsize=2)

@@ -119,18 +119,5 @@ def bird() -> Skeleton:
     return Skeleton(Part(Blob((0.26, 0.62, 0.26)), children=(neck, tail, *wings)))
 
 
-_ALL: tuple[Callable[[], Skeleton], ...] = (
-    biped,
-    quadruped,
-    octopus,
-    spider,
-    hand,
-    snake,
-    plier,
-    mug,
-    glasses,
-    chair,
-    fish,
-    bird,
-)
-TEMPLATES = {build.__name__: build for build in _ALL}
+_ALL = (biped, quadruped, octopus, spider, hand, snake, plier, mug, glasses, chair, fish, bird)
+TEMPLATES: dict[str, Callable[[], Skeleton]] = {build.__name__: build for build in _ALL}

@@ -32,46 +32,6 @@ DEBYE_LENGTH = 7.85
 _BLOCK = 2**22
 
 
-def charge(molecule: Molecule, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P,) mean charge of the residues around points (P, 3), elementary charges."""
-    return _mean("charge", molecule, points)
-
-
-def hydropathy(molecule: Molecule, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P,) mean hydropathy of the amino acids around points (P, 3) (Kyte and Doolittle 1982)."""
-    return _mean("hydropathy", molecule, points)
-
-
-def b_factor(molecule: Molecule, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P,) mean B-factor, Å², or pLDDT of the residues around points (P, 3)."""
-    return _mean("b_factor", molecule, points)
-
-
-def donors(molecule: Molecule, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P,) mean number of hydrogen-bond donors in the side chains around points (P, 3)."""
-    return _mean("donors", molecule, points)
-
-
-def acceptors(molecule: Molecule, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P,) mean number of hydrogen-bond acceptors in the side chains around points (P, 3)."""
-    return _mean("acceptors", molecule, points)
-
-
-def aromaticity(molecule: Molecule, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P,) share of amino acids with an aromatic ring around points (P, 3)."""
-    return _mean("aromaticity", molecule, points)
-
-
-def residue_volume(molecule: Molecule, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P,) mean volume of the amino acids around points (P, 3), Å³ (Zamyatnin 1972)."""
-    return _mean("residue_volume", molecule, points)
-
-
-def residue_shares(molecule: Molecule, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P, 25) shares of `RESIDUE_KINDS` in the residues around points (P, 3); rows of sum 1."""
-    return residue_means(molecule, points, _kinds(molecule))
-
-
 def screened_potential(molecule: Molecule, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """(P,) potential at points (P, 3) of all charges in salt water, kT/e (Debye and Hückel 1923).
 
@@ -114,34 +74,25 @@ def residue_means(
     return means
 
 
-def residue_attributes(
-    molecule: Molecule, points: NDArray[np.float64], names: Sequence[str]
-) -> Mapping[str, NDArray[np.float32]]:
-    """Named attributes of points, each (P,) or (P, 25), see `RESIDUE_ATTRIBUTES`; several cost hardly more than one.
+def residue_attribute(molecule: Molecule, points: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    """A named attribute of points (P, 3), Å: (P,), of "residue_shares" (P, 25); see `RESIDUE_ATTRIBUTES`.
 
     Raises:
         ValueError: an unknown name.
     """
-    if unknown := [name for name in names if name not in RESIDUE_ATTRIBUTES]:
-        raise ValueError(f"attributes: expected some of {', '.join(RESIDUE_ATTRIBUTES)}, got {unknown[0]!r}.")
-    of_residues = {name: _COLUMNS[name](molecule) for name in names if name in _COLUMNS}
-    found = {}
-    if of_residues:
-        means = residue_means(molecule, points, np.concatenate(list(of_residues.values()), axis=1))
-        ends = np.cumsum([column.shape[1] for column in of_residues.values()])
-        parts = np.split(means, ends[:-1], axis=1)
-        found = dict(zip(of_residues, (part[:, 0] if part.shape[1] == 1 else part for part in parts), strict=True))
-    if "screened_potential" in names:
-        found["screened_potential"] = screened_potential(molecule, points)
-    return {name: found[name].astype(np.float32) for name in names}
+    if name == "screened_potential":
+        return screened_potential(molecule, points)
+    if name not in _COLUMNS:
+        raise ValueError(f"attributes: expected some of {', '.join(RESIDUE_ATTRIBUTES)}, got {name!r}.")
+    means = residue_means(molecule, points, _COLUMNS[name](molecule))
+    return means[:, 0] if means.shape[1] == 1 else means
 
 
 def with_residue_attributes(signature: Signature, molecule: Molecule, names: Sequence[str]) -> Signature:
     """A Signature of the molecule's surface whose samples have the named attributes, too."""
 
     def added(samples: Samples) -> Samples:
-        new = residue_attributes(molecule, samples.points, names)
-        return replace(samples, attributes={**samples.attributes, **new})
+        return samples.with_attributes({name: residue_attribute(molecule, samples.points, name) for name in names})
 
     return replace(signature, interior=added(signature.interior), surface=added(signature.surface))
 
@@ -170,22 +121,18 @@ def _kinds(molecule: Molecule) -> NDArray[np.float64]:
 
 
 _COLUMNS: Mapping[str, Callable[[Molecule], NDArray[np.float64]]] = {
-    "charge": _charges,
-    "hydropathy": _by_name(HYDROPATHY),
-    "b_factor": lambda molecule: molecule.b_factors[:, None],
-    "donors": _by_name(DONORS, 0.0),
+    "charge": _charges,  # elementary charges
+    "hydropathy": _by_name(HYDROPATHY),  # Kyte and Doolittle 1982
+    "b_factor": lambda molecule: molecule.b_factors[:, None],  # Å², or pLDDT
+    "donors": _by_name(DONORS, 0.0),  # of hydrogen bonds in side chains
     "acceptors": _by_name(ACCEPTORS, 0.0),
-    "aromaticity": _by_name(dict.fromkeys(AROMATIC, 1.0), 0.0),
-    "residue_volume": _by_name(VOLUMES),
-    "residue_shares": _kinds,
+    "aromaticity": _by_name(dict.fromkeys(AROMATIC, 1.0), 0.0),  # share of amino acids with a ring
+    "residue_volume": _by_name(VOLUMES),  # Å³, Zamyatnin 1972
+    "residue_shares": _kinds,  # of `RESIDUE_KINDS`, of sum 1
 }
 
 RESIDUE_ATTRIBUTES: tuple[str, ...] = (*_COLUMNS, "screened_potential")
-"""Names of the attributes; each is a function of this module, of a molecule and points."""
-
-
-def _mean(name: str, molecule: Molecule, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    return residue_means(molecule, points, _COLUMNS[name](molecule))[:, 0]
+"""Names of the attributes, see `residue_attribute`."""
 
 
 def _blocks(n_points: int, n_others: int) -> list[slice]:
