@@ -13,7 +13,6 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from igps.data.attributes import AttributeSource
 from igps.mesh.formats import images, vertex_values
-from igps.mesh.formats.molecules import Molecule, MoleculeBodies, is_structure, read_molecule
+from igps.mesh.formats.molecules import Molecule, MoleculeBodies, is_structure, molecules_by_part
 from igps.mesh.loading import BodyRef, load_mesh, read_surface
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
@@ -68,19 +67,18 @@ class ResidueAttribute:
                 f"{body}: has no atoms, which {self.name!r} is known of. Give a PDB, mmCIF or PQR file, or choose "
                 "another descriptor."
             )
-        values = residue_attribute(_molecule(body, os.stat(body.path).st_mtime_ns), points, self.name)
+        values = residue_attribute(_molecule(body), points, self.name)
         return completed(values, points, f"{body}: {self.name}")
 
 
-@lru_cache(maxsize=2)
-def _molecule(body: BodyRef, changed: int) -> Molecule:
+def _molecule(body: BodyRef) -> Molecule:
     """That whose surface the body is."""
-    part = body.part or ""
+    part, changed = body.part or "", os.stat(body.path).st_mtime_ns
     how: MoleculeBodies = "chains" if "chain" in part else "assembly" if "assembly" in part else "models"
-    found = {one.name.removeprefix(str(body.path)).lstrip("#") or "model": one for one in read_molecule(body.path, how)}
+    found = molecules_by_part(body.path, changed, how)
     if part in found:
         return found[part]
-    first, *others = read_molecule(body.path, "models")
+    first, *others = molecules_by_part(body.path, changed, "models").values()
     for other in others:  # a body of all of them
         first = replace(
             first,

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from igps.mesh.formats.molecules import Molecule
 from igps.mesh.residues import ACCEPTORS, AROMATIC, DONORS, HYDROPATHY, VOLUMES
@@ -43,7 +44,7 @@ def screened_potential(molecule: Molecule, points: NDArray[np.float64]) -> NDArr
     strength = BJERRUM_LENGTH * molecule.charges[charged]
     potential = np.zeros(len(points))
     for block in _blocks(len(points), len(charged)):
-        distance = np.maximum(np.sqrt(_squared_distances(points[block], at)), radii)
+        distance = np.maximum(cdist(points[block], at), radii)
         potential[block] = (np.exp(-distance / DEBYE_LENGTH) / distance) @ strength
     return potential
 
@@ -66,7 +67,7 @@ def residue_means(
     filled = np.where(known, values, 0)
     means = np.empty((len(points), values.shape[1]))
     for block in _blocks(len(points), len(values)):
-        squares = _squared_distances(points[block], molecule.residue_positions)
+        squares = cdist(points[block], molecule.residue_positions, "sqeuclidean")
         # Relative to the nearest, so that far outside it counts alone, rather than nothing.
         weights = np.exp((squares.min(axis=1, keepdims=True) - squares) / (2 * width**2))
         total = weights @ known.astype(float)
@@ -138,11 +139,3 @@ RESIDUE_ATTRIBUTES: tuple[str, ...] = (*_COLUMNS, "screened_potential")
 def _blocks(n_points: int, n_others: int) -> list[slice]:
     step = max(_BLOCK // max(n_others, 1), 1)
     return [slice(start, start + step) for start in range(0, n_points, step)]
-
-
-def _squared_distances(points: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P, R), by columns: no array of three dimensions."""
-    squares = np.zeros((len(points), len(others)))
-    for axis in range(3):
-        squares += np.square(points[:, axis, None] - others[:, axis])
-    return squares

@@ -17,7 +17,7 @@ from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 
 if TYPE_CHECKING:
-    from igps.mesh.formats.molecules import Molecule
+    from igps.mesh.formats.molecules import Molecule, MoleculeBodies
     from igps.mesh.formats.volumes import VolumeOptions
 
 
@@ -67,11 +67,10 @@ def structure_parts(path: Path, options: LoadOptions) -> list[str]:
 
 
 def _molecules(path: Path, options: LoadOptions) -> dict[str, Molecule]:
-    from igps.mesh.formats.molecules import read_molecule
+    from igps.mesh.formats.molecules import molecules_by_part
 
-    how = options.bodies if options.bodies in ("chains", "models", "assembly") else "models"
-    found = read_molecule(path, how)
-    return {molecule.name.removeprefix(str(path)).lstrip("#") or "model": molecule for molecule in found}
+    how: MoleculeBodies = options.bodies if options.bodies in ("chains", "assembly") else "models"
+    return molecules_by_part(path, path.stat().st_mtime_ns, how)
 
 
 def _body(

@@ -6,6 +6,7 @@ import logging
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -136,6 +137,13 @@ def read_molecule(
     for name in left_out:
         logger.warning("%s: no atoms of a polymer, left out; read its ligands, or check the file.", name)
     return found
+
+
+@lru_cache(maxsize=1)
+def molecules_by_part(path: Path, changed: int, bodies: MoleculeBodies) -> dict[str, Molecule]:
+    """The bodies of a structure file by their parts; it is read once, unless it was `changed` at another time."""
+    found = read_molecule(path, bodies)
+    return {molecule.name.removeprefix(str(path)).lstrip("#") or "model": molecule for molecule in found}
 
 
 def _molecules(
