@@ -380,6 +380,23 @@ def signature_1500(data: Path | None) -> Figure:
     return Figure(ours, "s", before, "version 0.2.0", before / ours, note)
 
 
+def epoch(data: Path | None) -> dict[str, Figure]:
+    """An epoch over 400 stored signatures: without and with workers, over version 0.2.0, and with over without."""
+    figures = {}
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "meshes"
+        igps.ArticulatedShapes(n_classes=4, n_per_class=5, n_vertices=1500).write(root)
+        with two_versions("epochs.py", root, VERSION_0_2_0) as seconds_of:
+            alone, before = seconds_of("0")
+            helped, before_helped = seconds_of("2")
+    note = "400 items of 20 generated bodies, batches of 16; ours from one file, without meshes"
+    figures["epoch"] = Figure(alone, "s", before, "version 0.2.0", before / alone, note)
+    faster = before_helped / helped
+    figures["epoch_workers"] = Figure(helped, "s", before_helped, "version 0.2.0", faster, "two workers")
+    figures["epoch_helped"] = Figure(helped, "s", alone, "no worker", alone / helped, "two workers")
+    return figures
+
+
 @contextlib.contextmanager
 def two_versions(script: str, path: Path, commit: str) -> Iterator[Callable[[str], tuple[float, float]]]:
     """A script beside this one, run by now's igps and by that of a commit on one thread: gives seconds for a line.
@@ -606,6 +623,7 @@ FIGURES: dict[str, Callable[[Path | None], Figure | dict[str, Figure]]] = {
     "oriented_pairs": oriented_pairs,
     "describe_rich": describe_before,
     "signature_1500": signature_1500,
+    "epoch": epoch,
     "descriptor_15k": descriptor_15k,
     "mesh_10k": mesh_10k,
     "mesh_250k": mesh_250k,

@@ -1,0 +1,63 @@
+"""What an epoch over stored signatures costs, by whichever igps is on the path: of now, or of version 0.2.0.
+
+    python epochs.py FOLDER-OF-MESHES
+
+Each line of its input is a number of worker processes, with "memory" behind it for signatures in memory; for each it
+tells the seconds of an epoch of batches of 16, the start of the workers not counted. Now's igps reads an exported file,
+without the meshes; version 0.2.0 its cache.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import sys
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.data import DataLoader
+
+import igps
+
+N_ITEMS = 400
+
+
+def main() -> None:
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(1)
+    root = Path(sys.argv[1])
+    version = hashlib.sha256(igps.__file__.encode()).hexdigest()[:8]
+    config = igps.SignatureConfig(n_eigenpairs=64)
+    dataset: Any = igps.SignatureDataset(root, config, root.parent / f"cache-{version}")
+    dataset.precompute(n_workers=1, progress=False)
+    if hasattr(dataset, "to_file"):
+        path = root.parent / f"{version}.igps"
+        dataset.to_file(path)
+        dataset = igps.SignatureDataset.from_file(path)
+    whole = [i % len(dataset) for i in range(N_ITEMS)]
+    collate = importlib.import_module("igps").collate
+    loaders: dict[str, Any] = {}
+    for line in sys.stdin:
+        n_workers, *where = line.split()
+        if line not in loaders:
+            items = dataset.to_memory() if where and hasattr(dataset, "to_memory") else dataset
+            n = int(n_workers)
+            loaders[line] = DataLoader(
+                items, 16, sampler=whole, num_workers=n, persistent_workers=n > 0, collate_fn=collate
+            )
+            epoch(loaders[line])
+        print(epoch(loaders[line]), flush=True)
+
+
+def epoch(loader: Any) -> float:
+    start = time.perf_counter()
+    n_seen = sum(len(batch.ids) for batch in loader)
+    assert n_seen == N_ITEMS
+    return time.perf_counter() - start
+
+
+if __name__ == "__main__":
+    main()
