@@ -46,7 +46,6 @@ NAMES = [
 
 # Import names whose distribution is called otherwise.
 DISTRIBUTIONS = {
-    "faiss": "faiss-cpu",
     "igl": "libigl",
     "ot": "POT",
     "umap": "umap-learn",

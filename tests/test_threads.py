@@ -32,9 +32,9 @@ needs_affinity = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason
 
 
 def blas() -> list[int]:
-    """Threads of NumPy's and SciPy's products; faiss, which other tests load, has a library of its own."""
+    """Threads of NumPy's and SciPy's products."""
     found = [library for library in threadpool_info() if library["user_api"] == "blas"]
-    return [library["num_threads"] for library in found if "faiss" not in library["filepath"]]
+    return [library["num_threads"] for library in found]
 
 
 def in_new_thread(function: Callable[[], Any]) -> Any:

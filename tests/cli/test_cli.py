@@ -497,8 +497,8 @@ def test_completion_knows_commands_and_options(
     subprocess.run([program, "-n", str(path)], check=True)
     typed = {
         "igps comp": ["compare", "completion"],
-        "igps index m": ["merge"],
-        "igps index build --des": ["--descriptor"],
+        "igps gallery m": ["merge"],
+        "igps gallery build --des": ["--descriptor"],
         "igps doctor --js": ["--json"],
         "igps retrieve --mend a": ["auto", "always"],
     }

@@ -89,13 +89,13 @@ def test_every_command_takes_the_file(
     call(monkeypatch, root, *query, "--gallery", root / "eggs", "--descriptor", model)
     nearest = json.loads(capsys.readouterr().out)
     assert [row["class"] for row in nearest] == ["long"] * 3
-    call(monkeypatch, root, "index", "build", root / "eggs", "--descriptor", model, "--out", tmp_path / "eggs.igps")
+    call(monkeypatch, root, "gallery", "build", root / "eggs", "--descriptor", model, "--out", tmp_path / "eggs.igps")
     monkeypatch.chdir(tmp_path)
     moved = tmp_path / "moved.safetensors"
     moved.write_bytes(model.read_bytes())
     for options in ([], ["--descriptor", "moved.safetensors"]):
         capsys.readouterr()
-        words = [*map(str, query), "--index", "eggs.igps", *options, "--cache_dir", str(root / "cache")]
+        words = [*map(str, query), "--gallery", "eggs.igps", *options, "--cache_dir", str(root / "cache")]
         monkeypatch.setattr(sys, "argv", ["igps", *words])
         main()
         assert [row["mesh"] for row in json.loads(capsys.readouterr().out)] == [row["mesh"] for row in nearest]

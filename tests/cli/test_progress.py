@@ -46,7 +46,7 @@ def bars(text: str) -> dict[str, tuple[int, int]]:
         ("extract ROOT --out OUT.npz --descriptor INTERIOR SMALL", {"signatures": 4, "descriptions": 4}),
         ("query MESH --gallery ROOT --descriptor INTERIOR SMALL", {"signatures": 4, "descriptions": 4}),
         ("precompute ROOT --descriptors INTERIOR SMALL", {"signatures": 4}),
-        ("index build ROOT --out OUT.igps --descriptor INTERIOR SMALL", {"signatures": 4, "descriptions": 4}),
+        ("gallery build ROOT --out OUT.igps --descriptor INTERIOR SMALL", {"signatures": 4, "descriptions": 4}),
         ("figure pose ROOT --out OUT.png SMALL", {"signatures": 4, "descriptions": 4}),
         ("figure topology MESH --weld 0 3 --out OUT.png --n_eigenpairs 20 --resolution 10", {"steps": 6}),
         ("figure potential MESH --out OUT.png --n_eigenpairs 20 --resolution 10", {"steps": 7}),
@@ -87,17 +87,17 @@ def test_a_bar_tells_how_far_it_is_and_what_time_is_left(
     assert not bars(printed.out)
 
 
-def test_merging_indices_shows_a_bar(
+def test_merging_galleries_shows_a_bar(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = ["--cache_dir", str(tmp_path / "cache"), *SMALL]
     for name in ("ball", "egg"):
-        build = ["index", "build", str(root / name), "--out", str(tmp_path / f"{name}.igps"), "--descriptor", INTERIOR]
-        monkeypatch.setattr(sys, "argv", ["igps", *build, *small])
+        build = ["gallery", "build", str(root / name), "--out", str(tmp_path / f"{name}.igps")]
+        monkeypatch.setattr(sys, "argv", ["igps", *build, "--descriptor", INTERIOR, *small])
         main()
     capsys.readouterr()
     both = [str(tmp_path / f"{name}.igps") for name in ("ball", "egg")]
-    monkeypatch.setattr(sys, "argv", ["igps", "index", "merge", *both, "--out", str(tmp_path / "all.igps")])
+    monkeypatch.setattr(sys, "argv", ["igps", "gallery", "merge", *both, "--out", str(tmp_path / "all.igps")])
     main()
     assert bars(capsys.readouterr().err)["entries"] == (4, 4)
 

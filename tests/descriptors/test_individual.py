@@ -174,10 +174,10 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path: Path, caps
     dataset = igps.SignatureDataset(root, cache_dir=tmp_path / "cache", descriptor="shape_dna")
     assert dataset.units() == ["in", "mm", "mm", "cm"]
     Gallery.build(tmp_path / "index", dataset, "shape_dna+size", n_workers=1)
-    found = query(root / "1/a.3mf", index=tmp_path / "index", top=2, cache_dir=tmp_path / "cache")
+    found = query(root / "1/a.3mf", gallery=tmp_path / "index", top=2, cache_dir=tmp_path / "cache")
     assert [row["mesh"] for row in found] == ["1/a.3mf", "1/b.3mf"]
     with pytest.raises(ValueError, match=r"descriptor: .*shape_dna"):
-        query(root / "1/a.3mf", index=tmp_path / "index", size="ignore", cache_dir=tmp_path / "cache")
+        query(root / "1/a.3mf", gallery=tmp_path / "index", size="ignore", cache_dir=tmp_path / "cache")
     SURFACE.export(root / "2/e.off")
     retrieve(root, "shape_dna", **options)
     assert "size is ignored: 1 of 5 bodies have no unit of length" in capsys.readouterr().out

@@ -220,10 +220,10 @@ def test_poses_are_grouped_by_the_descriptor_alone(dataset: SignatureDataset) ->
     assert grouped(duplicates(dataset, Same(), calibration=calibration, n_workers=1).groups) == SAME
 
 
-def test_an_index_gives_the_same_groups_and_tells_of_files_that_are_gone(
+def test_a_gallery_gives_the_same_groups_and_tells_of_files_that_are_gone(
     dataset: SignatureDataset, root: Path, cache: Path, tmp_path: Path
 ) -> None:
-    pytest.importorskip("filelock")
+    pytest.importorskip("lancedb")
     moved = tmp_path / "moved"
     shutil.copytree(root, moved)
     here = SignatureDataset(moved, CONFIG, cache)
@@ -300,15 +300,12 @@ def test_what_is_wrong_is_one_sentence(
     root: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ["--cache_dir", cache, "--n_workers", 1]
-    expected = "root, index: expected one of them"
-    assert expected in error_of(monkeypatch, capsys, "duplicates", *options)
-    assert expected in error_of(monkeypatch, capsys, "duplicates", root, "--index", tmp_path, *options)
     assert "meshes: expected two files, got 1" in error_of(monkeypatch, capsys, "distance", root / "bar.off", *options)
     fewer = ["--signature.n_surface_samples", "300"]
     words = error_of(monkeypatch, capsys, "distance", root / "bar.off", root / "bar.off", *options, *fewer)
     assert "n_surface_samples: expected 2000, as of the signatures that pretrained is calibrated for, got 300" in words
-    pytest.importorskip("filelock")
+    pytest.importorskip("lancedb")
     dataset = SignatureDataset([root / "bar.off", root / "lump.off"], None, cache)
     Gallery.build(tmp_path / "g.igps", dataset, "gps", n_workers=1)
-    words = error_of(monkeypatch, capsys, "duplicates", "--index", tmp_path / "g.igps", *options)
+    words = error_of(monkeypatch, capsys, "duplicates", tmp_path / "g.igps", *options)
     assert "descriptor: expected pretrained, whose distances are calibrated, got gps" in words

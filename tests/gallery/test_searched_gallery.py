@@ -1,12 +1,15 @@
-"""An index of meshes against the comparison with each of them."""
+"""A gallery of meshes against the comparison with each of them."""
 
 from __future__ import annotations
 
+import io
+import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 import trimesh
@@ -16,19 +19,16 @@ from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies
 from igps.descriptors.fingerprint import fingerprint
+from igps.gallery._table import BodyTable
 from igps.gallery.gallery import Gallery
+from igps.gallery.sync import sync
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
 from igps.retrieval import chi_square
-from igps.retrieval.index import VectorIndex
-from igps.retrieval.ranking import SearchResult
 from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, small_interior
-
-pytest.importorskip("faiss")
-pytest.importorskip("filelock")
 
 INTERIOR = "own_descriptors:small_interior"
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=60)
@@ -85,25 +85,25 @@ def test_more_are_ranked_under_a_head(
 ) -> None:
     """Whose distance may be only near the cosine's, by which candidates are found."""
     asked = []
-    search = VectorIndex.search
+    search = BodyTable.search
 
-    def spied(index: VectorIndex, *arguments: object, **options: Any) -> SearchResult:
+    def spied(table: BodyTable, *arguments: Any, **options: Any) -> Any:
         asked.append(options["candidates"])
-        return search(index, *arguments, **options)  # type: ignore[arg-type]
+        return search(table, *arguments, **options)
 
-    monkeypatch.setattr(VectorIndex, "search", spied)
+    monkeypatch.setattr(BodyTable, "search", spied)
     histograms = describe(dataset, small_interior())
     embedded = EmbeddedDescriptor(small_interior(), TwoLevelHead().fit(histograms, dataset.labels))
     for descriptor, descriptions in ((small_interior(), histograms), (embedded, embedded.head(histograms))):
         gallery, _ = Gallery.build(tmp_path / f"{len(asked)}.igps", dataset, descriptor, n_workers=1)
-        gallery.nearest(descriptions, top=3)
+        gallery.nearest(descriptions[:1], top=3)
     assert asked[1] > asked[0] >= 512
 
 
 def test_adding_and_merging_are_building(dataset: SignatureDataset, root: Path, tmp_path: Path) -> None:
     whole, _ = Gallery.build(tmp_path / "whole.igps", dataset, INTERIOR, n_workers=1)
-    Gallery.build(tmp_path / "a.igps", dataset.subset([0, 1, 2]), INTERIOR, n_workers=1)
-    added, _ = Gallery.add(tmp_path / "a.igps", dataset.subset([2, 3, 4]), INTERIOR, n_workers=1)
+    added, _ = Gallery.build(tmp_path / "a.igps", dataset.subset([0, 1, 2]), INTERIOR, n_workers=1)
+    added.add(dataset.subset([2, 3, 4]), n_workers=1)
     assert len(added) == 5
     Gallery.build(tmp_path / "b.igps", dataset.subset([4, 5]), INTERIOR, n_workers=1)
     merged = Gallery.merge(tmp_path / "c.igps", [tmp_path / "a.igps", tmp_path / "b.igps"])
@@ -111,7 +111,8 @@ def test_adding_and_merging_are_building(dataset: SignatureDataset, root: Path, 
     assert merged.nearest(described) == whole.nearest(described)
     # A file of other content takes the place of what it was.
     write_body(root / "ball" / "1.off", 3.0, 0.3)
-    changed, _ = Gallery.add(tmp_path / "c.igps", dataset, INTERIOR, n_workers=1)
+    changed = Gallery(tmp_path / "c.igps")
+    changed.add(dataset, n_workers=1)
     assert len(changed) == 6
     (first, *_) = changed.query(root / "ball" / "1.off", cache_dir=tmp_path / "cache")
     assert first.name == "ball/1.off"
@@ -125,9 +126,11 @@ def test_bodies_of_one_file_are_entries_of_their_own(tmp_path: Path) -> None:
     trimesh.Scene({f"part {i}": one for i, one in enumerate(boxes)}).export(tmp_path / "plate.glb")
     bodies = find_bodies(tmp_path, LoadOptions(bodies="objects"))
     dataset = SignatureDataset(bodies, CONFIG, tmp_path / "cache", reading=LoadOptions(bodies="objects"))
-    for make in (Gallery.build, Gallery.add):
-        gallery, _ = make(tmp_path / "plate.igps", dataset, INTERIOR, n_workers=1)
-        assert len(gallery) == 3
+    gallery, _ = Gallery.build(tmp_path / "plate.igps", dataset, INTERIOR, n_workers=1)
+    gallery.add(dataset, n_workers=1)
+    assert {(row["file"], row["part"]) for row in gallery.rows("file", "part")} == {
+        (str((tmp_path / "plate.glb").resolve()), part) for part in bodies.parts
+    }
     found = gallery.nearest(describe(dataset, small_interior()), top=1)
     assert [one.name for (one,) in found] == list(bodies.names)
     assert {one.path for (one,) in found} == {(tmp_path / "plate.glb").resolve()}
@@ -138,10 +141,10 @@ def test_what_cannot_be_described_is_told(root: Path, tmp_path: Path) -> None:
     gallery, failures = Gallery.build(tmp_path / "g.igps", dataset, "own_descriptors:picky", n_workers=1)
     assert [failure.id for failure in failures] == ["egg/1.off"]
     assert len(gallery) == 5
-    added, failures = Gallery.add(tmp_path / "g.igps", dataset, "own_descriptors:picky", n_workers=1)
+    failures = gallery.add(dataset, n_workers=1)
     assert [failure.id for failure in failures] == ["egg/1.off"]
     assert "too much" in failures[0].error
-    assert len(added) == 5
+    assert len(gallery) == 5
 
 
 def test_a_checksum_tells_descriptors_apart() -> None:
@@ -158,32 +161,32 @@ def test_commands(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     index, cache = tmp_path / "gallery.igps", ["--cache_dir", tmp_path / "cache"]
-    command(monkeypatch, "index", "build", root / "egg", "--out", index, "--descriptor", INTERIOR, *cache, *SMALL)
-    assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 3 meshes by {INTERIOR}"
-    command(monkeypatch, "index", "add", root, "--index", index, *cache, "--n_workers", 1)
+    command(monkeypatch, "gallery", "build", root / "egg", "--out", index, "--descriptor", INTERIOR, *cache, *SMALL)
+    assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 3 bodies by {INTERIOR}"
+    command(monkeypatch, "gallery", "add", root, "--gallery", index, *cache, "--n_workers", 1)
     # Those of the folder of one class have no class: they are known already.
-    assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 6 meshes by {INTERIOR}"
-    command(monkeypatch, "index", "build", root, "--out", index, "--descriptor", INTERIOR, *cache, *SMALL)
-    command(monkeypatch, "index", "merge", index, "--out", tmp_path / "copy.igps")
-    assert capsys.readouterr().out.splitlines()[-1] == f"{tmp_path / 'copy.igps'}: 6 meshes by {INTERIOR}"
+    assert capsys.readouterr().out.splitlines()[-1] == f"{index}: 6 bodies by {INTERIOR}"
+    command(monkeypatch, "gallery", "build", root, "--out", index, "--descriptor", INTERIOR, *cache, *SMALL)
+    command(monkeypatch, "gallery", "merge", index, "--out", tmp_path / "copy.igps")
+    assert capsys.readouterr().out.splitlines()[-1] == f"{tmp_path / 'copy.igps'}: 6 bodies by {INTERIOR}"
 
     wanted = root / "egg" / "1.off"
     command(monkeypatch, "query", wanted, "--gallery", root, "--descriptor", INTERIOR, "--top", 4, *cache, *SMALL)
     expected = capsys.readouterr().out
     for which in (index, tmp_path / "copy.igps"):
-        command(monkeypatch, "query", wanted, "--index", which, "--top", 4, *cache)
+        command(monkeypatch, "query", wanted, "--gallery", which, "--top", 4, *cache)
         assert capsys.readouterr().out == expected
     command(monkeypatch, "query", wanted, "--gallery", root, "--descriptor", INTERIOR, "--rerank", *cache, *SMALL)
     reranked = capsys.readouterr().out
     assert len(reranked.splitlines()) == 7
     assert reranked.splitlines()[:5] != expected.splitlines()[:5]
-    command(monkeypatch, "query", wanted, "--index", index, "--rerank", *cache)
+    command(monkeypatch, "query", wanted, "--gallery", index, "--rerank", *cache)
     assert capsys.readouterr().out == reranked
     (root / "egg" / "0.off").unlink()
-    command(monkeypatch, "query", wanted, "--index", index, "--top", 4, *cache)
+    command(monkeypatch, "query", wanted, "--gallery", index, "--top", 4, *cache)
     out = capsys.readouterr().out
     assert out.startswith(expected)
-    assert out.splitlines()[-1] == "1 of these 4 files are no longer where they were when they were indexed."
+    assert out.splitlines()[-1] == "1 of these 4 files are no longer where they were when they were described."
 
 
 def test_what_does_not_fit_is_refused_in_a_sentence(
@@ -192,20 +195,21 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
 ) -> None:  # fmt: skip
     index, mesh = tmp_path / "g.igps", root / "egg" / "1.off"
     Gallery.build(index, dataset, INTERIOR, n_workers=1)
-    query = ["query", mesh, "--index", index, "--cache_dir", tmp_path / "cache"]
+    query = ["query", mesh, "--gallery", index, "--cache_dir", tmp_path / "cache"]
     for options, words in (
         (["--descriptor", "rich"], f'another descriptor: it has "{INTERIOR}", not "rich"'),
         (["--signature.n_eigenpairs", 20, "--signature.resolution", 12], "another signature."),
         (["--mend", "never"], 'another reading.mend: it has "auto", not "never"'),
-        (["--gallery", root], "gallery, index: expected one of them"),
+        (["--where", "weight > 3"], "where: expected a condition on the columns id, name, class, file, part"),
     ):
         assert words in error_of(monkeypatch, capsys, *query, *options)
-    assert "expected one of them" in error_of(monkeypatch, capsys, "query", mesh)
-    assert "no index there" in error_of(monkeypatch, capsys, "query", mesh, "--index", tmp_path / "none.igps")
+    assert "no such folder" in error_of(monkeypatch, capsys, "query", mesh, "--gallery", tmp_path / "none.igps")
+    of_meshes = error_of(monkeypatch, capsys, "query", mesh, "--gallery", root, "--where", "volume > 3")
+    assert "where: expected a gallery" in of_meshes
     monkeypatch.setattr(SignatureConfig, "ALGORITHM_VERSION", SignatureConfig.ALGORITHM_VERSION + 1)
     assert "version" in error_of(monkeypatch, capsys, *query)
     monkeypatch.undo()
-    gone = error_of(monkeypatch, capsys, "index", "add", tmp_path / "gone", "--index", index)
+    gone = error_of(monkeypatch, capsys, "gallery", "add", tmp_path / "gone", "--gallery", index)
     assert "gone: no such folder" in gone
     changed = small_interior()
     next(changed.buffers()).add_(1e-3)
@@ -213,3 +217,103 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
     with pytest.raises(ValueError, match="another model"):
         Gallery(index, changed)
     assert len(Gallery(index)) == 6
+
+
+def test_rows_tell_size_class_and_what_labels_tell(root: Path, tmp_path: Path) -> None:
+    """Volumes and areas are those of the meshes, and a condition keeps what NumPy keeps."""
+    rows = [(f"{one}/{i}.off", f"{one}s", 10 * i, "A" if i else "") for one in ("ball", "egg") for i in range(3)]
+    lines = ["file,label,age,scanner", *(",".join(map(str, row)) for row in rows)]
+    (root / "labels.csv").write_text("\n".join(lines))
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
+    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    assert {"volume", "area", "age", "scanner"} <= gallery.columns.keys()
+    meshes = {name: trimesh.load(root / name) for name, *_ in rows}
+    told = {row["name"]: row for row in gallery.rows(*gallery.columns)}
+    for name, label, age, scanner in rows:
+        assert told[name]["volume"] == pytest.approx(meshes[name].volume)
+        assert told[name]["area"] == pytest.approx(meshes[name].area)
+        assert (told[name]["class"], told[name]["age"], told[name]["scanner"]) == (label, age, scanner or None)
+        picture = PIL.Image.open(io.BytesIO(told[name]["thumbnail"]))
+        assert np.asarray(picture.convert("L")).max() > 200
+    description = describe(dataset, small_interior())[:1]
+    volume = meshes["ball/1.off"].volume * 1.001
+    found = gallery.nearest(description, where=f"age >= 10 AND class = 'eggs' AND volume > {volume}")[0]
+    wanted = {name for name, label, age, _ in rows if age >= 10 and label == "eggs" and meshes[name].volume > volume}
+    assert {one.name for one in found} == wanted
+    assert [one.distance for one in found] == sorted(one.distance for one in found)
+    assert gallery.nearest(description, where="age > 99") == [[]]
+
+
+def test_sync_finds_what_is_new_changed_and_gone(root: Path, tmp_path: Path) -> None:
+    """Afterwards it is what building makes; what has not changed is neither described nor written."""
+    cache = tmp_path / "cache"
+    gallery, _ = Gallery.build(
+        tmp_path / "g.igps", SignatureDataset(root, CONFIG, cache), small_interior(), n_workers=1
+    )
+    (tmp_path / "elsewhere").mkdir()
+    write_body(tmp_path / "elsewhere" / "o'clock.off", 1.0, 1.5)
+    gallery.add(SignatureDataset(tmp_path / "elsewhere", CONFIG, cache), n_workers=1)
+    version = gallery.versions()[-1]["version"]
+    assert sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1) == (0, 0, [])
+    assert gallery.versions()[-1]["version"] == version
+    write_body(root / "egg" / "new.off", 1.3, 2.0)
+    write_body(root / "ball" / "1.off", 3.0, 0.3)
+    (root / "egg" / "0.off").unlink()
+    (root / "egg" / "broken.off").write_text("OFF\n1 0 0\n0 0 0\n")
+    dataset = SignatureDataset(root, CONFIG, cache)
+    n_new, n_gone, (failure,) = sync(gallery, dataset, root, n_workers=1)
+    assert (n_new, n_gone, failure.id) == (2, 1, "egg/broken.off")
+    (root / "egg" / "broken.off").unlink()
+    (root / "labels.csv").write_text("\n".join(["file,label", *(f"{name},round" for name in dataset.bodies.names
+                                                               if "broken" not in name)]))  # fmt: skip
+    dataset = SignatureDataset(root, CONFIG, cache)
+    assert sync(gallery, dataset, root, n_workers=1) == (0, 0, [])
+    assert gallery.remove("name = 'o''clock.off'") == 1
+    built, _ = Gallery.build(tmp_path / "built.igps", dataset, small_interior(), n_workers=1)
+    described = describe(dataset, small_interior())
+    assert gallery.nearest(described) == built.nearest(described)
+    assert {one.label for one in built.nearest(described)[0]} == {"round"}
+
+
+def test_it_opens_where_it_was_moved_to(dataset: SignatureDataset, tmp_path: Path) -> None:
+    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    described = describe(dataset, small_interior())
+    expected = gallery.nearest(described)
+    (tmp_path / "far").mkdir()
+    (tmp_path / "g.igps").rename(tmp_path / "far" / "h.igps")
+    moved = Gallery(tmp_path / "far" / "h.igps", small_interior())
+    assert moved.nearest(described) == expected
+    assert moved.remove("class = 'egg'") == 3
+
+
+def test_commands_that_change_a_gallery(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gallery, cache = tmp_path / "gallery.igps", ["--cache_dir", tmp_path / "cache", "--n_workers", 1]
+
+    def lines(*arguments: object) -> list[str]:
+        command(monkeypatch, "gallery", *arguments)
+        return capsys.readouterr().out.splitlines()
+
+    lines("build", root, "--out", gallery, "--descriptor", INTERIOR, *cache, *SMALL)
+    assert lines("update", gallery, "--where", "name LIKE 'ball/%'", "--to", "class=round", "unit=mm") == [
+        "3 bodies updated"
+    ]
+    assert lines("remove", gallery, "--where", "name = 'egg/0.off'")[0] == "1 bodies removed"
+    (root / "egg" / "1.off").unlink()
+    synced = lines("sync", root, "--gallery", gallery, *cache)
+    assert synced[-2:] == ["1 bodies described, 1 removed", f"{gallery}: 5 bodies by {INTERIOR}"]
+    told = json.loads("\n".join(lines("info", gallery, "--json")))
+    assert (told["bodies"], told["descriptor"], told["columns"]["volume"]) == (5, INTERIOR, "float")
+    found = lines("query", root / "egg" / "2.off", "--gallery", gallery, "--where", "class = 'ball'", "--exact", *cache)
+    assert len(found) == 1 + 3  # what update told was overridden by the folder
+    versions = json.loads("\n".join(lines("versions", gallery, "--json")))
+    assert [one["bodies"] for one in versions][:2] == [6, 6]
+    assert lines("restore", gallery, "--version", versions[0]["version"]) == [f"{gallery}: 6 bodies by {INTERIOR}"]
+    assert "version: expected one of those" in error_of(
+        monkeypatch, capsys, "gallery", "restore", gallery, "--version", 999
+    )
+    wrong = error_of(monkeypatch, capsys, "gallery", "update", gallery, "--where", "area > 0", "--to", "volume=much")
+    assert "values: expected numbers" in wrong
+    wrong = error_of(monkeypatch, capsys, "gallery", "update", gallery, "--where", "area > 0", "--to", "colour=red")
+    assert "colour: expected one of the columns name, class" in wrong

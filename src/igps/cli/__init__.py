@@ -26,8 +26,18 @@ from igps.cli.doctor import doctor
 from igps.cli.duplicates import distance, duplicates
 from igps.cli.explain import explain
 from igps.cli.fit import classify, fit
+from igps.cli.gallery import (
+    gallery_add,
+    gallery_build,
+    gallery_info,
+    gallery_merge,
+    gallery_remove,
+    gallery_restore,
+    gallery_sync,
+    gallery_update,
+    gallery_versions,
+)
 from igps.cli.groups import groups
-from igps.cli.index import index_add, index_build, index_merge
 from igps.cli.outliers import outliers
 from igps.cli.precompute import precompute
 from igps.cli.reading import FLAGS, LISTS, Verdict
@@ -46,7 +56,18 @@ COMMANDS: Commands = {
     "classify": classify,
     "precompute": precompute,
     "cache": {"export": cache_export},
-    "index": {"build": index_build, "add": index_add, "merge": index_merge},
+    "gallery": {
+        "build": gallery_build,
+        "add": gallery_add,
+        "sync": gallery_sync,
+        "remove": gallery_remove,
+        "update": gallery_update,
+        "merge": gallery_merge,
+        "query": query,
+        "info": gallery_info,
+        "versions": gallery_versions,
+        "restore": gallery_restore,
+    },
     "duplicates": duplicates,
     "distance": distance,
     "demo": demo,

@@ -6,10 +6,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from igps.cli.index import as_indexed
+from igps.cli.gallery import as_described
 from igps.cli.reading import Folder, signatures, write_rows
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import Size
+from igps.gallery.about import is_gallery
 from igps.gallery.calibration import Calibration
 from igps.gallery.duplicates import Duplicates, body_distance
 from igps.gallery.duplicates import duplicates as find_duplicates
@@ -20,8 +21,7 @@ DESCRIPTOR = "pretrained"
 
 
 def duplicates(
-    root: Path | None = None,
-    index: Path | None = None,
+    root: Path,
     poses: bool = False,
     size: Size = "auto",
     out: Path | None = None,
@@ -33,8 +33,7 @@ def duplicates(
     """List the files that show the same body, whatever its mirror image, triangles, detail, format, and unitless scale.
 
     Args:
-        root: folder of meshes, with or without classes.
-        index: an index of meshes in place of their folder, see igps index.
+        root: folder of meshes, with or without classes, or a gallery of them, see igps gallery.
         poses: take other poses of a body for the same, which mistakes more siblings for it
         size: keep takes files that differ in size for different, ignore does not; auto does where all have a unit.
         out: a table of the groups, a file ending in .csv.
@@ -42,15 +41,12 @@ def duplicates(
         n_workers: processes that compute; all cores if not given.
         strict: stop at the first mesh that cannot be used instead of skipping it
     """
-    if (root is None) == (index is None):
-        raise ValueError("root, index: expected one of them. Name a folder of meshes, or an index of one.")
     calibration, n_skipped = Calibration.load(), 0
     source: Any
-    if index is not None:
-        source = Gallery(index)
-        as_indexed(source, reading)
+    if is_gallery(root):
+        source = Gallery(root)
+        as_described(source, reading)
     else:
-        assert root is not None
         chosen, files = descriptor_of(DESCRIPTOR), Folder(root)
         source, unread = signatures(files, [chosen], n_workers=n_workers, strict=strict, cache_dir=cache_dir, **reading)
         n_skipped = len(unread)

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from igps.analysis.comparison import pair_distances
 from igps.cli.feature_table import SUFFIXES, feature_table, wide_table, write_table
-from igps.cli.index import as_indexed
+from igps.cli.gallery import as_described
 from igps.cli.reading import Folder, signatures, sized, with_side, write_notes, write_rows
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
@@ -23,6 +23,7 @@ from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.individual import IndividualDescriptor, Mirror, Size
+from igps.gallery.about import is_gallery
 from igps.gallery.gallery import Gallery
 from igps.nn.description import describe, fit_centres
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
@@ -135,41 +136,43 @@ def extract(
 
 def query(
     mesh: Path,
-    gallery: Path | None = None,
-    index: Path | None = None,
+    gallery: Path,
     top: int = 10,
     descriptor: str | None = None,
+    where: str | None = None,
+    exact: bool = False,
     rerank: bool = False,
     **reading: Any,
 ) -> list[dict[str, Any]]:
-    """List the meshes of a gallery that are most similar to one mesh.
+    """List the bodies of a gallery that are most similar to one mesh.
 
     Args:
         mesh: the file to look for, or FILE#PART, one body of several in a file.
-        gallery: folder of meshes, with or without classes.
-        index: an index of meshes in place of their folder, see igps index.
+        gallery: what igps gallery build made, or a folder of meshes, with or without classes.
         top: how many to list.
         descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own; if not given, that of the
-            index, or pretrained.
+            gallery, or pretrained.
+        where: only bodies that satisfy this condition on columns of the gallery, such as "class = 'femur' AND volume >
+            2e5".
+        exact: compare with all bodies; the nearest of a large gallery are found by short vectors otherwise
         rerank: put the nearest 200 in order by what neighbours they have in common (diffusion and k-reciprocal
             re-ranking, without labels); the distances listed are those of this order, without unit.
     """
     if top < 1:
         raise ValueError(f"top: expected at least 1, got {top}.")
-    if (gallery is None) == (index is None):
-        raise ValueError("gallery, index: expected one of them. Name a folder of meshes, or an index of one.")
-    if index is not None:
-        opened = Gallery(index, descriptor)
-        reading = as_indexed(opened, reading)
+    if is_gallery(gallery):
+        opened = Gallery(gallery, descriptor)
+        reading = as_described(opened, reading)
         wanted = _one(mesh, opened.descriptor, **{**reading, "n_workers": 1})
-        matches = opened.nearest(wanted, top=top, rerank=rerank)[0]
+        matches = opened.nearest(wanted, top=top, rerank=rerank, where=where, exact=exact)[0]
         rows = [(match.name, match.label, match.distance) for match in matches]
         missing = sum(not match.path.exists() for match in matches)
         _print_found(rows)
         if missing:
-            print(f"{missing} of these {len(matches)} files are no longer where they were when they were indexed.")
+            print(f"{missing} of these {len(matches)} files are no longer where they were when they were described.")
         return _as_rows(rows)
-    assert gallery is not None
+    if where is not None:
+        raise ValueError(f"where: expected a gallery, {gallery} is a folder of meshes. See igps gallery build.")
     dataset, descriptions, _, name = described(Folder(gallery), descriptor or "pretrained", **reading)
     chosen, unsized = descriptor_of(name), {**reading, "size": "ignore"}  # as the name says already
     wanted = _one(mesh, name, **unsized)
@@ -195,7 +198,7 @@ def _one(mesh: Path, descriptor: str | Descriptor, **reading: Any) -> Tensor:
 
 
 def _print_found(rows: Sequence[tuple[str, str | None, float]]) -> None:
-    width = max(len(name) for name, _, _ in rows)
+    width = max((len(name) for name, _, _ in rows), default=4)
     print(f"{'rank':>4}  {'distance':>9}  {'mesh':<{width}}  class")
     for place, (name, label, distance) in enumerate(rows, 1):
         print(f"{place:>4}  {distance:>9.3g}  {name:<{width}}  {'-' if label is None else label}")

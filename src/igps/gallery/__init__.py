@@ -1,1 +1,1 @@
-"""Collections that are asked again and again: indexed, searched, and freed of duplicates."""
+"""Collections that are asked again and again: kept, searched, and freed of duplicates."""

@@ -1,8 +1,8 @@
 """Files that show the same body, whatever its scale, mirror image, triangulation, level of detail or file format.
 
 Two surfaces are laid onto each other, which tells the same shape from another pose and from a sibling, see
-`igps.gallery.surfaces`. Only those are laid whose samples lie at about the same distances from each other, or in an
-index, whose descriptions are near. And no file joins two that are not the same as each other.
+`igps.gallery.surfaces`. Only those are laid whose samples lie at about the same distances from each other, or in a
+gallery, whose descriptions are near. And no file joins two that are not the same as each other.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from tqdm import tqdm
 
 from igps._parallel import on_threads
 from igps.data.dataset import Failure, SignatureDataset
-from igps.data.sources import Bodies, file_and_part
+from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import Size, keeps_size
 from igps.gallery._alignment import surface_distance
@@ -36,7 +37,7 @@ from igps.retrieval.distances import Distance, euclidean
 
 # Rows of distances, and pairs whose surfaces are compared, in memory at once.
 _ROWS, _PAIRS = 256, 256
-# Pairs as near as copies are asked for among so many of an index, then among ever more.
+# Pairs as near as copies are asked for among so many of a gallery, then among ever more.
 _FIRST_TOP = 32
 # Of the logarithm of √area; a level of detail of a body takes up to half of it
 _ONE_SIZE = 0.05
@@ -100,13 +101,13 @@ def duplicates(
     """Groups of files that show the same body in the same shape.
 
     Args:
-        source: the files; or an index of them, whose near pairs are found without comparing all, and of which only the
+        source: the files; or a gallery of them, whose near pairs are found without comparing all, and of which only the
             files of these are read again, if their Signatures are not cached.
-        descriptor: a calibrated one; for an index its own.
+        descriptor: a calibrated one; for a gallery its own.
         poses: whether other poses of a body count as the same; then nothing tells them from siblings but the distance
             of descriptions, and false pairs are more.
         size: whether files that differ in size are different, too, see `keeps_size`.
-        cache_dir: of Signatures, for an index; the user's cache directory if None.
+        cache_dir: of Signatures, for a gallery; the user's cache directory if None.
         calibration: of the descriptor; the one that is shipped if None.
         n_workers: threads; all cores if None.
         progress: show bars.
@@ -118,9 +119,9 @@ def duplicates(
     calibration = calibration or Calibration.load()
     failures: list[Failure] = []
     if isinstance(source, Gallery):
-        calibration.check(source.index.about["descriptor"], source.descriptor, source.config)
+        calibration.check(source.about["descriptor"], source.descriptor, source.config)
         chosen, dataset = source.descriptor, _files_of(source, cache_dir)
-        near = _near_in_index(source, calibration.pose.distance if poses else calibration.near, progress)
+        near = _near_in_gallery(source, calibration.pose.distance if poses else calibration.near, progress)
     else:
         chosen = descriptor_of(descriptor)
         calibration.check(descriptor, chosen, source.config)
@@ -283,21 +284,20 @@ def _near(descriptions: Tensor, distance: Distance, limit: float, progress: bool
             bar.update(len(rows))
 
 
-def _near_in_index(gallery: Gallery, limit: float, progress: bool) -> Iterator[tuple[int, int, float]]:
-    """The same of the entries of an index, numbered as in `_files_of`."""
-    index = gallery.index
-    numbers = {position: i for i, position in enumerate(p for some, _ in index.batches() for p in some.tolist())}
-    with _bar(len(index), progress) as bar:
-        for positions, descriptions in index.batches():
-            for position, description in zip(positions.tolist(), descriptions, strict=True):
-                top = min(_FIRST_TOP, len(index))
-                found = gallery.search(description[None], top=top)
-                while float(found.distances[0, -1]) <= limit and top < len(index):
-                    top = min(4 * top, len(index))
-                    found = gallery.search(description[None], top=top)
-                for other, distance in zip(found.indices[0].tolist(), found.distances[0].tolist(), strict=True):
-                    if numbers[position] < numbers[other] and distance <= limit:
-                        yield numbers[position], numbers[other], distance
+def _near_in_gallery(gallery: Gallery, limit: float, progress: bool) -> Iterator[tuple[int, int, float]]:
+    """The same of the bodies of a gallery, numbered as in `_files_of`."""
+    numbers = {name: i for i, name in enumerate(sorted(row["id"] for row in gallery.rows("id")))}
+    with _bar(len(gallery), progress) as bar:
+        for some in gallery.table.batches():
+            for description, row in zip(*gallery.table.decoded(some), strict=True):
+                top = min(_FIRST_TOP, len(gallery))
+                found, distances, _ = gallery.search(description[None], top=top)
+                while float(distances[-1]) <= limit and top < len(gallery):
+                    top = min(4 * top, len(gallery))
+                    found, distances, _ = gallery.search(description[None], top=top)
+                for other, distance in zip(found, distances.tolist(), strict=True):
+                    if numbers[row["id"]] < numbers[other["id"]] and distance <= limit:
+                        yield numbers[row["id"]], numbers[other["id"]], distance
                 bar.update()
 
 
@@ -306,11 +306,10 @@ def _bar(n_files: int, progress: bool) -> tqdm:
 
 
 def _files_of(gallery: Gallery, cache_dir: str | Path | None) -> SignatureDataset:
-    """The files that an index was made of, in its order."""
-    entries = [entry for positions, _ in gallery.index.batches() for entry in gallery.index.entries(positions)]
-    names = tuple(one.name for one in entries)
+    """The files that a gallery was made of, in order of their ids."""
+    rows = sorted(gallery.rows("id", "name", "file", "part"), key=itemgetter("id"))
+    names = tuple(one["name"] for one in rows)
     if len(set(names)) < len(names):  # of several folders
-        names = tuple(one.id for one in entries)
-    paths, parts = zip(*(file_and_part(Path(one.id)) for one in entries), strict=True)
-    files = Bodies(paths, names, None, parts)
+        names = tuple(one["id"] for one in rows)
+    files = Bodies(tuple(Path(one["file"]) for one in rows), names, None, tuple(one["part"] for one in rows))
     return SignatureDataset(files, gallery.config, cache_dir, reading=gallery.reading)

@@ -1,149 +1,162 @@
-"""The meshes of a collection in an index, with the descriptor that they were described by."""
+"""The bodies of a collection in a database, with the descriptor that they were described by."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from igps.data.dataset import Failure, SignatureDataset
-from igps.data.sources import file_and_part
 from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.fingerprint import fingerprint, name_of
+from igps.descriptors.fingerprint import fingerprint
 from igps.descriptors.registry import is_file
-from igps.mesh.loading import BodyRef
-from igps.mesh.mesh import MeshError
+from igps.gallery.about import KNOWN, Batch, about_of, check_alike, in_words, open_table, tables
+from igps.gallery.rows import described_rows, further_columns
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
-from igps.retrieval.index import CANDIDATES, Entry, VectorIndex, check_alike, extend_index, merge_indices, write_index
 from igps.retrieval.ranking import SearchResult
 from igps.retrieval.reranking import N_RERANKED, rerank_found
 from igps.signature.signature import SignatureConfig
 
-# So many descriptions are in memory at once.
-_AT_ONCE = 256
+Found = tuple[list[dict[str, Any]], Tensor, Tensor]
+"""Rows, their distances (M,) and descriptions (M, ...), the closest first."""
+
+CANDIDATES = 512
+"""Bodies whose short vectors are the nearest, which are ranked again by the distance itself."""
 
 
 @dataclass(frozen=True)
 class Match:
-    """A mesh that a query found.
+    """A body that a query found.
 
     Args:
         name: in its collection.
         label: its class, if it is known.
-        path: its file when it was indexed, which may have been moved since.
+        path: its file when it was described, which may have been moved since.
         distance: from the query, by the descriptor's own distance; or re-ranked, without unit.
+        row: all that the gallery tells of it, by column.
     """
 
     name: str
     label: str | None
     path: Path
     distance: float
+    row: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
 
 class Gallery:
-    """An index of meshes, opened for queries, which need neither the mesh files nor their Signatures.
+    """Described bodies, opened for queries, which need neither their files nor their Signatures.
 
     Args:
-        path: folder of the index.
-        descriptor: the one that the index was built with. It may be left out if the index knows it by its name.
+        path: its folder. One that `igps index` wrote becomes a gallery, once.
+        descriptor: the one that it was built with. It may be left out if the gallery knows it by its name.
+        version: an earlier one of its `versions`; the last if None.
 
     Raises:
-        FileNotFoundError: there is no index.
+        FileNotFoundError: there is no gallery.
         ValueError: it is damaged, or of another descriptor, another version of it, or another version of Signatures.
+        ImportError: LanceDB is not installed.
     """
 
-    def __init__(self, path: str | Path, descriptor: str | Descriptor | None = None) -> None:
-        self.index = VectorIndex(path)
-        about = self.index.about
+    def __init__(
+        self, path: str | Path, descriptor: str | Descriptor | None = None, version: int | None = None
+    ) -> None:
+        self.path, self.table = Path(path), open_table(path, version)
+        about = self.about
         by_name = not isinstance(descriptor, Descriptor) and not is_file(descriptor or "")  # a file may have moved
         if by_name and descriptor is not None:
-            check_alike(self.index, {"descriptor": str(descriptor)})
+            check_alike(path, about, {"descriptor": str(descriptor)})
         self.descriptor = descriptor_of(about["descriptor"] if descriptor is None else descriptor)
         if isinstance(descriptor, Descriptor):
-            check_alike(self.index, {"descriptor": descriptor.name})
-        check_alike(self.index, {"model": fingerprint(self.descriptor)})
-        version = SignatureConfig.ALGORITHM_VERSION
-        if about["signature"]["algorithm_version"] != version:
+            check_alike(path, about, {"descriptor": descriptor.name})
+        check_alike(path, about, {"model": fingerprint(self.descriptor)})
+        here = SignatureConfig.ALGORITHM_VERSION
+        if about["signature"]["algorithm_version"] != here:
             raise ValueError(
-                f"{path}: the index is of version {about['signature']['algorithm_version']} of the signatures, not "
-                f"{version} as here. Build it again."
+                f"{path}: the gallery is of version {about['signature']['algorithm_version']} of the signatures, not "
+                f"{here} as here. Build it again."
             )
         parameters = {name: value for name, value in about["signature"].items() if name != "algorithm_version"}
         self.config = SignatureConfig(**{**parameters, "attributes": tuple(parameters["attributes"])})
         self.reading = LoadOptions(**about["reading"])
 
     @property
-    def path(self) -> Path:
-        """Folder of the index."""
-        return self.index.path
+    def about(self) -> dict[str, Any]:
+        """What it records of how its descriptions were made."""
+        return self.table.about
+
+    @property
+    def columns(self) -> dict[str, type]:
+        """What it tells of each body, and of which type."""
+        return self.table.columns
 
     def __len__(self) -> int:
-        return len(self.index)
+        return len(self.table)
 
     def query(
-        self,
-        mesh: str | Path,
-        *,
-        top: int = 10,
-        cache_dir: str | Path | None = None,
-        exact: bool = False,
-        rerank: bool = False,
-    ) -> list[Match]:
-        """The meshes closest to that of a file, closest first.
+        self, mesh: str | Path, *, top: int = 10, cache_dir: str | Path | None = None, exact: bool = False,
+        rerank: bool = False, where: str | None = None,
+    ) -> list[Match]:  # fmt: skip
+        """The bodies closest to that of a file, closest first.
 
         Args:
-            mesh: a file, read as those of the index were.
+            mesh: a file, read as those of the gallery were.
             top: how many; all if there are fewer.
             cache_dir: of Signatures; the user's cache directory if None.
-            exact: compare with all, which takes long in a large index.
+            exact: compare with all, which takes long in a large gallery.
             rerank: put the nearest in order by what neighbours they have in common, see `rerank_found`.
+            where: only among those that satisfy this condition, such as "class = 'femur' AND volume > 2e5".
 
         Raises:
             MeshError: the mesh cannot be used.
+            ValueError: a condition that cannot be understood.
         """
         dataset = SignatureDataset([mesh], self.config, cache_dir, descriptor=self.descriptor, reading=self.reading)
         descriptions = describe(dataset, self.descriptor, n_workers=1)
-        return self.nearest(descriptions, top=top, exact=exact, rerank=rerank)[0]
+        return self.nearest(descriptions, top=top, exact=exact, rerank=rerank, where=where)[0]
 
     def nearest(
-        self, descriptions: Tensor, *, top: int = 10, exact: bool = False, rerank: bool = False
+        self,
+        descriptions: Tensor,
+        *,
+        top: int = 10,
+        exact: bool = False,
+        rerank: bool = False,
+        where: str | None = None,
     ) -> list[list[Match]]:
-        """For each of the descriptions (Q, ...) the meshes closest to it, closest first; options as of `query`."""
-        if rerank:
-            wide = self.search(descriptions, top=max(top, N_RERANKED), exact=exact)
-            with torch.inference_mode():
-                found = rerank_found(
-                    descriptions,
-                    wide,
-                    lambda positions: self.index.descriptions(positions.numpy()),
-                    self.descriptor.distances,
-                    top=min(top, len(self)),
-                )
-        else:
-            found = self.search(descriptions, top=top, exact=exact)
-        return [
-            [
-                Match(entry.name, entry.label, file_and_part(Path(entry.id))[0], distance)
-                for entry, distance in zip(self.index.entries(indices.numpy()), distances.tolist(), strict=True)
-            ]
-            for indices, distances in zip(found.indices, found.distances, strict=True)
-        ]
+        """For each of the descriptions (Q, ...) the bodies closest to it, closest first; options as of `query`."""
+        if top < 1:
+            raise ValueError(f"top: expected at least 1, got {top}.")
+        matches = []
+        for query in descriptions:
+            n_near = max(top, N_RERANKED) if rerank else top
+            rows, distances, near = self.search(query[None], top=n_near, exact=exact, where=where)
+            order = list(range(len(rows)))
+            if rerank and rows:
+                whole, n = SearchResult(torch.arange(len(rows))[None], distances[None]), min(top, len(rows))
+                with torch.inference_mode():
+                    found = rerank_found(query[None], whole, near.__getitem__, self.descriptor.distances, top=n)
+                order, distances = found.indices[0].tolist(), found.distances[0]
+            matches.append([
+                Match(rows[i]["name"], rows[i]["class"], Path(rows[i]["file"]), distance, rows[i])
+                for i, distance in zip(order, distances.tolist(), strict=True)
+            ])  # fmt: skip
+        return matches
 
-    def search(self, descriptions: Tensor, *, top: int, exact: bool = False) -> SearchResult:
-        """The entries of the index closest to each of the descriptions (Q, ...), by the descriptor's own distance."""
+    def search(self, query: Tensor, *, top: int, exact: bool = False, where: str | None = None) -> Found:
+        """Rows, distances and descriptions of the bodies closest to a description (1, ...)."""
         # More are ranked under a head, whose distance may be only near the cosine's.
-        candidates = 4 * CANDIDATES if isinstance(self.descriptor, EmbeddedDescriptor) else CANDIDATES
+        n = 4 * CANDIDATES if isinstance(self.descriptor, EmbeddedDescriptor) else CANDIDATES
         with torch.inference_mode():
-            return self.index.search(
-                descriptions, self.descriptor.distances, top=min(top, len(self)), exact=exact, candidates=candidates
-            )
+            return self.table.search(query, self.descriptor.distances, top=top, exact=exact, candidates=n, where=where)
 
     @classmethod
     def build(
@@ -156,52 +169,47 @@ class Gallery:
         strict: bool = False,
         progress: bool = False,
     ) -> tuple[Gallery, list[Failure]]:
-        """Index the meshes of a dataset, in place of an index that is there; also returns those that failed.
+        """Describe the bodies of a dataset into a gallery; also returns those that failed.
 
+        A gallery that is there keeps its state until the new one is complete, and becomes an earlier version of it.
         Signatures that are not cached are computed on the way; `dataset.precompute()` does that on all cores.
 
         Args:
-            path: folder of the index.
-            dataset: of the meshes.
-            descriptor: a name, which the index keeps, or a descriptor, which then is given whenever it is opened.
+            path: its folder.
+            dataset: of the bodies.
+            descriptor: a name, which the gallery keeps, or a descriptor, which then is given whenever it is opened.
             n_workers: threads or processes that describe; all cores if None.
-            strict: raise at the first mesh that cannot be described.
-            progress: show bars.
+            strict: raise at the first body that cannot be described.
+            progress: show a bar.
         """
-        chosen = descriptor_of(descriptor)
-        failures: list[Failure] = []
+        chosen, failures = descriptor_of(descriptor), list[Failure]()
+        # In any order, as short vectors are fitted to the first
+        mixed = dataset.subset(np.random.default_rng(0).permutation(len(dataset)).tolist())
+        batches = described_rows(mixed, chosen, {}, failures, n_workers, strict, progress)
         about = about_of(dataset.config, dataset.reading, descriptor)
-        batches = _batches(dataset, chosen, {}, failures, n_workers, strict, progress)
-        write_index(path, about, chosen.searched_by, batches, progress=progress)
+        tables().write(Path(path), about, chosen.searched_by, batches, further_columns(dataset.bodies))
         return cls(path, descriptor), failures
 
-    @classmethod
     def add(
-        cls,
-        path: str | Path,
-        dataset: SignatureDataset,
-        descriptor: str | Descriptor = "pretrained",
-        *,
-        n_workers: int | None = None,
-        strict: bool = False,
-        progress: bool = False,
-    ) -> tuple[Gallery, list[Failure]]:
-        """Add the meshes of a dataset to an index. Files that it has already are passed over, changed ones replaced.
+        self, dataset: SignatureDataset, *, n_workers: int | None = None, strict: bool = False, progress: bool = False
+    ) -> list[Failure]:
+        """Add the bodies of a dataset; returns those that failed.
+
+        Bodies that it has already are passed over, and replaced where their content has changed.
 
         Args:
-            path, dataset, descriptor, n_workers, strict, progress: see `build`.
+            dataset, n_workers, strict, progress: see `build`.
 
         Raises:
-            ValueError: the index is of another descriptor or of other Signatures.
+            ValueError: the gallery is of other Signatures.
         """
-        chosen, about = descriptor_of(descriptor), about_of(dataset.config, dataset.reading, descriptor)
-        failures: list[Failure] = []
-        index = VectorIndex(path)
-        check_alike(index, about)
-        known = index.marks([_id(one) for one in dataset.bodies])
-        batches = _batches(dataset, chosen, known, failures, n_workers, strict, progress)
-        extend_index(path, about, batches, progress=progress)
-        return cls(path, descriptor), failures
+        wanted = about_of(dataset.config, dataset.reading, self.descriptor)
+        check_alike(self.path, self.about, {name: wanted[name] for name in ("signature", "reading")})
+        known = {one["id"]: one["checksum"] for one in self.rows("id", "checksum")}
+        failures, further = list[Failure](), further_columns(dataset.bodies)
+        for some in described_rows(dataset, self.descriptor, known, failures, n_workers, strict, progress):
+            self.table.add(*some, further)
+        return failures
 
     @classmethod
     def merge(
@@ -212,76 +220,66 @@ class Gallery:
         *,
         progress: bool = False,
     ) -> Gallery:
-        """An index of the meshes of others, added to that at `path`, if there is one.
-
-        Args:
-            path, descriptor, progress: see `build`.
-            others: folders of the other indices.
+        """A gallery of the bodies of others, which stay as they are, added to that at `path`, if there is one.
 
         Raises:
-            ValueError: they are of different descriptors or Signatures.
+            ValueError: they are of different descriptors or Signatures, or none is given.
         """
-        merge_indices(path, others, progress=progress)
+
+        opened = [open_table(other) for other in others]
+        if not opened:
+            raise ValueError("others: expected at least one gallery, got none.")
+        with contextlib.suppress(FileNotFoundError):
+            opened.insert(0, open_table(path))
+        first, is_new = opened[0], len(opened) == len(others)
+        for one in opened:
+            check_alike(one.path, one.about, first.about)
+        with tqdm(total=sum(map(len, opened[not is_new :])), desc="entries", disable=not progress) as bar:
+
+            def batches(table: Any) -> Iterator[Batch]:
+                for some in table.batches():
+                    yield table.decoded(some)
+                    bar.update(len(some))
+
+            further = [{name: one.columns[name] for name in one.columns.keys() - KNOWN.keys()} for one in opened]
+            if is_new:
+                tables().write(Path(path), first.about, first.head["searched_by"], batches(first), further[0])
+            into = open_table(path)
+            for one, kinds in zip(opened[1:], further[1:], strict=True):
+                for some in batches(one):
+                    into.add(*some, kinds)
         return cls(path, descriptor)
 
+    def remove(self, where: str) -> int:
+        """Remove the bodies that satisfy a condition; how many."""
+        with self.table.changing(where) as table:
+            return int(table.delete(where).num_deleted_rows)
 
-def about_of(config: SignatureConfig, reading: LoadOptions, descriptor: str | Descriptor) -> dict[str, Any]:
-    """What an index records of how its descriptions were made; only such descriptions can be compared with them."""
-    signature = {**asdict(config), "algorithm_version": SignatureConfig.ALGORITHM_VERSION}
-    return {
-        "descriptor": name_of(descriptor),
-        "model": fingerprint(descriptor_of(descriptor)),
-        "signature": {**signature, "attributes": list(config.attributes)},
-        "reading": reading.as_dict(),
-    }
+    def update(self, where: str, values: Mapping[str, str | float | None]) -> int:
+        """Set columns of the bodies that satisfy a condition, such as {"class": "femur"}; of how many."""
+        kinds = {name: kind for name, kind in self.columns.items() if name not in ("id", "checksum", "thumbnail")}
+        if wrong := values.keys() - kinds.keys():
+            raise ValueError(f"{min(wrong)}: expected one of the columns {', '.join(kinds)}.")
+        with in_words("values: expected numbers in columns of numbers"):
+            typed = {name: None if value is None else kinds[name](value) for name, value in values.items()}
+        with self.table.changing(where) as table:
+            return int(table.update(where=where, values=typed).rows_updated)
 
+    def versions(self) -> list[dict[str, Any]]:
+        """Number, time and bodies of each version, the oldest first; those of the last month are kept."""
+        return [
+            {"version": one["version"], "time": f"{one['timestamp']:%Y-%m-%d %H:%M:%S}",
+             "bodies": int(one["metadata"]["total_rows"])}
+            for one in self.table.table.list_versions()
+        ]  # fmt: skip
 
-def _batches(
-    dataset: SignatureDataset,
-    descriptor: Descriptor,
-    known: dict[str, str],
-    failures: list[Failure],
-    n_workers: int | None,
-    strict: bool,
-    progress: bool,
-) -> Iterator[tuple[Tensor, list[Entry]]]:
-    """Descriptions and entries of the files that are not known by their marks; the failures are added to the list."""
-    with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
-        for start in range(0, len(dataset), _AT_ONCE):
-            part = dataset.subset(range(start, min(start + _AT_ONCE, len(dataset))))
-            keys = [_key(part, i) for i in range(len(part))]
-            ids, names = [_id(one) for one in part.bodies], part.bodies.names
-            labels = part.bodies.labels or (None,) * len(part)
-            new = [i for i, one in enumerate(ids) if keys[i] is None or known.get(one) != keys[i]]
-            descriptions, failed = _described(part.subset(new), descriptor, n_workers, strict)
-            if len(new) > len(failed):
-                lost = {failure.id for failure in failed}
-                left = [i for i in new if names[i] not in lost]
-                yield descriptions, [Entry(ids[i], names[i], labels[i], keys[i] or "") for i in left]
-            failures += failed
-            bar.update(len(part))
+    def restore(self, version: int) -> None:
+        """Make an earlier version the last; those between stay."""
+        open_table(self.path, version)
+        with self.table.changing() as table:
+            table.restore(version)
 
-
-def _described(
-    dataset: SignatureDataset, descriptor: Descriptor, n_workers: int | None, strict: bool
-) -> tuple[Tensor, list[Failure]]:
-    """Descriptions of those of the meshes that can be described, which may be none, and the failures of the others."""
-    failed: list[Failure] = []
-    try:
-        if len(dataset):
-            return describe(dataset, descriptor, failures=None if strict else failed, n_workers=n_workers), failed
-    except MeshError:
-        if strict:
-            raise
-    return torch.zeros(0), failed
-
-
-def _key(dataset: SignatureDataset, i: int) -> str | None:
-    try:
-        return dataset.key(i)
-    except MeshError:  # describing it will say why
-        return None
-
-
-def _id(body: BodyRef) -> str:
-    return str(replace(body, path=body.path.resolve()))
+    def rows(self, *columns: str) -> Iterator[dict[str, Any]]:
+        """Some of what it tells of each body, always in the same order."""
+        for some in self.table.batches(columns=columns):
+            yield from some.to_pylist()

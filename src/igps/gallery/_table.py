@@ -1,0 +1,248 @@
+"""The bodies of a gallery as rows of a LanceDB table. Each change is one commit, and makes a version.
+
+A short vector stands for each description (see `VectorMap`). LanceDB finds those of the nearest few hundred, which are
+ranked by the distance of the descriptions themselves; of few bodies all are compared. Writers wait for each other, and
+what a killed process leaves behind belongs to no version.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import secrets
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import timedelta
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from igps.gallery.about import KNOWN, Batch, Row, in_words
+from igps.retrieval.distances import Distance
+from igps.retrieval.vectors import SearchDistance, VectorMap
+
+try:
+    import lancedb
+    import pyarrow as pa
+    from filelock import FileLock
+    from lancedb.index import BTree, IvfPq
+except ImportError as error:
+    raise ImportError('a gallery needs LanceDB: pip install "interior-gps[index]".') from error
+
+_BODIES, _MAP, _ABOUT = "bodies", "map-", b"gallery"
+# Fewer are all compared; the map to short vectors is fitted to the first so many.
+_FEWEST_FOR_VECTORS = 4096
+# Of so many and fewer the short vectors are all compared. Those that a filter leaves lie in more of the clusters.
+_MOST_FLAT, _PROBED, _PROBED_IF_FILTERED, _ROWS_AT_ONCE = 20_000, 40, 160, 1024
+# Longer descriptions are kept in half precision; the width of short vectors is a multiple of the other.
+_MOST_IN_FULL, _STEP = 1024, 16
+_ARROW = {str: pa.string(), float: pa.float64(), bytes: pa.binary()}
+
+
+class BodyTable:
+    """The last version of the rows, or an earlier one, of the gallery in a folder; `Gallery` tells what is raised."""
+
+    def __init__(self, path: str | Path, version: int | None = None) -> None:
+        self.path = Path(path)
+        if not exists(self.path):
+            raise FileNotFoundError(f"{path}: no gallery there, or its building was not finished. Build it.")
+        with self._told(None):
+            self.table = _opened(self.path, _BODIES)
+        with in_words(f"version: expected one of those that `igps gallery versions` lists, got {version}"):
+            self.table.checkout(self.table.version if version is None else version)
+        self._read_head()
+
+    def _read_head(self) -> None:
+        with self._told(None):
+            schema = self.table.schema
+            self.head: dict[str, Any] = json.loads(schema.metadata[_ABOUT])
+            self.about, self.shape, self.vector_map = self.head["about"], tuple(self.head["shape"]), None
+            self.columns = {one.name: kind for one in schema for kind, known in _ARROW.items() if known == one.type}
+            if schema.field("vector").type.list_size != np.prod(self.shape):
+                raise ValueError(f"descriptions of {schema.field('vector').type}, not of shape {self.shape}")
+            if name := self.head["map"]:
+                kept = _opened(self.path, name).to_arrow()["arrays"][0].as_py()
+                with np.load(io.BytesIO(kept), allow_pickle=False) as arrays:
+                    self.vector_map = VectorMap.of_arrays(arrays)
+
+    def __len__(self) -> int:
+        return int(self.table.count_rows())
+
+    def batches(self, where: str | None = None, columns: Sequence[str] = ()) -> Iterator[Any]:
+        """Arrow tables of the rows, some at a time; of all that `decoded` needs if no columns are named."""
+        with self._told(where):
+            asked = self.table.search() if where is None else self.table.search().where(where)
+            for batch in asked.select(list(columns) or [*self.columns, "vector", "scale"]).to_batches(_ROWS_AT_ONCE):
+                if batch.num_rows:
+                    yield pa.Table.from_batches([batch])
+
+    def decoded(self, rows: Any) -> tuple[Tensor, list[dict[str, Any]]]:
+        """Descriptions, and what is known of each, of an Arrow table of rows."""
+        values = torch.from_numpy(np.array(rows["vector"].combine_chunks().flatten())).float().reshape(len(rows), -1)
+        values *= torch.tensor(rows["scale"].to_numpy())[:, None]
+        return values.reshape(-1, *self.shape), rows.select(list(self.columns)).to_pylist()
+
+    def search(
+        self, query: Tensor, distance: Distance, *, top: int, candidates: int = 512, exact: bool = False,
+        where: str | None = None,
+    ) -> tuple[list[dict[str, Any]], Tensor, Tensor]:  # fmt: skip
+        """Rows, distances (M,) and descriptions (M, ...) of the M ≤ top closest to a description (1, ...), ties by id.
+
+        Of `candidates` that are near by their short vectors, or of all rows if exact; of those that satisfy `where`.
+        """
+        self._check_shape(query)
+        groups = self.batches(where)
+        if not exact and self.vector_map is not None:
+            with self._told(where):
+                short = _short(self.vector_map, query.reshape(1, -1).cpu().float().numpy())[0]
+                asked = self.table.search(short, vector_column_name="short").distance_type("l2").nprobes(_PROBED)
+                if where is not None:
+                    asked = asked.minimum_nprobes(_PROBED_IF_FILTERED).maximum_nprobes(0).where(where, prefilter=True)
+                asked = asked.limit(max(candidates, top)).select([*self.columns, "vector", "scale", "_distance"])
+                near = asked.to_arrow().drop(["_distance"])
+            groups = iter([near]) if len(near) >= top else groups
+        kept, distances = None, torch.zeros(0)
+        for group in groups:
+            kept = group if kept is None else pa.concat_tables([kept, group.select(kept.column_names)])
+            distances = distance(query, self.decoded(kept)[0].to(query.device)).cpu()[0]
+            best = np.lexsort((np.array(kept["id"].to_pylist()), distances.numpy()))[:top]
+            kept, distances = kept.take(best), distances[best]
+        if kept is None:
+            return [], distances, torch.zeros(0, *self.shape)
+        descriptions, rows = self.decoded(kept)
+        return rows, distances, descriptions
+
+    def add(self, descriptions: Tensor, rows: Sequence[Row], further: Mapping[str, type]) -> None:
+        """Add rows, no id twice, in place of those of the same id; of columns beside `KNOWN`, further by name."""
+        with self.changing():
+            self._check_shape(descriptions)
+            for name, kind in further.items():
+                if self.columns.get(name, kind) not in (kind, str):
+                    raise ValueError(f"{name}: expected numbers as in {self.path}, got text. Correct the labels.")
+            if new := further.keys() - self.columns.keys():
+                self.table.add_columns(pa.schema([(name, _ARROW[further[name]]) for name in sorted(new)]))
+                self._read_head()
+            arrow = _encoded((descriptions, rows), self.columns, self.vector_map).select(self.table.schema.names)
+            merging = self.table.merge_insert("id").when_matched_update_all().when_not_matched_insert_all()
+            merging.execute(arrow.cast(self.table.schema))
+            if self.vector_map is None and self.head["searched_by"] and len(self) >= _FEWEST_FOR_VECTORS:
+                _overwrite(self.path, self.head, map(self.decoded, self.batches()), self.columns)
+
+    @contextlib.contextmanager
+    def changing(self, where: str | None = None) -> Iterator[Any]:
+        """LanceDB's table, alone among those who write, from the last version to the next."""
+        with alone(self.path):
+            self.table.checkout_latest()
+            self._read_head()
+            with contextlib.nullcontext() if where is None else self._told(where):
+                yield self.table
+            self.table.checkout_latest()
+            _index(self.table)
+            self.table.checkout(self.table.version)
+            self._read_head()
+
+    def _check_shape(self, descriptions: Tensor) -> None:
+        if (found := tuple(descriptions.shape[1:])) != self.shape:
+            raise ValueError(f"descriptions: expected shape {self.shape} as in {self.path}, got {found}.")
+
+    def _told(self, where: str | None) -> contextlib.AbstractContextManager[None]:
+        if where is None:
+            return in_words(f"{self.path}: the gallery is damaged. Restore a version of it, or build it again")
+        return in_words(f"where: expected a condition on the columns {', '.join(self.columns)}, got {where!r}")
+
+
+def write(
+    path: Path, about: Row, searched_by: SearchDistance | None, batches: Iterable[Batch], further: Mapping[str, type]
+) -> None:
+    """Make a table, in place of the one that is there, which stays an earlier version of it.
+
+    Of what its users want to know of it, for JSON, the distance that finds candidates (None: all will be compared), and
+    at least one row; the first few thousand should be like the others. Further columns are those beside `KNOWN`.
+    """
+    there = {one.name for one in path.iterdir()} if path.is_dir() else set()
+    if strange := {one for one in there if not one.startswith((_BODIES, _MAP, "lock", "manifest", "part-", "staged-"))}:
+        raise ValueError(f"{path}: expected a gallery or a new folder, got one with {min(strange)}. Name another.")
+    batches = (batch for batch in batches if len(batch[1]))
+    if (first := next(batches, None)) is None:
+        raise ValueError("descriptions: expected at least one for the gallery, got none.")
+    head = {"about": dict(about), "shape": list(first[0].shape[1:]), "searched_by": searched_by}
+    with alone(path):
+        _overwrite(path, head, chain([first], batches), {**KNOWN, **further})
+        _index(_opened(path, _BODIES))
+
+
+def _overwrite(path: Path, head: Row, batches: Iterable[Batch], columns: Mapping[str, type]) -> None:
+    """Under the lock: a version of these rows alone, with short vectors if they are many."""
+    batches, first, vector_map, name, database = iter(batches), list[Batch](), None, None, lancedb.connect(path)
+    while sum(len(rows) for _, rows in first) < _FEWEST_FOR_VECTORS and (batch := next(batches, None)):
+        first.append(batch)
+    if head["searched_by"] and sum(len(rows) for _, rows in first) >= _FEWEST_FOR_VECTORS:
+        sample = torch.cat([some.flatten(1) for some, _ in first]).float().numpy()
+        vector_map, file, name = VectorMap.fit(sample, head["searched_by"]), io.BytesIO(), _MAP + secrets.token_hex(8)
+        np.savez(file, **vector_map.arrays())
+        database.create_table(name, pa.table({"arrays": pa.array([file.getvalue()], pa.large_binary())}))
+    coming = (_encoded(some, columns, vector_map) for some in chain(first, batches))
+    begun = next(coming)
+    schema = begun.schema.with_metadata({_ABOUT: json.dumps({**head, "map": name})})
+    whole = (batch for some in chain([begun], coming) for batch in some.cast(schema).to_batches())
+    reader = pa.RecordBatchReader.from_batches(schema, whole)
+    database.create_table(_BODIES, reader, mode="overwrite" if exists(path) else "create")
+
+
+def _index(table: Any) -> None:
+    """Under the lock: a large table gets indices, rows since the last time come to them, and versions of a month go."""
+    n, listed = table.count_rows(), {one.columns[0]: one.name for one in table.list_indices()}
+    width = table.schema.field("short").type.list_size
+    if n > _MOST_FLAT and "id" not in listed:
+        table.create_index("id", config=BTree())
+        if width > 1:
+            n_clusters = 2 ** round(np.log2(np.sqrt(n) / 2))
+            quantized = IvfPq(distance_type="l2", num_partitions=n_clusters, num_sub_vectors=width // _STEP * 2)
+            table.create_index("short", config=quantized)
+    elif table.version % 50 == 0 or (listed and table.index_stats(listed["id"]).num_unindexed_rows > _MOST_FLAT // 2):
+        table.optimize(cleanup_older_than=timedelta(days=30))
+
+
+def _encoded(batch: Batch, columns: Mapping[str, type], vector_map: VectorMap | None) -> Any:
+    """An Arrow table; long descriptions in half precision, scaled by powers of two, each number to 0.05 %."""
+    descriptions, rows = batch
+    values = descriptions.reshape(len(rows), -1).cpu().float().numpy()
+    if not np.isfinite(values).all():
+        raise ValueError("descriptions: expected finite numbers, got others. Look for the mesh that gives them.")
+    told = {name: pa.array([None if row.get(name) is None else kind(row[name]) for row in rows], _ARROW[kind])
+            for name, kind in columns.items()}  # fmt: skip
+    scales, kept = np.ones(len(rows), np.float32), values
+    if values.shape[1] > _MOST_IN_FULL:
+        scales = np.ldexp(scales, np.frexp(np.abs(values).max(axis=1))[1] - 15)
+        kept = (values / scales[:, None]).astype(np.float16)
+    short = np.zeros((len(rows), 1), np.float32) if vector_map is None else _short(vector_map, values)
+    lists = {name: pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(one).ravel()), one.shape[1])
+             for name, one in (("vector", kept), ("short", short))}  # fmt: skip
+    return pa.table({**told, "scale": pa.array(scales), **lists})
+
+
+def _short(vector_map: VectorMap, values: Any) -> Any:
+    """Short vectors with zeros behind, which change no distance."""
+    vectors = vector_map(values)
+    return np.pad(vectors, ((0, 0), (0, -vectors.shape[1] % _STEP)))
+
+
+def _opened(path: Path, name: str) -> Any:
+    table = lancedb.connect(path).open_table(name)
+    if b"embedding_functions" in (table.schema.metadata or {}):  # LanceDB would load the models that they name
+        raise ValueError("it names models to be loaded")
+    return table
+
+
+def exists(path: Path) -> bool:
+    return (path / f"{_BODIES}.lance" / "_versions").is_dir()
+
+
+def alone(path: Path) -> FileLock:
+    """Alone among all processes that write; the system unlocks what a killed process had locked."""
+    path.mkdir(parents=True, exist_ok=True)
+    return FileLock(path / "lock", is_singleton=True)

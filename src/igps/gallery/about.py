@@ -1,0 +1,90 @@
+"""What a gallery records: of each body, and of how its descriptions were made, which others are compared by."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from igps.descriptors import descriptor as descriptor_of
+from igps.descriptors.fingerprint import fingerprint, name_of
+from igps.mesh.options import LoadOptions
+from igps.nn.descriptor import Descriptor
+from igps.signature.signature import SignatureConfig
+
+KNOWN: dict[str, type] = {"id": str, "name": str, "class": str, "file": str, "part": str, "checksum": str,
+                          "area": float, "volume": float, "unit": str, "thumbnail": bytes}  # fmt: skip
+"""What every row tells beside its description, and of which type."""
+
+Row = Mapping[str, Any]
+Batch = tuple[Tensor, Sequence[Row]]
+"""Descriptions (N, ...) and what is known of each: `KNOWN`, and further columns, of text or numbers."""
+
+
+def about_of(config: SignatureConfig, reading: LoadOptions, descriptor: str | Descriptor) -> dict[str, Any]:
+    """Name and checksum of the descriptor, and all parameters of the Signatures and of how files are read."""
+    signature = {**asdict(config), "algorithm_version": SignatureConfig.ALGORITHM_VERSION}
+    return {
+        "descriptor": name_of(descriptor),
+        "model": fingerprint(descriptor_of(descriptor)),
+        "signature": {**signature, "attributes": list(config.attributes)},
+        "reading": reading.as_dict(),
+    }
+
+
+def check_alike(path: str | Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Raise a ValueError that names the first difference between a gallery's record and what is expected of it."""
+    known = _flat(found)
+    for name, value in _flat(json.loads(json.dumps(dict(wanted)))).items():
+        if known.get(name) != value:
+            raise ValueError(
+                f"{path}: the gallery is of another {name}: it has {_short(known.get(name))}, not {_short(value)}. "
+                "Ask it with its own, or build another."
+            )
+
+
+def _flat(about: Mapping[str, Any]) -> dict[str, Any]:
+    """By name, and what has names within by both."""
+    inner = {f"{name}.{k}": v for name, value in about.items() if isinstance(value, dict) for k, v in value.items()}
+    return {**{name: value for name, value in about.items() if not isinstance(value, dict)}, **inner}
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) < 80 else f"{text[:77]}..."
+
+
+@contextlib.contextmanager
+def in_words(sentence: str) -> Iterator[None]:
+    """A sentence, and the first line of what the engine raises."""
+    try:
+        yield
+    except (ValueError, RuntimeError, OSError, KeyError, TypeError, IndexError) as error:
+        words = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise ValueError(f"{sentence} ({words}).") from error
+
+
+def is_gallery(path: str | Path) -> bool:
+    """Whether a folder is a gallery, or an index of an earlier version."""
+    return any((Path(path) / name).exists() for name in ("bodies.lance", "manifest.json"))
+
+
+def tables() -> Any:
+    """The module that needs LanceDB."""
+    from igps.gallery import _table
+
+    return _table
+
+
+def open_table(path: str | Path, version: int | None = None) -> Any:
+    """The table of a gallery, or of an index of an earlier version, which becomes a gallery."""
+    if not tables().exists(Path(path)) and (Path(path) / "manifest.json").exists():
+        from igps.gallery._old_index import convert
+
+        convert(Path(path))
+    return tables().BodyTable(path, version)

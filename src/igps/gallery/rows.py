@@ -1,0 +1,127 @@
+"""Bodies become rows of a gallery: described, and with what is known of them."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from igps.data.dataset import Failure, SignatureDataset
+from igps.data.sources import LABELS_FILE, Bodies
+from igps.gallery.about import KNOWN, Batch
+from igps.mesh.loading import BodyRef
+from igps.mesh.mesh import MeshError
+from igps.nn.description import describe
+from igps.nn.descriptor import Descriptor
+from igps.signature.signature import Signature
+
+# So many descriptions are in memory at once; pixels of a side of a thumbnail, which shows the samples of the surface.
+_AT_ONCE, _PIXELS = 256, 40
+
+
+def described_rows(
+    dataset: SignatureDataset, descriptor: Descriptor, known: Mapping[str, str], failures: list[Failure],
+    n_workers: int | None, strict: bool, progress: bool,
+) -> Iterator[Batch]:  # fmt: skip
+    """Descriptions and rows of the bodies that are not known by their checksums; failures are added to the list."""
+    bodies, kinds = dataset.bodies, further_columns(dataset.bodies)
+    with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
+        for start in range(0, len(dataset), _AT_ONCE):
+            numbers = range(start, min(start + _AT_ONCE, len(dataset)))
+            keys = {i: key_of(dataset, i) for i in numbers}
+            new = [i for i in numbers if not keys[i] or known.get(id_of(bodies[i])) != keys[i]]
+            failed: list[Failure] = []
+            descriptions = _described(dataset.subset(new), descriptor, None if strict else failed, n_workers)
+            lost = {failure.id for failure in failed}
+            left = [i for i in new if bodies.names[i] not in lost]
+            if left:
+                yield descriptions, [{**told_of(dataset, i, kinds), **_measured(dataset, i), "checksum": keys[i]}
+                                     for i in left]  # fmt: skip
+            failures += failed
+            bar.update(len(numbers))
+
+
+def further_columns(bodies: Bodies) -> dict[str, type]:
+    """Further columns of the table of labels, and of which type: numbers where all values are.
+
+    Raises:
+        ValueError: one has the name of a column that every gallery has.
+    """
+    if taken := bodies.columns.keys() & {*KNOWN, "vector", "scale", "short"}:
+        raise ValueError(f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name.")
+    return {name: float if all(map(_is_number, values)) else str for name, values in bodies.columns.items()}
+
+
+def told_of(dataset: SignatureDataset, i: int, kinds: Mapping[str, type]) -> dict[str, Any]:
+    """What is known of a body without reading its file."""
+    bodies = dataset.bodies
+    values = {name: column[i] for name, column in bodies.columns.items()}
+    return {
+        "id": id_of(bodies[i]),
+        "name": bodies.names[i],
+        "class": bodies.labels[i] if bodies.labels else None,
+        "file": str(bodies.paths[i].resolve()),
+        "part": bodies.parts[i],
+        **{name: None if value is None else kinds[name](value) for name, value in values.items()},
+    }
+
+
+def id_of(body: BodyRef) -> str:
+    """What tells bodies apart: file and part."""
+    return str(replace(body, path=body.path.resolve()))
+
+
+def key_of(dataset: SignatureDataset, i: int) -> str:
+    """A checksum of a body and of all that its Signature depends on; "" where it cannot be read."""
+    try:
+        return dataset.key(i)
+    except MeshError:  # describing it will say why
+        return ""
+
+
+def thumbnail(signature: Signature) -> bytes:
+    """A PNG of a body: how near the samples of its surface are, seen along its shortest axis."""
+    from matplotlib.image import imsave
+
+    points = np.asarray(signature.surface.points if len(signature.surface) else signature.interior.points, np.float64)
+    centred = points - points.mean(axis=0)
+    seen = centred @ np.linalg.eigh(centred.T @ centred)[1][:, ::-1]
+    span, depth = np.abs(seen[:, :2]).max(initial=1e-300), np.abs(seen[:, 2]).max(initial=1e-300)
+    columns, rows = np.rint((seen[:, :2] / span + 1) * (_PIXELS - 1) / 2).astype(int).T
+    picture, file = np.zeros((_PIXELS, _PIXELS)), io.BytesIO()
+    np.maximum.at(picture, (rows, columns), 0.6 + 0.4 * seen[:, 2] / depth)
+    imsave(file, picture, cmap="gray", vmin=0, vmax=1, origin="lower", format="png")
+    return file.getvalue()
+
+
+def _measured(dataset: SignatureDataset, i: int) -> dict[str, Any]:
+    signature = dataset[i].signature
+    measured = {name: getattr(signature, name) for name in ("area", "volume", "unit")}
+    return {**measured, "thumbnail": thumbnail(signature)}
+
+
+def _described(
+    dataset: SignatureDataset, descriptor: Descriptor, failures: list[Failure] | None, n_workers: int | None
+) -> Tensor:
+    """Descriptions of those of the bodies that can be described, which may be none."""
+    try:
+        if len(dataset):
+            return describe(dataset, descriptor, failures=failures, n_workers=n_workers)
+    except MeshError:
+        if failures is None:
+            raise
+    return torch.zeros(0)
+
+
+def _is_number(value: str | None) -> bool:
+    try:
+        return value is None or math.isfinite(float(value))
+    except ValueError:
+        return False

@@ -1,0 +1,72 @@
+"""A gallery brought up to a folder, in the time that the changes take."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from igps.data.dataset import Failure, SignatureDataset
+from igps.gallery.gallery import Gallery
+from igps.gallery.rows import further_columns, key_of, told_of
+
+# Rows that are removed, or told anew, at once.
+_AT_ONCE = 1000
+
+
+def sync(
+    gallery: Gallery,
+    dataset: SignatureDataset,
+    root: str | Path,
+    *,
+    n_workers: int | None = None,
+    strict: bool = False,
+    progress: bool = False,
+) -> tuple[int, int, list[Failure]]:
+    """Describe new and changed files of a folder, take classes and columns over, and remove deleted files.
+
+    Files that the cache knows by their size and time of change are not read.
+
+    Args:
+        gallery: what is brought up to the folder.
+        dataset: of all bodies below the folder; Signatures that are missing are computed.
+        root: the folder. Rows of files elsewhere stay.
+        n_workers, strict, progress: see `Gallery.build`.
+
+    Returns:
+        How many bodies were described, how many removed, and those that failed, of which the old row stays.
+    """
+    kinds = further_columns(dataset.bodies)
+    now = [told_of(dataset, i, kinds) for i in range(len(dataset))]
+    asked = [name for name in ("checksum", *now[0]) if name in gallery.columns]
+    known = {one["id"]: one for one in gallery.rows(*asked)}
+    new: list[int] = []
+    told: dict[str, dict[str, Any]] = {}
+    for i, row in enumerate(now):
+        before = known.get(row["id"])
+        if before is None or before["checksum"] != key_of(dataset, i):
+            new.append(i)
+        elif any(before.get(name) != value for name, value in row.items()):
+            told[row["id"]] = row
+    for where in _where_id(sorted(told)):  # of the same content, with another class
+        for some in gallery.table.batches(where):
+            descriptions, rows = gallery.table.decoded(some)
+            gallery.table.add(descriptions, [{**row, **told[row["id"]]} for row in rows], kinds)
+    failures: list[Failure] = []
+    if new:
+        chosen = dataset.subset(new)
+        failures = chosen.precompute(n_workers=n_workers, strict=strict, progress=progress)
+        failures += gallery.add(chosen.usable(failures), n_workers=n_workers, strict=strict, progress=progress)
+    here = f"{Path(root).resolve()}{os.sep}"
+    gone = [name for name in known.keys() - {row["id"] for row in now} if name.startswith(here)]
+    for where in _where_id(gone):
+        gallery.remove(where)
+    return len(new) - len(failures), len(gone), failures
+
+
+def _where_id(ids: Sequence[str]) -> Iterator[str]:
+    """Conditions that some of the ids satisfy, together all."""
+    for start in range(0, len(ids), _AT_ONCE):
+        quoted = ("'" + name.replace("'", "''") + "'" for name in ids[start : start + _AT_ONCE])
+        yield f"id IN ({', '.join(quoted)})"

@@ -1,0 +1,382 @@
+"""Rows of a gallery against the comparison with all of them."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+from scipy.stats import spearmanr
+
+pytest.importorskip("lancedb", reason="the extra [index]")
+
+import lancedb
+import pyarrow as pa
+
+from igps.gallery import _table
+from igps.gallery._table import BodyTable
+from igps.gallery.about import check_alike, open_table
+from igps.retrieval import chi_square, cosine, search
+from igps.retrieval.vectors import VectorMap
+
+ABOUT = {"descriptor": "test", "signature": {"resolution": 32}}
+FURTHER = {"age": float}
+
+
+def histograms(n: int, n_cells: int = 300, seed: int = 0) -> torch.Tensor:
+    """Histograms of sum 1, in families of twenty."""
+    generator = np.random.default_rng(seed)
+    families = generator.gamma(0.5, size=(n // 20 + 1, n_cells)).repeat(20, axis=0)[:n]
+    found = families * generator.gamma(20, size=families.shape)
+    return torch.from_numpy((found / found.sum(axis=1, keepdims=True)).astype(np.float32))
+
+
+def units(n: int, width: int = 16, seed: int = 0) -> torch.Tensor:
+    found = torch.randn(n, width, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.normalize(found, dim=1)
+
+
+def told(number: int, mark: str = "a") -> dict[str, Any]:
+    label = "odd" if number % 2 else None
+    return {"id": f"{number:05}", "name": f"mesh {number}", "class": label, "checksum": mark, "volume": 2.0 * number,
+            "age": float(number % 90)}  # fmt: skip
+
+
+def batches(rows: torch.Tensor, first: int = 0, mark: str = "a") -> Iterator[tuple[torch.Tensor, list[dict[str, Any]]]]:
+    for start in range(0, len(rows), 700):
+        part = rows[start : start + 700]
+        yield part, [told(first + start + i, mark) for i in range(len(part))]
+
+
+def written(path: Path, rows: torch.Tensor, searched_by: Any, mark: str = "a") -> BodyTable:
+    _table.write(path, ABOUT, searched_by, batches(rows, mark=mark), FURTHER)
+    return BodyTable(path)
+
+
+def numbers(found: tuple[list[dict[str, Any]], torch.Tensor, torch.Tensor]) -> list[int]:
+    return [int(row["id"]) for row in found[0]]
+
+
+def recall(table: BodyTable, asked: torch.Tensor, rows: torch.Tensor, distance: Any, **options: Any) -> float:
+    exact = search(asked, rows, top=10, distance=distance).indices.tolist()
+    found = [numbers(table.search(one[None], distance, top=10, **options)) for one in asked]
+    return float(np.mean([len(set(one) & set(other)) / 10 for one, other in zip(found, exact, strict=True)]))
+
+
+@pytest.fixture
+def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Short vectors, and clusters of them, for a thousand rows."""
+    monkeypatch.setattr(_table, "_FEWEST_FOR_VECTORS", 1000)
+    monkeypatch.setattr(_table, "_MOST_FLAT", 1000)
+
+
+@pytest.mark.parametrize("searched_by", ["chi_square", None])
+def test_few_are_compared_one_by_one(tmp_path: Path, searched_by: str | None) -> None:
+    rows = histograms(90, 12).reshape(90, 3, 4)
+    table = written(tmp_path / "g.igps", rows, searched_by)
+    expected = search(rows[:5], rows, top=7)
+    for i in range(5):
+        found = table.search(rows[i : i + 1], chi_square, top=7)
+        assert numbers(found) == expected.indices[i].tolist()
+        torch.testing.assert_close(found[1], expected.distances[i], rtol=1e-6, atol=1e-7)
+        assert torch.equal(found[2], rows[expected.indices[i]])
+    assert {name: found[0][0][name] for name in told(4)} == told(4)
+    assert len(table) == 90
+
+
+@pytest.mark.usefixtures("few_are_many")
+@pytest.mark.parametrize("clusters", [False, True])
+def test_the_nearest_of_many_are_those_of_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clusters: bool) -> None:
+    """By short vectors alone, and by clusters of them."""
+    monkeypatch.setattr(_table, "_MOST_FLAT", 1000 if clusters else 10_000)
+    rows, asked = histograms(3000), histograms(3000)[::75]
+    table = written(tmp_path / "g.igps", rows, "chi_square")
+    assert bool(table.table.list_indices()) == clusters
+    assert recall(table, asked, rows, chi_square, candidates=200) >= 0.98
+    exact = search(asked[:3], rows, top=10)
+    found = [table.search(one[None], chi_square, top=10, exact=True) for one in asked[:3]]
+    assert [numbers(one) for one in found] == exact.indices.tolist()
+    torch.testing.assert_close(torch.stack([one[1] for one in found]), exact.distances, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.usefixtures("few_are_many")
+def test_a_condition_keeps_what_numpy_keeps(tmp_path: Path) -> None:
+    """The nearest among those that satisfy it, by clusters, where it keeps one in a hundred, and where it keeps few."""
+    rows, every = units(3000), np.arange(3000)
+    table = written(tmp_path / "g.igps", rows, "cosine")
+    for where, kept in (
+        ("class = 'odd' AND volume > 3000", (every % 2 == 1) & (2 * every > 3000)),
+        ("age = 17", every % 90 == 17),
+        ("id IN ('00004', '02222')", (every == 4) | (every == 2222)),
+        ("class IS NULL AND name LIKE 'mesh 1%'", (every % 2 == 0) & np.array([str(i)[0] == "1" for i in every])),
+        ("age > 1000", every < 0),
+    ):
+        left = np.flatnonzero(kept)
+        for query in rows[:2]:
+            expected = left[torch.sort(1 - rows[left] @ query, stable=True).indices[:10].numpy()].tolist()
+            assert numbers(table.search(query[None], cosine, top=10, where=where)) == expected, where
+            assert numbers(table.search(query[None], cosine, top=10, where=where, exact=True)) == expected, where
+    for wrong in ("weight > 3", "volume >", "volume > 'much' AND"):
+        for exact in (False, True):
+            with pytest.raises(ValueError, match=r"where: expected a condition on the columns id, name, .* age, got"):
+                table.search(rows[:1], cosine, top=1, where=wrong, exact=exact)
+
+
+@pytest.mark.usefixtures("few_are_many")
+def test_vectors_of_any_length_are_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zeros behind them change no distance; more may be wanted than are near."""
+    rows = units(2000, width=21)
+    table = written(tmp_path / "g.igps", rows, "cosine")
+    assert recall(table, rows[:40], rows, cosine) == 1
+    monkeypatch.setattr(_table, "_PROBED", 1)
+    (expected,) = search(rows[:1], rows, top=1500, distance=cosine).indices.tolist()
+    assert numbers(table.search(rows[:1], cosine, top=1500)) == expected
+
+
+def test_long_descriptions_are_kept_in_half_precision(tmp_path: Path) -> None:
+    """Each number to 0.05 %, however small all of them are."""
+    rows = histograms(60, 1500)
+    rows[7] *= 1e-9
+    rows[8] = 0
+    table = written(tmp_path / "g.igps", rows, "chi_square")
+    assert str(table.table.schema.field("vector").type) == "fixed_size_list<item: halffloat>[1500]"
+    kept = torch.cat([table.decoded(some)[0] for some in table.batches()])
+    torch.testing.assert_close(kept, rows, rtol=2**-11, atol=1e-11)
+    found = table.search(rows[:1], chi_square, top=5)
+    torch.testing.assert_close(found[1], search(rows[:1], rows, top=5).distances[0], rtol=2e-3, atol=1e-6)
+
+
+def test_features_order_as_chi_square_does() -> None:
+    """By a fifth to a third less, the more the closer, and in nearly the same order."""
+    rows = histograms(120, 500)
+    vectors = VectorMap.fit(rows.numpy(), "chi_square")(rows.numpy())
+    assert vectors.shape[1] <= 256
+    a, b = rows[:, None].double(), rows[None].double()
+    expected = ((a - b) ** 2 / (a + b).clamp_min(1e-300)).sum(2) / 2
+    apart = ~np.eye(120, dtype=bool)
+    found = cdist(vectors, vectors)[apart] ** 2 / 2
+    ratio = found / expected[apart].numpy()
+    assert ratio.min() > 0.63
+    assert ratio.max() < 0.9
+    assert spearmanr(found, expected[apart].numpy())[0] > 0.995
+
+
+@pytest.mark.usefixtures("few_are_many")
+def test_long_unit_vectors_are_reduced(tmp_path: Path) -> None:
+    rows = torch.nn.functional.normalize(histograms(1500, 700).sqrt(), dim=1)
+    table = written(tmp_path / "g.igps", rows, "cosine")
+    assert table.vector_map is not None
+    assert table.vector_map(rows[:1].numpy()).shape == (1, 256)
+    assert recall(table, rows[:40], rows, cosine, candidates=200) >= 0.98
+
+
+@pytest.mark.usefixtures("few_are_many")
+def test_rows_are_added_replaced_and_removed(tmp_path: Path) -> None:
+    """Whatever the way they came, the answers are those of all at once; a new column is empty before."""
+    rows = units(2100)
+    table = written(tmp_path / "g.igps", rows[:600], "cosine")
+    assert table.vector_map is None
+    for start in range(600, 1800, 600):
+        table.add(*next(batches(rows[start : start + 600], start)), {"site": str})
+    assert table.vector_map is not None
+    assert table.columns["site"] is str
+    changed, few = rows[1800:2000], [{**told(i, "b"), "site": "A"} for i in range(200)]
+    table.add(changed, few, {"site": str})
+    assert (len(table), len(list(table.table.search().where("site = 'A'").to_list()))) == (1800, 200)
+    with table.changing() as engine:
+        engine.delete("id < '00100'")
+    now = torch.cat([changed[100:], rows[200:1800]])
+    for query in now[::300]:
+        expected = (search(query[None], now, top=6, distance=cosine).indices[0] + 100).tolist()
+        assert numbers(BodyTable(table.path).search(query[None], cosine, top=6)) == expected
+    with pytest.raises(ValueError, match=r"age: expected numbers as in .*g\.igps, got text"):
+        table.add(rows[:1], [{**told(0), "age": "old"}], {"age": str})
+
+
+def test_each_change_is_a_version_to_return_to(tmp_path: Path) -> None:
+    rows = units(40)
+    table = written(tmp_path / "g.igps", rows[:30], "cosine")
+    first = table.table.version
+    table.add(rows[30:], [told(i) for i in range(30, 40)], {})
+    written(tmp_path / "g.igps", rows[:3], "cosine")
+    assert [len(BodyTable(table.path, version)) for version in (first, table.table.version, None)] == [30, 40, 3]
+    before = BodyTable(table.path, first)
+    assert numbers(before.search(rows[29:30], cosine, top=1)) == [29]
+    with pytest.raises(ValueError, match=r"version: expected one of those that `igps gallery versions` lists, got 99"):
+        BodyTable(table.path, 99)
+
+
+def test_what_is_no_gallery_of_this_kind_is_refused(tmp_path: Path) -> None:
+    table = written(tmp_path / "g.igps", units(10), "cosine")
+    other = {"descriptor": "test", "signature": {"resolution": 20}}
+    with pytest.raises(ValueError, match=r"g\.igps: the gallery is of another signature.resolution: it has 32, not 20"):
+        check_alike(table.path, table.about, other)
+    with pytest.raises(ValueError, match=r"descriptions: expected shape \(16,\) as in .*, got \(5,\)"):
+        table.search(units(1, 5), cosine, top=1)
+    with pytest.raises(ValueError, match=r"descriptions: expected shape \(16,\) as in .*, got \(4, 4\)"):
+        table.add(units(1).reshape(1, 4, 4), [told(0)], {})
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        table.add(units(1) / 0, [told(0)], {})
+    with pytest.raises(ValueError, match="at least one for the gallery"):
+        _table.write(tmp_path / "new.igps", ABOUT, "cosine", [], {})
+    with pytest.raises(FileNotFoundError, match=r"nowhere: no gallery there"):
+        open_table(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match=r"got one with g.igps"):
+        written(tmp_path, units(10), "cosine")
+    assert len(BodyTable(tmp_path / "g.igps")) == 10
+
+
+def test_a_strangers_gallery_runs_nothing(tmp_path: Path) -> None:
+    """LanceDB would load the model that a table names; a head that does not fit is told in a sentence."""
+    for i, (name, value) in enumerate((("embedding_functions", b"[]"), ("gallery", b"{"), ("gallery", b"[1]"))):
+        table = written(tmp_path / f"{i}.igps", units(3), "cosine")
+        arrow = table.table.to_arrow()
+        changed = arrow.replace_schema_metadata({**arrow.schema.metadata, name.encode(): value})
+        lancedb.connect(table.path).create_table("bodies", changed, mode="overwrite")
+        with pytest.raises(ValueError, match=rf"{i}\.igps: the gallery is damaged\. Restore"):
+            BodyTable(table.path)
+    table = written(tmp_path / "map.igps", units(3), "cosine")
+    lancedb.connect(table.path).create_table("map-x", pa.table({"arrays": [b"\x80\x04N."]}))
+    arrow = table.table.to_arrow()
+    head = arrow.schema.metadata[b"gallery"].replace(b'"map": null', b'"map": "map-x"')
+    changed = arrow.replace_schema_metadata({b"gallery": head})
+    lancedb.connect(table.path).create_table("bodies", changed, mode="overwrite")
+    with pytest.raises(ValueError, match=r"map\.igps: the gallery is damaged.*pickle"):
+        BodyTable(table.path)
+
+
+@pytest.mark.parametrize("how", ["truncated", "gone"])
+def test_damaged_files_are_told_in_a_sentence(tmp_path: Path, how: str) -> None:
+    table = written(tmp_path / "g.igps", histograms(300, 1100), "chi_square")
+    files = [path for path in table.path.rglob("*") if path.suffix in (".lance", ".manifest") and path.is_file()]
+    assert len(files) == 2
+    for path in files:
+        content = path.read_bytes()
+        path.unlink()
+        if how == "truncated":
+            path.write_bytes(content[: len(content) // 2])
+        with pytest.raises((ValueError, FileNotFoundError), match=r"g\.igps") as raised:
+            BodyTable(table.path).search(histograms(1, 1100), chi_square, top=1)
+        assert "uild it" in str(raised.value)
+        assert "\n" not in str(raised.value)
+        path.write_bytes(content)
+    assert len(BodyTable(table.path)) == 300
+
+
+def test_an_index_of_an_earlier_version_becomes_a_gallery(tmp_path: Path) -> None:
+    """Two that 0.2.0 wrote: of 12 short descriptions, two of which were replaced; and of four in half precision."""
+    with zipfile.ZipFile(Path(__file__).parent / "old_indices.zip") as file:
+        file.extractall(tmp_path)
+
+    def values(n: int, width: int, seed: int) -> torch.Tensor:
+        return torch.from_numpy(np.random.default_rng(seed).random((n, width), dtype=np.float32))
+
+    short, long = open_table(tmp_path / "short.igps"), open_table(tmp_path / "long.igps")
+    assert (short.about, len(short), short.head["searched_by"]) == (ABOUT, 12, "chi_square")
+    expected = torch.cat([values(2, 8, 1), values(12, 8, 0)[2:]])
+    for i in range(12):
+        (row,), distances, description = short.search(expected[i : i + 1], chi_square, top=1)
+        assert torch.equal(description[0], expected[i])
+        assert (row["id"], row["name"], row["class"]) == (f"/meshes/{i}.off", f"{i}.off", "odd" if i % 2 else None)
+        assert (row["checksum"], row["volume"], float(distances)) == ("b" if i < 2 else "a", None, 0)
+    (some,) = long.batches()
+    torch.testing.assert_close(long.decoded(some)[0], values(4, 1030, 2).reshape(4, 2, 515) * 1e-6, rtol=2**-11, atol=0)
+    short.add(values(1, 8, 5), [told(0)], {})
+    assert len(open_table(tmp_path / "short.igps")) == 13
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "descriptions.raw", "entries.sqlite"])
+def test_an_old_index_that_cannot_be_read_says_what_to_do(tmp_path: Path, name: str) -> None:
+    with zipfile.ZipFile(Path(__file__).parent / "old_indices.zip") as file:
+        file.extractall(tmp_path)
+    next((tmp_path / "short.igps").rglob(name)).write_text("{}")
+    with pytest.raises(ValueError, match=r"short\.igps: expected an index of an earlier version.*Build a gallery"):
+        open_table(tmp_path / "short.igps")
+
+
+_WRITER = """
+import sys
+sys.path[:0] = [{tests!r}]
+from test_table import BodyTable, told, units
+table = BodyTable({folder!r})
+who = int(sys.argv[1])
+print("ready", flush=True)
+sys.stdin.readline()
+for turn in range(1000):
+    mark, first = f"{{who}}-{{turn}}", 1000 * who
+    table.add(units(40, seed=turn), [told(first + i, mark) for i in range(40)], {{}})
+    with table.changing() as engine:
+        engine.update(where=f"id >= '{{first:05}}' AND id < '{{first + 20:05}}'", values={{"class": mark}})
+    with table.changing() as engine:
+        engine.delete(f"id >= '{{first + 30:05}}' AND id < '{{first + 40:05}}'")
+"""
+
+
+def killed_writers(folder: Path, n_kills: int, longest: float = 0.25) -> int:
+    """Kill one of two processes that add, update and remove; how often rows were of no moment between two changes.
+
+    Each writer has rows of its own. Whole are 40 of one turn, of which the class of 20 and then 10 less may be as the
+    next changes make them.
+    """
+    written(folder, units(50, seed=1), "cosine", mark="still")
+    wrong, generator = 0, random.Random(0)
+    words = _WRITER.format(tests=str(Path(__file__).parent), folder=str(folder))
+    for _ in range(n_kills):
+        both = [subprocess.Popen([sys.executable, "-c", words, str(who)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+                for who in (1, 2)]  # fmt: skip
+        for child in both:
+            assert child.stdout is not None
+            child.stdout.readline()
+        for child in both:
+            assert child.stdin is not None
+            child.stdin.write(b"go\n")
+            child.stdin.flush()
+        for child in both:
+            time.sleep(generator.uniform(0, longest))
+            os.kill(child.pid, signal.SIGKILL)
+            child.communicate()
+        wrong += not is_whole(BodyTable(folder))
+    return wrong
+
+
+def is_whole(table: BodyTable) -> bool:
+    rows = [row for some in table.batches() for row in zip(*table.decoded(some), strict=True)]
+    still = {row["id"]: values for values, row in rows if row["checksum"] == "still"}
+    good = len(still) == 50 and all(torch.equal(still[f"{i:05}"], one) for i, one in enumerate(units(50, seed=1)))
+    for who in (1, 2):
+        own = sorted((row["id"], row["checksum"], row["class"], values) for values, row in rows
+                     if row["id"].startswith(f"0{who}"))  # fmt: skip
+        marks = {mark for _, mark, _, _ in own}
+        good &= len(own) in ((0,) if not own else (30, 40)) and len(marks) <= 1
+        if own and good:
+            (mark,), expected = marks, units(40, seed=int(min(marks).partition("-")[2]))
+            classes = {label for _, _, label, _ in own[:20]}
+            good &= classes == {mark} or (classes <= {"odd", None} and len(own) == 40)
+            good &= all(torch.equal(values, expected[i]) for i, (_, _, _, values) in enumerate(own))
+    return bool(good)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no SIGKILL")
+def test_kills_of_two_writers_leave_whole_changes(tmp_path: Path) -> None:
+    assert killed_writers(tmp_path / "g.igps", 1, longest=0.8) == 0
+    assert len({row["checksum"] for some in BodyTable(tmp_path / "g.igps").batches() for row in some.to_pylist()}) > 1
+
+
+def test_is_whole_tells_halves_of_a_change(tmp_path: Path) -> None:
+    """So that the kills before could have been told."""
+    table = written(tmp_path / "g.igps", units(50, seed=1), "cosine", mark="still")
+    table.add(units(40, seed=3), [told(1000 + i, "1-3") for i in range(40)], {})
+    assert is_whole(table)
+    table.add(units(7, seed=3), [told(1000 + i, "1-4") for i in range(7)], {})
+    assert not is_whole(table)
