@@ -139,7 +139,8 @@ def leaves(commands: Any, before: tuple[str, ...] = ()) -> list[tuple[str, ...]]
 
 
 # The demo makes its meshes; a report reads those of its results as they were read; the others read none.
-READS_NONE = {("demo",), ("report",), ("completion",), ("index", "merge")}
+NO_MESHES = "merge", "remove", "update", "info", "versions", "restore"
+READS_NONE = {("demo",), ("report",), ("completion",), *(("gallery", one) for one in NO_MESHES)}
 
 
 @pytest.mark.parametrize("command", [c for c in leaves(COMMANDS) if c not in READS_NONE], ids=" ".join)
