@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 import trimesh
+from sklearn.metrics import roc_auc_score
 
 from conftest import as_mesh
 from igps.analysis.explanation import explain, explain_groups, held, on_surface, unit_shares
@@ -58,6 +61,9 @@ def test_all_shares_add_up_to_the_distance(name: str, batches: list[SignatureBat
     of_samples = sum(values.sum() for of_body in found.samples for values in of_body.values())
     assert of_samples == pytest.approx(found.distance, rel=1e-6)
     assert sum(found.parts.values()) == pytest.approx(found.distance, rel=1e-6)
+    by_place = np.concatenate([values for of_body in found.places or () for values in of_body.values()])
+    assert by_place.sum() == pytest.approx(found.distance, rel=1e-6)
+    assert by_place.min() >= 0
     assert "%" in found.told()
 
 
@@ -101,6 +107,24 @@ def test_a_bump_is_painted_where_it_is(name: str, signatures: list[Signature], b
     values = on_surface(found.samples[1], places, points)  # type: ignore[arg-type]
     at_bump = np.linalg.norm(points - points[points[:, 0].argmax()], axis=1) < 0.25
     assert values[at_bump].mean() > 2 * abs(values[~at_bump].mean())
+
+
+def test_a_small_bump_is_painted_in_another_pose() -> None:
+    """A rod, bent, with a bump that is a hundredth of its length high; the pairs of samples alone do not show it."""
+    straight = trimesh.creation.capsule(height=4.0, radius=0.5, count=[24, 24]).subdivide()
+    bent, bump = straight.copy(), straight.vertices[np.abs(straight.vertices - [0.5, 0, 2.6]).sum(axis=1).argmin()]
+    away = np.linalg.norm(straight.vertices - bump, axis=1)
+    bent.vertices += 0.08 * np.clip(1 - (away / 0.5) ** 2, 0, 1)[:, None] ** 2 * straight.vertex_normals
+    angle, along = bent.vertices[:, 2] / 4, 4 + bent.vertices[:, 0]
+    bent.vertices = np.stack([along * np.cos(angle), bent.vertices[:, 1], along * np.sin(angle)], axis=1)
+    config = descriptor("interior").requirements.apply_to(replace(CONFIG, n_surface_samples=800))
+    pair = [compute_signature(as_mesh(one), config) for one in (straight, bent)]
+    found = explain(descriptor("interior"), *(collate([one]) for one in pair))
+    points = pair[1].surface.points
+    true = np.linalg.norm(points - bent.vertices[away.argmin()], axis=1) < 0.5
+    places = {"interior": pair[1].interior.points, "surface": points}
+    assert found.places is not None
+    assert roc_auc_score(true, on_surface(found.places[1], places, points)) > 0.9  # type: ignore[arg-type]
 
 
 def test_bodies_that_are_alike_have_nothing_to_share(batches: list[SignatureBatch]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -49,7 +51,7 @@ def test_a_wrong_label_is_told() -> None:
     ("name", "value", "told"),
     [
         ("volume", np.log(2), "its volume is 1.99 times"),
-        ("spacing", np.log(2), "its surface is 1.99 times as coarse"),
+        ("spacing", np.log(2), "it is 1.99 times as coarse"),
         ("handles", 3.0, "it has 3 handles, where 0 are usual"),
         ("flat", 0.3, "30% of its surface lie in one plane"),
     ],
@@ -96,3 +98,15 @@ def test_measures_are_those_of_the_meshes(tmp_path: object) -> None:
     assert measures["volume"][0] == pytest.approx(np.log(torus.volume))
     assert measures["spacing"][0] == pytest.approx(np.log(torus.area / len(torus.faces)) / 2)
     assert all(np.isnan(values[1]) for values in measures.values())
+
+
+def test_the_spacing_of_a_label_is_the_side_of_its_voxels(tmp_path: Path) -> None:
+    """Which its surface hides: a ball has as many faces on a grid that is twice as coarse."""
+    nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
+    for name, side in (("fine", 1.0), ("coarse", 2.0)):
+        places = (np.indices(3 * [int(40 / side)]) + 0.5) * side - 20
+        mask = ((places**2).sum(axis=0) < 14**2).astype(np.uint8)
+        nibabel.save(nibabel.Nifti1Image(mask, np.diag([side, side, side, 1])), tmp_path / f"{name}.nii.gz")
+    dataset = SignatureDataset([tmp_path / "fine.nii.gz", tmp_path / "coarse.nii.gz"], cache_dir=tmp_path)
+    spacing = measures_of(dataset, n_workers=1)["spacing"]
+    assert np.exp(spacing) == pytest.approx([1, 2], rel=0.01)

@@ -144,7 +144,7 @@ def test_a_page_with_the_difference_of_each_body_from_its_nearest(
     mesh, signature, values = dataset.mesh(3), dataset[3].signature, []
     for vertex in mesh.vertices:  # so few that the picture has them all
         value = 0.0
-        for kind, shares in found.samples[1].items():
+        for kind, shares in found.places[1].items():  # type: ignore[index]
             if shares.any():
                 away = np.linalg.norm(getattr(signature, kind).points - vertex, axis=1)
                 value += len(shares) * np.mean([shares[i] for i in np.argsort(away)[:12]])

@@ -69,17 +69,21 @@ def explaining(
         batches = [collate([signature]) for signature in signatures]
         for name, descriptor in chosen.items():
             found = explain(descriptor, *batches)
-            values = on_surface(found.samples[1], samples, points)
+            by_samples, by_place = (
+                float(roc_auc_score(true, on_surface(shares[1], samples, points)))
+                for shares in (found.samples, found.places or found.samples)
+            )
             rows.append({
                 "body": drawn[1].name, "alteration": how, "size": round(size, 4), "descriptor": name,
-                "distance": found.distance, "auc": float(roc_auc_score(true, values)), "told": found.told(),
+                "distance": found.distance, "auc": by_place, "auc_of_pairs": by_samples, "told": found.told(),
             })  # fmt: skip
             print(rows[-1], flush=True)
         write_answer(out, "explaining", rows)
     for name in descriptors:
         for how in ("all", *ALTERATIONS):
-            some = [row["auc"] for row in rows if row["descriptor"] == name and how in ("all", row["alteration"])]
-            print(f"{name} {how}: {np.mean(some):.3f} of {len(some)}, median {np.median(some):.3f}")
+            own = [row for row in rows if row["descriptor"] == name and how in ("all", row["alteration"])]
+            some, pairs = ([row[column] for row in own] for column in ("auc", "auc_of_pairs"))
+            print(f"{name} {how}: {np.mean(some):.3f} of {len(some)}, by pairs alone {np.mean(pairs):.3f}")
 
 
 def alter(mesh: Mesh, how: str, size: float, random: np.random.Generator) -> tuple[Mesh, Points, float]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from igps.analysis.correspondence import unlikeness
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.nn.batch_features import WEIGHT, BatchFeatures, SampleKind
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
@@ -36,11 +37,14 @@ class Explanation:
         parts: of each histogram, by what it counts, its share; they sum to the distance.
         samples: of the one and the other body, of each kind of samples (P,) their shares; all together sum to the
             distance.
+        places: the same distance shared out among the samples of the surfaces by where the bodies are unlike, see
+            `igps.analysis.correspondence`; none is negative. None of two groups.
     """
 
     distance: float
     parts: Mapping[str, float]
     samples: tuple[Shares, Shares]
+    places: tuple[Shares, Shares] | None = None
 
     def told(self, most: int = 3) -> str:
         """The largest shares in words."""
@@ -61,6 +65,10 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
     the other. So it goes to the pairs in the cell, from each pair to its two samples in halves, and from a limb, a
     piece or an eigenvalue to the samples that make it.
 
+    In other poses most pairs move a little, and what they share lies everywhere. `places` tells better where a small
+    part is other: half of the distance goes to each body, and there to each sample of the surface in proportion to how
+    unlike it is to those of the other body that correspond to it.
+
     Args:
         descriptor: of histograms, such as interior or rich, alone or under a head, such as pretrained.
         one, other: a body each.
@@ -78,8 +86,17 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
     parts, samples = _shared(histograms, pair[0], units)
     others, samples_of_other = _shared(histograms, pair[1], -units)
     return Explanation(
-        distance, {name: share + others[name] for name, share in parts.items()}, (samples, samples_of_other)
+        distance,
+        {name: share + others[name] for name, share in parts.items()},
+        (samples, samples_of_other),
+        (_placed(one, other, samples, distance), _placed(other, one, samples_of_other, distance)),
     )
+
+
+def _placed(body: SignatureBatch, other: SignatureBatch, samples: Shares, distance: float) -> Shares:
+    """Half of the distance, shared out among the surface samples of a body."""
+    weights = unlikeness(body, other)
+    return {"interior": np.zeros(len(samples["interior"])), "surface": distance / 2 * weights / weights.sum()}
 
 
 def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Tensor, float]:

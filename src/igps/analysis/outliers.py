@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from igps._parallel import Failed, run
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
-from igps.mesh.loading import BodyRef
+from igps.mesh.loading import BodyRef, each_surface, surface_body
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors
 
@@ -34,7 +34,7 @@ LIMIT = 3.5
 _SAYS = {
     "shape": "its shape is unlike its class",
     "volume": "its volume is {ratio:.2f} times the usual",
-    "spacing": "its surface is {ratio:.2f} times as coarse as usual",
+    "spacing": "it is {ratio:.2f} times as coarse as usual",
     "handles": "it has {value:.0f} handles, where {usual:.0f} are usual",
     "repairs": "it was repaired as few are: {notes}",
     "flat": "{value:.0%} of its surface lie in one plane, as if it were cut",
@@ -116,8 +116,8 @@ def outliers(
 def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Values]:
     """What segmentations go wrong in, of each body: NaN where its mesh cannot be read again.
 
-    "volume" and "spacing", the root of the area of a face, as logarithms; "handles" of the surface; "flat", the largest
-    share of the surface that lies in one plane.
+    "volume" and "spacing", the side of a voxel or else the root of the area of a face, as logarithms; "handles" of the
+    surface; "flat", the largest share of the surface that lies in one plane.
 
     Args:
         dataset: N bodies.
@@ -152,8 +152,11 @@ def flat_share(mesh: Mesh) -> float:
 
 
 def _measures(pipeline: SignaturePipeline, body: BodyRef) -> tuple[float, float, float, float]:
-    mesh = pipeline.mesh(body)
+    ((_, raw),) = each_surface(body.path, pipeline.reading, parts=[body.part])
+    mesh = surface_body(raw, body, pipeline.reading, least_vertices=pipeline.config.n_vertices_read)
     spacing = np.log(mesh.area / len(mesh.faces)) / 2
+    if raw.voxels is not None:  # the surface of a label has as many faces as its form needs, on any grid
+        spacing = np.log(mesh.volume / raw.voxels().n_voxels) / 3
     return float(np.log(mesh.volume)), float(spacing), float(mesh.genus), flat_share(mesh)
 
 

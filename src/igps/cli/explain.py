@@ -74,7 +74,7 @@ def _painted(dataset: SignatureDataset, i: int, found: Explanation, place: int) 
     mesh, signature = dataset.mesh(i), dataset[i].signature
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     samples = {kind: getattr(signature, kind).points for kind in KINDS}
-    return mesh, on_surface(found.samples[place], samples, centres)
+    return mesh, on_surface((found.places or found.samples)[place], samples, centres)
 
 
 def _half(values: Any) -> float:
@@ -86,8 +86,11 @@ def _half(values: Any) -> float:
 
 def _sample_rows(dataset: SignatureDataset, chosen: list[int], found: Explanation) -> list[dict[str, Any]]:
     return [
-        {"body": dataset.bodies.names[i], "samples": kind, **dict(zip("xyz", point, strict=True)), "share": share}
-        for i, shares in zip(chosen, found.samples, strict=True)
+        {"body": dataset.bodies.names[i], "samples": kind, **dict(zip("xyz", point, strict=True)),
+         "share": float(share), "share_by_place": float(placed)}
+        for i, shares, places in zip(chosen, found.samples, found.places or found.samples, strict=True)
         for kind in KINDS
-        for point, share in zip(getattr(dataset[i].signature, kind).points.tolist(), shares[kind].tolist(), strict=True)
-    ]
+        for point, share, placed in zip(
+            getattr(dataset[i].signature, kind).points.tolist(), shares[kind], places[kind], strict=True
+        )
+    ]  # fmt: skip

@@ -31,8 +31,7 @@ class Painted:
     Args:
         other: the name of the nearest.
         told: the largest shares of their distance, in words.
-        values: (V,) uint8 of each vertex of both surfaces: 128 where the bodies are alike, more where one has much of
-            what the other lacks.
+        values: (V,) uint8 of each vertex of both surfaces: 128 where the bodies are alike, more where they are not.
     """
 
     other: str
@@ -106,7 +105,8 @@ def _painted(
     descriptor, dataset, surfaces = job
     with one_thread():
         found = explain(descriptor, dataset.batch([0]), dataset.batch([1]))
-    one, other = (_values(dataset.mesh(i), dataset[i].signature, found.samples[i], surfaces[i]) for i in (0, 1))
+    shares = found.places or found.samples
+    one, other = (_values(dataset.mesh(i), dataset[i].signature, shares[i], surfaces[i]) for i in (0, 1))
     return found.told(), (one, other)
 
 

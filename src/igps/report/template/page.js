@@ -228,7 +228,7 @@ function showExplained(shape) {
   byId("explained").hidden = !told;
   if (!told) return;
   byId("explained-heading").textContent = `Where it differs from its nearest, ${shapes[other].name}`;
-  byId("explained-told").textContent = `${told}. Red: it has much there of what the other lacks; blue: it lacks it; grey: alike.`;
+  byId("explained-told").textContent = `${told}. Red: unlike what corresponds to it in the other body; grey: alike.`;
   const painted = [shape, other].flatMap((one, place) =>
     ["front", "back"].map((side) => {
       const canvas = element("canvas", { width: 1, height: 1, role: "img", "aria-label": `${shapes[one].name}, ${side}` });
