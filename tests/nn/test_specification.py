@@ -32,6 +32,27 @@ def learnable() -> HistogramDescriptor:
     return HistogramDescriptor([one, PairHistogram(["interior_distance"], embedding)], name="mine")
 
 
+def test_a_folder_to_share_has_the_model_and_its_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the names that hubs of models expect; a folder that is called as a descriptor of the library hides none."""
+    descriptor, batch = learnable(), two_bodies()
+    monkeypatch.chdir(tmp_path)
+    for folder in ("shared", "rich"):
+        descriptor.save(folder, {"author": "me", "classes": ["cat", "dog"]})
+        assert sorted(path.name for path in Path(folder).iterdir()) == ["README.md", "model.safetensors"]
+    card = Path("shared/README.md").read_text()
+    assert card.startswith("---\nlibrary_name: igps\n")
+    assert '| classes | `["cat", "dog"]` |' in card
+    for found in (igps.load("shared"), igps.descriptor("shared"), igps.descriptor(tmp_path / "shared")):
+        assert torch.equal(found(batch), descriptor(batch))
+        assert found.card["author"] == "me"
+    assert igps.descriptor("rich").name == "rich"
+    with pytest.raises(ValueError, match="got ''"):
+        igps.descriptor("")
+    Path("empty").mkdir()
+    with pytest.raises(FileNotFoundError, match=r"empty/model\.safetensors: no such file"):
+        igps.load("empty")
+
+
 @pytest.mark.parametrize("name", [*NAMES, "molecular"])
 def test_every_descriptor_of_the_library_comes_back(name: str, tmp_path: Path) -> None:
     descriptor = igps.descriptor(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -25,7 +26,7 @@ from igps.descriptors.volume_shape_dna import VolumeShapeDNA
 from igps.descriptors.with_attributes import WithAttributes
 from igps.descriptors.written import written
 from igps.nn.descriptor import Descriptor
-from igps.nn.specification import load_module
+from igps.nn.specification import IN_FOLDER, load_module
 
 _MAKERS: Mapping[str, Callable[[], Descriptor]] = {
     "interior": interior,
@@ -56,14 +57,17 @@ _OF_ATTRIBUTES: Mapping[str, Callable[[], Descriptor]] = {"molecular": molecular
 
 
 def is_file(which: str | Path) -> bool:
-    """Whether a descriptor is asked for by its file."""
-    return str(which).endswith((".safetensors", *_WRITTEN))
+    """Whether a descriptor is asked for by its file, or by its folder."""
+    if str(which) in _MAKERS or str(which) in _OF_ATTRIBUTES:
+        return False
+    in_folder = bool(which) and os.path.isfile(os.path.join(which, IN_FOLDER))  # False of what cannot be a path
+    return str(which).endswith((".safetensors", *_WRITTEN)) or in_folder
 
 
 def load(path: str | Path) -> Descriptor:
     """A descriptor that `Descriptor.save` or `igps fit` wrote, in evaluation mode, with its `card`. No code runs.
 
-    Or one that is written in YAML, see `igps.descriptors.written`.
+    From a file or a folder. Or one that is written in YAML, see `igps.descriptors.written`.
 
     Example:
         >>> import tempfile

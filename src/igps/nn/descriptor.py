@@ -93,10 +93,11 @@ class Descriptor(Specified, ABC):
             return self(collate([compute_signature(mesh, config)], [mesh]))[0].numel()
 
     def save(self, path: str | Path, card: Mapping[str, Any] | None = None) -> None:
-        """Write it to a safetensors file, which `igps.load` and every `--descriptor` takes.
+        """Write it to a safetensors file, or a folder to share, which `igps.load` and every `--descriptor` takes.
 
         Args:
-            path: such as ``mine.safetensors``; a file that is there is replaced.
+            path: such as ``mine.safetensors``; a file that is there is replaced. A name without this ending is that of
+                a folder, which gets ``model.safetensors`` and its card, ``README.md``, as hubs of models expect them.
             card: what a reader should know of it, for JSON; its own if None.
 
         Raises:

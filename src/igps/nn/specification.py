@@ -17,6 +17,20 @@ from safetensors.torch import save_file
 from torch import nn
 
 _FORMAT = "igps-descriptor-1"
+# Of a folder that is shared as a whole, beside its card
+IN_FOLDER = "model.safetensors"
+_README = """---
+library_name: igps
+tags: [3d, shape-descriptor]
+---
+
+# {name}
+
+A descriptor of bodies: `igps.load("FOLDER")`, or `igps retrieve ROOT --descriptor FOLDER`. Loading runs no code.
+
+| | |
+|---|---|
+{rows}"""
 _CLASS = re.compile(r"igps\.(?:nn|descriptors)(?:\.[a-z0-9_]+)*\.[A-Z][A-Za-z0-9]*")
 # A hostile file asks for no more: modules, a number, and numbers in a module whose size the file does not show
 _MOST_MODULES, _MOST, _MOST_PARAMETERS = 200, 100_000, 1_000_000
@@ -112,11 +126,17 @@ def _numbers(values: Any) -> Iterator[int]:
 
 
 def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) -> None:
-    """Write a module of the library, with its parameters and what is told of it, to a safetensors file.
+    """Write a module of the library, with its parameters and what is told of it, to a safetensors file or a folder.
 
     Raises:
         ValueError: see `specification`.
     """
+    if Path(path).suffix != ".safetensors":
+        save_module(module, path := Path(path) / IN_FOLDER, card)
+        rows = (f"| {name} | `{json.dumps(value)}` |\n" for name, value in card.items())
+        text = _README.format(name=getattr(module, "name", type(module).__name__), rows="".join(rows))
+        path.with_name("README.md").write_text(text, encoding="utf-8")
+        return
     words = {"format": _FORMAT, "specification": json.dumps(specification(module)), "card": json.dumps(card)}
     state = {name: value.detach().cpu().clone().contiguous() for name, value in module.state_dict().items()}
     Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -131,6 +151,7 @@ def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
         ValueError: it is none of these files, or a damaged one.
     """
     path = Path(path)
+    path = path / IN_FOLDER if path.is_dir() else path
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file. Check the path.")
     try:
