@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -40,11 +41,11 @@ class CompiledCount(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, layout: Layout, weights: Tensor, *tensors: Tensor) -> Tensor:
-        ctx.layout = layout
+        ctx.layout, ctx.members = layout, (members := _Members(layout, weights.detach()))
         ctx.save_for_backward(weights, *tensors)
 
         def counts(number: int, team: Team) -> Tensor:
-            shape = _Shape(layout, number, weights, tensors)
+            shape = _Shape(layout, number, members, tensors)
             [total] = _summed(shape, shape.counts, team)
             return _folded(total, shape.bins)
 
@@ -57,7 +58,7 @@ class CompiledCount(torch.autograd.Function):
         gradients = [torch.zeros_like(tensor) for tensor in (weights, *tensors)]
 
         def derivatives(number: int, team: Team) -> tuple[Tensor, list[Tensor]]:
-            shape = _Shape(ctx.layout, number, weights, tensors, upstream[number])
+            shape = _Shape(ctx.layout, number, ctx.members, tensors, upstream[number])
             return shape.order, _summed(shape, shape.gradients, team)
 
         for number, (order, sums) in enumerate(_of_shapes(derivatives, len(weights))):
@@ -96,27 +97,47 @@ def _summed(shape: _Shape, task: Callable[[Blocks], list[Tensor]], team: Team) -
     return total
 
 
+class _Members:
+    """The points of all shapes in the order in which loops want them, real ones of the same classes side by side.
+
+    Args:
+        layout: see `count_pairs`.
+        weights: (N, P, M).
+    """
+
+    def __init__(self, layout: Layout, weights: Tensor) -> None:
+        key = torch.zeros_like(layout.classes[..., 0])
+        for classes, own in zip(layout.classes.unbind(2), weights.unbind(2), strict=True):
+            key = key * layout.n_classes + torch.where(own > 0, classes, 0)
+        last = torch.iinfo(key.dtype).max  # where padding goes
+        self.order = torch.argsort(key.masked_fill(~layout.mask, last), dim=1, stable=True)
+        by_order = self.order.unsqueeze(2).expand_as(layout.classes)
+        self._classes = layout.classes.gather(1, by_order).int().transpose(1, 2).contiguous().numpy()
+        self._weights = weights.gather(1, by_order).double().transpose(1, 2).contiguous().numpy()
+        self._n_points = layout.mask.sum(dim=1).tolist()
+
+    def of(self, number: int) -> tuple[Tensor, tuple[NDArray[np.int32], NDArray[np.float64]]]:
+        """Of a shape (P,) its points in order, and (M, P) their classes and weights."""
+        n = self._n_points[number]
+        classes, weights = (np.ascontiguousarray(one[number, :, :n]) for one in (self._classes, self._weights))
+        return self.order[number, :n], (classes, weights)
+
+
 class _Shape:
-    """The real points of one shape as the loops want them: those of the same classes side by side.
+    """The real points of one shape as the loops want them.
 
     Args:
         layout: see `count_pairs`.
         number: of the shape.
-        weights: (N, P, M).
+        members: of all shapes.
         tensors: inputs and centres of the axes.
         upstream: (C(C+1)/2, B, ...) derivatives by the counts; None where no gradient is asked for.
     """
 
     def __init__(
-        self, layout: Layout, number: int, weights: Tensor, tensors: Sequence[Tensor], upstream: Tensor | None = None
+        self, layout: Layout, number: int, members: _Members, tensors: Sequence[Tensor], upstream: Tensor | None = None
     ) -> None:
-        real = layout.mask[number].nonzero().flatten()
-        classes, own = layout.classes[number, real], weights.detach()[number, real].double()
-        key = torch.zeros(len(real), dtype=torch.int64)
-        for k in range(classes.shape[1]):
-            key = key * layout.n_classes + torch.where(own[:, k] > 0, classes[:, k], 0)
-        order = torch.argsort(key, stable=True)
-        self.order = real[order]
+        self.order, self.members = members.of(number)
         taken = [t.detach()[number].index_select(0, self.order) if t.ndim > 1 else t.detach() for t in tensors]
         self.pairs = with_tensors(layout.pairs, taken)
         centres = centres_of(self.pairs)
@@ -124,7 +145,7 @@ class _Shape:
         kinds = [kind for one in self.pairs for kind in one.kinds]
         self.n_values, self.n_oriented = sum(kind != COSINES for kind in kinds), kinds.count(COSINES)
         self.centred = [_centred(one.inputs[0]) if DISTANCES in one.kinds else None for one in self.pairs]
-        n_points, n_columns = len(order), min(len(order), _MOST_COLUMNS)
+        n_points, n_columns = len(self.order), min(len(self.order), _MOST_COLUMNS)
         n_matrices = self.n_values if upstream is None else self.n_values + 4 * self.n_oriented
         n_rows = min(max(1, _BLOCK // (n_columns * max(1, n_matrices))), n_columns)
         self.block = n_rows, n_columns
@@ -152,7 +173,6 @@ class _Shape:
             np.array(kinds), norms.numpy(), turned.numpy(), np.array(n_dimensions, np.int64), padded.numpy(),
             np.array(self.bins),
         )  # fmt: skip
-        self.members = classes[order].int().T.contiguous().numpy(), own[order].T.contiguous().numpy()
 
     def counts(self, blocks: Blocks) -> list[Tensor]:
         """(C(C+1)/2, cells·2^K) float64 counts of some blocks, by the cell below and the corner of it."""
