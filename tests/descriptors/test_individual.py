@@ -15,7 +15,7 @@ import igps
 from igps import Mesh, SignatureConfig, collate, compute_signature
 from igps.cli.retrieval import query, retrieve
 from igps.descriptors.fingerprint import cache_tag
-from igps.descriptors.individual import SCALES, IndividualDescriptor, keeps_size
+from igps.descriptors.individual import SCALES, IndividualDescriptor, keeps_size, signed_volumes
 from igps.gallery.duplicates import duplicates
 from igps.gallery.gallery import Gallery
 from igps.nn.descriptor import EmbeddedDescriptor
@@ -78,8 +78,8 @@ def test_short_vectors_keep_the_numbers_of_size_and_side(signatures: dict[str, S
     descriptor = igps.descriptor("pretrained+side+size")
     vectors = descriptor(collate(list(signatures.values())))
     short = descriptor.short(vectors)
-    assert short.shape[1] == 256 + 20
-    torch.testing.assert_close(short[:, -20:], vectors[:, -20:])
+    assert short.shape[1] == 256 + 55
+    torch.testing.assert_close(short[:, -55:], vectors[:, -55:])
     with pytest.raises(ValueError, match="short: expected a descriptor of vectors"):
         igps.descriptor("rich+size").short(vectors)
 
@@ -99,6 +99,45 @@ def test_twists_of_a_mirror_image_have_the_other_sign_and_a_symmetric_body_has_n
     odd = {name: descriptor(collate([one]))[0, -18:] for name, one in signatures.items()}
     assert float((odd["body"] + odd["mirrored"]).norm()) < 0.15 * float(odd["body"].norm())
     assert float(odd["straight"].norm()) < 0.2 * float(odd["body"].norm())
+
+
+def bent(mirrored: bool = False, turn: np.ndarray | None = None) -> Mesh:
+    """A limb that grows thicker and bends to one side, and to another at its end."""
+    x, y, z = SURFACE.vertices.T
+    wide, along = 0.45 * (1 + 0.5 * z), 2 * z
+    points = np.stack([wide * x + 0.35 * along**2, wide * y + 0.6 * np.maximum(along, 0) ** 2, along], axis=1)
+    if mirrored:
+        return Mesh(points * [1, 1, -1], SURFACE.faces[:, ::-1])
+    return Mesh(points if turn is None else points @ turn.T * 3 + 5, SURFACE.faces)
+
+
+def test_signed_volumes_turn_their_signs_with_a_mirror_image_and_are_blind_to_motion_scale_and_padding() -> None:
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    made = [compute_signature(one, CONFIG) for one in (bent(), bent(True), bent(turn=turn), twisted(0.0))]
+    found = signed_volumes(collate(made))
+    alone = torch.cat([signed_volumes(collate([one])) for one in made])
+    torch.testing.assert_close(found, alone, atol=1e-6, rtol=0)
+    assert float((found[0] + found[1]).norm()) < 0.1 * float(found[0].norm())
+    assert float((found[0] - found[2]).norm()) < 0.1 * float(found[0].norm())
+    # Its three planes of symmetry leave it nothing but where samples lie
+    assert float(found[3].norm()) < 0.1 * float(found[0].norm())
+
+
+def test_a_signed_volume_is_that_of_its_three_vectors() -> None:
+    """Of the interior and of the surface by distance, and of the surface by heat: written down for one body."""
+    signature = compute_signature(bent(), CONFIG)
+    inside, outside = (
+        (one.points - one.points.mean(axis=0, dtype=float)) / np.sqrt(signature.area)
+        for one in (signature.interior, signature.surface)
+    )
+    decay = np.exp(-0.01 * signature.area * signature.eigenvalues[:16])
+    heat = np.square(signature.surface.eigenfunctions[:, :16].astype(float)) @ decay
+    weighted = [(inside, np.linalg.norm(inside, axis=1)), (outside, np.linalg.norm(outside, axis=1))]
+    three = np.stack([weights @ points / len(points) for points, weights in (*weighted, (outside, heat / heat.mean()))])
+    expected = np.linalg.det(three) / np.linalg.norm(three, axis=1).prod() ** (2 / 3)
+    assert abs(expected) > 1e-4
+    assert float(signed_volumes(collate([signature]))[0, 0]) == pytest.approx(expected, rel=1e-3)
 
 
 def test_names_carry_the_choice() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
@@ -32,21 +33,23 @@ SCALES: Mapping[str, float] = {
 
 # The distance between individuals of a body is a quarter of that, but for `pretrained`, which leaves little of it.
 _SHARE, _NEAR = 0.25, {"pretrained": 0.0043}
-# How much more a distance counts at most where size differs; the difference in size of half that; and the difference
-# in twist between poses of one body.
-_MOST, _HALF, _TWIST = 2.0, 0.3, 0.002
+# How much more a distance counts at most where size differs; the difference in size of half that; and the differences
+# in twist and in signed volumes between individuals of one body.
+_MOST, _HALF, _TWIST, _VOLUME = 2.0, 0.3, 0.002, 0.0085
+# Vectors of `signed_volumes`, and diffusion times over area
+_N_VECTORS, _TIMES = 7, (0.01, 0.04, 0.15)
 
 
 class IndividualDescriptor(Descriptor):
     """A descriptor that also keeps size, or tells left from right, or both: `NAME+side+size`.
 
-    A description is that of the descriptor, then for the side the odd part of a histogram of `PairTwist`, whose signs a
-    mirror image turns, then for size log √area and log ∛volume, of millimetres where the unit is known. With d the
-    distance of the descriptor, n what is usual between individuals of a body (a quarter of its scale if not known), t
-    the Euclidean distance of the odd parts and s the sum of the two differences in size, that of the bodies is
-    e + 2 (e + n) s/(0.3 + s) of e = d + t. So where bodies are much the same in form size adds to the distance, and
-    else multiplies it, up to three times; no collection is looked at. The numbers of side and size are written so that
-    Euclidean distances of whole descriptions, too, count them like this.
+    A description is that of the descriptor, then for the side `signed_volumes` and the odd part of a histogram of
+    `PairTwist`, whose signs a mirror image turns, then for size log √area and log ∛volume, of millimetres where the
+    unit is known. With d the distance of the descriptor, n what is usual between individuals of a body (a quarter of
+    its scale if not known), t the Euclidean distance of the numbers of side and s the sum of the two differences in
+    size, that of the bodies is e + 2 (e + n) s/(0.3 + s) of e = d + t. So where bodies are much the same in form size
+    adds to the distance, and else multiplies it, up to three times; no collection is looked at. The numbers of side and
+    size are written so that Euclidean distances of whole descriptions, too, count them like this.
 
     Args:
         descriptor: any.
@@ -85,12 +88,12 @@ class IndividualDescriptor(Descriptor):
             self.requirements |= self.twists.requirements
 
     def describe(self, batch: SignatureBatch) -> Tensor:
-        """(N, D + 18 + 2), of which side and size are there if they are told."""
+        """(N, D + 53 + 2), of which side and size are there if they are told."""
         parts = [self.descriptor(batch).flatten(1)]
         if self.twists is not None:
             counts = self.twists(BatchFeatures(batch, self.training))
             odd = (counts - counts.flip(-1))[..., counts.shape[-1] // 2 :] / 2
-            parts.append(self._unit / _TWIST * odd.flatten(1))
+            parts += [self._unit / _VOLUME * signed_volumes(batch).to(odd), self._unit / _TWIST * odd.flatten(1)]
         if self.keeps_size:
             lengths = [MILLIMETRES.get(one or "mm", 1.0) for one in batch.units or [None] * len(batch)]
             size = torch.stack([batch.area.log() / 2, batch.volume.log() / 3], dim=1)
@@ -111,7 +114,7 @@ class IndividualDescriptor(Descriptor):
         return found
 
     def short(self, descriptions: Tensor) -> Tensor:
-        """(N, D) descriptions to (N, ≤ 256 + 20): the short ones of the descriptor, and the numbers of side and size.
+        """(N, D) descriptions to (N, ≤ 256 + 55): the short ones of the descriptor, and the numbers of side and size.
 
         Raises:
             ValueError: the descriptor has no short ones.
@@ -120,10 +123,40 @@ class IndividualDescriptor(Descriptor):
         return torch.cat([self.descriptor.short(form), *others], dim=1)
 
     def _parts(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        n_size, n_side = 2 * self.keeps_size, 0 if self.twists is None else self.twists.n_cells // 2
+        n_volumes = math.comb(_N_VECTORS, 3)
+        n_size, n_side = 2 * self.keeps_size, 0 if self.twists is None else n_volumes + self.twists.n_cells // 2
         n_form = descriptions.shape[1] - n_side - n_size
         form, side, size = descriptions.split([n_form, n_side, n_size], dim=1)
         return form, side, size
+
+
+def signed_volumes(batch: SignatureBatch) -> Tensor:
+    """(N, 35) volumes of what three of seven vectors span, whose signs a mirror image turns.
+
+    The vectors are means of samples about their middle: of interior ones and of surface ones by their distance from it,
+    of surface ones by the heat that stays with them at three times; and two of these by the second moments of the
+    interior. They turn with the body. Each volume is over the product of its three lengths to the power of 2/3, in
+    units of √area. A body that looks the same after two turns of its own has none.
+    """
+    root = batch.area.sqrt()[:, None, None]
+    (inside, real), (outside, shown) = (
+        (one.points / root, (one.mask / one.mask.sum(dim=1, keepdim=True))[..., None].to(root))
+        for one in (batch.interior, batch.surface)
+    )
+    inside, outside = inside - (inside * real).sum(dim=1)[:, None], outside - (outside * shown).sum(dim=1)[:, None]
+    moments = (inside * real).mT @ inside
+    moments = moments / moments.diagonal(dim1=1, dim2=2).sum(dim=1)[:, None, None]
+    k = min(16, batch.eigenvalues.shape[1])
+    eigenvalues = batch.eigenvalues[:, None, :k] * batch.area[:, None, None]
+    decay = torch.exp(-torch.tensor(_TIMES).to(root)[:, None] * eigenvalues)
+    heat = batch.surface.eigenfunctions[..., :k].to(root).square() @ decay.mT
+    heat = heat / (heat * shown).sum(dim=1, keepdim=True)
+    weights = torch.cat([outside.norm(dim=2, keepdim=True), heat], dim=2) * shown
+    vectors = torch.cat([(inside.norm(dim=2, keepdim=True) * real).mT @ inside, weights.mT @ outside], dim=1)
+    vectors = torch.cat([vectors, vectors[:, 1:3] @ moments], dim=1)
+    triples = vectors[:, torch.combinations(torch.arange(_N_VECTORS), 3)]
+    lengths = triples.norm(dim=3).prod(dim=2).clamp_min(torch.finfo(triples.dtype).tiny)
+    return torch.linalg.det(triples) / lengths.pow(2 / 3)
 
 
 def scale_of(descriptor: Descriptor) -> float | None:
