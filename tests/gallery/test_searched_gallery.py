@@ -19,6 +19,7 @@ from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import find_bodies
 from igps.descriptors.fingerprint import fingerprint
+from igps.gallery import rows
 from igps.gallery._table import BodyTable
 from igps.gallery.gallery import Gallery
 from igps.gallery.sync import sync
@@ -221,15 +222,15 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
 
 def test_rows_tell_size_class_and_what_labels_tell(root: Path, tmp_path: Path) -> None:
     """Volumes and areas are those of the meshes, and a condition keeps what NumPy keeps."""
-    rows = [(f"{one}/{i}.off", f"{one}s", 10 * i, "A" if i else "") for one in ("ball", "egg") for i in range(3)]
-    lines = ["file,label,age,scanner", *(",".join(map(str, row)) for row in rows)]
+    labelled = [(f"{one}/{i}.off", f"{one}s", 10 * i, "A" if i else "") for one in ("ball", "egg") for i in range(3)]
+    lines = ["file,label,age,scanner", *(",".join(map(str, row)) for row in labelled)]
     (root / "labels.csv").write_text("\n".join(lines))
     dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     assert {"volume", "area", "age", "scanner"} <= gallery.columns.keys()
-    meshes = {name: trimesh.load(root / name) for name, *_ in rows}
+    meshes = {name: trimesh.load(root / name) for name, *_ in labelled}
     told = {row["name"]: row for row in gallery.rows(*gallery.columns)}
-    for name, label, age, scanner in rows:
+    for name, label, age, scanner in labelled:
         assert told[name]["volume"] == pytest.approx(meshes[name].volume)
         assert told[name]["area"] == pytest.approx(meshes[name].area)
         assert (told[name]["class"], told[name]["age"], told[name]["scanner"]) == (label, age, scanner or None)
@@ -238,13 +239,15 @@ def test_rows_tell_size_class_and_what_labels_tell(root: Path, tmp_path: Path) -
     description = describe(dataset, small_interior())[:1]
     volume = meshes["ball/1.off"].volume * 1.001
     found = gallery.nearest(description, where=f"age >= 10 AND class = 'eggs' AND volume > {volume}")[0]
-    wanted = {name for name, label, age, _ in rows if age >= 10 and label == "eggs" and meshes[name].volume > volume}
+    wanted = {
+        name for name, label, age, _ in labelled if age >= 10 and label == "eggs" and meshes[name].volume > volume
+    }
     assert {one.name for one in found} == wanted
     assert [one.distance for one in found] == sorted(one.distance for one in found)
     assert gallery.nearest(description, where="age > 99") == [[]]
 
 
-def test_sync_finds_what_is_new_changed_and_gone(root: Path, tmp_path: Path) -> None:
+def test_sync_finds_what_is_new_changed_and_gone(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Afterwards it is what building makes; what has not changed is neither described nor written."""
     cache = tmp_path / "cache"
     gallery, _ = Gallery.build(
@@ -255,7 +258,12 @@ def test_sync_finds_what_is_new_changed_and_gone(root: Path, tmp_path: Path) -> 
     gallery.add(SignatureDataset(tmp_path / "elsewhere", CONFIG, cache), n_workers=1)
     version = gallery.versions()[-1]["version"]
     assert sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1) == (0, 0, [])
-    assert gallery.versions()[-1]["version"] == version
+    assert gallery.versions()[-1]["version"] == version  # all are so young that they are read
+    monkeypatch.setattr(rows, "_YOUNG", 0)
+    sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
+    with monkeypatch.context() as context:
+        context.setattr(SignatureDataset, "key", lambda *_: pytest.fail("a file was read"))
+        assert sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1) == (0, 0, [])
     write_body(root / "egg" / "new.off", 1.3, 2.0)
     write_body(root / "ball" / "1.off", 3.0, 0.3)
     (root / "egg" / "0.off").unlink()

@@ -40,7 +40,7 @@ _FEWEST_FOR_VECTORS = 4096
 _MOST_FLAT, _PROBED, _PROBED_IF_FILTERED, _ROWS_AT_ONCE = 20_000, 40, 160, 1024
 # Longer descriptions are kept in half precision; the width of short vectors is a multiple of the other.
 _MOST_IN_FULL, _STEP = 1024, 16
-_ARROW = {str: pa.string(), float: pa.float64(), bytes: pa.binary()}
+_ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bytes: pa.binary()}
 
 
 class BodyTable:

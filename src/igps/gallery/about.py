@@ -18,7 +18,8 @@ from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig
 
 KNOWN: dict[str, type] = {"id": str, "name": str, "class": str, "file": str, "part": str, "checksum": str,
-                          "area": float, "volume": float, "unit": str, "thumbnail": bytes}  # fmt: skip
+                          "bytes": int, "modified": int, "area": float, "volume": float, "unit": str,
+                          "thumbnail": bytes}  # fmt: skip
 """What every row tells beside its description, and of which type."""
 
 Row = Mapping[str, Any]

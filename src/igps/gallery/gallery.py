@@ -257,7 +257,8 @@ class Gallery:
 
     def update(self, where: str, values: Mapping[str, str | float | None]) -> int:
         """Set columns of the bodies that satisfy a condition, such as {"class": "femur"}; of how many."""
-        kinds = {name: kind for name, kind in self.columns.items() if name not in ("id", "checksum", "thumbnail")}
+        ours = ("id", "checksum", "bytes", "modified", "thumbnail")
+        kinds = {name: kind for name, kind in self.columns.items() if name not in ours}
         if wrong := values.keys() - kinds.keys():
             raise ValueError(f"{min(wrong)}: expected one of the columns {', '.join(kinds)}.")
         with in_words("values: expected numbers in columns of numbers"):

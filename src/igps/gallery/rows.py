@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import math
+import os
+import time
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from tqdm import tqdm
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import LABELS_FILE, Bodies
 from igps.gallery.about import KNOWN, Batch
-from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import MeshError
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
@@ -24,6 +24,8 @@ from igps.signature.signature import Signature
 
 # So many descriptions are in memory at once; pixels of a side of a thumbnail, which shows the samples of the surface.
 _AT_ONCE, _PIXELS = 256, 40
+# Nanoseconds.
+_YOUNG = 2 * 10**9
 
 
 def described_rows(
@@ -35,15 +37,15 @@ def described_rows(
     with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
         for start in range(0, len(dataset), _AT_ONCE):
             numbers = range(start, min(start + _AT_ONCE, len(dataset)))
+            told = dict(zip(numbers, told_of(bodies.subset(numbers), kinds), strict=True))  # before files are read
             keys = {i: key_of(dataset, i) for i in numbers}
-            new = [i for i in numbers if not keys[i] or known.get(id_of(bodies[i])) != keys[i]]
+            new = [i for i in numbers if not keys[i] or known.get(told[i]["id"]) != keys[i]]
             failed: list[Failure] = []
             descriptions = _described(dataset.subset(new), descriptor, None if strict else failed, n_workers)
             lost = {failure.id for failure in failed}
             left = [i for i in new if bodies.names[i] not in lost]
             if left:
-                yield descriptions, [{**told_of(dataset, i, kinds), **_measured(dataset, i), "checksum": keys[i]}
-                                     for i in left]  # fmt: skip
+                yield descriptions, [{**told[i], **_measured(dataset, i), "checksum": keys[i]} for i in left]
             failures += failed
             bar.update(len(numbers))
 
@@ -59,23 +61,37 @@ def further_columns(bodies: Bodies) -> dict[str, type]:
     return {name: float if all(map(_is_number, values)) else str for name, values in bodies.columns.items()}
 
 
-def told_of(dataset: SignatureDataset, i: int, kinds: Mapping[str, type]) -> dict[str, Any]:
-    """What is known of a body without reading its file."""
-    bodies = dataset.bodies
-    values = {name: column[i] for name, column in bodies.columns.items()}
-    return {
-        "id": id_of(bodies[i]),
-        "name": bodies.names[i],
-        "class": bodies.labels[i] if bodies.labels else None,
-        "file": str(bodies.paths[i].resolve()),
-        "part": bodies.parts[i],
-        **{name: None if value is None else kinds[name](value) for name, value in values.items()},
-    }
+def told_of(bodies: Bodies, kinds: Mapping[str, type]) -> list[dict[str, Any]]:
+    """What is known of bodies without reading their files."""
+    folders = {folder: os.path.realpath(folder) for folder in {os.path.dirname(path) for path in bodies.paths}}
+    files = [os.path.join(folders[os.path.dirname(path)], os.path.basename(path)) for path in bodies.paths]
+    told = [
+        {
+            "id": file if part is None else f"{file}#{part}",
+            "name": name,
+            "class": label,
+            "file": file,
+            "part": part,
+            **_stamp(file),
+        }
+        for file, part, name, label in zip(
+            files, bodies.parts, bodies.names, bodies.labels or [None] * len(bodies), strict=True
+        )
+    ]
+    for column, values in bodies.columns.items():
+        for row, value in zip(told, values, strict=True):
+            row[column] = None if value is None else kinds[column](value)
+    return told
 
 
-def id_of(body: BodyRef) -> str:
-    """What tells bodies apart: file and part."""
-    return str(replace(body, path=body.path.resolve()))
+def _stamp(file: str) -> dict[str, int]:
+    """Size and time of the last change; −1 where the file may change again within the grain of its clock."""
+    try:
+        stat = os.stat(file)
+    except OSError:  # describing it will say why
+        return {"bytes": -1, "modified": -1}
+    changed = max(stat.st_mtime_ns, stat.st_ctime_ns)
+    return {"bytes": stat.st_size, "modified": changed if time.time_ns() - changed > _YOUNG else -1}
 
 
 def key_of(dataset: SignatureDataset, i: int) -> str:

@@ -26,7 +26,7 @@ def sync(
 ) -> tuple[int, int, list[Failure]]:
     """Describe new and changed files of a folder, take classes and columns over, and remove deleted files.
 
-    Files that the cache knows by their size and time of change are not read.
+    Files of the same size and time of change as before are not read.
 
     Args:
         gallery: what is brought up to the folder.
@@ -38,16 +38,18 @@ def sync(
         How many bodies were described, how many removed, and those that failed, of which the old row stays.
     """
     kinds = further_columns(dataset.bodies)
-    now = [told_of(dataset, i, kinds) for i in range(len(dataset))]
+    now = told_of(dataset.bodies, kinds)
     asked = [name for name in ("checksum", *now[0]) if name in gallery.columns]
     known = {one["id"]: one for one in gallery.rows(*asked)}
     new: list[int] = []
     told: dict[str, dict[str, Any]] = {}
     for i, row in enumerate(now):
-        before = known.get(row["id"])
-        if before is None or before["checksum"] != key_of(dataset, i):
+        before = known.get(row["id"], {})
+        differs = [name for name, value in row.items() if before.get(name) != value]
+        is_known = row["modified"] >= 0 and not {"bytes", "modified"} & set(differs)
+        if not is_known and before.get("checksum") != key_of(dataset, i):
             new.append(i)
-        elif any(before.get(name) != value for name, value in row.items()):
+        elif differs:
             told[row["id"]] = row
     for where in _where_id(sorted(told)):  # of the same content, with another class
         for some in gallery.table.batches(where):
