@@ -1,4 +1,4 @@
-"""Studies of the library: `python -m training.study {robustness,damage,scales,figure} …`, `--help` for each."""
+"""Studies of the library: `python -m training.study {robustness,damage,scales,surfaces,figure}`, `--help` for each."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from igps.cli import Commands
 from igps.cli import main as run
 from training.studies.damage_command import damage
 from training.studies.figure_command import pose, potential, topology
+from training.studies.label_surfaces import surfaces
 from training.studies.robustness_command import robustness
 from training.studies.scales import scales
 
@@ -13,6 +14,7 @@ COMMANDS: Commands = {
     "robustness": robustness,
     "damage": damage,
     "scales": scales,
+    "surfaces": surfaces,
     "figure": {"pose": pose, "topology": topology, "potential": potential},
 }
 

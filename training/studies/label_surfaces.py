@@ -175,10 +175,17 @@ def measure(
     return found
 
 
-def main() -> None:
-    """Print the medians of each kind, in percent."""
+def surfaces(n_turns: int = 1, descriptors: list[str] | None = None) -> None:
+    """Print how far surfaces of voxelised solids are from these, medians of each kind, in percent.
+
+    Args:
+        n_turns: orientations and places of each solid.
+        descriptors: names of those that describe the solids of 16 voxels; pretrained and interior if None.
+    """
+    names = ["pretrained", "interior"] if descriptors is None else descriptors
     for n_voxels in ((4,), (8, 12), (16,)):
-        found = measure(n_voxels, descriptors=("pretrained", "interior") if n_voxels == (16,) else ())
+        found = measure(n_voxels, descriptors=names if n_voxels == (16,) else (), n_turns=n_turns)
+        sizes = " and ".join(map(str, n_voxels))
         for kind in (*KINDS, "all"):
             rows = [one for one in found if kind in (one.kind, "all")]
             told = [
@@ -188,8 +195,4 @@ def main() -> None:
             told += [
                 f"{name} {100 * np.median([one.distances[name] for one in rows]):.1f}" for name in rows[0].distances
             ]
-            print(f"{n_voxels} voxels, {kind}: {', '.join(told)}", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+            print(f"{sizes} voxels, {kind}: {', '.join(told)}", flush=True)

@@ -13,6 +13,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -114,8 +115,8 @@ class FileAttribute(ABC):
             MeshError: there is no such file.
         """
         file, name = self.file(body)
-        with file.open("rb") as content:
-            return f"{type(self).__name__} 1 {name} {hashlib.file_digest(content, 'sha256').hexdigest()}"
+        about = file.stat()
+        return f"{type(self).__name__} 1 {name} {_checksum(file, about.st_mtime_ns, about.st_size)}"
 
     def __call__(self, body: BodyRef, points: Values) -> Values:
         """(P,) or (P, C) at points (P, 3).
@@ -162,6 +163,13 @@ class FileAttribute(ABC):
         if not path.is_file():
             raise MeshError(f"{body}: its attribute's file {path} does not exist. Check the pattern {self.path!r}.")
         return path, name
+
+
+@lru_cache(maxsize=1000)
+def _checksum(file: Path, changed: int, n_bytes: int) -> str:
+    """Of the content; the many bodies of a volume may have one image."""
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
 
 
 @dataclass(frozen=True)
