@@ -1,6 +1,7 @@
 """Tensors in, numbers out: distances between descriptors, rankings and retrieval scores."""
 
 from igps.retrieval.distances import Distance, chi_square, cosine, euclidean, hellinger
+from igps.retrieval.graph_reranking import rerank_graph
 from igps.retrieval.ranking import SearchResult, rank, search
 from igps.retrieval.reranking import N_RERANKED, rerank, rerank_found
 from igps.retrieval.scores import (
@@ -26,6 +27,7 @@ __all__ = [
     "rank",
     "rerank",
     "rerank_found",
+    "rerank_graph",
     "retrieval_scores",
     "search",
 ]

@@ -1,0 +1,199 @@
+"""Re-ranking on the graph of nearest neighbours: time and memory grow with the number of shapes, not its square."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import sparse
+
+from igps._compiled import compiled
+from igps.retrieval.ranking import SearchResult
+
+# Of conjugate gradients, for walks whose condition is below 40
+_ROUNDS = 40
+_TINY = np.finfo(np.float64).tiny
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+def rerank_graph(
+    found: SearchResult,
+    mean: float,
+    n_neighbours: int = 20,
+    n_expanded: int = 6,
+    share: float = 0.3,
+    diffusion: float = 0.95,
+) -> SearchResult:
+    """`rerank` of a collection of which each shape's nearest are known.
+
+    Walks are those among a shape and its nearest (Yang, Hinami, Matsui, Ly and Satoh 2019). With lists of all others,
+    this is `rerank`; the nearest of each stays its nearest.
+
+    Args:
+        found: of each of N shapes, the M others that are nearest, closest first: (N, M).
+        mean: distance of two shapes of the collection, over all pairs or a sample of them.
+        n_neighbours, n_expanded, share, diffusion: see `rerank`.
+
+    Returns:
+        the same shapes in their new order, (N, M), and their distances, without unit; of two shapes of which neither is
+        in the other's list, it would be 1 - share and more.
+
+    Raises:
+        ValueError: shorter lists than there shall be neighbours, or a mean of 0.
+    """
+    lists, given = found.indices.numpy(), found.distances.double().numpy()
+    n, m = lists.shape
+    n_near = max(n_neighbours, n_expanded - 1)
+    if n_near > m or mean <= 0:
+        raise ValueError(
+            f"found, mean: expected at least {n_near} neighbours of each shape and a mean above 0, got {m} and {mean}."
+        )
+    n_pairs, half = n * (n - 1), max(1, round(n_neighbours / 2))
+    own = _symmetric(lists, given)
+    apart = own.data / mean
+    if diffusion:
+        scale = np.maximum(given[:, :half].mean(axis=1), _TINY)
+        ends = lists[:, :half]
+        tied = _symmetric(ends, np.exp(-np.square(given[:, :half]) / np.maximum(scale[:, None] * scale[ends], _TINY)))
+        degree = sparse.diags_array(1 / np.sqrt(np.maximum(tied.sum(axis=1), _TINY)))
+        steps = sparse.csr_array(diffusion * (degree @ tied @ degree))
+        alike = np.zeros((n, m + 1))
+        walks(np.column_stack([np.arange(n), lists]), steps.indptr, steps.indices, steps.data, _ROUNDS, alike)
+        length = 1 / np.sqrt(alike[:, 0])
+        walked = _symmetric(lists, (1 - length[:, None] * alike[:, 1:] * length[lists]).clip(0)).data
+        average = 1 - (own.nnz - walked.sum()) / n_pairs  # of those in no list, it is 1
+        apart = (1 - share) * walked / max(average, _TINY) + share * own.data / mean
+    before = apart
+    if diffusion:
+        apart = _brought_forward(apart, own, lists[:, 0])
+    order = np.empty((n, n_near + 1), dtype=np.int64)
+    nearest_of_rows(own.indptr, own.indices, apart, order)
+    neighbours = _binary(order[:, : n_neighbours + 1])
+    members = neighbours.multiply(neighbours.T).tocsr()
+    halves = _binary(order[:, : half + 1])
+    halves = halves.multiply(halves.T).tocsr()
+    joins = sparse.csr_array(members @ halves.T).multiply(members).tocsr()
+    joins.data = (2 / 3 * halves.sum(axis=1)[joins.indices] <= joins.data).astype(np.float64)
+    of, to = (members + joins @ halves).nonzero()
+    nearest = order[:, 1 : n_neighbours + 1]
+    near = _values(apart, own, np.repeat(np.arange(n), n_neighbours), nearest.ravel()).reshape(n, -1).mean(axis=1)
+    weight = np.exp(-np.where(of == to, 0.0, _values(apart, own, of, to)) / np.maximum(near, _TINY)[of])
+    weights = sparse.csr_array((weight, (of, to)), shape=(n, n))
+    weights = _binary(order[:, :n_expanded]) @ sparse.diags_array(1 / (n_expanded * weights.sum(axis=1))) @ weights
+    weights = sparse.csr_array(weights)
+    weights.sort_indices()
+    smaller = np.zeros(own.nnz)
+    common(own.indptr, own.indices, weights.indptr, weights.indices, weights.data, smaller)
+    average = 1 + (apart.sum() - before.sum()) / n_pairs
+    anew = (1 - share) * (1 - smaller / (2 - smaller)) + share * apart / average
+    anew = _brought_forward(anew, own, lists[:, 0])
+    ranked = _values(anew, own, np.repeat(np.arange(n), m), lists.ravel()).reshape(n, m)
+    best = np.argsort(ranked, axis=1, kind="stable")
+    return SearchResult(*(torch.from_numpy(np.take_along_axis(one, best, axis=1)) for one in (lists, ranked)))
+
+
+def _symmetric(lists: Integers, values: Floats) -> sparse.csr_array:
+    """(N, N) of values (N, M) of pairs (i, lists[i]) and of those the other way round; the mean of both where given."""
+    n, m = lists.shape
+
+    def both_ways(given: Floats) -> sparse.csr_array:
+        one_way = sparse.csr_array((given.ravel(), lists.ravel(), np.arange(n + 1) * m), shape=(n, n), copy=True)
+        one_way.sort_indices()
+        return one_way + one_way.T.tocsr()
+
+    # One is added, as SciPy drops sums of 0
+    total, count = both_ways(values + 1), both_ways(np.ones(lists.shape))
+    total.data = total.data / count.data - 1
+    return total
+
+
+def _binary(lists: Integers) -> sparse.csr_array:
+    n, m = lists.shape
+    return sparse.csr_array((np.ones(n * m), (np.repeat(np.arange(n), m), lists.ravel())), shape=(n, n))
+
+
+def _values(values: Floats, graph: sparse.csr_array, rows: Integers, columns: Integers) -> Floats:
+    """Those of pairs of a graph, by place; infinite of others."""
+    n = graph.shape[0]
+    keys = np.repeat(np.arange(n), np.diff(graph.indptr)) * n + graph.indices
+    wanted = rows.astype(np.int64) * n + columns
+    place = np.searchsorted(keys, wanted).clip(max=len(keys) - 1)
+    return np.where(keys[place] == wanted, values[place], np.inf)
+
+
+def _brought_forward(values: Floats, own: sparse.csr_array, nearest: Integers) -> Floats:
+    """The values of pairs, with those of which one is the other's nearest before all others, in their own order."""
+    rows = np.repeat(np.arange(own.shape[0]), np.diff(own.indptr))
+    first = (nearest[rows] == own.indices) | (nearest[own.indices] == rows)
+    others = values[~first & (values > 0)]
+    least = others.min() if len(others) else 1.0
+    # half of the least, so that single precision leaves no tie
+    return np.where(first, 0.5 * least * own.data / max(own.data[first].max(), _TINY), values)
+
+
+@compiled()
+def walks(lists: Integers, starts: Integers, ends: Integers, steps: Floats, n_rounds: int, alike: Floats) -> None:
+    """Write, of each shape, the sums over all walks from it to those of its list (N, L), itself first, among these.
+
+    Rows of (I - S) x = e by conjugate gradients, S sparse: `starts`, `ends` and `steps` are those of its rows.
+    """
+    place = np.full(len(lists), -1)
+    for i in range(len(lists)):
+        here = lists[i]
+        for a in range(len(here)):
+            place[here[a]] = a
+        residual = np.zeros(len(here))
+        residual[0] = 1.0
+        direction, size = residual.copy(), 1.0
+        for _ in range(n_rounds):
+            moved = direction.copy()
+            for a in range(len(here)):
+                for e in range(starts[here[a]], starts[here[a] + 1]):
+                    if place[ends[e]] >= 0:
+                        moved[a] -= steps[e] * direction[place[ends[e]]]
+            along = size / (direction * moved).sum()
+            alike[i] += along * direction
+            residual -= along * moved
+            left = (residual * residual).sum()
+            if left < 1e-10:
+                break
+            direction = residual + left / size * direction
+            size = left
+        for a in range(len(here)):
+            place[here[a]] = -1
+
+
+@compiled()
+def nearest_of_rows(starts: Integers, others: Integers, values: Floats, order: Integers) -> None:
+    """Write each shape, and those of its pairs of least value, ties by number, to (N, k + 1); rows have at least k."""
+    least = np.empty(order.shape[1])
+    for i in range(len(order)):
+        order[i, 0], n = i, 1
+        for e in range(starts[i], starts[i + 1]):
+            if n < len(least) or values[e] < least[n - 1]:
+                n = min(n + 1, len(least))
+                place = n - 1
+                while place > 1 and values[e] < least[place - 1]:
+                    least[place], order[i, place] = least[place - 1], order[i, place - 1]
+                    place -= 1
+                least[place], order[i, place] = values[e], others[e]
+
+
+@compiled()
+def common(
+    starts: Integers, others: Integers, row_starts: Integers, members: Integers, weights: Floats, smaller: Floats
+) -> None:
+    """Write, of each pair of a graph, the sum of the smaller of their weights; rows of weights are sorted."""
+    for i in range(len(starts) - 1):
+        for e in range(starts[i], starts[i + 1]):
+            a, b = row_starts[i], row_starts[others[e]]
+            while a < row_starts[i + 1] and b < row_starts[others[e] + 1]:
+                if members[a] == members[b]:
+                    smaller[e] += min(weights[a], weights[b])
+                    a, b = a + 1, b + 1
+                elif members[a] < members[b]:
+                    a += 1
+                else:
+                    b += 1
