@@ -378,3 +378,13 @@ def test_a_function_whose_code_does_not_tell_what_it_does_is_refused(tmp_path: P
     ):
         with pytest.raises(ValueError, match=rf"attributes: .*{said}.*cache_tag"):
             SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", attributes={"told": function})
+
+
+def test_a_body_of_all_models_has_the_residues_of_all(tmp_path: Path) -> None:
+    pytest.importorskip("gemmi")
+    atom = "ATOM      1  CA  {} A   1    {:8.3f}   0.000   0.000  1.00 20.00           C"
+    lines = [("MODEL        1", "LYS", 0.0), ("MODEL        2", "ASP", 60.0)]
+    text = "\n".join(f"{model}\n{atom.format(name, x)}\nENDMDL" for model, name, x in lines)
+    (tmp_path / "two.pdb").write_text(text + "\nEND\n")
+    charges = ResidueAttribute("charge")(BodyRef(tmp_path / "two.pdb"), np.array([[0.0, 0, 0], [60, 0, 0], [1, 0, 0]]))
+    np.testing.assert_allclose(charges, [1, -1, 1], atol=1e-6)

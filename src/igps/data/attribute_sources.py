@@ -79,19 +79,12 @@ def _molecule(body: BodyRef) -> Molecule:
     found = molecules_by_part(body.path, changed, how)
     if part in found:
         return found[part]
-    first, *others = molecules_by_part(body.path, changed, "models").values()
-    for other in others:  # a body of all of them
-        first = replace(
-            first,
-            positions=np.concatenate([first.positions, other.positions]),
-            radii=np.concatenate([first.radii, other.radii]),
-            charges=np.concatenate([first.charges, other.charges]),
-            residue_of=np.concatenate([first.residue_of, other.residue_of + len(first.residue_names)]),
-            residue_names=(*first.residue_names, *other.residue_names),
-            residue_positions=np.concatenate([first.residue_positions, other.residue_positions]),
-            b_factors=np.concatenate([first.b_factors, other.b_factors]),
-        )
-    return first
+    models = list(molecules_by_part(body.path, changed, "models").values())  # a body of all of them
+    fields = ("positions", "radii", "charges", "residue_positions", "b_factors")
+    arrays: dict[str, Any] = {field: np.concatenate([getattr(one, field) for one in models]) for field in fields}
+    starts = np.cumsum([0, *(len(one.residue_names) for one in models)])
+    arrays["residue_of"] = np.concatenate([one.residue_of + at for one, at in zip(models, starts, strict=False)])
+    return replace(models[0], residue_names=tuple(name for one in models for name in one.residue_names), **arrays)
 
 
 @dataclass(frozen=True)

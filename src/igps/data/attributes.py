@@ -32,12 +32,6 @@ class AttributeSource(Protocol):
 class FunctionAttribute:
     """A function `(body, points)` as a source; its name and source code stand for it in the keys of the cache.
 
-    Example:
-        >>> from igps.data import attributes
-        >>> source = FunctionAttribute(attributes.takes_body)  # of any function in a file
-        >>> source.cache_tag(None)[:19]
-        'function takes_body'
-
     Raises:
         ValueError: its source code is not known, or does not tell what it does.
     """
@@ -70,8 +64,10 @@ def takes_body(function: Callable[..., Any]) -> bool:
         given = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
         return False
-    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(one.kind in positional and one.default is one.empty for one in given) == 2
+    return (
+        sum(one.default is one.empty and one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in given)
+        == 2
+    )
 
 
 def with_attribute(signature: Signature, name: str, values: Mapping[str, ArrayLike]) -> Signature:
