@@ -82,9 +82,11 @@ class BodyTable:
 
     def decoded(self, rows: Any) -> tuple[Tensor, list[dict[str, Any]]]:
         """Descriptions, and what is known of each, of an Arrow table of rows."""
+        return self._descriptions(rows), rows.select(list(self.columns)).to_pylist()
+
+    def _descriptions(self, rows: Any) -> Tensor:
         values = torch.from_numpy(np.array(rows["vector"].combine_chunks().flatten())).float().reshape(len(rows), -1)
-        values *= torch.tensor(rows["scale"].to_numpy())[:, None]
-        return values.reshape(-1, *self.shape), rows.select(list(self.columns)).to_pylist()
+        return (values * torch.tensor(rows["scale"].to_numpy())[:, None]).reshape(-1, *self.shape)
 
     def search(
         self, query: Tensor, distance: Distance, *, top: int, candidates: int = 512, exact: bool = False,
@@ -108,7 +110,7 @@ class BodyTable:
         kept, distances = None, torch.zeros(0)
         for group in groups:
             kept = group if kept is None else pa.concat_tables([kept, group.select(kept.column_names)])
-            distances = distance(query, self.decoded(kept)[0].to(query.device)).cpu()[0]
+            distances = distance(query, self._descriptions(kept).to(query.device)).cpu()[0]
             best = np.lexsort((np.array(kept["id"].to_pylist()), distances.numpy()))[:top]
             kept, distances = kept.take(best), distances[best]
         if kept is None:
