@@ -116,6 +116,25 @@ def test_copies_are_grouped_and_neither_poses_nor_siblings(dataset: SignatureDat
     assert len(found.pairs) == 3
     assert all(any({*pair} <= group for group in SAME) for pair in found.pairs)
     assert max(found.pairs.values()) <= Calibration.load().same.distance
+    grades = {frozenset(pair): grade for pair, grade in found.grades.items()}
+    assert grades.pop(frozenset({"bar.obj", "bar.ply"})) == "same mesh"
+    assert set(grades.values()) == {"same at another level of detail"}
+
+
+def test_pairs_are_graded(tmp_path: Path) -> None:
+    """A file beside its copy, the mesh turned and scaled, its vertices in another order, or fewer, and a sibling."""
+    body = bar(4)
+    order = np.random.default_rng(0).permutation(len(body.vertices))
+    renumbered = trimesh.Trimesh(body.vertices[order], np.argsort(order)[body.faces], process=False)
+    longer = renumbered.copy()
+    longer.vertices += np.outer(longer.vertices[:, 0] > 0, [0.005 * body.area**0.5, 0, 0])
+    files = {"a.off": body, "b.ply": copied(body, 2, 0.2), "c.off": renumbered, "d.off": bar(3), "e.off": longer}
+    for name, one in files.items():
+        one.export(tmp_path / name)
+    shutil.copy(tmp_path / "a.off", tmp_path / "f.off")
+    surfaces = Surfaces(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"))
+    level = "same at another level of detail"
+    assert [surfaces.grade(0, i) for i in range(1, 6)] == ["same mesh", "same surface", level, level, "same file"]
 
 
 def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path: Path) -> None:

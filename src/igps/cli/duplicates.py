@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,10 @@ def duplicates(
         write_rows(out, ("group", "file", "path"), rows)
     return {
         "groups": [list(group) for group in found.groups],
-        "pairs": [{"files": list(pair), "distance": distance} for pair, distance in found.pairs.items()],
+        "pairs": [
+            {"files": list(pair), "distance": distance, "grade": found.grades.get(pair)}
+            for pair, distance in found.pairs.items()
+        ],
         "n_files": found.n_files,
         "n_skipped": n_skipped,
     }
@@ -96,5 +100,5 @@ def _print_groups(found: Duplicates, calibration: Calibration, poses: bool) -> N
     print(
         f"{n_alike} of {found.n_files} files in {len(found.groups)} groups; of generated bodies, {threshold.n_found} "
         f"of {threshold.n_same} pairs of {what} are found, and {threshold.n_false} of {threshold.n_other} others taken "
-        "for such"
+        "for such" + "".join(f"; {n} pairs {grade}" for grade, n in Counter(found.grades.values()).most_common())
     )

@@ -127,7 +127,7 @@ class TriangleSurface:
 
 
 def surface_distance(
-    one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, hopeless: float = math.inf
+    one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, hopeless: float = math.inf, patch: int = _PATCH
 ) -> float:
     """How far apart two surfaces laid onto each other stay, over √area: root mean square of patches, of both ways.
 
@@ -144,6 +144,7 @@ def surface_distance(
         hopeless: a distance beyond which it matters no more how far apart they are: where few samples are farther
             after many steps, no more are taken; nor is the other surface itself asked for, where more samples are
             farther than two thirds of it.
+        patch: neighbours whose offsets are averaged; with 1, lost relief counts.
 
     Returns:
         Without unit; symmetric but for where the search ends.
@@ -161,7 +162,7 @@ def surface_distance(
         else:
             fine = [_fitted(_subset(one, _N_FINE), other, placing, _FINE_STEPS) for _, placing in coarse[:2]]
             far, placing = min(fine, key=lambda found: found[0])
-            best = min(best, far if far > hopeless / _FINER else _apart(one, other, placing))
+            best = min(best, far if far > hopeless / _FINER else _apart(one, other, placing, patch))
         # A body may be nearly its own mirror image: near is not yet the nearest.
         if best <= enough or (best > hopeless and not is_ambiguous):
             break
@@ -173,19 +174,20 @@ def offset_in_place(samples: SurfaceSamples, surface: TriangleSurface) -> float:
     return math.sqrt(_mean_square(samples, surface))
 
 
-def _apart(one: SurfaceSamples, other: SurfaceSamples, placing: _Placing) -> float:
+def _apart(one: SurfaceSamples, other: SurfaceSamples, placing: _Placing, patch: int) -> float:
     """Root mean square of the patches of either, each laid onto all that is known of the other."""
     squares = []
     for samples, target, way in ((one, other, placing), (other, one, placing.inverse())):
         finest = target if target.surface is None else target.surface()
         _, fitted = _fitted(samples, finest, way, _LAST_STEPS)
         # In units of the mean of both, so that neither is favoured.
-        squares.append(_mean_square(fitted(samples), finest) / fitted.scale)
+        squares.append(_mean_square(fitted(samples), finest, patch) / fitted.scale)
     return math.sqrt(sum(squares) / 2)
 
 
-def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) -> float:
-    neighbours = samples.tree.query(_with_normals(samples), k=min(_PATCH, len(samples.points)))[1]
+def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface, patch: int = _PATCH) -> float:
+    among = np.arange(1, min(patch, len(samples.points)) + 1)
+    neighbours = samples.tree.query(_with_normals(samples), k=among)[1]
     means = _offsets(samples, target)[neighbours].mean(axis=1)
     return float(np.einsum("ni,ni->n", means, means).mean())
 

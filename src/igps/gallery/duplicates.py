@@ -29,7 +29,7 @@ from igps.descriptors.individual import Size, keeps_size
 from igps.gallery._alignment import surface_distance
 from igps.gallery.calibration import Calibration
 from igps.gallery.gallery import Gallery
-from igps.gallery.surfaces import Surfaces
+from igps.gallery.surfaces import Grade, Surfaces
 from igps.mesh.mesh import MILLIMETRES
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
@@ -57,6 +57,7 @@ class Duplicates:
         paths: where the files of the groups are, by name.
         pairs: those that make the groups, and how far apart: their surfaces over √area, or their descriptions where
             poses are asked for.
+        grades: of these pairs, see `Grade`; none where poses are asked for.
         n_files: among how many they were looked for.
         failures: files that could not be compared.
     """
@@ -64,6 +65,7 @@ class Duplicates:
     groups: tuple[tuple[str, ...], ...]
     paths: dict[str, Path]
     pairs: dict[tuple[str, str], float]
+    grades: dict[tuple[str, str], Grade]
     n_files: int
     failures: tuple[Failure, ...]
 
@@ -139,12 +141,16 @@ def duplicates(
     if surfaces is not None:
         joined = _around_the_finest(joined, surfaces, calibration, n_workers, progress)
         failures = [*failures, *surfaces.failures.values()]
-    names = dataset.bodies.names
+    names, grades = dataset.bodies.names, dict[tuple[int, int], Grade]()
+    if surfaces is not None:
+        found = on_threads(lambda pair: surfaces.grade(*pair), list(joined), n_workers)
+        grades = dict(zip(joined, found, strict=True))
     groups = _groups(joined)
     return Duplicates(
         tuple(tuple(names[i] for i in one) for one in groups),
         {names[i]: dataset.bodies.paths[i] for one in groups for i in one},
         {(names[i], names[j]): distance for (i, j), distance in joined.items()},
+        {(names[i], names[j]): grade for (i, j), grade in grades.items()},
         len(dataset),
         tuple(failures),
     )

@@ -9,9 +9,11 @@ same.
 from __future__ import annotations
 
 import contextlib
+import filecmp
 import math
 from dataclasses import replace
 from functools import lru_cache, partial
+from typing import Literal
 
 import numpy as np
 import torch
@@ -41,6 +43,12 @@ _HOPELESS = 0.03
 
 # How far rounding of coordinates in a file moves a vertex at most, over √area.
 _ROUNDED = 5e-4
+
+# Root mean square, over √area, up to which two surfaces are one and the same; a hole that is 0.5 % larger is beyond it.
+_ONE_SURFACE = 1e-4
+
+Grade = Literal["same file", "same mesh", "same surface", "same at another level of detail"]
+"""What two files of one body have in common, the most first; a mesh is the same with its vertices numbered alike."""
 
 # What is done to a mesh that leaves its handles as they are.
 _KEEP_HANDLES: set[Step] = {"welded", "smoothed", "subdivided"}
@@ -109,6 +117,22 @@ class Surfaces:
             return apart if apart <= limit else math.inf
         except MeshError:
             return math.inf
+
+    def grade(self, i: int, j: int) -> Grade:
+        """What two have in common that are the same at their level of detail.
+
+        Raises:
+            MeshError: one cannot be read.
+        """
+        one, other = self._dataset.bodies[i], self._dataset.bodies[j]
+        with contextlib.suppress(OSError):
+            if one.part == other.part and filecmp.cmp(one.path, other.path, shallow=False):
+                return "same file"
+        (_, faces), (_, faces_of_other) = self._numbered(i), self._numbered(j)
+        if np.array_equal(faces, faces_of_other) and not self._numbered_alike_elsewhere(i, j):
+            return "same mesh"
+        apart = surface_distance(self._last(i), self._last(j), enough=_ONE_SURFACE, hopeless=_HOPELESS, patch=1)
+        return "same surface" if apart <= _ONE_SURFACE else "same at another level of detail"
 
     def limit(self, i: int, j: int, calibration: Calibration) -> float:
         """How far two may be apart and the same, see `Calibration.limit`; raises as `coarseness` does.
