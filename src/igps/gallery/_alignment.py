@@ -144,7 +144,8 @@ def surface_distance(
         hopeless: a distance beyond which it matters no more how far apart they are: where few samples are farther
             after many steps, no more are taken; nor is the other surface itself asked for, where more samples are
             farther than two thirds of it.
-        patch: neighbours whose offsets are averaged; with 1, lost relief counts.
+        patch: neighbours whose offsets are averaged; with 1 lost relief counts, and the farthest sample instead of the
+            mean.
 
     Returns:
         Without unit; symmetric but for where the search ends.
@@ -189,7 +190,8 @@ def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurfa
     among = np.arange(1, min(patch, len(samples.points)) + 1)
     neighbours = samples.tree.query(_with_normals(samples), k=among)[1]
     means = _offsets(samples, target)[neighbours].mean(axis=1)
-    return float(np.einsum("ni,ni->n", means, means).mean())
+    squares = np.einsum("ni,ni->n", means, means)
+    return float(squares.max() if patch == 1 else squares.mean())
 
 
 def _offsets(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) -> Array:

@@ -44,7 +44,8 @@ _HOPELESS = 0.03
 # How far rounding of coordinates in a file moves a vertex at most, over √area.
 _ROUNDED = 5e-4
 
-# Root mean square, over √area, up to which two surfaces are one and the same; a hole that is 0.5 % larger is beyond it.
+# How far the farthest sample may be off, over √area, where two surfaces are one and the same; a hole that is 0.5 %
+# larger is farther.
 _ONE_SURFACE = 1e-4
 
 Grade = Literal["same file", "same mesh", "same surface", "same at another level of detail"]
