@@ -16,7 +16,7 @@ N_RERANKED = 200
 """Nearest entries whose neighbourhoods among each other put those of a single query in order."""
 
 # More shapes are put in order by the graph of so many nearest each; all pairs would take time as their number cubed.
-_MOST_WHOLE, _LISTED = 2000, 400
+_MOST_WHOLE, _LISTED = 2000, 300
 
 
 def rerank(
@@ -43,7 +43,7 @@ def rerank(
 
     The result of each step is mixed with the distances it started from. It depends on the whole collection: without
     one of the shapes, the others may rank differently. Common neighbours tell the class of a shape rather than its
-    body, so the nearest shape of each stays its nearest. Of more than 2,000 shapes each is tied to its nearest 400 by
+    body, so the nearest shape of each stays its nearest. Of more than 2,000 shapes each is tied to its nearest 300 by
     `rerank_graph`, and others have no common neighbour with it.
 
     Args:
