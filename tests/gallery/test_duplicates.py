@@ -134,7 +134,11 @@ def test_pairs_are_graded(tmp_path: Path) -> None:
     shutil.copy(tmp_path / "a.off", tmp_path / "f.off")
     surfaces = Surfaces(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"))
     level = "same at another level of detail"
-    assert [surfaces.grade(0, i) for i in range(1, 6)] == ["same mesh", "same surface", level, level, "same file"]
+    found = [surfaces.grade(0, i) for i in range(1, 6)]
+    assert [grade for grade, _ in found] == ["same mesh", "same surface", level, level, "same file"]
+    assert max(found[i][1] for i in (0, 1, 4)) < 1e-4
+    # One half has moved on by 0.005; laid onto each other, a half of that is left in the middle and at either end.
+    assert 0.001 < found[3][1] < 0.005
 
 
 def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path: Path) -> None:
@@ -150,6 +154,15 @@ def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path: Path) -> No
     dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
     assert grouped(duplicates(dataset, n_workers=1).groups) == {frozenset({"one.off", "copy.off"})}
     names = dataset.bodies.names
+    assert duplicates(dataset, n_workers=1).nearly == {}
+    near = duplicates(dataset, n_workers=1, tolerance=0.02).nearly
+    assert {frozenset(pair) for pair in near} & {
+        frozenset({"one.off", "longer.off"}),
+        frozenset({"copy.off", "longer.off"}),
+    }
+    assert all("longer.off" in pair for pair in near)
+    with pytest.raises(ValueError, match=r"tolerance: expected 0 to 0\.02"):
+        duplicates(dataset, n_workers=1, tolerance=0.5)
     apart = body_distance(dataset.subset([names.index("one.off"), names.index("longer.off")]))
     assert apart.limit < apart.surfaces < Calibration.load().same.distance
 

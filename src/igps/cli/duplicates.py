@@ -25,6 +25,7 @@ def duplicates(
     root: Path,
     poses: bool = False,
     size: Size = "auto",
+    tolerance: float = 0.0,
     out: Path | None = None,
     cache_dir: Path | None = None,
     n_workers: int | None = None,
@@ -37,6 +38,8 @@ def duplicates(
         root: folder of meshes, with or without classes, or a gallery of them, see igps gallery.
         poses: take other poses of a body for the same, which mistakes more siblings for it
         size: keep takes files that differ in size for different, ignore does not; auto does where all have a unit.
+        tolerance: tell pairs, too, that are not the same and no farther apart, in parts of the root of the area; 0.02
+            at most.
         out: a table of the groups, a file ending in .csv.
         cache_dir: folder where computed signatures are kept; the user's cache directory if not given.
         n_workers: processes that compute; all cores if not given.
@@ -52,8 +55,9 @@ def duplicates(
         source, unread = signatures(files, [chosen], n_workers=n_workers, strict=strict, cache_dir=cache_dir, **reading)
         n_skipped = len(unread)
     found = find_duplicates(
-        source, DESCRIPTOR, poses=poses, size=size, cache_dir=cache_dir, n_workers=n_workers, progress=True
-    )
+        source, DESCRIPTOR, poses=poses, size=size, tolerance=tolerance, cache_dir=cache_dir, n_workers=n_workers,
+        progress=True,
+    )  # fmt: skip
     _print_groups(found, calibration, poses)
     n_skipped += len(found.failures)
     if n_skipped:
@@ -65,9 +69,15 @@ def duplicates(
     return {
         "groups": [list(group) for group in found.groups],
         "pairs": [
-            {"files": list(pair), "distance": distance, "grade": found.grades.get(pair)}
+            {
+                "files": list(pair),
+                "distance": distance,
+                "grade": found.grades.get(pair),
+                **dict(zip(("largest", "largest_length", "unit"), found.largest.get(pair, ()), strict=False)),
+            }
             for pair, distance in found.pairs.items()
         ],
+        "nearly": [{"files": list(pair), "distance": distance} for pair, distance in found.nearly.items()],
         "n_files": found.n_files,
         "n_skipped": n_skipped,
     }
@@ -95,6 +105,8 @@ def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
 def _print_groups(found: Duplicates, calibration: Calibration, poses: bool) -> None:
     for number, group in enumerate(found.groups, 1):
         print(f"group {number}: " + "  ".join(group))
+    for pair, distance in found.nearly.items():
+        print(f"nearly: {'  '.join(pair)}  {distance:.3%} of the root of the area apart")
     n_alike = sum(map(len, found.groups))
     threshold, what = (calibration.pose, "poses") if poses else (calibration.detail, "copies")
     print(

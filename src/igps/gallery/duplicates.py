@@ -45,6 +45,7 @@ _ONE_SIZE = 0.05
 _PROFILE_NOISE = 0.02
 
 _Pairs = dict[tuple[int, int], float]
+_Names = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,9 @@ class Duplicates:
         pairs: those that make the groups, and how far apart: their surfaces over √area, or their descriptions where
             poses are asked for.
         grades: of these pairs, see `Grade`; none where poses are asked for.
+        largest: of these pairs, how far the farthest sample of one surface is from the other: over √area, as a length,
+            and its unit if that is known.
+        nearly: pairs that are not the same, but no farther apart than was tolerated, and how far, over √area.
         n_files: among how many they were looked for.
         failures: files that could not be compared.
     """
@@ -66,6 +70,8 @@ class Duplicates:
     paths: dict[str, Path]
     pairs: dict[tuple[str, str], float]
     grades: dict[tuple[str, str], Grade]
+    largest: dict[tuple[str, str], tuple[float, float, str | None]]
+    nearly: dict[tuple[str, str], float]
     n_files: int
     failures: tuple[Failure, ...]
 
@@ -95,6 +101,7 @@ def duplicates(
     *,
     poses: bool = False,
     size: Size = "auto",
+    tolerance: float = 0.0,
     cache_dir: str | Path | None = None,
     calibration: Calibration | None = None,
     n_workers: int | None = None,
@@ -109,6 +116,8 @@ def duplicates(
         poses: whether other poses of a body count as the same; then nothing tells them from siblings but the distance
             of descriptions, and false pairs are more.
         size: whether files that differ in size are different, too, see `keeps_size`.
+        tolerance: over √area, up to 0.02; pairs that are not the same and no farther apart are told as nearly so. In a
+            gallery, of those whose descriptions are near.
         cache_dir: of Signatures, for a gallery; the user's cache directory if None.
         calibration: of the descriptor; the one that is shipped if None.
         n_workers: threads; all cores if None.
@@ -132,25 +141,38 @@ def duplicates(
             near = _near(descriptions, chosen.distances, calibration.pose.distance, progress)
         else:
             profiles, failures = Surfaces(source).profiles(n_workers, progress)
-            near = _near(profiles, _profile_distances, 2 * calibration.same.distance + _PROFILE_NOISE, progress)
+            most = max(calibration.same.distance, tolerance)
+            near = _near(profiles, _profile_distances, 2 * most + _PROFILE_NOISE, progress)
         dataset = source.usable(failures)
     if keeps_size(size, dataset.units())[0]:
         near = _of_one_size(near, dataset)
-    surfaces = None if poses else Surfaces(dataset)
+    surfaces = None if poses else Surfaces(dataset, tolerance)
     joined = _joined(near, surfaces, calibration, n_workers, progress)
     if surfaces is not None:
         joined = _around_the_finest(joined, surfaces, calibration, n_workers, progress)
         failures = [*failures, *surfaces.failures.values()]
-    names, grades = dataset.bodies.names, dict[tuple[int, int], Grade]()
+    names, groups = dataset.bodies.names, _groups(joined)
+    grades, largest, nearly = (
+        dict[_Names, Grade](),
+        dict[_Names, tuple[float, float, str | None]](),
+        dict[_Names, float](),
+    )
     if surfaces is not None:
         found = on_threads(lambda pair: surfaces.grade(*pair), list(joined), n_workers)
-        grades = dict(zip(joined, found, strict=True))
-    groups = _groups(joined)
+        for (i, j), (grade, apart) in zip(joined, found, strict=True):
+            length, unit = surfaces.length(i)
+            grades[names[i], names[j]], largest[names[i], names[j]] = grade, (apart, apart * length, unit)
+        together = {i: number for number, one in enumerate(groups) for i in one}
+        for (i, j), apart in sorted(surfaces.nearly.items()):
+            if together.get(i, -1 - i) != together.get(j, -1 - j):
+                nearly[names[i], names[j]] = apart
     return Duplicates(
         tuple(tuple(names[i] for i in one) for one in groups),
         {names[i]: dataset.bodies.paths[i] for one in groups for i in one},
         {(names[i], names[j]): distance for (i, j), distance in joined.items()},
-        {(names[i], names[j]): grade for (i, j), grade in grades.items()},
+        grades,
+        largest,
+        nearly,
         len(dataset),
         tuple(failures),
     )

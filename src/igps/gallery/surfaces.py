@@ -40,6 +40,8 @@ _NORMALS: AttributeName = "surface_direction"
 _MOST_STRETCHED = 0.15
 # A tenth of this is much between copies.
 _HOPELESS = 0.03
+MOST_TOLERATED = 0.02
+"""Over √area: what is farther apart is not looked at closely."""
 
 # How far rounding of coordinates in a file moves a vertex at most, over √area.
 _ROUNDED = 5e-4
@@ -67,13 +69,22 @@ class Surfaces:
 
     Args:
         dataset: of meshes, whose Signatures give the samples; a mesh itself is read where another is near.
+        tolerance: up to which two that are not the same are nearly so, over √area.
 
     Attributes:
         failures: of meshes that could not be read, by index.
+        nearly: how far apart those are that `distance` found to be nearly the same, by their indices.
+
+    Raises:
+        ValueError: a tolerance within which nothing is looked for.
     """
 
-    def __init__(self, dataset: SignatureDataset) -> None:
+    def __init__(self, dataset: SignatureDataset, tolerance: float = 0.0) -> None:
+        if not 0 <= tolerance <= MOST_TOLERATED:
+            raise ValueError(f"tolerance: expected 0 to {MOST_TOLERATED} of the root of the area, got {tolerance}.")
         self.failures: dict[int, Failure] = {}
+        self.nearly: dict[tuple[int, int], float] = {}
+        self._tolerance = tolerance
         self._dataset = dataset
         self._last = lru_cache(_SURFACES)(self.samples)
         self._last_triangles = lru_cache(_TRIANGLES)(self._triangles)
@@ -108,19 +119,24 @@ class Surfaces:
         """That of two, over √area; infinite where they are not the same, or one cannot be read."""
         try:
             one, other = self._last(i), self._last(j)
-            apart = distance_if_alike(one, other, enough=calibration.same.distance)
-            if apart > calibration.same.distance:
-                return math.inf
-            limit = self.limit(i, j, calibration)
-            if apart > limit > 0:
-                # The search has ended at what was near enough: the nearest may be within the limit.
-                apart = distance_if_alike(one, other, enough=limit)
-            return apart if apart <= limit else math.inf
+            apart, limit = distance_if_alike(one, other, enough=calibration.same.distance), 0.0
+            if apart <= calibration.same.distance:
+                limit = self.limit(i, j, calibration)
+                if apart > limit > 0:
+                    # The search has ended at what was near enough: the nearest may be within the limit.
+                    apart = distance_if_alike(one, other, enough=limit)
+            if apart <= limit:
+                return apart
+            if apart <= self._tolerance:
+                self.nearly[min(i, j), max(i, j)] = apart
+            return math.inf
         except MeshError:
             return math.inf
 
-    def grade(self, i: int, j: int) -> Grade:
-        """What two have in common that are the same at their level of detail.
+    def grade(self, i: int, j: int) -> tuple[Grade, float]:
+        """What two have in common that are the same at their level of detail; how far the farthest sample is off.
+
+        The latter over √area, and 0 for the same file or mesh.
 
         Raises:
             MeshError: one cannot be read.
@@ -128,12 +144,17 @@ class Surfaces:
         one, other = self._dataset.bodies[i], self._dataset.bodies[j]
         with contextlib.suppress(OSError):
             if one.part == other.part and filecmp.cmp(one.path, other.path, shallow=False):
-                return "same file"
+                return "same file", 0.0
         (_, faces), (_, faces_of_other) = self._numbered(i), self._numbered(j)
         if np.array_equal(faces, faces_of_other) and not self._numbered_alike_elsewhere(i, j):
-            return "same mesh"
+            return "same mesh", 0.0
         apart = surface_distance(self._last(i), self._last(j), enough=_ONE_SURFACE, hopeless=_HOPELESS, patch=1)
-        return "same surface" if apart <= _ONE_SURFACE else "same at another level of detail"
+        return ("same surface" if apart <= _ONE_SURFACE else "same at another level of detail"), apart
+
+    def length(self, i: int) -> tuple[float, str | None]:
+        """√area of one, and its unit, if it is known."""
+        signature = self._signature(i)
+        return math.sqrt(signature.area), signature.unit
 
     def limit(self, i: int, j: int, calibration: Calibration) -> float:
         """How far two may be apart and the same, see `Calibration.limit`; raises as `coarseness` does.
