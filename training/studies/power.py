@@ -44,7 +44,7 @@ def power(
         n_draws: of two groups.
         seed: of all.
     """
-    from lapy import TriaMesh, shapedna
+    from lapy import TriaMesh, shapedna  # the extra `studies`
 
     random, chosen = np.random.default_rng(seed), descriptor_of(descriptor)
     config = chosen.requirements.apply_to(SignatureConfig())

@@ -65,7 +65,7 @@ def _count_rows(
     weight = weight * torch.ones_like(weight[0, :, :, 0]).triu(1).unsqueeze(2)
     shares = []
     for value, centres in zip(torch.cat(values, dim=1).unbind(1), centres_of(pairs), strict=True):
-        below = torch.bucketize(value.detach(), centres.detach()[1:-1], right=True)
+        below = torch.bucketize(value.detach().contiguous(), centres.detach()[1:-1], right=True)
         shares.append(((value - centres[below]) / (centres[below + 1] - centres[below])).clamp(0, 1))
         into = into * len(centres) + below.unsqueeze(3)
     stride = math.prod(shape[1:])
