@@ -8,10 +8,8 @@ from __future__ import annotations
 import argparse
 import re
 import tempfile
-import time
 import traceback
 import warnings
-from collections import Counter
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,12 +19,11 @@ import numpy as np
 import SimpleITK
 import trimesh
 from body_files import AS_IT_IS, REFUSED, BodyFile, body_file, field_at, helices
-from broken_meshes import MEMORY, SECONDS, Verdict
+from broken_meshes import Verdict, tallied
 from outcome import Row
 from scipy import ndimage
 
 from igps import LoadOptions, Mesh, MeshError
-from igps._parallel import Failed, Limits, run
 from igps.data.attribute_sources import attribute_source
 from igps.mesh.loading import BodyRef, each_body, list_bodies
 
@@ -139,10 +136,8 @@ def _bounds(path: Path) -> dict[str, tuple[float, float]]:
         label, n_pieces = ndimage.label(mask, np.ones((3, 3, 3)))
         sizes = np.bincount(label.ravel())[1:] if n_pieces else np.zeros(1)
         least, most = sizes[sizes >= 0.02 * sizes.sum()].sum(), ndimage.binary_fill_holes(mask).sum()
-        found[str(int(value))] = (
-            cell * least * (1 - VOLUME),
-            cell * most * 1.05,
-        )  # voxels join pieces that share a corner
+        # Joining pieces that share a corner adds voxels.
+        found[str(int(value))] = (cell * least * (1 - VOLUME), cell * most * 1.05)
     return found
 
 
@@ -180,31 +175,15 @@ def _judge_image(given: BodyFile, path: Path) -> Verdict:
 
 def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
     """Read so many files."""
-    start = time.monotonic()
-    jobs = [(SEED, number) for number in range(n_cases)]
-    kinds: Counter[str] = Counter()
-    reasons: Counter[str] = Counter()
-    missed = []
-    for place, verdict in run(examine, jobs, n_workers=n_workers, limits=Limits(SECONDS, MEMORY)):
-        number = jobs[place][1]
-        if isinstance(verdict, Failed):
-            verdict = Verdict("wrong", verdict.reason)
-        kinds[verdict.kind] += 1
-        reasons[" ".join(word for word in verdict.reason.split() if word.isalpha())[:60]] += verdict.kind == "refused"
-        if verdict.kind == "wrong":
-            missed.append(f"--case {number} ({body_file(SEED, number).story}): {verdict.reason}"[:400])
-    return [
-        Row(
-            "broken bodies",
-            "volumes, molecules, scenes and images beside bodies",
-            n_cases,
-            "a sentence that names file, body and remedy, or right bodies; no fault of one loses another",
-            f"{kinds['refused']} refused, {kinds['confirmed']} confirmed, {kinds['wrong']} wrong",
-            missed=sorted(missed),
-            details={"kinds": dict(kinds), "refusals": dict(reasons.most_common(40))},
-            seconds=time.monotonic() - start,
-        )
-    ]
+    return tallied(
+        "broken bodies",
+        "volumes, molecules, scenes and images beside bodies",
+        "a sentence that names file, body and remedy, or right bodies; no fault of one loses another",
+        examine,
+        [(SEED, number) for number in range(n_cases)],
+        lambda number: body_file(SEED, number).story,
+        n_workers,
+    )
 
 
 def main() -> None:

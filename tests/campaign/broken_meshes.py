@@ -11,6 +11,7 @@ import time
 import traceback
 import warnings
 from collections import Counter
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -118,13 +119,33 @@ def _grid(number: int) -> AbstractContextManager[object]:
 
 def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
     """Read and describe so many files."""
+    return tallied(
+        "broken meshes",
+        "OFF, OBJ, PLY, STL, GLB and 3MF read and described",
+        "no traceback, hang or crash, every number confirmed",
+        examine,
+        [(SEED, number) for number in range(n_cases)],
+        lambda number: broken_mesh(SEED, number).story,
+        n_workers,
+    )
+
+
+def tallied(
+    part: str,
+    what: str,
+    target: str,
+    examined: Callable[[tuple[int, int]], Verdict],
+    jobs: Sequence[tuple[int, int]],
+    story: Callable[[int], str],
+    n_workers: int | None,
+) -> list[Row]:
+    """The row of a part, from what becomes of each file by its seed and number; a story tells what was broken."""
     start = time.monotonic()
-    jobs = [(SEED, number) for number in range(n_cases)]
     kinds: Counter[str] = Counter()
     reasons: Counter[str] = Counter()
     checks: Counter[str] = Counter()
     missed = []
-    for place, verdict in run(examine, jobs, n_workers=n_workers, limits=Limits(SECONDS, MEMORY)):
+    for place, verdict in run(examined, jobs, n_workers=n_workers, limits=Limits(SECONDS, MEMORY)):
         number = jobs[place][1]
         if isinstance(verdict, Failed):
             verdict = Verdict("wrong", verdict.reason)
@@ -133,16 +154,16 @@ def campaign(n_cases: int, n_workers: int | None = None) -> list[Row]:
         if verdict.kind == "refused":
             reasons[" ".join(word for word in verdict.reason.split() if word.isalpha())[:60]] += 1
         if verdict.kind == "wrong":
-            missed.append(f"--case {number} ({broken_mesh(SEED, number).story}): {verdict.reason}"[:400])
+            missed.append(f"--case {number} ({story(number)}): {verdict.reason}"[:400])
     return [
         Row(
-            "broken meshes",
-            "OFF, OBJ, PLY, STL, GLB and 3MF read and described",
-            n_cases,
-            "no traceback, hang or crash, every number confirmed",
+            part,
+            what,
+            len(jobs),
+            target,
             f"{kinds['refused']} refused, {kinds['confirmed']} confirmed, {kinds['wrong']} wrong",
             missed=sorted(missed),
-            details={"kinds": dict(kinds), "confirmations": dict(checks), "refusals": dict(reasons.most_common(30))},
+            details={"kinds": dict(kinds), "confirmations": dict(checks), "refusals": dict(reasons.most_common(40))},
             seconds=time.monotonic() - start,
         )
     ]
