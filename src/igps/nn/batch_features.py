@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.nn._kernels.balls import ball_radii
+from igps.nn._kernels.nearest import smallest
 from igps.nn._precision import full_precision
 from igps.nn.embedding import barycentroid_potential
 
@@ -152,9 +153,9 @@ def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest:
     """
     with full_precision():
         distances = torch.cdist(points.detach(), targets.detach().masked_fill(~mask[:, None], _FAR))
-    nearest = distances.topk(min(n_nearest, len(targets)), largest=False)
-    found = (nearest.values < _FAR).unsqueeze(2)
-    mean = torch.where(found, targets[nearest.indices], 0).sum(dim=1) / found.sum(dim=1)
+    nearest, which = smallest(distances, min(n_nearest, len(targets)))
+    found = (nearest < _FAR).unsqueeze(2)
+    mean = torch.where(found, targets[which], 0).sum(dim=1) / found.sum(dim=1)
     return functional.normalize(mean - points, dim=1)
 
 
@@ -169,4 +170,4 @@ def nearest_neighbours(points: Tensor, n_nearest: int = N_NEIGHBOURS) -> Tensor:
     with full_precision():
         squares = torch.cdist(points.detach(), points.detach(), compute_mode="use_mm_for_euclid_dist")
     squares.fill_diagonal_(torch.inf)
-    return squares.topk(min(n_nearest, len(points) - 1), dim=1, largest=False).indices
+    return smallest(squares, min(n_nearest, len(points) - 1))[1]
