@@ -273,6 +273,15 @@ def test_patterns_name_the_file_and_lead_out_of_no_folder(tmp_path: Path) -> Non
         file("none.nii")
 
 
+@pytest.mark.parametrize(("suffix", "content"), [("dx", b"delta"), ("thickness", b"\xff\xff\xff" + bytes(12))])
+def test_what_is_wrong_with_a_file_names_the_body_whose_it_is(body: BodyRef, suffix: str, content: bytes) -> None:
+    body.path.with_suffix(f".{suffix}").write_bytes(content)
+    with pytest.raises(MeshError) as error:
+        attribute_source(f"{{stem}}.{suffix}")(body, INSIDE)
+    assert str(error.value).startswith(f"{body}: ")
+    assert str(body.path.with_suffix(f".{suffix}")) in str(error.value)
+
+
 @pytest.mark.parametrize("is_absolute", [False, True])
 def test_images_among_bodies_are_no_bodies(tmp_path: Path, is_absolute: bool) -> None:
     for name in ("ball", "cube"):

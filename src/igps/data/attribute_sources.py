@@ -121,8 +121,10 @@ class FileAttribute(ABC):
         file, name = self.file(body)
         try:
             values = self.values(body, file, name, points)
-        except (MeshError, MemoryError):
+        except MemoryError:
             raise
+        except MeshError as error:  # of the file, which may be one of thousands
+            raise error if str(body) in str(error) else MeshError(f"{body}: its attribute's file {error}") from error
         except Exception as error:  # readers of many formats raise whatever they like
             raise MeshError(
                 f"{body}: its attribute's file {file} is not readable ({type(error).__name__}: {error}). Check that "
