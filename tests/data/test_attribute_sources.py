@@ -273,6 +273,35 @@ def test_patterns_name_the_file_and_lead_out_of_no_folder(tmp_path: Path) -> Non
         file("none.nii")
 
 
+@pytest.mark.parametrize(("suffix", "content"), [("dx", b"delta"), ("thickness", b"\xff\xff\xff" + bytes(12))])
+def test_what_is_wrong_with_a_file_names_the_body_whose_it_is(body: BodyRef, suffix: str, content: bytes) -> None:
+    body.path.with_suffix(f".{suffix}").write_bytes(content)
+    with pytest.raises(MeshError) as error:
+        attribute_source(f"{{stem}}.{suffix}")(body, INSIDE)
+    assert str(error.value).startswith(f"{body}: ")
+    assert str(body.path.with_suffix(f".{suffix}")) in str(error.value)
+
+
+@pytest.mark.parametrize("is_absolute", [False, True])
+def test_images_among_bodies_are_no_bodies(tmp_path: Path, is_absolute: bool) -> None:
+    for name in ("ball", "cube"):
+        (tmp_path / name).mkdir()
+        trimesh.creation.icosphere(subdivisions=1).export(tmp_path / name / "x.off")
+        image = tmp_path / "ct" / name / "x.off.nii.gz"
+        image.parent.mkdir(parents=True)
+        image.touch()
+    pattern = f"{tmp_path}/ct/{{file}}.nii.gz" if is_absolute else "ct/{file}.nii.gz"
+    images = attribute_source(pattern, tmp_path)
+    dataset = SignatureDataset(tmp_path, cache_dir=tmp_path / ".cache", attributes={"ct": images})
+    assert dataset.bodies.names == ("ball/x.off", "cube/x.off")
+    assert dataset.classes == ("ball", "cube")
+    files = [images.file(body)[0] for body in dataset.bodies]  # type: ignore[attr-defined]
+    assert files == [tmp_path / "ct" / name / "x.off.nii.gz" for name in ("ball", "cube")]
+    # What is itself a body's file stays one.
+    own = {"thickness": attribute_source("{file}#thickness", tmp_path / "ball")}
+    assert SignatureDataset(tmp_path / "ball", cache_dir=tmp_path / ".cache", attributes=own).bodies.names == ("x.off",)
+
+
 def test_words_of_the_command_line_become_sources() -> None:
     found = attribute_sources(["ct=a/{stem}.nii.gz", "q=charge", "t={file}#t", "e=a.vtu"], Path("root"))
     assert found == {

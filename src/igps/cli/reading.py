@@ -170,7 +170,8 @@ def chosen_dataset(
     attributes = attribute_sources(attribute or (), root)
     if isinstance(source, Folder):
         find = labelled_bodies if source.labelled else find_bodies
-        source, classes = find(source.root, reading, classes=classes or "folder"), None
+        found = find(source.root, reading, classes=classes or "folder", attributes=attributes.values())
+        source, classes = found, None
     return SignatureDataset(
         source, config, cache_dir, descriptor=needs, classes=classes, reading=reading, attributes=attributes
     )

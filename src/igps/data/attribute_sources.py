@@ -7,11 +7,12 @@ what is not finite, and what is so large that it stands for nothing (10¹⁵).
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -120,8 +121,10 @@ class FileAttribute(ABC):
         file, name = self.file(body)
         try:
             values = self.values(body, file, name, points)
-        except (MeshError, MemoryError):
+        except MemoryError:
             raise
+        except MeshError as error:  # of the file, which may be one of thousands
+            raise error if str(body) in str(error) else MeshError(f"{body}: its attribute's file {error}") from error
         except Exception as error:  # readers of many formats raise whatever they like
             raise MeshError(
                 f"{body}: its attribute's file {file} is not readable ({type(error).__name__}: {error}). Check that "
@@ -133,6 +136,15 @@ class FileAttribute(ABC):
     def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
         """(P,) or (P, C) at points (P, 3), NaN where they are not known."""
 
+    def files(self, paths: Iterable[Path]) -> set[Path]:
+        """See `igps.data.attributes.FromFiles`; those of bodies by {part} are not known before their files are read."""
+        found = set()
+        for path in paths:
+            with contextlib.suppress(MeshError):
+                if (file := self.file(BodyRef(path))[0]) != path:
+                    found.add(file)
+        return found
+
     def file(self, body: BodyRef) -> tuple[Path, str]:
         """The file of a body, and the name of the array in it, which may be "".
 
@@ -141,12 +153,12 @@ class FileAttribute(ABC):
         """
         pattern, _, name = self.path.partition("#")
         root = body.path.parent if self.root is None else self.root
-        if Path(pattern).is_absolute():
-            root = Path(pattern.partition("{")[0]).parent if "{" in pattern else Path(pattern).parent
         try:
             below = body.path.resolve().relative_to(root.resolve()).as_posix()
         except ValueError:
             below = body.path.name
+        if Path(pattern).is_absolute():
+            root = Path(pattern.partition("{")[0]).parent if "{" in pattern else Path(pattern).parent
         words = {"{stem}": body.path.name.partition(".")[0], "{file}": below, "{part}": body.part or ""}
         for word, value in words.items():
             pattern = pattern.replace(word, value)

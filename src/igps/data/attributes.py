@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -26,6 +27,14 @@ class AttributeSource(Protocol):
 
     def __call__(self, body: BodyRef, points: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
         """Values (P,) or (P, C) at points (P, 3) in the coordinates of the body's file."""
+
+
+@runtime_checkable
+class FromFiles(Protocol):
+    """A source that reads files, which may lie among those of bodies."""
+
+    def files(self, paths: Iterable[Path]) -> set[Path]:
+        """What it reads for the bodies in the files of these paths, but for their own files."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -112,8 +112,6 @@ class SignatureDataset(Dataset[LabelledSignature]):
         if descriptor is not None:
             requirements = requirements_of(descriptor)
             config, given = requirements.apply_to(config), {**requirements.sources, **given}
-        self.bodies = _bodies(root_or_paths, labels, reading).classed(classes or "folder")
-        self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
         sources: dict[str, AttributeSource] = {}
         self._functions: dict[str, PointFunction] = {}
         for name, one in given.items():
@@ -123,6 +121,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
                 sources[name] = FunctionAttribute(one)
             else:
                 self._functions[name] = one
+        self.bodies = _bodies(root_or_paths, labels, reading, sources.values()).classed(classes or "folder")
+        self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
         if pre_transform is not None and pre_transform.cache_tag and self._functions:
             raise ValueError("pre_transform: expected attributes with a cache_tag beside it, got a function of points.")
         self.pipeline = SignaturePipeline(
@@ -450,10 +450,13 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
 
 def _bodies(
-    given: str | Path | Sequence[str | Path] | Bodies, labels: Sequence[str] | None, reading: LoadOptions
+    given: str | Path | Sequence[str | Path] | Bodies,
+    labels: Sequence[str] | None,
+    reading: LoadOptions,
+    attributes: Iterable[AttributeSource],
 ) -> Bodies:
     if isinstance(given, Bodies):
         return given
-    if isinstance(given, str | Path):
-        return find_bodies(given, reading) if Path(given).is_dir() else given_bodies([given], labels, reading)
-    return given_bodies(given, labels, reading)
+    if isinstance(given, str | Path) and Path(given).is_dir():
+        return find_bodies(given, reading, attributes=attributes)
+    return given_bodies([given] if isinstance(given, str | Path) else given, labels, reading)

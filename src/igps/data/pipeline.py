@@ -7,7 +7,7 @@ import importlib.metadata
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Protocol
 
@@ -242,7 +242,7 @@ class SignaturePipeline:
     def _cached(self, body: BodyRef, file: BodyFile) -> Iterator[str]:
         """The keys that the cache has of the Signature of a body and of larger ones, which begin with it."""
         cache = SignatureCache(self.cache_dir)
-        for config in (self.config, *self.config.larger()):
+        for config in _serving(self.config):
             for mended in (False, True):
                 key = self._key(body, file, config, mended)
                 if key not in cache:
@@ -269,6 +269,12 @@ class SignaturePipeline:
         assert self.pre_transform is not None
         attributes = [self._attribute_key(body, key, name) for name in sorted(self.attributes)]
         return digest(["changed", key, self.pre_transform.cache_tag, attributes])
+
+
+@lru_cache
+def _serving(config: SignatureConfig) -> tuple[SignatureConfig, ...]:
+    """Those whose Signatures serve, for thousands of files the same."""
+    return (config, *config.larger())
 
 
 def version() -> str:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
+from igps.data.attributes import AttributeSource, FromFiles
 from igps.mesh.formats import is_searched, searched_suffixes
 from igps.mesh.loading import BodyRef, list_bodies
 from igps.mesh.mesh import MeshError
@@ -124,7 +125,13 @@ class Bodies:
         return replace(self, labels=tuple(files))
 
 
-def find_bodies(root: str | Path, options: LoadOptions | None = None, *, classes: ClassRule = "folder") -> Bodies:
+def find_bodies(
+    root: str | Path,
+    options: LoadOptions | None = None,
+    *,
+    classes: ClassRule = "folder",
+    attributes: Iterable[AttributeSource] = (),
+) -> Bodies:
     """The bodies below a folder, with their classes if it tells them.
 
     Three layouts are known: files and a `labels.csv` with the columns `file,label` (paths relative to the folder), or
@@ -136,6 +143,7 @@ def find_bodies(root: str | Path, options: LoadOptions | None = None, *, classes
         root: the folder.
         options: how files are read, which says what bodies there are in one.
         classes: what the class of a body is, see `ClassRule`.
+        attributes: what bodies bring along; the files of these are no bodies.
 
     Raises:
         FileNotFoundError: the folder does not exist, or holds no file that may be a body.
@@ -146,9 +154,11 @@ def find_bodies(root: str | Path, options: LoadOptions | None = None, *, classes
         raise FileNotFoundError(f"{root}: no such folder.")
     if (root / LABELS_FILE).is_file():
         return _from_labels_file(root, options).classed(classes)
+    files = _files_in(root)
+    beside = {file for one in attributes if isinstance(one, FromFiles) for file in one.files(files)}
     folders = sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
-    in_classes = [(path, folder.name) for folder in folders for path in _files_in(folder)]
-    rows = in_classes or [(path, "") for path in _files_in(root)]
+    in_classes = [(path, folder.name) for folder in folders for path in _files_in(folder) if path not in beside]
+    rows = in_classes or [(path, "") for path in files if path not in beside]
     if not rows:
         raise FileNotFoundError(
             f"{root}: no mesh found. Expected a folder per class, or mesh files with a {LABELS_FILE} (file,label), "
@@ -163,13 +173,19 @@ def find_bodies(root: str | Path, options: LoadOptions | None = None, *, classes
     return Bodies(paths, names, labels if in_classes else None, parts).classed(classes)
 
 
-def labelled_bodies(root: str | Path, options: LoadOptions | None = None, *, classes: ClassRule = "folder") -> Bodies:
+def labelled_bodies(
+    root: str | Path,
+    options: LoadOptions | None = None,
+    *,
+    classes: ClassRule = "folder",
+    attributes: Iterable[AttributeSource] = (),
+) -> Bodies:
     """`find_bodies` of a folder that tells classes.
 
     Raises:
         ValueError: it tells none.
     """
-    bodies = find_bodies(root, options, classes=classes)
+    bodies = find_bodies(root, options, classes=classes, attributes=attributes)
     if bodies.labels is None:
         raise ValueError(f"{root}: no classes found. Expected one folder per class, or a {LABELS_FILE} (file,label).")
     return bodies
