@@ -29,7 +29,7 @@ from igps.signature.signature import SignatureConfig
 Found = tuple[list[dict[str, Any]], Tensor, Tensor]
 """Rows, their distances (M,) and descriptions (M, ...), the closest first."""
 
-CANDIDATES = 256
+CANDIDATES = 512
 """Bodies whose short vectors are the nearest, which are ranked again by the distance itself."""
 
 
@@ -154,7 +154,7 @@ class Gallery:
     def search(self, query: Tensor, *, top: int, exact: bool = False, where: str | None = None) -> Found:
         """Rows, distances and descriptions of the bodies closest to a description (1, ...)."""
         # More are ranked under a head, whose distance may be only near the cosine's.
-        n = 8 * CANDIDATES if isinstance(self.descriptor, EmbeddedDescriptor) else CANDIDATES
+        n = 4 * CANDIDATES if isinstance(self.descriptor, EmbeddedDescriptor) else CANDIDATES
         with torch.inference_mode():
             return self.table.search(query, self.descriptor.distances, top=top, exact=exact, candidates=n, where=where)
 
