@@ -26,6 +26,7 @@ _AMOUNTS: dict[str, tuple[int, int | None]] = {
     "broken_meshes": (10_000, 200),
     "broken_bodies": (3_000, 90),
     "kills": (200, 8),
+    "gallery_kills": (200, 8),
     "machine_faults": (0, None),
     "properties": (12, 1),
     "mutants": (20, None),
@@ -36,7 +37,7 @@ _AMOUNTS: dict[str, tuple[int, int | None]] = {
 _ORDER = (
     (("broken_meshes",),),
     (("broken_bodies",),),
-    (("kills",), ("properties", "machine_faults")),
+    (("kills",), ("properties", "machine_faults", "gallery_kills")),
     (("mutants",),),
 )
 

@@ -152,7 +152,7 @@ def test_long_descriptions_are_kept_in_half_precision(tmp_path: Path) -> None:
     rows[7] *= 1e-9
     rows[8] = 0
     table = written(tmp_path / "g.igps", rows, "chi_square")
-    assert str(table.table.schema.field("vector").type) == "fixed_size_list<item: halffloat>[1500]"
+    assert str(table.table.schema.field("vector").type) == "fixed_size_list<item: halffloat>[1501]"
     kept = torch.cat([table.decoded(some)[0] for some in table.batches()])
     torch.testing.assert_close(kept, rows, rtol=2**-11, atol=1e-11)
     found = table.search(rows[:1], chi_square, top=5)

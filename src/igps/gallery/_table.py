@@ -29,15 +29,15 @@ try:
     import lancedb
     import pyarrow as pa
     from filelock import FileLock
-    from lancedb.index import BTree, IvfPq
+    from lancedb.index import BTree, IvfFlat, IvfRq
 except ImportError as error:
     raise ImportError('a gallery needs LanceDB: pip install "interior-gps[index]".') from error
 
 _BODIES, _MAP, _ABOUT = "bodies", "map-", b"gallery"
 # Fewer are all compared; the map to short vectors is fitted to the first so many.
 _FEWEST_FOR_VECTORS = 4096
-# Of so many and fewer the short vectors are all compared. Those that a filter leaves lie in more of the clusters.
-_MOST_FLAT, _PROBED, _PROBED_IF_FILTERED, _ROWS_AT_ONCE = 20_000, 40, 160, 1024
+# Of so many and fewer the short vectors are all compared; of more, those of the nearest so many clusters.
+_MOST_FLAT, _PROBED, _ROWS_AT_ONCE = 20_000, 160, 1024
 # Longer descriptions are kept in half precision; the width of short vectors is a multiple of the other.
 _MOST_IN_FULL, _STEP = 1024, 16
 _ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bytes: pa.binary()}
@@ -62,7 +62,7 @@ class BodyTable:
             self.head: dict[str, Any] = json.loads(schema.metadata[_ABOUT])
             self.about, self.shape, self.vector_map = self.head["about"], tuple(self.head["shape"]), None
             self.columns = {one.name: kind for one in schema for kind, known in _ARROW.items() if known == one.type}
-            if schema.field("vector").type.list_size != np.prod(self.shape):
+            if schema.field("vector").type.list_size != np.prod(self.shape) + 1:
                 raise ValueError(f"descriptions of {schema.field('vector').type}, not of shape {self.shape}")
             if name := self.head["map"]:
                 kept = _opened(self.path, name).to_arrow()["arrays"][0].as_py()
@@ -76,9 +76,8 @@ class BodyTable:
         """Arrow tables of the rows, some at a time; of all that `decoded` needs if no columns are named."""
         with self._told(where):
             asked = self.table.search() if where is None else self.table.search().where(where)
-            for batch in asked.select(list(columns) or [*self.columns, "vector", "scale"]).to_batches(_ROWS_AT_ONCE):
-                if batch.num_rows:
-                    yield pa.Table.from_batches([batch])
+            asked = asked.with_row_id("_rowid" in columns).select([*(columns or (*self.columns, "vector"))])
+            yield from (pa.Table.from_batches([one]) for one in asked.to_batches(_ROWS_AT_ONCE) if one.num_rows)
 
     def decoded(self, rows: Any) -> tuple[Tensor, list[dict[str, Any]]]:
         """Descriptions, and what is known of each, of an Arrow table of rows."""
@@ -86,7 +85,7 @@ class BodyTable:
 
     def _descriptions(self, rows: Any) -> Tensor:
         values = torch.from_numpy(np.array(rows["vector"].combine_chunks().flatten())).float().reshape(len(rows), -1)
-        return (values * torch.tensor(rows["scale"].to_numpy())[:, None]).reshape(-1, *self.shape)
+        return torch.ldexp(values[:, :-1], values[:, -1:]).reshape(-1, *self.shape)
 
     def search(
         self, query: Tensor, distance: Distance, *, top: int, candidates: int = 512, exact: bool = False,
@@ -94,29 +93,32 @@ class BodyTable:
     ) -> tuple[list[dict[str, Any]], Tensor, Tensor]:  # fmt: skip
         """Rows, distances (M,) and descriptions (M, ...) of the M ≤ top closest to a description (1, ...), ties by id.
 
-        Of `candidates` that are near by their short vectors, or of all rows if exact; of those that satisfy `where`.
+        Of `candidates` near by their short vectors; of all that satisfy `where` if exact, or if it leaves few near.
         """
         self._check_shape(query)
-        groups = self.batches(where)
+        groups = self.batches(where, ("_rowid", "vector"))
         if not exact and self.vector_map is not None:
             with self._told(where):
                 short = _short(self.vector_map, query.reshape(1, -1).cpu().float().numpy())[0]
                 asked = self.table.search(short, vector_column_name="short").distance_type("l2").nprobes(_PROBED)
-                if where is not None:
-                    asked = asked.minimum_nprobes(_PROBED_IF_FILTERED).maximum_nprobes(0).where(where, prefilter=True)
-                asked = asked.limit(max(candidates, top)).select([*self.columns, "vector", "scale", "_distance"])
-                near = asked.to_arrow().drop(["_distance"])
-            groups = iter([near]) if len(near) >= top else groups
-        kept, distances = None, torch.zeros(0)
+                asked = asked.limit(max(candidates, top)).select(["_rowid", "_distance"])
+                near = (asked if where is None else asked.where(where, prefilter=True)).to_arrow()
+            groups = iter([self._taken(near["_rowid"], "vector")]) if len(near) >= max(candidates, top) else groups
+        ids, distances, kept = np.zeros(0, np.uint64), torch.zeros(0), torch.zeros(0, *self.shape)
         for group in groups:
-            kept = group if kept is None else pa.concat_tables([kept, group.select(kept.column_names)])
-            distances = distance(query, self._descriptions(kept).to(query.device)).cpu()[0]
-            best = np.lexsort((np.array(kept["id"].to_pylist()), distances.numpy()))[:top]
-            kept, distances = kept.take(best), distances[best]
-        if kept is None:
-            return [], distances, torch.zeros(0, *self.shape)
-        descriptions, rows = self.decoded(kept)
-        return rows, distances, descriptions
+            ids, kept = np.append(ids, group["_rowid"].to_numpy()), torch.cat([kept, self._descriptions(group)])
+            distances = distance(query, kept.to(query.device)).cpu()[0]
+            best = distances <= distances.kthvalue(min(top, len(ids))).values
+            ids, distances, kept = ids[best.numpy()], distances[best], kept[best]
+        rows = {row.pop("_rowid"): row for row in (self._taken(ids, *self.columns).to_pylist() if len(ids) else ())}
+        told = [rows[one] for one in ids.tolist()]
+        first = np.lexsort(([row["id"] for row in told], distances.numpy()))[:top]
+        return [told[i] for i in first], distances[first], kept[first]
+
+    def _taken(self, row_ids: Any, *columns: str) -> Any:
+        """An Arrow table of rows by LanceDB's numbers of them; few columns are read sooner than many."""
+        with self._told(None):
+            return self.table.take_row_ids(np.asarray(row_ids).tolist()).with_row_id().select([*columns]).to_arrow()
 
     def add(self, descriptions: Tensor, rows: Sequence[Row], further: Mapping[str, type]) -> None:
         """Add rows, no id twice, in place of those of the same id; of columns beside `KNOWN`, further by name."""
@@ -198,39 +200,37 @@ def _overwrite(path: Path, head: Row, batches: Iterable[Batch], columns: Mapping
 def _index(table: Any) -> None:
     """Under the lock: a large table gets indices, rows since the last time come to them, and versions of a month go."""
     n, listed = table.count_rows(), {one.columns[0]: one.name for one in table.list_indices()}
-    width = table.schema.field("short").type.list_size
     if n > _MOST_FLAT and "id" not in listed:
-        table.create_index("id", config=BTree())
-        if width > 1:
-            n_clusters = 2 ** round(np.log2(np.sqrt(n) / 2))
-            quantized = IvfPq(distance_type="l2", num_partitions=n_clusters, num_sub_vectors=width // _STEP * 2)
-            table.create_index("short", config=quantized)
+        for one in (one for one in table.schema if one.type in _ARROW.values() and one.type != pa.binary()):
+            table.create_index(one.name, config=BTree())
+        if (width := table.schema.field("short").type.list_size) > 1:  # of few numbers a bit of each tells little
+            kind = IvfRq if width > 64 else IvfFlat
+            table.create_index("short", config=kind(num_partitions=2 ** round(np.log2(n) / 2 - 1)))
     elif table.version % 50 == 0 or (listed and table.index_stats(listed["id"]).num_unindexed_rows > _MOST_FLAT // 2):
         table.optimize(cleanup_older_than=timedelta(days=30))
 
 
 def _encoded(batch: Batch, columns: Mapping[str, type], vector_map: VectorMap | None) -> Any:
-    """An Arrow table; long descriptions in half precision, scaled by powers of two, each number to 0.05 %."""
+    """An Arrow table; long descriptions in half precision, each number to 0.05 %, behind them the power of two."""
     descriptions, rows = batch
     values = descriptions.reshape(len(rows), -1).cpu().float().numpy()
     if not np.isfinite(values).all():
         raise ValueError("descriptions: expected finite numbers, got others. Look for the mesh that gives them.")
     told = {name: pa.array([None if row.get(name) is None else kind(row[name]) for row in rows], _ARROW[kind])
             for name, kind in columns.items()}  # fmt: skip
-    scales, kept = np.ones(len(rows), np.float32), values
+    scale, precision = np.zeros((len(rows), 1), np.int32), "f4"
     if values.shape[1] > _MOST_IN_FULL:
-        scales = np.ldexp(scales, np.frexp(np.abs(values).max(axis=1))[1] - 15)
-        kept = (values / scales[:, None]).astype(np.float16)
+        scale, precision = np.frexp(np.abs(values).max(axis=1, keepdims=True))[1] - 15, "f2"
+    kept = np.hstack([np.ldexp(values, -scale), scale]).astype(precision)
     short = np.zeros((len(rows), 1), np.float32) if vector_map is None else _short(vector_map, values)
     lists = {name: pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(one).ravel()), one.shape[1])
              for name, one in (("vector", kept), ("short", short))}  # fmt: skip
-    return pa.table({**told, "scale": pa.array(scales), **lists})
+    return pa.table({**told, **lists})
 
 
 def _short(vector_map: VectorMap, values: Any) -> Any:
     """Short vectors with zeros behind, which change no distance."""
-    vectors = vector_map(values)
-    return np.pad(vectors, ((0, 0), (0, -vectors.shape[1] % _STEP)))
+    return np.pad(vectors := vector_map(values), ((0, 0), (0, -vectors.shape[1] % _STEP)))
 
 
 def _opened(path: Path, name: str) -> Any:

@@ -62,10 +62,12 @@ def rerank_graph(
         alike = np.zeros((n, m + 1))
         walks(np.column_stack([np.arange(n), lists]), steps.indptr, steps.indices, steps.data, _ROUNDS, alike)
         length = 1 / np.sqrt(alike[:, 0])
-        walked = _symmetric(lists, (1 - length[:, None] * alike[:, 1:] * length[lists]).clip(0)).data
+        alike = (1 - length[:, None] * alike[:, 1:] * length[lists]).clip(0)
+        walked = _symmetric(lists, alike).data
+        del alike, tied, steps
         average = 1 - (own.nnz - walked.sum()) / n_pairs  # of those in no list, it is 1
         apart = (1 - share) * walked / max(average, _TINY) + share * own.data / mean
-    before = apart
+    before = apart.sum()
     if diffusion:
         apart = _brought_forward(apart, own, lists[:, 0])
     order = np.empty((n, n_near + 1), dtype=np.int64)
@@ -86,7 +88,7 @@ def rerank_graph(
     weights.sort_indices()
     smaller = np.zeros(own.nnz)
     common(own.indptr, own.indices, weights.indptr, weights.indices, weights.data, smaller)
-    average = 1 + (apart.sum() - before.sum()) / n_pairs
+    average = 1 + (apart.sum() - before) / n_pairs
     anew = (1 - share) * (1 - smaller / (2 - smaller)) + share * apart / average
     anew = _brought_forward(anew, own, lists[:, 0])
     ranked = _values(anew, own, np.repeat(np.arange(n), m), lists.ravel()).reshape(n, m)
@@ -98,13 +100,13 @@ def _symmetric(lists: Integers, values: Floats) -> sparse.csr_array:
     """(N, N) of values (N, M) of pairs (i, lists[i]) and of those the other way round; the mean of both where given."""
     n, m = lists.shape
 
-    def both_ways(given: Floats) -> sparse.csr_array:
+    def both_ways(given: Floats | NDArray[np.int8]) -> sparse.csr_array:
         one_way = sparse.csr_array((given.ravel(), lists.ravel(), np.arange(n + 1) * m), shape=(n, n), copy=True)
         one_way.sort_indices()
         return one_way + one_way.T.tocsr()
 
     # One is added, as SciPy drops sums of 0
-    total, count = both_ways(values + 1), both_ways(np.ones(lists.shape))
+    total, count = both_ways(values + 1), both_ways(np.ones(lists.shape, dtype=np.int8))
     total.data = total.data / count.data - 1
     return total
 

@@ -1,0 +1,115 @@
+"""A gallery of a million made vectors: `python tests/benchmarks/million.py [--n N] [--folder FOLDER]`.
+
+Families of 250, which differ by noise of a tenth of their length; with `--noise 0.7` the nearest of a query are members
+and strangers, spread over many clusters. It tells what building costs, how long queries take, with conditions and
+without, and how many of the nearest ten of all are found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from igps.gallery import _table
+from igps.gallery._table import BodyTable
+from igps.gallery.gallery import CANDIDATES
+from igps.retrieval import cosine
+
+WIDTH, FAMILY, BATCH, TOP = 256, 250, 10_000, 10
+AMPLITUDES = (1 + np.arange(WIDTH, dtype=np.float32)) ** -0.5
+CONDITIONS = {"all": "", "1 % at random": "volume < 0.01", "1 % by class": "class IN ('3', '4', '5', '6', '7')"}
+
+
+def members(centres: np.ndarray, noise: float, generator: np.random.Generator) -> np.ndarray:
+    vectors = (centres + noise * generator.standard_normal(centres.shape, dtype=np.float32)) * AMPLITUDES
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def centres(start: int) -> np.ndarray:
+    """Of the families of the batch that begins there."""
+    return np.random.default_rng([0, start]).standard_normal((BATCH // FAMILY, WIDTH), dtype=np.float32)
+
+
+def batch(start: int, noise: float) -> tuple[torch.Tensor, list[dict[str, Any]]]:
+    generator = np.random.default_rng([1, start])
+    vectors = members(np.repeat(centres(start), FAMILY, axis=0), noise, generator)
+    area, volume = generator.random((2, BATCH))
+    rows = [
+        {"id": f"/meshes/{n:07}.off", "name": f"{n:07}", "class": str(n // FAMILY % 500), "file": f"/meshes/{n:07}.off",
+         "checksum": f"{n:064x}", "bytes": n, "modified": n, "area": area[i], "volume": volume[i],
+         "thumbnail": generator.bytes(900)}
+        for i, n in enumerate(range(start, start + BATCH))
+    ]  # fmt: skip
+    return torch.from_numpy(vectors), rows
+
+
+def queries(n: int, n_rows: int, noise: float) -> np.ndarray:
+    """Further members of families."""
+    generator = np.random.default_rng(2)
+    starts = generator.integers(0, n_rows // BATCH, n) * BATCH
+    chosen = [centres(int(start))[generator.integers(BATCH // FAMILY)] for start in starts]
+    return members(np.stack(chosen), noise, generator)
+
+
+def nearest_of_all(asked: np.ndarray, n_rows: int, noise: float) -> dict[str, np.ndarray]:
+    """The numbers (Q, 10) of the nearest under each condition, by comparing all."""
+    far = {name: np.full((len(asked), TOP), np.inf) for name in CONDITIONS}
+    found = {name: np.zeros((len(asked), TOP), dtype=np.int64) for name in CONDITIONS}
+    for start in range(0, n_rows, BATCH):
+        vectors, rows = batch(start, noise)
+        away = 1 - asked @ vectors.numpy().T
+        label = np.array([int(row["class"]) for row in rows])
+        kept = {"all": np.ones(BATCH, bool), "1 % at random": np.array([row["volume"] < 0.01 for row in rows]),
+                "1 % by class": (label >= 3) & (label <= 7)}  # fmt: skip
+        for name, mask in kept.items():
+            numbers = np.broadcast_to(start + np.flatnonzero(mask), (len(asked), int(mask.sum())))
+            both, which = np.hstack([far[name], away[:, mask]]), np.hstack([found[name], numbers])
+            best = np.argsort(both, axis=1)[:, :TOP]
+            far[name], found[name] = (np.take_along_axis(one, best, axis=1) for one in (both, which))
+    return found
+
+
+def main() -> None:
+    """Build it if it is not there, and ask."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--n", type=int, default=1_000_000)
+    parser.add_argument("--noise", type=float, default=0.1)
+    parser.add_argument("--n_queries", type=int, default=200)
+    parser.add_argument("--folder", type=Path, default=Path("build/million.igps"))
+    arguments = parser.parse_args()
+    if not arguments.folder.exists():
+        start = time.monotonic()
+        batches = (batch(start, arguments.noise) for start in range(0, arguments.n, BATCH))
+        _table.write(arguments.folder, {"descriptor": "made"}, "cosine", batches, {})
+        size = sum(path.stat().st_size for path in arguments.folder.rglob("*") if path.is_file())
+        print(f"built in {time.monotonic() - start:.0f} s, {size / 2**30:.2f} GiB, {memory()}", flush=True)
+    table, asked = BodyTable(arguments.folder), queries(arguments.n_queries, arguments.n, arguments.noise)
+    answers: dict[str, list[list[int]]] = {}
+    seconds: dict[str, list[float]] = {}
+    for name, where in CONDITIONS.items():
+        for query in torch.from_numpy(asked):
+            begun = time.perf_counter()
+            rows, _, _ = table.search(query[None], cosine, top=TOP, candidates=CANDIDATES, where=where or None)
+            seconds.setdefault(name, []).append(time.perf_counter() - begun)
+            answers.setdefault(name, []).append([int(row["name"]) for row in rows])
+    asking = memory()
+    for name, expected in nearest_of_all(asked, arguments.n, arguments.noise).items():
+        both = zip(answers[name], expected.tolist(), strict=True)
+        recall = np.mean([len(set(one) & set(other)) / TOP for one, other in both])
+        median, rare = (1e3 * np.quantile(seconds[name], share) for share in (0.5, 0.99))
+        print(f"{name}: {median:.1f} ms (median), {rare:.1f} ms (99 %), {recall:.4f} of the nearest {TOP}; {asking}")
+
+
+def memory() -> str:
+    """The most that this process has had."""
+    return f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB of memory at most"
+
+
+if __name__ == "__main__":
+    main()
