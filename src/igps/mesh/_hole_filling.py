@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
 
+from igps.mesh._arrays import Floats, Integers, Surface
 from igps.mesh.surface import directed_edges, face_parts, undirected_edges
 
 # A hole is small if a circle as long as its rim has at most this share of the area of its part of the surface.
 _SMALL_HOLE = 0.03
 
 
-def with_small_holes_filled(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def with_small_holes_filled(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     """With patches in the small holes."""
     part, areas = face_parts(vertices, faces)
     part_of_vertex = np.zeros(len(vertices), dtype=np.int64)
@@ -32,7 +30,7 @@ def with_small_holes_filled(
     return vertices, faces
 
 
-def _loops(faces: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _loops(faces: Integers) -> list[Integers]:
     """The rims of holes, as the faces that would close them run along them; no loop meets itself.
 
     Where several rims meet in a vertex, or faces do not agree, the free edges still make loops, if any that end nowhere
@@ -71,9 +69,7 @@ def _loops(faces: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return loops
 
 
-def _with_patch(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], loop: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _with_patch(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
     """A patch on a loop, as a disc of rings with the rim's spacing is triangulated, bent like a thin plate."""
     n = len(loop)
     if n == 3:
@@ -95,11 +91,11 @@ def _with_patch(
     return _fair(np.vstack([vertices, points[n:]]), np.vstack([faces, index[patch]]), len(vertices))
 
 
-def _circle(turns: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+def _circle(turns: Floats, radius: float) -> Floats:
     return radius * np.stack([np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)], axis=1)
 
 
-def _relaxed(points: NDArray[np.float64], faces: NDArray[np.int64], n_fixed: int, order: int) -> NDArray[np.float64]:
+def _relaxed(points: Floats, faces: Integers, n_fixed: int, order: int) -> Floats:
     """The free points, after the first `n_fixed`, where the `order`-th power of the umbrella operator vanishes."""
     edges, _ = undirected_edges(faces, len(points))
     size = len(points)
@@ -112,9 +108,7 @@ def _relaxed(points: NDArray[np.float64], faces: NDArray[np.int64], n_fixed: int
     return np.asarray(solved).reshape(-1, 3)
 
 
-def _fair(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], n_old: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _fair(vertices: Floats, faces: Integers, n_old: int) -> Surface:
     """The vertices from `n_old` on moved so that the surface goes on smoothly over the rim (a thin plate)."""
     ring = np.unique(faces[(faces >= n_old).any(axis=1)])
     near = faces[np.isin(faces, ring).any(axis=1)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers, Surface
 from igps.mesh._level_set import LEAST, without_bubbles
 from igps.mesh.mesh import MeshError
 from igps.mesh.surface import (
@@ -22,12 +23,12 @@ from igps.mesh.surface import (
 _FLAT = 0.95
 
 
-def marched(field: NDArray[np.float32], name: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def marched(field: NDArray[np.float32], name: str) -> Surface:
     """The closed surface on which the field is zero, its largest part."""
     return largest(*level_surface(field, name))
 
 
-def level_surface(field: NDArray[np.float32], name: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def level_surface(field: NDArray[np.float32], name: str) -> Surface:
     """The closed surface on which the field is zero; grid points are filled where it would touch itself."""
     from skimage.measure import marching_cubes
 
@@ -54,9 +55,7 @@ def level_surface(field: NDArray[np.float32], name: str) -> tuple[NDArray[np.flo
     return vertices.astype(np.float64), faces
 
 
-def simplified(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], max_vertices: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def simplified(vertices: Floats, faces: Integers, max_vertices: int) -> Surface:
     surplus = len(vertices) - max_vertices
     if surplus <= 0:
         return vertices, faces
@@ -79,9 +78,7 @@ def simplified(
     return with_volume(points, triangles, signed_volume(vertices, faces)), triangles
 
 
-def with_volume(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], volume: float, most: float = 0.25
-) -> NDArray[np.float64]:
+def with_volume(vertices: Floats, faces: Integers, volume: float, most: float = 0.25) -> Floats:
     """The vertices moved along their normals, all by the same length of at most `most`, to give the volume.
 
     Collapsed edges cut corners, which takes some percent of the volume of thin limbs.
@@ -95,7 +92,7 @@ def with_volume(
     return vertices
 
 
-def _bad_edges(faces: NDArray[np.int64], n_vertices: int) -> NDArray[np.int64]:
+def _bad_edges(faces: Integers, n_vertices: int) -> Integers:
     """(E, 2) vertices of the edges that are not run through once in each direction."""
     start, end = directed_edges(faces)
     forward, backward = np.sort(start * n_vertices + end), np.sort(end * n_vertices + start)
@@ -106,7 +103,7 @@ def _bad_edges(faces: NDArray[np.int64], n_vertices: int) -> NDArray[np.int64]:
     return np.stack([bad // n_vertices, bad % n_vertices], axis=1)
 
 
-def largest(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def largest(vertices: Floats, faces: Integers) -> Surface:
     """The connected component of the largest volume."""
     count, label = components(faces, len(vertices))
     if count > 1:
@@ -118,7 +115,7 @@ def largest(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[ND
     return compact(vertices, faces)
 
 
-def _flipped(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+def _flipped(vertices: Floats, faces: Integers) -> Integers:
     """The faces after edges were turned where the two angles that face them are more than 180° together.
 
     Quadrics leave long thin triangles in flat places; there these flips lead to a Delaunay triangulation, on which the
@@ -167,6 +164,6 @@ def _flipped(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray
     return faces
 
 
-def _angle(at: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _angle(at: Floats, a: Floats, b: Floats) -> Floats:
     u, v = a - at, b - at
     return np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("ij,ij->i", u, v))

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from igps.mesh._arrays import Floats, Integers, Surface
 from igps.mesh.surface import face_areas
-
-Surface = tuple[NDArray[np.float64], NDArray[np.int64]]
 
 # A thread takes no more of a triangle than this share of its sides.
 _MOST = 0.5
@@ -36,7 +34,7 @@ def joined_by_threads(parts: Sequence[Surface], share: float) -> Surface:
     return vertices, faces
 
 
-def _nearest(parts: Sequence[NDArray[np.float64]]) -> list[tuple[int, int, int, int]]:
+def _nearest(parts: Sequence[Floats]) -> list[tuple[int, int, int, int]]:
     """Two parts and a vertex of each, for every link of the shortest tree that joins them all."""
     trees, links = [cKDTree(points) for points in parts], []
     best = dict.fromkeys(range(1, len(parts)), (np.inf, 0, 0, 0))
@@ -52,7 +50,7 @@ def _nearest(parts: Sequence[NDArray[np.float64]]) -> list[tuple[int, int, int, 
     return links
 
 
-def _with_thread(vertices: NDArray[np.float64], faces: NDArray[np.int64], a: int, b: int, girth: float) -> Surface:
+def _with_thread(vertices: Floats, faces: Integers, a: int, b: int, girth: float) -> Surface:
     """With a tube of this girth between the largest triangles at two vertices."""
     areas = face_areas(vertices, faces)
     ends = [int(at[areas[at].argmax()]) for at in (np.flatnonzero((faces == v).any(axis=1)) for v in (a, b))]

@@ -11,10 +11,10 @@ the level is moved to give it back: nearby first, then as a whole.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from igps._compiled import compiled
+from igps.mesh._arrays import Booleans, Floats, Integers
 
 # Least absolute value of a voxel that is wholly inside or outside, in shortest sides; half would be the most that all
 # bodies allow. More keeps edges sharper, less leaves round bodies smoother; this serves descriptors best.
@@ -33,7 +33,7 @@ PAD = _BAND + 2
 """Empty voxels that the grid must have on every side."""
 
 
-def smooth_field(share: NDArray[np.float64], spacing: NDArray[np.float64], is_mask: bool) -> NDArray[np.float64]:
+def smooth_field(share: Floats, spacing: Floats, is_mask: bool) -> Floats:
     """The function at the centres of the voxels, in units of length, about the distance to the surface nearby.
 
     Args:
@@ -66,7 +66,7 @@ def smooth_field(share: NDArray[np.float64], spacing: NDArray[np.float64], is_ma
     return field * scale
 
 
-def filled_share(field: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def filled_share(field: Floats) -> tuple[Floats, Floats]:
     """The share of each voxel on which the field is negative, and how fast it grows as the level does."""
     width = np.full(field.shape, 1e-3)
     for axis in range(3):
@@ -75,11 +75,11 @@ def filled_share(field: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
     return np.clip(share, 0, 1), np.where((share > 0) & (share < 1), 1 / width, 0.0)
 
 
-def _bending(sides: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _bending(sides: Floats) -> tuple[Integers, Floats]:
     """Gradient of the sum of squared second differences: offsets (25, 3), the centre's first, and weights (25,)."""
     weights = {(0, 0, 0): 0.0}
 
-    def add(one: NDArray[np.float64], two: NDArray[np.float64], axes: tuple[int, int], factor: float) -> None:
+    def add(one: Floats, two: Floats, axes: tuple[int, int], factor: float) -> None:
         for i, a in enumerate(one):
             for j, b in enumerate(two):
                 offset = [0, 0, 0]
@@ -97,14 +97,14 @@ def _bending(sides: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.
 
 @compiled(fastmath={"contract", "reassoc", "nsz"})
 def _relax(
-    field: NDArray[np.float64],
-    nodes: NDArray[np.int64],
-    steps: NDArray[np.int64],
-    weights: NDArray[np.float64],
+    field: Floats,
+    nodes: Integers,
+    steps: Integers,
+    weights: Floats,
     centre: float,
-    target: NDArray[np.float64],
-    inside: NDArray[np.bool_],
-    margin: NDArray[np.float64],
+    target: Floats,
+    inside: Booleans,
+    margin: Floats,
 ) -> None:
     """Projected Gauss-Seidel sweeps, forwards and backwards in turn, in place."""
     n = len(nodes)

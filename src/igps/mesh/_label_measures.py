@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
+
+from igps.mesh._arrays import Booleans
 
 # Share of the voxels that must lie near balls of a diameter for no part to be thinner; and how near, in radii: corners
 # of a box as thick are no thinner.
@@ -28,13 +29,13 @@ class VoxelMeasures:
     thinnest: int
 
 
-def measured(mask: NDArray[np.bool_]) -> VoxelMeasures:
+def measured(mask: Booleans) -> VoxelMeasures:
     """The measures of a mask (X, Y, Z)."""
     n_pieces = ndimage.label(mask, np.ones((3, 3, 3), dtype=bool))[1]
     return VoxelMeasures(int(np.count_nonzero(mask)), int(n_pieces), thinnest_part(mask))
 
 
-def thinnest_part(mask: NDArray[np.bool_]) -> int:
+def thinnest_part(mask: Booleans) -> int:
     """The largest diameter up to ten voxels of which balls fit into the mask nearly everywhere, at least 1."""
     mask = np.pad(mask, 1)
     parts = 2 if mask.size < _SMALL else 1  # thickness of even numbers of voxels is seen in halves alone

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 
+from igps.mesh._arrays import Booleans, Floats, Integers
 from igps.mesh._distance_grid import BAND
 from igps.mesh._outside import WALL, OrientedSurface
 
@@ -22,7 +23,7 @@ SPECK_VOLUME = 2e-3
 
 
 def level_set(
-    distance: NDArray[np.float32], nearest: NDArray[np.float32], outside: NDArray[np.bool_], surface: OrientedSurface
+    distance: NDArray[np.float32], nearest: NDArray[np.float32], outside: Booleans, surface: OrientedSurface
 ) -> NDArray[np.float32]:
     """The signed distance of solids and, for what has no inside, the distance to a sheet of a cell's thickness."""
     from skimage.segmentation import watershed
@@ -57,11 +58,8 @@ def level_set(
 
 
 def _has_inside(
-    inside: NDArray[np.bool_],
-    at: tuple[NDArray[np.int64], ...],
-    foot: NDArray[np.floating[Any]],
-    way: NDArray[np.floating[Any]],
-) -> NDArray[np.bool_]:
+    inside: Booleans, at: tuple[Integers, ...], foot: NDArray[np.floating[Any]], way: NDArray[np.floating[Any]]
+) -> Booleans:
     """Whether a point is inside or sees an inside when it looks through the surface where that is nearest."""
     solid = inside[at]
     for step in (0.25, 0.5, 0.75, 1.0):
@@ -128,7 +126,7 @@ def joined(field: NDArray[np.float32], notes: list[str]) -> NDArray[np.float32]:
     return without_bubbles(field)
 
 
-def _add_bar(field: NDArray[np.float32], a: NDArray[np.float64], b: NDArray[np.float64]) -> None:
+def _add_bar(field: NDArray[np.float32], a: Floats, b: Floats) -> None:
     low = np.maximum(np.minimum(a, b).astype(int) - 2, 0)
     high = np.minimum(np.maximum(a, b).astype(int) + 3, field.shape)
     box = tuple(slice(low[d], high[d]) for d in range(3))

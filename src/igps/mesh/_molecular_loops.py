@@ -8,17 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._compiled import compiled
+from igps.mesh._arrays import Floats, Integers, Surface
 
 _TURN = 2 * math.pi
 
 
 @compiled()
-def exposed_arcs(
-    centres: NDArray[np.float64],
-    radii: NDArray[np.float64],
-    first: NDArray[np.int64],
-    neighbours: NDArray[np.int64],
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: Integers) -> Surface:
     """The arcs in which two spheres meet outside all other balls.
 
     Args:
@@ -114,11 +110,7 @@ def exposed_arcs(
 
 @compiled()
 def depths(
-    centres: NDArray[np.float64],
-    radii: NDArray[np.float64],
-    shape: tuple[int, int, int],
-    spacing: float,
-    margin: float,
+    centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, margin: float
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """How deep each grid point lies in the ball in which it lies deepest, and in which that is.
 
@@ -158,12 +150,12 @@ def depths(
 def distances_outside(
     depth: NDArray[np.float32],
     owner: NDArray[np.int32],
-    centres: NDArray[np.float64],
-    radii: NDArray[np.float64],
-    first: NDArray[np.int64],
-    neighbours: NDArray[np.int64],
-    exposed: NDArray[np.int64],
-    arcs: NDArray[np.float64],
+    centres: Floats,
+    radii: Floats,
+    first: Integers,
+    neighbours: Integers,
+    exposed: Integers,
+    arcs: Floats,
     spacing: float,
     reach: float,
 ) -> NDArray[np.float32]:
@@ -258,7 +250,7 @@ def _span(low: float, high: float, spacing: float, size: int) -> tuple[int, int]
 
 
 @compiled()
-def cubic_values(field: NDArray[np.float32], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def cubic_values(field: NDArray[np.float32], points: Floats) -> Floats:
     """A function on a grid and its gradient, (P, 4), between its points by cubic convolution (Keys 1981).
 
     Args:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from igps.mesh._arrays import Booleans, Floats, Integers
 from igps.mesh._distance_grid import MARGIN
 from igps.mesh.surface import area_vectors, face_areas, signed_volume, unit
 
@@ -44,12 +45,12 @@ _FEW_PAIRS = 10**7
 class OrientedSurface:
     """The surface with each connected part turned outward as a whole, for its winding numbers."""
 
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    vertices: Floats
+    faces: Integers
     is_nearly_closed: bool
 
     @classmethod
-    def of(cls, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> OrientedSurface:
+    def of(cls, vertices: Floats, faces: Integers) -> OrientedSurface:
         import igl
 
         _, first, index = np.unique(np.round(vertices, 4), axis=0, return_index=True, return_inverse=True)
@@ -90,7 +91,7 @@ class OrientedSurface:
         """Volume over area, cells: half of a plate's thickness, half of a rod's radius, a third of a ball's."""
         return signed_volume(self.vertices, self.faces) / float(face_areas(self.vertices, self.faces).sum())
 
-    def winding(self, points: NDArray[Any]) -> NDArray[np.float64]:
+    def winding(self, points: NDArray[Any]) -> Floats:
         if not len(points) or not len(self.faces):
             return np.zeros(len(points))
         import igl
@@ -117,7 +118,7 @@ class OrientedSurface:
         return replace(bare, is_nearly_closed=_defect(bare.winding(points)) < _NEARLY_CLOSED)
 
 
-def _probes(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _probes(vertices: Floats, faces: Integers) -> tuple[Floats, Floats]:
     """Middles of faces, chosen evenly by area from the first to the last, and their unit normals."""
     normals = area_vectors(vertices, faces)
     area = np.linalg.norm(normals, axis=1)
@@ -127,12 +128,12 @@ def _probes(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[ND
     return vertices[faces[face]].mean(axis=1), normals[face] / area[face, None]
 
 
-def _defect(winding: NDArray[np.float64]) -> float:
+def _defect(winding: Floats) -> float:
     """Mean distance to 0, 1, 2, ...: zero beside closed surfaces that are turned outward."""
     return float(np.abs(winding - np.maximum(np.round(winding), 0)).mean())
 
 
-def outside_of(distance: NDArray[np.float32], surface: OrientedSurface) -> tuple[NDArray[np.bool_], int]:
+def outside_of(distance: NDArray[np.float32], surface: OrientedSurface) -> tuple[Booleans, int]:
     """Which grid points the flood reaches, walls excepted, and how many openings were closed to it."""
     label, _ = ndimage.label(distance > WALL)
     outside = label == label[0, 0, 0]
@@ -152,8 +153,8 @@ def outside_of(distance: NDArray[np.float32], surface: OrientedSurface) -> tuple
 
 
 def _outside_by_winding(
-    outside: NDArray[np.bool_], distance: NDArray[np.float32], surface: OrientedSurface
-) -> tuple[NDArray[np.bool_], int]:
+    outside: Booleans, distance: NDArray[np.float32], surface: OrientedSurface
+) -> tuple[Booleans, int]:
     near = np.argwhere(outside & np.isfinite(distance))
     # A third of the points beside the surface, in all directions, shows whether the flood went in anywhere.
     probe = near[near.sum(axis=1) % 3 == 0]
@@ -174,7 +175,7 @@ def _outside_by_winding(
     return outside & ~inside, count
 
 
-def _cavities(outside: NDArray[np.bool_], surface: OrientedSurface) -> NDArray[np.bool_]:
+def _cavities(outside: Booleans, surface: OrientedSurface) -> Booleans:
     """The middles of what lies behind holes: connected to the outside only by passages of less than half their width.
 
     The passages are measured by balls of a growing radius.
@@ -199,7 +200,7 @@ def _cavities(outside: NDArray[np.bool_], surface: OrientedSurface) -> NDArray[n
     return found
 
 
-def _border(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _border(shape: tuple[int, ...]) -> Booleans:
     border = np.ones(shape, dtype=bool)
     border[1:-1, 1:-1, 1:-1] = False
     return border

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh.mesh import MeshError
 from igps.mesh.surface import longest_side
 
@@ -15,9 +15,7 @@ _MANY_POINTS = 200_000
 _LINE = 1e-5
 
 
-def splats(
-    points: NDArray[np.float64], normals: NDArray[np.float64] | None, resolution: int, name: str
-) -> tuple[NDArray[np.float64], NDArray[np.int64], float]:
+def splats(points: Floats, normals: Floats | None, resolution: int, name: str) -> tuple[Floats, Integers, float]:
     """A disc (a hexagon) around each point of a cloud, and the spacing of the points."""
     if len(points) < 10:
         raise MeshError(

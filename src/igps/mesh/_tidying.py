@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import compact, diagonal, face_areas, face_parts, signed_volume, undirected_edges
 from igps.mesh.winding import winding_number
@@ -19,9 +19,7 @@ SPECK = 2e-3
 _FINS = 0.05
 
 
-def welded(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def welded(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     """Coincident vertices made one, degenerate and doubled faces and unused vertices dropped, neighbours turned alike.
 
     Vertices and faces that stay keep their order. What was done is added to `notes`.
@@ -46,7 +44,7 @@ def welded(
     return vertices, oriented(faces, notes)
 
 
-def places(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
+def places(vertices: Floats) -> Integers:
     """(V,) of each vertex the first that is in the same place.
 
     On a lattice in units of the bounding box, so that the unit of length does not matter.
@@ -56,13 +54,13 @@ def places(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.asarray(first[index.ravel()])
 
 
-def are_specks(areas: NDArray[np.float64]) -> NDArray[np.bool_]:
+def are_specks(areas: Floats) -> Booleans:
     """Which of some parts with these areas are crumbs beside the others; none if all of them together are many."""
     specks = areas < SPECK * areas.sum()
     return specks & (areas[specks].sum() < 10 * SPECK * areas.sum())
 
 
-def oriented(faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.int64]:
+def oriented(faces: Integers, notes: list[str]) -> Integers:
     """The faces turned so that neighbours agree, as far as the surface can be oriented; the smaller side is turned."""
     if not len(faces):
         return faces
@@ -78,9 +76,7 @@ def oriented(faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.int64]:
     return faces
 
 
-def tidied(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def tidied(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     """Without fins and specks."""
     kept = _without_fins(vertices, faces)
     if len(kept) < len(faces):
@@ -96,7 +92,7 @@ def tidied(
     return vertices, oriented(faces, notes)
 
 
-def _without_fins(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+def _without_fins(vertices: Floats, faces: Integers) -> Integers:
     """Without the faces that hang on an edge of two others, peeled from their free edges; all, if they are many."""
     kept = faces
     while len(kept):
@@ -111,9 +107,7 @@ def _without_fins(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> ND
     return kept if left >= (1 - _FINS) * face_areas(vertices, faces).sum() else faces
 
 
-def without_hidden(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str], *, cavities: bool = False
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def without_hidden(vertices: Floats, faces: Integers, notes: list[str], *, cavities: bool = False) -> Surface:
     """Without the parts that lie inside the largest, if that is closed.
 
     Args:

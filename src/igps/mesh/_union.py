@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh._hole_filling import with_small_holes_filled
 from igps.mesh._tidying import SPECK, oriented, tidied, welded
 from igps.mesh.mesh import Mesh, MeshError
@@ -19,9 +19,7 @@ _COINCIDENT = 1e-6
 _MOST_PATCHES, _MOST_PARTS = 200, 200
 
 
-def without_walls(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def without_walls(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     """Without the walls inside the body, and the sheets that lie on another, where more than two faces meet in an edge.
 
     Parts that overlap and have vertices in common leave them, as a body does that was cut and put together again. A
@@ -46,14 +44,7 @@ def without_walls(
     return vertices, oriented(faces, notes)
 
 
-def _superfluous(
-    points: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    areas: NDArray[np.float64],
-    places: NDArray[np.float64],
-    at: NDArray[np.int64],
-    sees: NDArray[np.bool_],
-) -> int:
+def _superfluous(points: Floats, faces: Integers, areas: Floats, places: Floats, at: Integers, sees: Booleans) -> int:
     """The patch that may go first, or −1; `places` lie on the faces `at`, −1 on one that is gone."""
     import igl
 
@@ -74,9 +65,7 @@ def _superfluous(
     return -1
 
 
-def _places(
-    points: NDArray[np.float64], faces: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+def _places(points: Floats, faces: Integers) -> tuple[Floats, Integers, Booleans]:
     """Places (S, 3) on each patch, evenly by area and always the same; the faces (S,) they are on; who sees outside."""
     import igl
 
@@ -99,16 +88,14 @@ def _places(
     return places, at, 1 - np.minimum(*occluded) > _OPEN
 
 
-def _inverse(kept: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+def _inverse(kept: Integers, n: int) -> Integers:
     """Where each of `n` is among those kept, −1 if it is not."""
     where = np.full(n, -1)
     where[kept] = np.arange(len(kept))
     return where
 
 
-def united(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def united(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     """The outer surface of parts that are closed each by itself and overlap, by manifold3d.
 
     Each part is tidied on its own, and turned outward. The surface as it is, and no note, if a part is not closed, if

@@ -19,9 +19,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh.surface import area_vectors, longest_side, undirected_edges, unit, vertex_normals
 
 # The lower quartile of that remainder over the mean length of a vertex's edges: up to 0.014 on generated shapes of more
@@ -71,7 +71,7 @@ _FACES_AT_ONCE, _MOST_AROUND = 2**15, 64
 _QUARTILE = 0.3186
 
 
-def is_noisy(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
+def is_noisy(vertices: Floats, faces: Integers) -> bool:
     """Whether most of a surface is rough with noise that neighbouring vertices do not share.
 
     Args:
@@ -94,14 +94,14 @@ def is_noisy(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
 class _Neighbours:
     """Of each vertex; where most are among thin triangles, the near ones: by the inverse squares of their distances."""
 
-    edges: NDArray[np.int64]  # (E, 2)
-    edge_of: NDArray[np.int64]  # (3F,): of every side of every face
+    edges: Integers  # (E, 2)
+    edge_of: Integers  # (3F,): of every side of every face
     averaging: sparse.csr_array  # (V, V): averages over the neighbours
-    length: NDArray[np.float64]  # (V,): of a vertex's edges
-    stretch: NDArray[np.float64]  # (V,): mean length of a vertex's edges over that of the near ones
+    length: Floats  # (V,): of a vertex's edges
+    stretch: Floats  # (V,): mean length of a vertex's edges over that of the near ones
 
     @staticmethod
-    def of(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> _Neighbours:
+    def of(vertices: Floats, faces: Integers) -> _Neighbours:
         """Of vertices in units of `_unit_of_length`."""
         n = len(vertices)
         edges, edge_of = undirected_edges(faces, n)
@@ -121,14 +121,12 @@ class _Neighbours:
         return _Neighbours(edges, edge_of, averaging, of_vertex, stretch)
 
     @property
-    def faces_at_sides(self) -> NDArray[np.int64]:
+    def faces_at_sides(self) -> Integers:
         """(F, 3) how many faces share the side from each corner to the next."""
         return np.asarray(np.bincount(self.edge_of)[self.edge_of].reshape(-1, 3))
 
 
-def _statistics(
-    vertices: NDArray[np.float64], normals: NDArray[np.float64], around: _Neighbours
-) -> tuple[float, float]:
+def _statistics(vertices: Floats, normals: Floats, around: _Neighbours) -> tuple[float, float]:
     """The lower quartile of the remainder over the edges' lengths, and the share of neighbours that have its sign."""
     edges, averaging, length = around.edges, around.averaging, around.length
     height = np.einsum("ij,ij->i", vertices - averaging @ vertices, normals)
@@ -138,7 +136,7 @@ def _statistics(
     return float(np.quantile(np.abs(rest), 0.25)), float(np.average(alike, weights=weights))
 
 
-def denoised(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+def denoised(vertices: Floats, faces: Integers) -> Floats:
     """(V, 3) vertices of a smoother surface of the same size; those on boundaries stay where they are.
 
     Taubin's λ|μ passes (1995), as many as the noise asks for, see `noise_over_edge`. Where triangles are thin, that is
@@ -167,9 +165,7 @@ def denoised(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray
     return unit_length * (vertices + move)
 
 
-def _filtered_normals(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], smooth: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _filtered_normals(vertices: Floats, faces: Integers, smooth: Floats) -> Floats:
     """(F, 3) unit normals: means over the faces that share a vertex, by area and by how alike a guide's normals are.
 
     The guide is the smooth surface at first, then what came of the run before.
@@ -193,9 +189,7 @@ def _filtered_normals(
     return normals
 
 
-def _with_normals(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], normals: NDArray[np.float64], free: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _with_normals(vertices: Floats, faces: Integers, normals: Floats, free: Floats) -> Floats:
     """(V, 3) vertices moved, as far as they are free (V, 1), until their faces have about these normals (F, 3)."""
     to_vertices = _at_corners(faces, len(vertices)).T.tocsr()
     projections = (to_vertices @ (normals[:, :, None] * normals[:, None]).reshape(-1, 9)).reshape(-1, 3, 3)
@@ -208,13 +202,13 @@ def _with_normals(
     return vertices
 
 
-def _at_corners(faces: NDArray[np.int64], n_vertices: int) -> sparse.csr_array:
+def _at_corners(faces: Integers, n_vertices: int) -> sparse.csr_array:
     """(F, V) ones where a face has a vertex."""
     begins = 3 * np.arange(len(faces) + 1)
     return sparse.csr_array((np.ones(faces.size), faces.ravel(), begins), shape=(len(faces), n_vertices))
 
 
-def noise_over_edge(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
+def noise_over_edge(vertices: Floats, faces: Integers) -> float:
     """Standard deviation of the noise along the normals over the root of the mean squared length of the noisy edges.
 
     On thin triangles, of the near ones.
@@ -228,9 +222,7 @@ def noise_over_edge(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> 
     return noise / edge
 
 
-def _noise_and_edge(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], around: _Neighbours
-) -> tuple[float, float]:
+def _noise_and_edge(vertices: Floats, faces: Integers, around: _Neighbours) -> tuple[float, float]:
     """The two lengths of `noise_over_edge`, in the unit of the vertices."""
     normals = vertex_normals(around.averaging @ (around.averaging @ vertices), faces)
     high_pass = (sparse.eye_array(len(vertices), format="csr") - around.averaging).tocsr()
@@ -240,13 +232,13 @@ def _noise_and_edge(
     return float(noise), float(max(np.sqrt(np.mean(around.length**2)), np.finfo(float).tiny))
 
 
-def _unit_of_length(vertices: NDArray[np.float64]) -> float:
+def _unit_of_length(vertices: Floats) -> float:
     """The longest side, up to a power of two: squares of lengths are numbers in it, and to divide by it is exact."""
     _, exponent = np.frexp(max(longest_side(vertices), np.finfo(float).tiny))
     return float(np.ldexp(1.0, int(exponent) - 1))
 
 
-def _share_of_flat_edges(vertices: NDArray[np.float64], faces: NDArray[np.int64], edge_of: NDArray[np.int64]) -> float:
+def _share_of_flat_edges(vertices: Floats, faces: Integers, edge_of: Integers) -> float:
     """The share of edges whose two triangles lie in one plane, of faces whose sides (3F,) are these edges."""
     normals = unit(area_vectors(vertices, faces))
     order = np.argsort(edge_of, kind="stable")

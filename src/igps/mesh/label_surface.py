@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from igps.mesh._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh._isosurface import level_surface, simplified, with_volume
 from igps.mesh._label_field import PAD, filled_share, smooth_field
 from igps.mesh._level_set import LEAST, without_bubbles
@@ -45,7 +46,7 @@ def voxel_surface(
     max_vertices: int = MAX_VERTICES,
     cavities: bool = False,
     name: str = "volume",
-) -> tuple[NDArray[np.float64], NDArray[np.int64], tuple[str, ...]]:
+) -> tuple[Floats, Integers, tuple[str, ...]]:
     """The closed, outward surface of the voxels of a body.
 
     It encloses the volume of the voxels, has every centre of a voxel on its side (unless it was put on a coarser grid),
@@ -111,7 +112,7 @@ def voxel_surface(
     return vertices, faces, tuple(notes)
 
 
-def checked_spacing(affine: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+def checked_spacing(affine: Floats, name: str) -> Floats:
     """(3,) sides of a voxel, length.
 
     Raises:
@@ -128,9 +129,7 @@ def checked_spacing(affine: NDArray[np.float64], name: str) -> NDArray[np.float6
     return spacing
 
 
-def _whole(
-    mask: NDArray[np.bool_], notes: list[str], least: int | None
-) -> tuple[NDArray[np.bool_], list[NDArray[np.bool_]]]:
+def _whole(mask: Booleans, notes: list[str], least: int | None) -> tuple[Booleans, list[Booleans]]:
     """Without islands, and with holes filled; and the holes of at least so many voxels, none if None."""
     label, island, size = _islands(mask)
     if len(island):
@@ -153,7 +152,7 @@ def _whole(
     return mask, []
 
 
-def _islands(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64]]:
+def _islands(mask: Booleans) -> tuple[NDArray[np.int32], Integers, Integers]:
     """The piece of each voxel, from 1; the pieces that are too small to stay; and the voxels of each, of 0 none."""
     label, _ = ndimage.label(mask, _TOUCHING)
     size = np.bincount(label.reshape(-1))
@@ -161,7 +160,7 @@ def _islands(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int
     return label, np.nonzero(size < _ISLAND * size.sum())[0][1:], size
 
 
-def _joined(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _joined(mask: Booleans) -> Booleans:
     """Where pieces share an edge or a corner only, voxels beside that are added."""
     for _ in range(3):
         label, n_pieces = ndimage.label(mask)
@@ -185,7 +184,7 @@ def _joined(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return mask
 
 
-def _n_vertices(mask: NDArray[np.bool_], sides: NDArray[np.float64]) -> float:
+def _n_vertices(mask: Booleans, sides: Floats) -> float:
     """About how many vertices marching cubes make on a grid as fine as the shortest side."""
     area = 0.0
     for axis in range(3):
@@ -194,9 +193,7 @@ def _n_vertices(mask: NDArray[np.bool_], sides: NDArray[np.float64]) -> float:
     return float(area / sides.min() ** 2)
 
 
-def _coarsened(
-    mask: NDArray[np.bool_], spacing: NDArray[np.float64], max_vertices: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> Surface:
     """Shares of larger voxels, and how many of the given ones each takes along each axis."""
     share, factor = mask.astype(np.float32), np.ones(3, dtype=np.int64)
     n_pieces = ndimage.label(mask, _TOUCHING)[1]
@@ -220,7 +217,7 @@ def _coarsened(
     return share.astype(np.float64), factor
 
 
-def _is_thick(mask: NDArray[np.bool_], axes: NDArray[np.bool_]) -> bool:
+def _is_thick(mask: Booleans, axes: Booleans) -> bool:
     """Whether hardly any of the body is less than three voxels thick along the axes."""
     size = np.where(axes, 3, 1)
     core = ndimage.minimum_filter(mask, tuple(size), mode="constant")
@@ -228,15 +225,13 @@ def _is_thick(mask: NDArray[np.bool_], axes: NDArray[np.bool_]) -> bool:
     return bool(np.count_nonzero(mask & ~reached) <= _THIN * np.count_nonzero(mask))
 
 
-def _fineness(sides: NDArray[np.float64], n_vertices: float) -> NDArray[np.int64]:
+def _fineness(sides: Floats, n_vertices: float) -> Integers:
     """Into how many parts each side goes, so that the parts are about equal and make vertices enough."""
     finer = min(max(math.ceil(math.sqrt(_FEWEST / n_vertices)), 1), _MOST_REFINED)
     return np.maximum(np.round(finer * sides / sides.min()), 1).astype(np.int64)
 
 
-def _refined(
-    field: NDArray[np.float64], share: NDArray[np.float64], fineness: NDArray[np.int64], least: float
-) -> NDArray[np.float64]:
+def _refined(field: Floats, share: Floats, fineness: Integers, least: float) -> Floats:
     """The field between the centres of the voxels, at the level that gives their volume.
 
     It is negative between neighbours in the body, which therefore hold together.
@@ -262,9 +257,7 @@ def _refined(
     return field
 
 
-def _meshed(
-    field: NDArray[np.float64], sides: NDArray[np.float64], volume: float, max_vertices: int, name: str
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _meshed(field: Floats, sides: Floats, volume: float, max_vertices: int, name: str) -> Surface:
     """The zero level of a field as closed pieces, in the unit of the sides, which are about equal."""
     cell = float(sides.min())
     level = np.where(field < 0, np.minimum(field, -LEAST * cell), np.maximum(field, LEAST * cell)) / cell

@@ -13,8 +13,8 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh._hole_filling import with_small_holes_filled
 from igps.mesh._tidying import tidied, welded, without_hidden
 from igps.mesh._union import united, without_walls
@@ -49,12 +49,12 @@ _PLENTY = 4
 
 
 def mend(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int64] | None,
+    vertices: Floats,
+    faces: Integers | None,
     *,
     how: Mending = "auto",
     least_vertices: int = 0,
-    normals: NDArray[np.float64] | None = None,
+    normals: Floats | None = None,
     cavities: Cavities = "fill",
     name: str = "mesh",
     notes: tuple[str, ...] = (),
@@ -111,7 +111,7 @@ def mended_by(notes: Iterable[str]) -> tuple[Step, ...]:
     return tuple(dict.fromkeys(steps))
 
 
-def _mended(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str, cavities: bool) -> Mesh:
+def _mended(vertices: Floats, faces: Integers, name: str, cavities: bool) -> Mesh:
     notes: list[str] = []
     given = vertices, faces
     hidden = partial(without_hidden, cavities=cavities)
@@ -128,9 +128,7 @@ def _mended(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str, 
     return body.told(notes=tuple(notes))
 
 
-def _body(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str], name: str, cavities: bool
-) -> Mesh | None:
+def _body(vertices: Floats, faces: Integers, notes: list[str], name: str, cavities: bool) -> Mesh | None:
     """The body that these are, smoothed if it is noisy; None if they are none."""
     try:
         mesh = Mesh(vertices, faces, name=name, notes=tuple(notes), cavities=cavities)
@@ -140,7 +138,7 @@ def _body(
     return mesh if smooth is mesh.vertices else replace(mesh, vertices=smooth, notes=tuple(notes))
 
 
-def _remade(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str, cavities: bool) -> Mesh:
+def _remade(vertices: Floats, faces: Integers, name: str, cavities: bool) -> Mesh:
     """The surface as it is, welded or smoothed, if it bounds one body then; otherwise what a grid makes of it."""
     notes: list[str] = []
     neat, triangles = vertices, faces
@@ -155,14 +153,14 @@ def _remade(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str, 
     return body.told(notes=tuple(notes))
 
 
-def _smoothed(vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.float64]:
+def _smoothed(vertices: Floats, faces: Integers, notes: list[str]) -> Floats:
     if not len(faces) or not is_noisy(vertices, faces):
         return vertices
     notes.append("smoothed: the surface was rough with noise")
     return denoised(vertices, faces)
 
 
-def _check_cloud(vertices: NDArray[np.float64], name: str) -> None:
+def _check_cloud(vertices: Floats, name: str) -> None:
     points = np.asarray(vertices, dtype=np.float64)
     if points.size == 0:
         raise MeshError(f"{name}: the file is empty: no vertices and no faces. Export it again.")
@@ -177,7 +175,7 @@ def _check_cloud(vertices: NDArray[np.float64], name: str) -> None:
     check_size(points, name)
 
 
-def _check_extent(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> None:
+def _check_extent(vertices: Floats, faces: Integers, name: str) -> None:
     if len(faces) == 1:
         raise MeshError(f"{name}: a single triangle is no body. Check that the export is complete.")
     corners = vertices[faces]

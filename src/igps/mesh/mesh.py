@@ -10,8 +10,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from igps.mesh._arrays import Booleans, Floats, Integers
 from igps.mesh.surface import (
     compact,
     components,
@@ -84,8 +85,8 @@ class Mesh:
             a distance from the origin at which numbers lose their digits.
     """
 
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    vertices: Floats
+    faces: Integers
     name: str = "mesh"
     allow_open: bool = False
     notes: tuple[str, ...] = field(default=())
@@ -157,7 +158,7 @@ class Mesh:
         object.__setattr__(other, "faces", rank[self.faces])
         return other
 
-    def outer(self) -> tuple[Mesh, NDArray[np.bool_]]:
+    def outer(self) -> tuple[Mesh, Booleans]:
         """The body without its cavities, and which of the vertices (V,) are its."""
         n_components, owner = components(self.faces, len(self.vertices)) if self.cavities else (1, None)
         if n_components == 1:
@@ -221,7 +222,7 @@ def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
         )
 
 
-def check_size(vertices: NDArray[np.float64], name: str) -> None:
+def check_size(vertices: Floats, name: str) -> None:
     """Raise a MeshError where a surface is too small, too large or too far away to compute with."""
     with np.errstate(over="ignore"):
         length, distance = diagonal(vertices), float(np.abs(vertices).max())
@@ -238,7 +239,7 @@ def check_size(vertices: NDArray[np.float64], name: str) -> None:
         )
 
 
-def _check_topology(faces: NDArray[np.int64], n_vertices: int, name: str, allow_open: bool, cavities: bool) -> None:
+def _check_topology(faces: Integers, n_vertices: int, name: str, allow_open: bool, cavities: bool) -> None:
     repeated = int((faces == np.roll(faces, 1, axis=1)).any(axis=1).sum())
     if repeated:
         raise MeshError(f"{name}: {repeated} faces use a vertex twice. Read the file with {_REPAIR} to drop them.")
@@ -277,7 +278,7 @@ def _check_topology(faces: NDArray[np.int64], n_vertices: int, name: str, allow_
         )
 
 
-def _check_cavities(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> None:
+def _check_cavities(vertices: Floats, faces: Integers, name: str) -> None:
     n_components, owner = components(faces, len(vertices))
     if n_components == 1:
         return

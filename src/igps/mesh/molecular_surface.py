@@ -16,6 +16,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from igps._threads import one_thread
+from igps.mesh._arrays import Floats, Integers, Surface
 from igps.mesh._isosurface import level_surface, simplified
 from igps.mesh._joining import joined_by_threads
 from igps.mesh._level_set import LEAST, SPECK_VOLUME, without_bubbles
@@ -109,9 +110,7 @@ def _check(kind: str, probe: float, spacing: float, pieces: str) -> None:
         raise ValueError(f"spacing: expected more than 0 Å, got {spacing}.")
 
 
-def _outermost(
-    centres: NDArray[np.float64], radii: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
     """The balls that lie in no other, largest first; of equal ones the first. What has no radius is left out."""
     order = np.argsort(-radii, kind="stable")
     order = order[radii[order] > 0]
@@ -126,7 +125,7 @@ def _outermost(
 
 
 def _field(
-    centres: NDArray[np.float64], radii: NDArray[np.float64], shape: tuple[int, int, int], spacing: float, probe: float
+    centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, probe: float
 ) -> NDArray[np.float32]:
     """How far each grid point is from the surface, in cells, negative inside; with `probe` of 0 that of the balls."""
     margin = _MARGIN * spacing
@@ -139,9 +138,7 @@ def _field(
     return ((np.float32(probe) - depth) / np.float32(spacing)).astype(np.float32)
 
 
-def _neighbours(
-    centres: NDArray[np.float64], radii: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _neighbours(centres: Floats, radii: Floats) -> tuple[Integers, Integers]:
     """Those balls that meet ball i are `neighbours[first[i]:first[i + 1]]`, nearest first."""
     pairs = cKDTree(centres).query_pairs(2 * radii.max(), output_type="ndarray")
     apart = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
@@ -153,8 +150,8 @@ def _neighbours(
 
 
 def _one_piece(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], pieces: Pieces, max_vertices: int | None, notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    vertices: Floats, faces: Integers, pieces: Pieces, max_vertices: int | None, notes: list[str]
+) -> Surface:
     """The surface of the largest piece, or of all but specks, joined; each with its share of the vertices."""
     n_pieces, owner = components(faces, len(vertices))
     parts = [compact(vertices, faces[owner[faces[:, 0]] == k]) for k in range(n_pieces)]
@@ -171,9 +168,7 @@ def _one_piece(
     return joined_by_threads(parts, _THREADS)
 
 
-def _settled(
-    field: NDArray[np.float32], vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _settled(field: NDArray[np.float32], vertices: Floats, faces: Integers) -> Floats:
     """The vertices moved to where the field is zero, and evenly apart along it; faces neither cut corners nor bulge.
 
     Triangles with their corners on a curved surface lie on one side of it. How far, at their centres, tells by how much
@@ -194,7 +189,7 @@ def _settled(
     return vertices - 0.75 * _at_vertices(heights, vertices, faces) * vertex_normals(vertices, faces)
 
 
-def _steps(field: NDArray[np.float32], points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _steps(field: NDArray[np.float32], points: Floats) -> tuple[Floats, Floats]:
     """How far points lie off the surface, as vectors (P, 3) in cells, and their directions; both point outwards."""
     found = cubic_values(field, points)
     # The slope of a distance is 1; where it is not, as in the middle between two surfaces, it leads nowhere.
@@ -203,9 +198,7 @@ def _steps(field: NDArray[np.float32], points: NDArray[np.float64]) -> tuple[NDA
     return np.clip(found[:, 0] / slope, -_STEP, _STEP)[:, None] * normals, normals
 
 
-def _at_vertices(
-    values: NDArray[np.float64], vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _at_vertices(values: Floats, vertices: Floats, faces: Integers) -> Floats:
     """(V, D) means of the values (F, D) of the faces around each vertex, by their areas."""
     areas, corners = face_areas(vertices, faces), faces.ravel()
     total = np.maximum(np.bincount(corners, np.repeat(areas, 3), len(vertices)), np.finfo(float).tiny)

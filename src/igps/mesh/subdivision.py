@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers, Surface
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import undirected_edges
 
@@ -27,13 +27,7 @@ def subdivided(mesh: Mesh, n_vertices: int) -> Mesh:
     return replace(mesh, vertices=vertices, faces=faces, notes=(*mesh.notes, note))
 
 
-def _cut(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    edges: NDArray[np.int64],
-    edge_of_side: NDArray[np.int64],
-    cut: NDArray[np.int64],
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _cut(vertices: Floats, faces: Integers, edges: Integers, edge_of_side: Integers, cut: Integers) -> Surface:
     """New vertices in the middles of the edges `cut`, and every face with such edges cut accordingly."""
     middle = np.full(len(edges), -1)
     middle[cut] = len(vertices) + np.arange(len(cut))

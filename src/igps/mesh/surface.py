@@ -7,34 +7,36 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from igps.mesh._arrays import Booleans, Floats, Integers, Surface
+
 _FLAT = 2.0**-26  # height over length of a triangle that counts as flat
 
 
-def area_vectors(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+def area_vectors(vertices: Floats, faces: Integers) -> Floats:
     """Normal of each face times its area: (F, 3), length²."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a) / 2
 
 
-def face_areas(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+def face_areas(vertices: Floats, faces: Integers) -> Floats:
     """(F,) areas, length²."""
     return np.linalg.norm(area_vectors(vertices, faces), axis=1)
 
 
-def vertex_areas(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
     """(V,) a third of the areas of the faces around each vertex, length²."""
     third = np.repeat(face_areas(vertices, faces) / 3, 3)
     return np.asarray(np.bincount(faces.ravel(), third, len(vertices)), dtype=np.float64)
 
 
-def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
     """(V, 3) outward unit normals of the vertices, means of those of their faces weighted by area."""
     corners = faces.ravel()
     vectors = np.repeat(area_vectors(vertices, faces), 3, axis=0)
     return unit(np.column_stack([np.bincount(corners, vectors[:, i], len(vertices)) for i in range(3)]))
 
 
-def mean_of_neighbours(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+def mean_of_neighbours(vertices: Floats, faces: Integers) -> Floats:
     """(V, 3) length, the mean of each vertex's neighbours, each by the inverse square of its distance."""
     ends = undirected_edges(faces, len(vertices))[0]
     squares = np.square(vertices[ends[:, 0]] - vertices[ends[:, 1]]).sum(axis=1)
@@ -49,40 +51,40 @@ def mean_of_neighbours(vertices: NDArray[np.float64], faces: NDArray[np.int64]) 
     return sums / total[:, None]
 
 
-def unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def unit(vectors: Floats) -> Floats:
     """(N, 3) vectors of length 1 in the same directions; zero stays zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
-def box_sides(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def box_sides(points: Floats) -> Floats:
     """(3,) sides of the bounding box of points (N, 3), length."""
     # By columns that lie side by side NumPy takes a thirtieth of the time.
     return np.asarray(np.ptp(np.ascontiguousarray(points.T), axis=1))
 
 
-def longest_side(points: NDArray[np.float64]) -> float:
+def longest_side(points: Floats) -> float:
     """The longest side of the bounding box of points (N, 3), length."""
     return float(box_sides(points).max())
 
 
-def diagonal(vertices: NDArray[np.float64]) -> float:
+def diagonal(vertices: Floats) -> float:
     """Length of the diagonal of the bounding box."""
     return float(np.linalg.norm(box_sides(vertices)))
 
 
-def directed_edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def directed_edges(faces: Integers) -> tuple[Integers, Integers]:
     """First and second vertex of every side of every face: (3F,) each, face by face."""
     return faces.ravel(), np.roll(faces, -1, axis=1).ravel()
 
 
-def undirected_edges(faces: NDArray[np.int64], n_vertices: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def undirected_edges(faces: Integers, n_vertices: int) -> tuple[Integers, Integers]:
     """The edges in ascending order, (E, 2) with the smaller vertex first; and (3F,) the edge of every side."""
     start, end = directed_edges(faces)
     keys, edge_of = np.unique(np.minimum(start, end) * n_vertices + np.maximum(start, end), return_inverse=True)
     return np.stack([keys // n_vertices, keys % n_vertices], axis=1), edge_of
 
 
-def components(faces: NDArray[np.int64], n_vertices: int) -> tuple[int, NDArray[np.int32]]:
+def components(faces: Integers, n_vertices: int) -> tuple[int, NDArray[np.int32]]:
     """Number of connected components, and the number of each vertex's, (V,)."""
     start, end = directed_edges(faces)
     graph = sparse.coo_array((np.ones(len(start), dtype=np.int8), (start, end)), shape=(n_vertices, n_vertices))
@@ -90,9 +92,7 @@ def components(faces: NDArray[np.int64], n_vertices: int) -> tuple[int, NDArray[
     return int(count), label
 
 
-def face_parts(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def face_parts(vertices: Floats, faces: Integers) -> tuple[Integers, Floats]:
     """The connected part of each face, (F,) counted from zero, and the areas of the parts, length²."""
     _, label = components(faces, len(vertices))
     _, part = np.unique(label[faces[:, 0]], return_inverse=True)
@@ -100,7 +100,7 @@ def face_parts(
     return part.astype(np.int64), area.astype(np.float64)
 
 
-def face_patches(faces: NDArray[np.int64], n_vertices: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def face_patches(faces: Integers, n_vertices: int) -> tuple[Integers, Booleans]:
     """The patch of each face, and which patches end only where at least two other faces meet.
 
     Faces are of one patch that share an edge with each other alone.
@@ -124,25 +124,25 @@ def face_patches(faces: NDArray[np.int64], n_vertices: int) -> tuple[NDArray[np.
     return patch.astype(np.int64), (np.bincount(patch_at, weights=free, minlength=n_patches) == 0) & shared
 
 
-def signed_volume(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
+def signed_volume(vertices: Floats, faces: Integers) -> float:
     """What a closed surface encloses, length³, negative if it is inside out (of an open one: of its cone over the
     centre of its vertices)."""
     centred = vertices - vertices.mean(axis=0)
     return float(np.einsum("ij,ij->", centred[faces[:, 0]], area_vectors(centred, faces)) / 3)
 
 
-def compact(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def compact(vertices: Floats, faces: Integers) -> Surface:
     """The vertices that faces use, in their order, and the faces that use them."""
     used, index = np.unique(faces, return_inverse=True)
     return vertices[used], index.reshape(-1, 3)
 
 
-def genus(faces: NDArray[np.int64], n_vertices: int) -> int:
+def genus(faces: Integers, n_vertices: int) -> int:
     """Handles of a closed surface of C pieces, by Euler's formula V − E + F = 2 C − 2 genus with 2E = 3F."""
     return components(faces, n_vertices)[0] - (n_vertices - len(faces) // 2) // 2
 
 
-def has_area(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+def has_area(corners: Floats) -> Booleans:
     """(F,) whether a triangle of corners (F, 3, 3) is one to rounding: its height is not nothing beside its length."""
     sides = corners - np.roll(corners, 1, axis=1)
     longest = (sides**2).sum(axis=2).max(axis=1)

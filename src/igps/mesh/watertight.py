@@ -20,9 +20,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from igps.mesh._arrays import Floats, Integers, Surface
 from igps.mesh._distance_grid import Grid, cell_sizes, distances, rounded
 from igps.mesh._isosurface import marched, simplified
 from igps.mesh._level_set import joined, level_set
@@ -41,10 +41,10 @@ _MANY_FACES = 400_000
 
 
 def watertight(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int64] | None = None,
+    vertices: Floats,
+    faces: Integers | None = None,
     *,
-    normals: NDArray[np.float64] | None = None,
+    normals: Floats | None = None,
     resolution: int = 96,
     max_vertices: int | None = 5000,
     name: str = "mesh",
@@ -107,7 +107,7 @@ def watertight(
     return Mesh(grid.from_cells(surface_vertices), surface_faces, name=name, notes=tuple(notes))
 
 
-def crosses_itself(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
+def crosses_itself(vertices: Floats, faces: Integers) -> bool:
     """Whether any two faces have points in common beyond their common vertices and edge, by exact predicates."""
     from igl import predicates
 
@@ -117,9 +117,7 @@ def crosses_itself(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> b
     return bool(found)
 
 
-def _with_area(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _with_area(vertices: Floats, faces: Integers, name: str) -> Surface:
     area = face_areas(vertices, faces)
     keep = area > 1e-14 * diagonal(vertices[faces].reshape(-1, 3)) ** 2
     if not keep.any():
@@ -129,9 +127,7 @@ def _with_area(
     return vertices, faces[keep]
 
 
-def _without_specks(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _without_specks(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     """The faces without groups that lie apart from everything else and have next to no area."""
     corners = vertices[faces]
     low, side = corners.min(axis=(0, 1)), longest_side(corners.reshape(-1, 3))
@@ -155,7 +151,7 @@ def _without_specks(
     return _without_specks(vertices, faces[keep], notes)
 
 
-def _spread(corners: NDArray[np.float64], spacing: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _spread(corners: Floats, spacing: float) -> Surface:
     """Points on triangles, at most about `spacing` apart, and the triangle of each."""
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     n = np.clip(np.ceil(edges / spacing), 1, 4 * _SPECK_CELLS).astype(np.int64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh.surface import has_area
 
 _TREE_ERROR = 0.01  # of libigl's fast winding numbers; twice the largest found
@@ -16,7 +17,7 @@ def winding_number(
     points: NDArray[np.floating],
     *,
     accuracy: float | None = None,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Winding number (P,) of a mesh about points (P, 3): the solid angles of its faces over 4π, by libigl.
 
     1 inside and 0 outside a closed, outward oriented surface; fractions for an open one. On the surface itself the
@@ -45,7 +46,7 @@ def winding_number(
 
 def checked_places(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+) -> tuple[Floats, Integers, Floats]:
     """The vertices of a mesh, its faces and points, in double precision and 64 bits.
 
     Raises:

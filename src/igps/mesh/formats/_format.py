@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh._label_measures import VoxelMeasures
 from igps.mesh._tidying import are_specks, places
 from igps.mesh.mesh import MeshError, check_arrays
@@ -17,12 +17,12 @@ from igps.mesh.options import BodyKind, LoadOptions
 from igps.mesh.surface import compact, face_parts
 
 
-def no_vertices() -> NDArray[np.float64]:
+def no_vertices() -> Floats:
     """Those of a body of which there is no surface, (0, 3)."""
     return np.zeros((0, 3))
 
 
-def no_faces() -> NDArray[np.int64]:
+def no_faces() -> Integers:
     """Those of a cloud of points, (0, 3)."""
     return np.zeros((0, 3), dtype=np.int64)
 
@@ -43,11 +43,11 @@ class RawBody:
         voxels: measures the voxels that the surface was made of.
     """
 
-    vertices: NDArray[np.float64] = field(default_factory=no_vertices)
-    faces: NDArray[np.int64] = field(default_factory=no_faces)
+    vertices: Floats = field(default_factory=no_vertices)
+    faces: Integers = field(default_factory=no_faces)
     part: str | None = None
     unit: str | None = None
-    normals: NDArray[np.float64] | None = None
+    normals: Floats | None = None
     notes: tuple[str, ...] = ()
     fault: MeshError | None = None
     make: Callable[[], RawBody] | None = None
@@ -135,7 +135,7 @@ def distinct(names: Iterable[str]) -> list[str]:
     return found
 
 
-def triangles(corners: NDArray[np.int64], n_corners: NDArray[np.int64]) -> NDArray[np.int64]:
+def triangles(corners: Integers, n_corners: Integers) -> Integers:
     """Polygons, with their corners laid end to end, cut into triangles from their first corners, (F, 3).
 
     Triangles come first, then the first and the second halves of quadrilaterals, then larger polygons.

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats
 from igps.mesh.formats._format import RawBody, check_unpacked, distinct, joined
 from igps.mesh.options import LoadOptions
 
@@ -77,7 +77,7 @@ def _n_bytes(geometry: Any) -> int:
     return 24 * (len(geometry.vertices) + len(getattr(geometry, "faces", ())))
 
 
-def _normals(scene: Any, cloud: Any, n_points: int) -> NDArray[np.float64] | None:
+def _normals(scene: Any, cloud: Any, n_points: int) -> Floats | None:
     """Those of a PLY file, which trimesh keeps as they were read, (n_points, 3)."""
     for raw in (scene.metadata.get("_ply_raw", {}), cloud.metadata.get("_ply_raw", {})):
         rows = raw.get("vertex", {}).get("data")

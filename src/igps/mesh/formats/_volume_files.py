@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats
 from igps.mesh.formats.label_names import names_in_extensions
 from igps.mesh.limits import available_memory
 from igps.mesh.mesh import MILLIMETRES, MeshError
@@ -30,7 +31,7 @@ class RawVolume:
     """
 
     layers: list[NDArray[Any]]
-    affine: NDArray[np.float64]
+    affine: Floats
     names: dict[int, str] = field(default_factory=dict)
     segments: list[tuple[str, int, int]] = field(default_factory=list)
     unit: str | None = "mm"

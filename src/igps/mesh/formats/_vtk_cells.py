@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Integers
 from igps.mesh.formats._format import triangles
-
-Integers = NDArray[np.int64]
 
 TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, TETRAHEDRON = 5, 6, 7, 8, 9, 10
 # Sides of volumes, seen from outside, as VTK orders their corners: of tetrahedra, voxels, hexahedra, wedges, pyramids.

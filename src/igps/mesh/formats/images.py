@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats
 from igps.mesh.formats import _volume_files
 from igps.mesh.mesh import MeshError
 
@@ -23,7 +24,7 @@ _MODES = {0: 1, 1: 2, 2: 4, 4: 8, 6: 2, 12: 2}
 
 
 @lru_cache(maxsize=1)
-def read(path: Path, changed: int) -> tuple[NDArray[Any], NDArray[np.float64]]:
+def read(path: Path, changed: int) -> tuple[NDArray[Any], Floats]:
     """Values (X, Y, Z) of an image or grid, and the affine (4, 4) from voxels to coordinates.
 
     NIfTI, MGH, NRRD, MetaImage and TIFF are in world coordinates (RAS, millimetres), OpenDX, MRC and CCP4 in ångström.
@@ -46,7 +47,7 @@ def read(path: Path, changed: int) -> tuple[NDArray[Any], NDArray[np.float64]]:
     return volume.layers[0], volume.affine
 
 
-def _dx(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
+def _dx(path: Path) -> tuple[NDArray[Any], Floats]:
     """Of an OpenDX file, as APBS writes it; GridDataFormats does not return from one that is cut short."""
     text = path.read_bytes()
     head, _, rest = text.partition(b"data follows")
@@ -67,7 +68,7 @@ def _dx(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
     return np.array(words, dtype=np.float32).reshape(sizes), affine
 
 
-def _map(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
+def _map(path: Path) -> tuple[NDArray[Any], Floats]:
     """Of an MRC or CCP4 file."""
     try:
         import mrcfile

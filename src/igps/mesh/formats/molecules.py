@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh.formats._structures import SUFFIXES, gemmi_module, read_structure, suffix
 from igps.mesh.mesh import MeshError
 from igps.mesh.residues import (
@@ -67,13 +67,13 @@ class Molecule:
     """
 
     name: str
-    positions: NDArray[np.float64]
-    radii: NDArray[np.float64]
-    charges: NDArray[np.float64]
-    residue_of: NDArray[np.int64]
+    positions: Floats
+    radii: Floats
+    charges: Floats
+    residue_of: Integers
     residue_names: tuple[str, ...]
-    residue_positions: NDArray[np.float64]
-    b_factors: NDArray[np.float64]
+    residue_positions: Floats
+    b_factors: Floats
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -188,11 +188,11 @@ class _Builder:
     def __init__(self, ligands: bool, hydrogens: bool, is_pqr: bool) -> None:
         self.ligands, self.hydrogens, self.is_pqr = ligands, hydrogens, is_pqr
         self.radii: list[float] = []
-        self._positions: list[NDArray[np.float64]] = []
+        self._positions: list[Floats] = []
         self._charges: list[float] = []
         self._residue_of: list[int] = []
         self._names: list[str] = []
-        self._places: list[NDArray[np.float64]] = []
+        self._places: list[Floats] = []
         self._b_factors: list[float] = []
         self._count: Counter[str] = Counter()
 
@@ -262,13 +262,13 @@ class _Builder:
         self._count["element"] += 1
         return _UNKNOWN_RADIUS
 
-    def _add_ball(self, position: NDArray[np.float64], radius: float, charge: float) -> None:
+    def _add_ball(self, position: Floats, radius: float, charge: float) -> None:
         self._positions.append(position)
         self.radii.append(radius)
         self._charges.append(charge)
         self._residue_of.append(len(self._names) - 1)
 
-    def _add_coarse_ball(self, name: str, atoms: list[gemmi.Atom], at: NDArray[np.float64], charge: float) -> None:
+    def _add_coarse_ball(self, name: str, atoms: list[gemmi.Atom], at: Floats, charge: float) -> None:
         """That which stands for a missing side chain, or for a residue of Cα alone."""
         place = {atom.name: position for atom, position in zip(atoms, at, strict=True)}
         if len(place) == 1:

@@ -11,11 +11,12 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh.formats import brain_surfaces, vtk
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
-Arrays = Mapping[str, NDArray[np.float64]]
+Arrays = Mapping[str, Floats]
 
 _MAGIC = b"\xff\xff\xff"
 _VTK = (".vtk", ".vtp", ".vtu")
@@ -41,7 +42,7 @@ def read(path: Path) -> Arrays:
     return {one: np.asarray(values, dtype=np.float64) for one, values in found.items()}
 
 
-def read_tetrahedra(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], Arrays]:
+def read_tetrahedra(path: Path) -> tuple[Floats, Integers, Arrays]:
     """Points (V, 3), tetrahedra (T, 4), and arrays (V,) or (V, C) by name, of a VTK file.
 
     Raises:
@@ -55,7 +56,7 @@ def read_tetrahedra(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64],
     return found.vertices, found.tetrahedra, {name: values.astype(float) for name, values in found.values.items()}
 
 
-def chosen(arrays: Arrays, name: str, path: Path) -> NDArray[np.float64]:
+def chosen(arrays: Arrays, name: str, path: Path) -> Floats:
     """The array of a name, or the only one.
 
     Raises:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
+from igps.mesh._arrays import Booleans, Floats
 from igps.mesh._label_measures import VoxelMeasures, measured
 from igps.mesh.formats._volume_files import READERS, RawVolume
 from igps.mesh.formats.label_names import names_beside, read_label_names
@@ -91,7 +92,7 @@ class LabelVolume:
     """
 
     layers: tuple[NDArray[Any], ...]
-    affine: NDArray[np.float64]
+    affine: Floats
     name: str = "volume"
     names: dict[int, str] | None = None
     segments: tuple[tuple[int, int, int], ...] | None = None
@@ -138,7 +139,7 @@ class LabelVolume:
         known = ", ".join(body.name for body in self.bodies[:10]) + (", …" if len(self.bodies) > 10 else "")
         raise MeshError(f"{self.name}: no label {part!r}. It has {len(self.bodies)}: {known}.")
 
-    def mask(self, part: int | str) -> NDArray[np.bool_]:
+    def mask(self, part: int | str) -> Booleans:
         """Where the label is, within `LabelBody.box`."""
         body = self.body(part)
         return np.asarray(self.layers[body.layer][body.box] == body.value)
@@ -220,7 +221,7 @@ def label_surface(
     return mend(vertices, faces, how=how, cavities=cavities, name=name, notes=(*volume.notes, *notes))
 
 
-def _canonical(mask: NDArray[np.bool_], affine: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def _canonical(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
     """With axes that run as nearly along x, y and z as they can: formats store the same voxels in different orders."""
     order = linear_sum_assignment(-np.abs(affine[:3, :3]) / np.linalg.norm(affine[:3, :3], axis=0))[1]
     mask, affine = mask.transpose(order), affine[:, [*order, 3]]

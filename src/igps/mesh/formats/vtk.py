@@ -16,6 +16,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh.formats import _data_arrays, _vtk_cells, _xml
 from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct
 from igps.mesh.options import LoadOptions
@@ -37,15 +38,15 @@ _LEGACY_TYPES = {
 _CELLS = {"POLYGONS": _vtk_cells.POLYGON, "TRIANGLE_STRIPS": _vtk_cells.STRIP}
 _POLYS = {"Polys": _vtk_cells.POLYGON, "Strips": _vtk_cells.STRIP}
 _COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
-Cells = tuple[NDArray[np.int64], NDArray[np.int64]]  # corners laid end to end, and how many each cell has
+Cells = tuple[Integers, Integers]  # corners laid end to end, and how many each cell has
 
 
 @dataclass(frozen=True, eq=False)
 class PointValues:
     """Points (V, 3) of a file, tetrahedra (T, 4) between them, and arrays (V,) or (V, C) by name."""
 
-    vertices: NDArray[np.float64]
-    tetrahedra: NDArray[np.int64]
+    vertices: Floats
+    tetrahedra: Integers
     values: Mapping[str, NDArray[np.generic]]
 
 
@@ -106,10 +107,10 @@ class _Legacy:
         is_corner[np.cumsum(counts + 1) - counts - 1] = False
         return row[is_corner], counts
 
-    def geometry(self) -> tuple[NDArray[np.float64], list[tuple[Cells, NDArray[np.int64]]], str]:
+    def geometry(self) -> tuple[Floats, list[tuple[Cells, Integers]], str]:
         """Points, cells with their kinds, and the first line behind them."""
         vertices = np.zeros((0, 3))
-        cells: list[tuple[Cells, NDArray[np.int64]]] = []
+        cells: list[tuple[Cells, Integers]] = []
         while (words := self.line().split()) and words[0].upper() not in ("POINT_DATA", "CELL_DATA"):
             word = words[0].upper()
             if word == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
@@ -173,7 +174,7 @@ def point_values(path: Path, options: LoadOptions) -> PointValues:
     return PointValues(vertices, _tetrahedra(cells), arrays)
 
 
-def _tetrahedra(cells: list[tuple[Cells, NDArray[np.int64]]]) -> NDArray[np.int64]:
+def _tetrahedra(cells: list[tuple[Cells, Integers]]) -> Integers:
     found = [np.zeros((0, 4), dtype=np.int64)]
     for (corners, n_corners), kinds in cells:
         if len(kinds) == len(n_corners) and (n_corners >= 0).all() and n_corners.sum() == len(corners):
@@ -215,13 +216,13 @@ class _Xml:
     def body(self, piece: Element, part: str | None = None) -> RawBody:
         return _body(*self.geometry(piece), part)
 
-    def geometry(self, piece: Element) -> tuple[NDArray[np.float64], list[tuple[Cells, NDArray[np.int64]]]]:
+    def geometry(self, piece: Element) -> tuple[Floats, list[tuple[Cells, Integers]]]:
         """Points, and cells with their kinds."""
         points = piece.find("Points/DataArray")
         if points is None:
             raise ValueError("no points in it")
         vertices = self.array(points).astype(np.float64).reshape(-1, 3)
-        cells: list[tuple[Cells, NDArray[np.int64]]] = []
+        cells: list[tuple[Cells, Integers]] = []
         for group in (*_POLYS, "Cells"):
             arrays = {one.get("Name"): self.array(one) for one in piece.findall(f"{group}/DataArray")}
             if len(arrays) >= 2:
@@ -272,9 +273,7 @@ def _n_letters(n_bytes: int) -> int:
     return 4 * -(-n_bytes // 3)
 
 
-def _body(
-    vertices: NDArray[np.float64], cells: list[tuple[Cells, NDArray[np.int64]]], part: str | None = None
-) -> RawBody:
+def _body(vertices: Floats, cells: list[tuple[Cells, Integers]], part: str | None = None) -> RawBody:
     """The surface of some cells, whose corners are checked: they are laid end to end."""
     faces = [np.zeros((0, 3), dtype=np.int64)]
     for (corners, n_corners), kinds in cells:
