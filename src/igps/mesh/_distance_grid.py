@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps.mesh._arrays import Floats, Integers, Surface
-from igps.mesh.surface import face_areas
+from igps.mesh.surface import face_areas, sums
 
 # How far from the surface exact distances are needed: marching cubes ask for both ends of the edges that cross it.
 BAND = 1.1
@@ -58,23 +58,17 @@ def rounded(vertices: Floats, faces: Integers) -> Surface:
     lattice = np.round(vertices * 4).astype(np.int64)
     _, index, count = np.unique(lattice, axis=0, return_inverse=True, return_counts=True)
     index = index.ravel()
-    # The mean of those put together: no vertex of the lattice, which would shift the surface.
-    mean = np.stack([np.bincount(index, weights=vertices[:, i]) for i in range(3)], axis=1) / count[:, None]
+    # The mean of those put together: vertices of the lattice would shift the surface.
+    mean = sums(index, vertices, len(count)) / count[:, None]
     faces = np.sort(index[faces], axis=1)
-    faces = np.unique(faces[(np.diff(faces, axis=1) > 0).all(axis=1)], axis=0)
-    return mean, faces
+    return mean, np.unique(faces[(np.diff(faces, axis=1) > 0).all(axis=1)], axis=0)
 
 
 def distances(
     vertices: Floats, faces: Integers, shape: tuple[int, int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Distance of the grid points in the band around the surface, infinite elsewhere, and the nearest points.
-
-    Blocks of eight cells are halved where the surface may be near.
-
-    Returns:
-        (X, Y, Z) distances and (X, Y, Z, 3) nearest points, cells.
-    """
+    """(X, Y, Z) distances of the grid points in the band around the surface, infinite elsewhere, and the nearest places
+    (X, Y, Z, 3). Blocks of eight cells are halved where the surface may be near."""
     import igl
 
     vertices, faces = np.asfortranarray(vertices), np.asfortranarray(faces)

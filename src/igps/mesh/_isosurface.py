@@ -23,41 +23,31 @@ from igps.mesh.surface import (
 _FLAT = 0.95
 
 
-def marched(field: NDArray[np.float32], name: str) -> Surface:
-    """The closed surface on which the field is zero, its largest part."""
-    return largest(*level_surface(field, name))
-
-
 def level_surface(field: NDArray[np.float32], name: str) -> Surface:
     """The closed surface on which the field is zero; grid points are filled where it would touch itself."""
     from skimage.measure import marching_cubes
 
     for _ in range(20):
         if not (field.min() < 0 < field.max()):
-            raise MeshError(
-                f"{name}: no point of the grid lies in the body, which is too thin everywhere for its length. "
-                "Give it some thickness."
-            )
+            thin = "no point of the grid lies in the body, which is too thin everywhere for its length"
+            raise MeshError(f"{name}: {thin}. Give it some thickness.")
         vertices, faces, _, _ = marching_cubes(field, 0.0, allow_degenerate=True)
-        # Downward gradients point outward here.
         faces = faces.astype(np.int64)
         bad = _bad_edges(faces, len(vertices))
         if not len(bad):
-            break
+            return vertices.astype(np.float64), faces
         # The four or eight grid points around a place where the surface meets itself.
         for vertex in np.unique(bad):
             low, high = np.floor(vertices[vertex]).astype(int), np.ceil(vertices[vertex]).astype(int)
             box = tuple(slice(max(low[d], 1), min(high[d] + 1, field.shape[d] - 1)) for d in range(3))
             field[box] = np.minimum(field[box], -LEAST)
         field = without_bubbles(field)
-    else:
-        raise MeshError(f"{name}: no closed surface came of it. Raise the resolution.")
-    return vertices.astype(np.float64), faces
+    raise MeshError(f"{name}: no closed surface came of it. Raise the resolution.")
 
 
 def simplified(vertices: Floats, faces: Integers, max_vertices: int) -> Surface:
-    surplus = len(vertices) - max_vertices
-    if surplus <= 0:
+    """With at most about so many vertices and the same volume, or as it is where that makes it no closed surface."""
+    if len(vertices) <= max_vertices:
         return vertices, faces
     import igl
 
@@ -67,9 +57,8 @@ def simplified(vertices: Floats, faces: Integers, max_vertices: int) -> Surface:
     for collapse, n_vertices in ((igl.decimate, 3 * max_vertices), (igl.qslim, max_vertices)):
         target = len(triangles) - 2 * (len(points) - n_vertices)
         if len(points) > n_vertices:
-            points, triangles, *_ = collapse(
-                np.asfortranarray(points), np.asfortranarray(triangles.astype(np.int32)), target
-            )
+            triangles = np.asfortranarray(triangles.astype(np.int32))
+            points, triangles, *_ = collapse(np.asfortranarray(points), triangles, target)
     triangles = np.asarray(triangles, dtype=np.int64)
     if len(triangles) == 0 or len(_bad_edges(triangles, len(points))) or not np.isfinite(points).all():
         return vertices, faces
@@ -127,40 +116,40 @@ def _flipped(vertices: Floats, faces: Integers) -> Integers:
         opposite = np.roll(faces, 1, axis=1).ravel()
         forward = start * n + end
         order = np.argsort(forward)
-        # The other side of each side of a face, and each pair once.
-        twin = order[np.searchsorted(forward[order], end * n + start)]
+        # Each edge once, as a side of one face and the other side of another.
         side = np.nonzero(start < end)[0]
-        other = twin[side]
+        other = order[np.searchsorted(forward[order], end[side] * n + start[side])]
         a, b, c, d = start[side], end[side], opposite[side], opposite[other]
         pa, pb, pc, pd = vertices[a], vertices[b], vertices[c], vertices[d]
         gain = _angle(pc, pa, pb) + _angle(pd, pb, pa) - np.pi
         old = [np.cross(pb - pa, pc - pa), np.cross(pa - pb, pd - pb)]
         new = [np.cross(pd - pc, pb - pc), np.cross(pc - pd, pa - pd)]
         mean = old[0] + old[1]
-        # A triangle so thin that it has no direction may go either way.
         length = np.linalg.norm(mean, axis=1, keepdims=True)
         mean = mean / np.maximum(length, 1e-30)
         flat = np.ones(len(side), dtype=bool)
         for vectors in (*old, *new):
             size = np.linalg.norm(vectors, axis=1)
+            # A triangle so thin that it has no direction may go either way.
             flat &= (np.einsum("ij,ij->i", vectors, mean) > _FLAT * size) | (size < 1e-3 * length[:, 0])
         exists = np.isin(np.minimum(c, d) * n + np.maximum(c, d), np.minimum(start, end) * n + np.maximum(start, end))
         wanted = np.nonzero((gain > 1e-3) & flat & ~exists & (c != d))[0]
         # Every face takes part in the best of its flips only, and no two flips make the same edge.
+        one, two, gain = side[wanted] // 3, other[wanted] // 3, gain[wanted]
         best = np.full(len(faces), -np.inf)
-        for sides in (side, other):
-            np.maximum.at(best, sides[wanted] // 3, gain[wanted])
-        wanted = wanted[(gain[wanted] >= best[side[wanted] // 3]) & (gain[wanted] >= best[other[wanted] // 3])]
-        _, once = np.unique(np.minimum(c, d)[wanted] * n + np.maximum(c, d)[wanted], return_index=True)
-        wanted = wanted[once]
-        taken, count = np.unique(np.concatenate([side[wanted] // 3, other[wanted] // 3]), return_counts=True)
-        alone = ~np.isin(side[wanted] // 3, taken[count > 1]) & ~np.isin(other[wanted] // 3, taken[count > 1])
-        wanted = wanted[alone]
-        if not len(wanted):
+        for of_face in (one, two):
+            np.maximum.at(best, of_face, gain)
+        chosen = np.nonzero((gain >= best[one]) & (gain >= best[two]))[0]
+        corners = np.minimum(c, d)[wanted] * n + np.maximum(c, d)[wanted]
+        chosen = chosen[np.unique(corners[chosen], return_index=True)[1]]
+        taken, count = np.unique(np.concatenate([one[chosen], two[chosen]]), return_counts=True)
+        crowded = taken[count > 1]
+        chosen = chosen[~np.isin(one[chosen], crowded) & ~np.isin(two[chosen], crowded)]
+        if not len(chosen):
             break
+        a, b, c, d = (corner[wanted[chosen]] for corner in (a, b, c, d))
         faces = faces.copy()
-        faces[side[wanted] // 3] = np.stack([c[wanted], d[wanted], b[wanted]], axis=1)
-        faces[other[wanted] // 3] = np.stack([d[wanted], c[wanted], a[wanted]], axis=1)
+        faces[one[chosen]], faces[two[chosen]] = np.stack([c, d, b], axis=1), np.stack([d, c, a], axis=1)
     return faces
 
 

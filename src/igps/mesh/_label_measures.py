@@ -19,10 +19,7 @@ _SMALL = 1 << 20
 
 @dataclass(frozen=True)
 class VoxelMeasures:
-    """Of a label: how many voxels, pieces that share no corner, and how many voxels thick the thinnest part is.
-
-    No thickness above ten voxels is told from ten.
-    """
+    """Of a label: how many voxels, pieces that share no corner, and the thickness of the thinnest part in voxels."""
 
     n_voxels: int
     n_pieces: int
@@ -31,7 +28,7 @@ class VoxelMeasures:
 
 def measured(mask: Booleans) -> VoxelMeasures:
     """The measures of a mask (X, Y, Z)."""
-    n_pieces = ndimage.label(mask, np.ones((3, 3, 3), dtype=bool))[1]
+    n_pieces = ndimage.label(mask, np.ones((3, 3, 3)))[1]
     return VoxelMeasures(int(np.count_nonzero(mask)), int(n_pieces), thinnest_part(mask))
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import numpy as np
 
 from igps.mesh._arrays import Booleans, Floats, Integers, Surface
@@ -29,10 +27,10 @@ def welded(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     if n_places < len(vertices):
         notes.append(f"welded {len(vertices) - n_places} coincident vertices")
         faces = place[faces]
-    sharp = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    if not sharp.all():
-        notes.append(f"dropped {int((~sharp).sum())} degenerate faces")
-        faces = faces[sharp]
+    is_degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    if is_degenerate.any():
+        notes.append(f"dropped {int(is_degenerate.sum())} degenerate faces")
+        faces = faces[~is_degenerate]
     _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     if len(once) < len(faces):
         notes.append(f"dropped {len(faces) - len(once)} duplicate faces")
@@ -45,17 +43,14 @@ def welded(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
 
 
 def places(vertices: Floats) -> Integers:
-    """(V,) of each vertex the first that is in the same place.
-
-    On a lattice in units of the bounding box, so that the unit of length does not matter.
-    """
+    """(V,) of each vertex the first that is in the same place, on a lattice in units of the bounding box."""
     lattice = np.round((vertices - vertices.mean(axis=0)) / (_WELD * max(diagonal(vertices), np.finfo(float).tiny)))
     _, first, index = np.unique(lattice.astype(np.int64), axis=0, return_index=True, return_inverse=True)
     return np.asarray(first[index.ravel()])
 
 
 def are_specks(areas: Floats) -> Booleans:
-    """Which of some parts with these areas are crumbs beside the others; none if all of them together are many."""
+    """Which of the parts with these areas are crumbs; none if all crumbs together have much area."""
     specks = areas < SPECK * areas.sum()
     return specks & (areas[specks].sum() < 10 * SPECK * areas.sum())
 
@@ -68,8 +63,7 @@ def oriented(faces: Integers, notes: list[str]) -> Integers:
 
     agreeing, part = igl.bfs_orient(faces)
     turn = (agreeing != faces).any(axis=1)
-    mostly = np.bincount(part, weights=turn) > np.bincount(part) / 2
-    turn ^= mostly[part]
+    turn ^= (np.bincount(part, weights=turn) > np.bincount(part) / 2)[part]
     if turn.any():
         notes.append(f"turned {int(turn.sum())} faces to orient the surface")
         faces = np.where(turn[:, None], faces[:, ::-1], faces)
@@ -77,7 +71,7 @@ def oriented(faces: Integers, notes: list[str]) -> Integers:
 
 
 def tidied(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
-    """Without fins and specks."""
+    """Without fins and specks, and turned alike once it is plain which faces are neighbours."""
     kept = _without_fins(vertices, faces)
     if len(kept) < len(faces):
         notes.append(f"dropped {len(faces) - len(kept)} faces of fins")
@@ -87,20 +81,21 @@ def tidied(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     if specks.any():
         notes.append(f"dropped {int(specks.sum())} specks")
         faces = faces[~specks[part]]
-    # Only now is it plain which faces are neighbours.
     vertices, faces = compact(vertices, faces)
     return vertices, oriented(faces, notes)
 
 
 def _without_fins(vertices: Floats, faces: Integers) -> Integers:
-    """Without the faces that hang on an edge of two others, peeled from their free edges; all, if they are many."""
+    """The faces but for those that hang on an edge of two others, peeled from their free edges; all, if they are many.
+
+    A face with a second free edge that is left of a larger fin does no harm: it hangs on nothing crowded.
+    """
     kept = faces
     while len(kept):
         _, edge_of_side = undirected_edges(kept, len(vertices))
         count = np.bincount(edge_of_side)[edge_of_side].reshape(-1, 3)
         fin = (count == 1).any(axis=1) & (count > 2).any(axis=1)
         if not fin.any():
-            # A face with a second free edge that was left of a larger fin does no harm: it hangs on nothing crowded.
             break
         kept = kept[~fin]
     left = face_areas(vertices, kept).sum()
@@ -110,10 +105,7 @@ def _without_fins(vertices: Floats, faces: Integers) -> Integers:
 def without_hidden(vertices: Floats, faces: Integers, notes: list[str], *, cavities: bool = False) -> Surface:
     """Without the parts that lie inside the largest, if that is closed.
 
-    Args:
-        vertices, faces: the surface.
-        notes: what was done is added.
-        cavities: keep those of them that are closed and lie in no other, turned so that they bound hollows.
+    With `cavities` those of them stay that are closed and lie in no other, turned so that they bound hollows.
     """
     part, areas = face_parts(vertices, faces)
     if len(areas) < 2:
@@ -134,15 +126,18 @@ def without_hidden(vertices: Floats, faces: Integers, notes: list[str], *, cavit
         kept: list[Mesh] = []
         for k in sorted(np.flatnonzero(hidden), key=lambda k: -areas[k]):
             own = part == k
-            with contextlib.suppress(MeshError):
-                cavity = Mesh(*compact(vertices, faces[own]))
-                if any((winding_number(one.vertices, one.faces, cavity.vertices) > 0.5).any() for one in kept):
-                    continue
-                kept.append(cavity)
-                hidden[k] = False
-                if signed_volume(*compact(vertices, faces[own])) > 0:
-                    notes.append("turned the surface of a cavity towards the inside")
-                    faces[own] = faces[own][:, ::-1]
+            surface = compact(vertices, faces[own])
+            try:
+                cavity = Mesh(*surface)
+            except MeshError:
+                continue
+            if any((winding_number(one.vertices, one.faces, cavity.vertices) > 0.5).any() for one in kept):
+                continue
+            kept.append(cavity)
+            hidden[k] = False
+            if signed_volume(*surface) > 0:
+                notes.append("turned the surface of a cavity towards the inside")
+                faces[own] = faces[own][:, ::-1]
     if hidden.any():
         notes.append(f"dropped {int(hidden.sum())} parts hidden inside")
     return compact(vertices, faces[~hidden[part]])

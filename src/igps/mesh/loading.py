@@ -105,15 +105,10 @@ def load_bodies(path: str | Path, options: LoadOptions = LoadOptions(), *, least
 
 
 def each_body(
-    path: str | Path,
-    options: LoadOptions = LoadOptions(),
-    *,
-    parts: Sequence[str | None] | None = None,
+    path: str | Path, options: LoadOptions = LoadOptions(), *, parts: Sequence[str | None] | None = None,
     least_vertices: int = 0,
-) -> Iterator[tuple[BodyRef, Mesh | MeshError]]:
-    """The bodies of a file, or those of the given parts, one after the other; what is wrong with one in its place.
-
-    The file is read once.
+) -> Iterator[tuple[BodyRef, Mesh | MeshError]]:  # fmt: skip
+    """The bodies of a file, read once, or those of the given parts; what is wrong with one stands in its place.
 
     Raises:
         MeshError: the file is missing or unreadable.
@@ -130,11 +125,7 @@ def each_body(
 def each_surface(
     path: str | Path, options: LoadOptions = LoadOptions(), *, parts: Sequence[str | None] | None = None
 ) -> Iterator[tuple[BodyRef, RawBody]]:
-    """The surfaces of the bodies of a file, or of the given parts, unchecked, one after the other; see `each_body`.
-
-    Raises:
-        MeshError: the file is missing or unreadable.
-    """
+    """The surfaces of the bodies of a file, or of the given parts, unchecked, one after the other; see `each_body`."""
     path = Path(path)
     for raw in _read(path, options, parts[0] if parts and len(parts) == 1 else None):
         if parts is None or raw.part in parts:
@@ -155,7 +146,7 @@ def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part
     if len(found) == 1:
         with _faults(path, _format(path)):
             return found[0].made()
-    names = [body.part for body in bodies] if part is None else [one.part for one in list_bodies(path, options)]
+    names = [body.part for body in (bodies if part is None else list_bodies(path, options))]
     shown = ", ".join(repr(name) for name in names[:8]) + (", ..." if len(names) > 8 else "")
     if part is None:
         raise MeshError(f"{path}: holds {len(names)} bodies: {shown}. Name one as part=, or read all by load_bodies.")
@@ -163,11 +154,7 @@ def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part
 
 
 def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> Mesh:
-    """The body that the options make of a surface; see `load_mesh`.
-
-    Raises:
-        MeshError: the surface is not usable.
-    """
+    """The body that the options make of a surface, see `load_mesh`; a MeshError if it is not usable."""
     if raw.fault is not None:
         raise raw.fault
     name = str(ref)
@@ -179,8 +166,8 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
         if len(areas) > 1:
             n_before = len(vertices)
             vertices, faces = compact(vertices, faces[owner == int(np.argmax(areas))])
-            kept = f"kept the largest of {len(areas)} components ({len(vertices)} of {n_before} vertices)"
-            notes = (*notes, kept)
+            kept = f"{len(vertices)} of {n_before} vertices"
+            notes = (*notes, f"kept the largest of {len(areas)} components ({kept})")
     if options.allow_open and options.mend != "always":
         try:
             return Mesh(vertices, faces, name=name, allow_open=True, notes=notes, unit=raw.unit)
@@ -188,23 +175,16 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
             if options.mend == "never":
                 raise
     mesh = mend(
-        vertices,
-        faces,
-        how=options.mend,
-        least_vertices=least_vertices,
-        normals=raw.normals,
-        cavities=options.cavities,
-        name=name,
-        notes=notes,
-    )
+        vertices, faces, how=options.mend, least_vertices=least_vertices, normals=raw.normals,
+        cavities=options.cavities, name=name, notes=notes,
+    )  # fmt: skip
     return mesh.told(unit=raw.unit)
 
 
 def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[RawBody]:
-    """The bodies of a file, or at least the one that is named."""
     kind = _format(path)
     how = _bodies(kind, options)
-    with _faults(path, kind):
+    with _faults(path, kind):  # of the bodies at least the one that is named
         bodies = list(kind.read(path, replace(options, bodies=how), part if how not in ("whole", "pieces") else None))
         if how == "whole":
             return [joined(bodies)]
@@ -212,9 +192,7 @@ def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[Raw
 
 
 def _bodies(kind: Format, options: LoadOptions) -> BodyKind:
-    """What of a file is a body: what is asked for, if the format has it."""
-    known = (*kind.bodies, "whole", "pieces")
-    return options.bodies if options.bodies in known else kind.bodies[0]
+    return options.bodies if options.bodies in (*kind.bodies, "whole", "pieces") else kind.bodies[0]
 
 
 def _format(path: Path) -> Format:

@@ -58,25 +58,21 @@ class LoadOptions:
     cavities: Cavities = "fill"
 
     def __post_init__(self) -> None:
-        if self.mend not in get_args(Mending):
-            raise ValueError(f"mend: expected 'auto', 'never' or 'always', got {self.mend!r}.")
-        if self.cavities not in get_args(Cavities):
-            raise ValueError(f"cavities: expected 'fill' or 'keep', got {self.cavities!r}.")
-        if self.component is not None and self.component not in get_args(Component):
-            raise ValueError(f"component: expected 'largest' or None, got {self.component!r}.")
-        if self.bodies is not None and self.bodies not in get_args(BodyKind):
-            raise ValueError(f"bodies: expected one of {', '.join(get_args(BodyKind))}, or None, got {self.bodies!r}.")
+        for name, kinds, expected in (
+            ("mend", get_args(Mending), "'auto', 'never' or 'always'"),
+            ("cavities", get_args(Cavities), "'fill' or 'keep'"),
+            ("component", (*get_args(Component), None), "'largest' or None"),
+            ("bodies", (*get_args(BodyKind), None), f"one of {', '.join(get_args(BodyKind))}, or None"),
+        ):
+            if getattr(self, name) not in kinds:
+                raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)!r}.")
         if self.max_unpacked < 1:
             raise ValueError(f"max_unpacked: expected a positive number of bytes, got {self.max_unpacked}.")
         if not 0 < self.threshold <= 1:
             raise ValueError(f"threshold: expected above 0 and at most 1, got {self.threshold}.")
 
     def as_dict(self) -> dict[str, object]:
-        """All on which a body depends, for the keys of caches; what says no more than the default is left out."""
-        said = {
-            "bodies": self.bodies is not None,
-            "threshold": self.threshold != 0.5,
-            "cavities": self.cavities != "fill",
-        }
-        left_out = {"max_unpacked", "names", *(name for name, is_said in said.items() if not is_said)}
-        return {name: value for name, value in asdict(self).items() if name not in left_out}
+        """All on which a body depends, for the keys of caches; later options only where they are not the default."""
+        later = {"bodies": None, "threshold": 0.5, "cavities": "fill"}
+        options = {name: value for name, value in asdict(self).items() if name not in ("max_unpacked", "names")}
+        return {name: value for name, value in options.items() if name not in later or value != later[name]}

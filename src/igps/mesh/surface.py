@@ -31,9 +31,12 @@ def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
 
 def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
     """(V, 3) outward unit normals of the vertices, means of those of their faces weighted by area."""
-    corners = faces.ravel()
-    vectors = np.repeat(area_vectors(vertices, faces), 3, axis=0)
-    return unit(np.column_stack([np.bincount(corners, vectors[:, i], len(vertices)) for i in range(3)]))
+    return unit(sums(faces.ravel(), np.repeat(area_vectors(vertices, faces), 3, axis=0), len(vertices)))
+
+
+def sums(index: Integers, rows: Floats, n: int) -> Floats:
+    """(n, D) sums of those rows (R, D) that have each index (R,)."""
+    return np.stack([np.bincount(index, column, n) for column in rows.T], axis=1)
 
 
 def mean_of_neighbours(vertices: Floats, faces: Integers) -> Floats:
@@ -42,13 +45,11 @@ def mean_of_neighbours(vertices: Floats, faces: Integers) -> Floats:
     squares = np.square(vertices[ends[:, 0]] - vertices[ends[:, 1]]).sum(axis=1)
     # Vertices in one place: nearer than any other, and no division by zero.
     weights = 1 / np.maximum(squares, 1e-12 * squares.mean())
-    total = np.zeros(len(vertices))
-    sums = np.zeros_like(vertices)
+    total, mean = np.zeros(len(vertices)), np.zeros_like(vertices)
     for here, there in (ends.T, ends.T[::-1]):
         total += np.bincount(here, weights, len(vertices))
-        for axis in range(3):
-            sums[:, axis] += np.bincount(here, weights * vertices[there, axis], len(vertices))
-    return sums / total[:, None]
+        mean += sums(here, weights[:, None] * vertices[there], len(vertices))
+    return mean / total[:, None]
 
 
 def unit(vectors: Floats) -> Floats:
@@ -94,19 +95,15 @@ def components(faces: Integers, n_vertices: int) -> tuple[int, NDArray[np.int32]
 
 def face_parts(vertices: Floats, faces: Integers) -> tuple[Integers, Floats]:
     """The connected part of each face, (F,) counted from zero, and the areas of the parts, length²."""
-    _, label = components(faces, len(vertices))
-    _, part = np.unique(label[faces[:, 0]], return_inverse=True)
-    area = np.bincount(part, weights=face_areas(vertices, faces))
-    return part.astype(np.int64), area.astype(np.float64)
+    part = np.unique(components(faces, len(vertices))[1][faces[:, 0]], return_inverse=True)[1]
+    areas = np.bincount(part, weights=face_areas(vertices, faces))
+    return part.astype(np.int64), np.asarray(areas, dtype=np.float64)
 
 
 def face_patches(faces: Integers, n_vertices: int) -> tuple[Integers, Booleans]:
-    """The patch of each face, and which patches end only where at least two other faces meet.
+    """The patch of each face, (F,) counted from zero, and which patches (P,) end only where two other faces meet.
 
     Faces are of one patch that share an edge with each other alone.
-
-    Returns:
-        (F,) counted from zero, and (patches,).
     """
     _, edge_of_side = undirected_edges(faces, n_vertices)
     by_edge = np.argsort(edge_of_side, kind="stable")
@@ -115,18 +112,15 @@ def face_patches(faces: Integers, n_vertices: int) -> tuple[Integers, Booleans]:
     one, two = by_edge[at] // 3, by_edge[at + 1] // 3
     graph = sparse.coo_array((np.ones(len(one), dtype=np.int8), (one, two)), shape=(len(faces), len(faces)))
     n_patches, patch = connected_components(graph, directed=False)
-    sides_of = np.repeat(patch, 3)
     # An edge where the patch itself has more than one face is no end of it that others could take over.
-    ends, n_own = np.unique(np.stack([sides_of, edge_of_side]), axis=1, return_counts=True)
-    patch_at, edge_at = ends
-    free = (count[edge_at] - n_own < 2) & (count[edge_at] != 2)
-    shared = np.bincount(patch_at, weights=(count[edge_at] > 2), minlength=n_patches) > 0
-    return patch.astype(np.int64), (np.bincount(patch_at, weights=free, minlength=n_patches) == 0) & shared
+    ends, n_own = np.unique(np.stack([np.repeat(patch, 3), edge_of_side]), axis=1, return_counts=True)
+    patch_at, n_at = ends[0], count[ends[1]]
+    n_free = np.bincount(patch_at, (n_at - n_own < 2) & (n_at != 2), n_patches)
+    return patch.astype(np.int64), (n_free == 0) & (np.bincount(patch_at, n_at > 2, n_patches) > 0)
 
 
 def signed_volume(vertices: Floats, faces: Integers) -> float:
-    """What a closed surface encloses, length³, negative if it is inside out (of an open one: of its cone over the
-    centre of its vertices)."""
+    """Enclosed volume, length³, negative inside out (of an open surface: of its cone over the vertices' centre)."""
     centred = vertices - vertices.mean(axis=0)
     return float(np.einsum("ij,ij->", centred[faces[:, 0]], area_vectors(centred, faces)) / 3)
 
@@ -137,13 +131,19 @@ def compact(vertices: Floats, faces: Integers) -> Surface:
     return vertices[used], index.reshape(-1, 3)
 
 
+def connected(vertices: Floats, faces: Integers) -> list[Surface]:
+    """The connected components, each by itself, in the order of their first vertices."""
+    count, owner = components(faces, len(vertices))
+    return [compact(vertices, faces[owner[faces[:, 0]] == k]) for k in range(count)]
+
+
 def genus(faces: Integers, n_vertices: int) -> int:
     """Handles of a closed surface of C pieces, by Euler's formula V − E + F = 2 C − 2 genus with 2E = 3F."""
     return components(faces, n_vertices)[0] - (n_vertices - len(faces) // 2) // 2
 
 
 def has_area(corners: Floats) -> Booleans:
-    """(F,) whether a triangle of corners (F, 3, 3) is one to rounding: its height is not nothing beside its length."""
+    """(F,) whether triangles of corners (F, 3, 3) are more than lines: their height is not lost beside their length."""
     sides = corners - np.roll(corners, 1, axis=1)
     longest = (sides**2).sum(axis=2).max(axis=1)
     return np.asarray(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) > _FLAT * longest)

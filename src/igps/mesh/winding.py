@@ -47,11 +47,7 @@ def winding_number(
 def checked_places(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
 ) -> tuple[Floats, Integers, Floats]:
-    """The vertices of a mesh, its faces and points, in double precision and 64 bits.
-
-    Raises:
-        ValueError: a shape, an index or a value of an argument is invalid.
-    """
+    """The vertices of a mesh, its faces and points, in double precision and 64 bits; a ValueError if one is invalid."""
     at, index, where = np.asarray(vertices, np.float64), np.asarray(faces), np.asarray(points, np.float64)
     for name, array in (("vertices", at), ("faces", index), ("points", where)):
         if array.ndim != 2 or array.shape[1] != 3:

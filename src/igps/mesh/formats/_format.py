@@ -153,6 +153,23 @@ def triangles(corners: Integers, n_corners: Integers) -> Integers:
     return np.concatenate(pieces)
 
 
+def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
+    """The corners of polygons laid end to end, and how many each has, of rows that begin with these numbers.
+
+    Raises:
+        ValueError: the last row is cut short.
+    """
+    starts, at = [], 0
+    while at < len(rows):
+        starts.append(at)
+        at += max(int(rows[at]), 0) + 1
+    if at != len(rows):
+        raise ValueError("the numbers of corners do not add up")
+    is_corner = np.ones(len(rows), dtype=bool)
+    is_corner[starts] = False
+    return rows[is_corner], rows[starts]
+
+
 def check_unpacked(n_bytes: int, path: Path, limit: int) -> None:
     """Refuse what would take more bytes than allowed.
 
