@@ -15,13 +15,10 @@ _MOST = 0.5
 
 
 def joined_by_threads(parts: Sequence[Surface], share: float) -> Surface:
-    """The parts as one closed surface; those that are nearest to each other are joined.
+    """The parts, closed and outward and none within another, as one closed surface; nearest ones are joined.
 
-    A thread is a tube of triangular section between two triangles, the largest at the nearest vertices.
-
-    Args:
-        parts: vertices (V, 3) and faces (F, 3) of each, closed and outward, none within another.
-        share: of the whole area that all threads may add.
+    A thread is a tube of triangular section between two triangles, the largest at the nearest vertices; together they
+    may add this share of the whole area.
     """
     starts = np.cumsum([0, *(len(points) for points, _ in parts)])
     vertices = np.concatenate([points for points, _ in parts])

@@ -1,11 +1,10 @@
 """A smooth function on a grid of voxels that is negative where most of a voxel lies in the body.
 
 Voxels tell where a body is by their centres, or by the share of each that it fills. Of all functions whose signs agree
-with that, one is taken that bends little: between the last voxels inside and the first outside its zero level is free,
-so no stairs are left, and no voxel changes sides, so nothing thin is lost. (Whitaker 2000 and Gibson 1998 hold surfaces
-by the same constraint; Lempitsky 2010 takes second derivatives, which shrink nothing, in place of area.) What bends
-little still cuts the corners of what is convex. The number of voxels tells the volume better than any surface does, so
-the level is moved to give it back: nearby first, then as a whole.
+with that, one is taken that bends little: no stairs are left, since the zero level is free between the last voxels
+inside and the first outside; and nothing thin is lost, since no voxel changes sides. (Whitaker 2000 and Gibson 1998
+hold surfaces by the same constraint; Lempitsky 2010 takes second derivatives, which shrink nothing, in place of area.)
+Convex corners are still cut, so the level is moved to give back the voxels' volume, nearby first, then as a whole.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ def smooth_field(share: Floats, spacing: Floats, is_mask: bool) -> Floats:
     Args:
         share: (X, Y, Z) the share of each voxel that lies in the body, 0 to 1; with `PAD` empty layers around.
         spacing: (3,) sides of a voxel, length.
-        is_mask: whether the shares are only 0 or 1, and tell whether the centre is in the body.
+        is_mask: the shares are 0 or 1, and tell whether the centre is in the body.
     """
     scale = float(spacing.min())
     sides = spacing / scale

@@ -15,15 +15,15 @@ _TURN = 2 * math.pi
 
 @compiled()
 def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: Integers) -> Surface:
-    """The arcs in which two spheres meet outside all other balls.
+    """The arcs in which two spheres meet outside all other balls, and (A,) 1 for balls that have one or meet no other.
 
     Args:
         centres, radii: (A, 3) and (A,) of the balls, none in another.
         first, neighbours: those that meet ball i are `neighbours[first[i]:first[i + 1]]`.
 
     Returns:
-        (arcs, 12): centre of the circle, first axis, normal, radius, angle of the start from the first axis, and angle
-        from start to end, up to 2π; and (A,) 1 for balls that have an arc or meet none.
+        Arcs (N, 12): centre of the circle, first axis, normal, radius, angle of the start from the first axis, and
+        angle from start to end, up to 2π.
     """
     room = 256
     found = np.empty((room, 12))
@@ -112,16 +112,8 @@ def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: In
 def depths(
     centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, margin: float
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """How deep each grid point lies in the ball in which it lies deepest, and in which that is.
-
-    Args:
-        centres, radii: (A, 3) and (A,), the first grid point is the origin.
-        shape, spacing: of the grid.
-        margin: how far outside of the balls depths, negative there, are told.
-
-    Returns:
-        Depths, at least `-margin`, and the balls, -1 where there is none within `margin`.
-    """
+    """How deep each grid point lies in the ball in which it lies deepest, at least `-margin` (outside of all, it is
+    negative), and in which that is, -1 where there is none within `margin`. The first grid point is the origin."""
     depth = np.full(shape, -margin, np.float32)
     owner = np.full(shape, -1, np.int32)
     for i in range(len(radii)):
@@ -164,15 +156,8 @@ def distances_outside(
     The nearest place outside lies on a sphere, on an arc of two, or at the end of an arc. On a sphere it can only be
     that of the ball in which the point lies deepest: all others end further out.
 
-    Args:
-        depth, owner: see `depths`.
-        centres, radii, first, neighbours: see `exposed_arcs`.
-        exposed, arcs: what it returned.
-        spacing: of the grid.
-        reach: distances beyond are told as this.
-
-    Returns:
-        The distances up to `reach`; outside of the balls `depth`, which is negative.
+    For the arguments see `depths` and `exposed_arcs`. Distances beyond `reach` are told as this; outside of the balls
+    they are `depth`, which is negative.
     """
     shape = depth.shape
     distance = np.minimum(depth, np.float32(reach))
@@ -251,11 +236,9 @@ def _span(low: float, high: float, spacing: float, size: int) -> tuple[int, int]
 
 @compiled()
 def cubic_values(field: NDArray[np.float32], points: Floats) -> Floats:
-    """A function on a grid and its gradient, (P, 4), between its points by cubic convolution (Keys 1981).
+    """A function on a grid and its gradient, (P, 4), at points (P, 3) in cells, by cubic convolution (Keys 1981).
 
-    Args:
-        field: at the grid points, at least four along each axis.
-        points: (P, 3), in cells.
+    The grid has at least four points along each axis.
     """
     values = np.empty((len(points), 4))
     weight, slope = np.empty((3, 4)), np.empty((3, 4))

@@ -20,7 +20,7 @@ from igps.mesh._label_field import PAD, filled_share, smooth_field
 from igps.mesh._level_set import LEAST, without_bubbles
 from igps.mesh.limits import check_grid
 from igps.mesh.mesh import MeshError
-from igps.mesh.surface import compact, components, signed_volume
+from igps.mesh.surface import connected, signed_volume
 
 MAX_VERTICES = 5000
 """As many vertices a label's surface has at most, where nothing else is said."""
@@ -49,9 +49,9 @@ def voxel_surface(
 ) -> tuple[Floats, Integers, tuple[str, ...]]:
     """The closed, outward surface of the voxels of a body.
 
-    It encloses the volume of the voxels, has every centre of a voxel on its side (unless it was put on a coarser grid),
-    and is closed where the body ends at the border of the volume. Voxels that share only a corner are one piece. Holes
-    inside are filled.
+    It encloses their volume, has the centres of all voxels on their side unless it was put on a coarser grid, and is
+    closed where the body ends at the border of the volume. Voxels that share only a corner are one piece. Holes inside
+    are filled.
 
     Example:
         >>> index = np.indices((24, 24, 24))
@@ -69,8 +69,7 @@ def voxel_surface(
         name: what error messages call the body.
 
     Returns:
-        Vertices (V, 3) in the world; faces (F, 3), counter-clockwise seen from outside, of one or several closed
-        pieces; and notes of what was done.
+        Vertices (V, 3) in the world, faces (F, 3) of one or several closed pieces, and notes of what was done.
 
     Raises:
         MeshError: too few voxels, or an affine that is singular.
@@ -80,16 +79,14 @@ def voxel_surface(
         raise MeshError(f"{name}: expected an array of three axes, got shape {mask.shape}.")
     matrix = np.eye(4) if affine is None else np.asarray(affine, dtype=np.float64)
     spacing = checked_spacing(matrix, name)
-    box = ndimage.find_objects(mask.view(np.uint8))
     n_voxels = int(np.count_nonzero(mask))
     if n_voxels < LEAST_VOXELS:
-        raise MeshError(
-            f"{name}: {n_voxels} voxels, at least {LEAST_VOXELS} expected: they tell no shape. Leave it out, or label "
-            "it on a finer grid."
-        )
-    low = np.array([part.start for part in box[0]], dtype=np.float64)
+        few = f"{name}: {n_voxels} voxels, at least {LEAST_VOXELS} expected: they tell no shape."
+        raise MeshError(f"{few} Leave it out, or label it on a finer grid.")
+    (box,) = ndimage.find_objects(mask.view(np.uint8))
+    low = np.array([side.start for side in box], dtype=np.float64)
     notes: list[str] = []
-    mask, hollows = _whole(mask[box[0]], notes, LEAST_VOXELS if cavities else None)
+    mask, hollows = _whole(mask[box], notes, LEAST_VOXELS if cavities else None)
     share, factor = _coarsened(mask, spacing, max_vertices)
     mask = _joined(share >= 0.5)
     share = np.pad(np.where(mask, np.maximum(share, 0.5), share), PAD)
@@ -113,19 +110,13 @@ def voxel_surface(
 
 
 def checked_spacing(affine: Floats, name: str) -> Floats:
-    """(3,) sides of a voxel, length.
-
-    Raises:
-        MeshError: the affine is no invertible matrix (4, 4) of finite numbers.
-    """
+    """(3,) sides of a voxel, length; a MeshError if the affine is no invertible matrix (4, 4) of finite numbers."""
     if affine.shape != (4, 4) or not np.isfinite(affine).all():
         raise MeshError(f"{name}: affine: expected a finite matrix of shape (4, 4), got {affine.tolist()}.")
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not spacing.all() or abs(np.linalg.det(affine[:3, :3] / np.where(spacing, spacing, 1))) < 1e-6:
-        raise MeshError(
-            f"{name}: the affine is singular, so the voxels have no volume. Write the file again with the spacing and "
-            "the directions of its axes."
-        )
+        singular = f"{name}: the affine is singular, so the voxels have no volume."
+        raise MeshError(f"{singular} Write the file again with the spacing and the directions of its axes.")
     return spacing
 
 
@@ -139,17 +130,15 @@ def _whole(mask: Booleans, notes: list[str], least: int | None) -> tuple[Boolean
         notes.append(f"dropped {pieces} apart of {lost} voxels, {lost / size.sum():.1%} of the label")
     # What is outside shares faces.
     hollow, n_hollow = ndimage.label(np.pad(~mask, 1, constant_values=True))
-    if n_hollow > 1:
-        hollow_outside = hollow[0, 0, 0]
-        hollow = hollow[1:-1, 1:-1, 1:-1]
-        filled = hollow != hollow_outside
-        size = np.bincount(hollow.reshape(-1))
-        size[[0, hollow_outside]] = 0
-        kept = [] if least is None else np.flatnonzero(size >= least).tolist()
-        if n_filled := int(size.sum() - size[kept].sum()):
-            notes.append(f"filled holes of {n_filled} voxels")
-        return np.asarray(filled), [hollow == k for k in kept]
-    return mask, []
+    if n_hollow < 2:
+        return mask, []
+    outside, hollow = hollow[0, 0, 0], hollow[1:-1, 1:-1, 1:-1]
+    size = np.bincount(hollow.reshape(-1))
+    size[[0, outside]] = 0
+    kept = [] if least is None else np.flatnonzero(size >= least).tolist()
+    if n_filled := int(size.sum() - size[kept].sum()):
+        notes.append(f"filled holes of {n_filled} voxels")
+    return np.asarray(hollow != outside), [hollow == k for k in kept]
 
 
 def _islands(mask: Booleans) -> tuple[NDArray[np.int32], Integers, Integers]:
@@ -175,7 +164,6 @@ def _joined(mask: Booleans) -> Booleans:
             moved = padded[tuple(slice(1 + d, 1 + d + n) for d, n in zip(offset, mask.shape, strict=True))]
             at = np.argwhere((label > 0) & (moved > 0) & (label != moved))
             for axis in np.nonzero(offset)[0][:-1]:
-                at = at.copy()
                 at[:, axis] += offset[axis]
                 extra[tuple(at.T)] = True
         if not extra.any():
@@ -186,11 +174,8 @@ def _joined(mask: Booleans) -> Booleans:
 
 def _n_vertices(mask: Booleans, sides: Floats) -> float:
     """About how many vertices marching cubes make on a grid as fine as the shortest side."""
-    area = 0.0
-    for axis in range(3):
-        crossings = np.count_nonzero(np.diff(mask.view(np.int8), axis=axis, prepend=0, append=0))
-        area += crossings * sides.prod() / sides[axis]
-    return float(area / sides.min() ** 2)
+    cuts = [np.count_nonzero(np.diff(mask.view(np.int8), axis=axis, prepend=0, append=0)) for axis in range(3)]
+    return float((cuts * sides.prod() / sides).sum() / sides.min() ** 2)
 
 
 def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> Surface:
@@ -219,8 +204,7 @@ def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> Surface:
 
 def _is_thick(mask: Booleans, axes: Booleans) -> bool:
     """Whether hardly any of the body is less than three voxels thick along the axes."""
-    size = np.where(axes, 3, 1)
-    core = ndimage.minimum_filter(mask, tuple(size), mode="constant")
+    core = ndimage.minimum_filter(mask, tuple(np.where(axes, 3, 1)), mode="constant")
     reached = ndimage.maximum_filter(core, tuple(np.where(axes, 5, 1)), mode="constant")
     return bool(np.count_nonzero(mask & ~reached) <= _THIN * np.count_nonzero(mask))
 
@@ -263,8 +247,7 @@ def _meshed(field: Floats, sides: Floats, volume: float, max_vertices: int, name
     level = np.where(field < 0, np.minimum(field, -LEAST * cell), np.maximum(field, LEAST * cell)) / cell
     vertices, faces = level_surface(without_bubbles(level.astype(np.float32)), name)
     vertices = vertices * (sides / cell)
-    n_pieces, piece_of = components(faces, len(vertices))
-    pieces = [compact(vertices, faces[piece_of[faces[:, 0]] == piece]) for piece in range(n_pieces)]
+    pieces = connected(vertices, faces)
     volumes = np.abs([signed_volume(*piece) for piece in pieces])
     parts, n_before = [], 0
     # Specks between voxels are none of theirs.

@@ -23,7 +23,7 @@ from igps.mesh._level_set import LEAST, SPECK_VOLUME, without_bubbles
 from igps.mesh._molecular_loops import cubic_values, depths, distances_outside, exposed_arcs
 from igps.mesh.formats.molecules import Molecule
 from igps.mesh.mesh import Mesh, MeshError
-from igps.mesh.surface import compact, components, face_areas, signed_volume, vertex_normals
+from igps.mesh.surface import connected, face_areas, signed_volume, sums, vertex_normals
 
 SurfaceKind = Literal["excluded", "accessible", "van_der_waals"]
 Pieces = Literal["joined", "largest"]
@@ -52,8 +52,8 @@ def molecular_surface(
     """The closed surface of a molecule, in ångström; hollows inside that it does not open to are filled.
 
     At a spacing of 0.5 the area and volume of the excluded surface are within 1 % of closed forms, before vertices are
-    taken away; afterwards the volume still is. Pieces, such as two balls of which each ends in a cusp, are joined by
-    threads, which add 0.3 % of the area at most; a neck of radius less than about half the spacing is a thread, too.
+    taken away; afterwards the volume still is. Threads between pieces, such as two balls that each end in a cusp, add
+    0.3 % of the area at most; a neck of radius less than about half the spacing is a thread, too.
 
     Example:
         >>> at, none = np.zeros((1, 3)), np.zeros(1)
@@ -63,8 +63,8 @@ def molecular_surface(
 
     Args:
         molecule: its balls.
-        kind: "excluded": what no probe enters; "accessible": where no centre of a probe can be, all balls larger by its
-            radius; "van_der_waals": the balls themselves.
+        kind: "excluded": what no probe enters; "accessible": where no centre of a probe can be; "van_der_waals": the
+            balls themselves.
         probe: radius, Å; that of water is 1.4.
         spacing: of the grid, Å.
         max_vertices: larger surfaces are simplified to so many; None keeps all.
@@ -75,16 +75,21 @@ def molecular_surface(
         ValueError: a parameter out of range.
         MeshError: the balls lie too far apart for a grid, or give no closed surface.
     """
-    _check(kind, probe, spacing, pieces)
+    if kind not in get_args(SurfaceKind):
+        raise ValueError(f"kind: expected one of {', '.join(get_args(SurfaceKind))}, got {kind!r}.")
+    if pieces not in get_args(Pieces):
+        raise ValueError(f"pieces: expected 'joined' or 'largest', got {pieces!r}.")
+    if not 0 <= probe < math.inf:
+        raise ValueError(f"probe: expected a radius of at least 0 Å, got {probe}.")
+    if not 0 < spacing < math.inf:
+        raise ValueError(f"spacing: expected more than 0 Å, got {spacing}.")
     centres, radii = _outermost(molecule.positions, molecule.radii + (0.0 if kind == "van_der_waals" else probe))
     margin = _MARGIN * spacing
     low = (centres - radii[:, None]).min(axis=0) - margin
     sides = np.ceil(((centres + radii[:, None]).max(axis=0) + margin - low) / spacing) + 1
     if sides.prod() > _MOST_CELLS:
-        raise MeshError(
-            f"{molecule.name}: a grid of {sides.prod():.3g} cells of {spacing} Å would be needed, at most "
-            f"{_MOST_CELLS:.3g} are made. Raise the spacing, or remove stray atoms."
-        )
+        needed = f"{molecule.name}: a grid of {sides.prod():.3g} cells of {spacing} Å would be needed, at most"
+        raise MeshError(f"{needed} {_MOST_CELLS:.3g} are made. Raise the spacing, or remove stray atoms.")
     shape = (int(sides[0]), int(sides[1]), int(sides[2]))
     exact = _field(centres - low, radii, shape, spacing, probe if kind == "excluded" else 0.0)
     notes = [f"{kind.replace('_', ' ')} surface, probe {probe:g} Å, grid of {spacing:g} Å"]
@@ -97,17 +102,6 @@ def molecular_surface(
     vertices = _settled(np.where(field == clear, exact, field), vertices, faces)
     vertices, faces = _one_piece(vertices, faces, pieces, max_vertices, notes)
     return Mesh(vertices * spacing + low, faces, name=molecule.name, notes=(*molecule.notes, *notes))
-
-
-def _check(kind: str, probe: float, spacing: float, pieces: str) -> None:
-    if kind not in get_args(SurfaceKind):
-        raise ValueError(f"kind: expected one of {', '.join(get_args(SurfaceKind))}, got {kind!r}.")
-    if pieces not in get_args(Pieces):
-        raise ValueError(f"pieces: expected 'joined' or 'largest', got {pieces!r}.")
-    if not 0 <= probe < math.inf:
-        raise ValueError(f"probe: expected a radius of at least 0 Å, got {probe}.")
-    if not 0 < spacing < math.inf:
-        raise ValueError(f"spacing: expected more than 0 Å, got {spacing}.")
 
 
 def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
@@ -153,11 +147,10 @@ def _one_piece(
     vertices: Floats, faces: Integers, pieces: Pieces, max_vertices: int | None, notes: list[str]
 ) -> Surface:
     """The surface of the largest piece, or of all but specks, joined; each with its share of the vertices."""
-    n_pieces, owner = components(faces, len(vertices))
-    parts = [compact(vertices, faces[owner[faces[:, 0]] == k]) for k in range(n_pieces)]
+    parts = connected(vertices, faces)
     sizes = [abs(signed_volume(*part)) for part in parts]
-    if n_pieces > 1 and pieces == "largest":
-        notes.append(f"the largest of {n_pieces} pieces was kept")
+    if len(parts) > 1 and pieces == "largest":
+        notes.append(f"the largest of {len(parts)} pieces was kept")
     least = max(sizes) if pieces == "largest" else SPECK_VOLUME * sum(sizes)
     parts = [part for part, size in zip(parts, sizes, strict=True) if size >= least]
     if max_vertices is not None:
@@ -177,8 +170,7 @@ def _settled(field: NDArray[np.float32], vertices: Floats, faces: Integers) -> F
     steps, normals = _steps(field, vertices)
     vertices = vertices - steps
     for _ in range(_N_ROUNDS):
-        means = _at_vertices(vertices[faces].mean(axis=1), vertices, faces)
-        shift = means - vertices
+        shift = _at_vertices(vertices[faces].mean(axis=1), vertices, faces) - vertices
         vertices = vertices + shift - np.einsum("ij,ij->i", shift, normals)[:, None] * normals
         steps, normals = _steps(field, vertices)
         vertices = vertices - steps
@@ -200,7 +192,7 @@ def _steps(field: NDArray[np.float32], points: Floats) -> tuple[Floats, Floats]:
 
 def _at_vertices(values: Floats, vertices: Floats, faces: Integers) -> Floats:
     """(V, D) means of the values (F, D) of the faces around each vertex, by their areas."""
-    areas, corners = face_areas(vertices, faces), faces.ravel()
-    total = np.maximum(np.bincount(corners, np.repeat(areas, 3), len(vertices)), np.finfo(float).tiny)
-    columns = [np.bincount(corners, np.repeat(areas * column, 3), len(vertices)) / total for column in values.T]
-    return np.stack(columns, axis=1)
+    areas = face_areas(vertices, faces)[:, None]
+    rows = np.repeat(np.concatenate([areas, areas * values], axis=1), 3, axis=0)
+    totals = sums(faces.ravel(), rows, len(vertices))
+    return totals[:, 1:] / np.maximum(totals[:, :1], np.finfo(float).tiny)

@@ -17,16 +17,6 @@ from igps.mesh.options import BodyKind, LoadOptions
 from igps.mesh.surface import compact, face_parts
 
 
-def no_vertices() -> Floats:
-    """Those of a body of which there is no surface, (0, 3)."""
-    return np.zeros((0, 3))
-
-
-def no_faces() -> Integers:
-    """Those of a cloud of points, (0, 3)."""
-    return np.zeros((0, 3), dtype=np.int64)
-
-
 @dataclass(frozen=True, eq=False)
 class RawBody:
     """A surface as a file has it, unchecked.
@@ -43,8 +33,8 @@ class RawBody:
         voxels: measures the voxels that the surface was made of.
     """
 
-    vertices: Floats = field(default_factory=no_vertices)
-    faces: Integers = field(default_factory=no_faces)
+    vertices: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    faces: Integers = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
     part: str | None = None
     unit: str | None = None
     normals: Floats | None = None

@@ -28,22 +28,15 @@ def read(path: Path, changed: int) -> tuple[NDArray[Any], Floats]:
     """Values (X, Y, Z) of an image or grid, and the affine (4, 4) from voxels to coordinates.
 
     NIfTI, MGH, NRRD, MetaImage and TIFF are in world coordinates (RAS, millimetres), OpenDX, MRC and CCP4 in ångström.
-
-    Args:
-        path: the file.
-        changed: when that was, so that the last file need not be read again.
+    The last file is not read again unless it was `changed` at another time.
 
     Raises:
         MeshError: another format, an image that does not fit into memory, or a file cut short.
         ImportError: a module is missing.
     """
-    name = path.name.lower()
-    if name.endswith(_GRIDS):
-        return (_dx if name.endswith(".dx") else _map)(path)
-    readers = [suffix for suffix in _volume_files.READERS if name.endswith(suffix)]
-    if not readers:
-        raise MeshError(f"{path}: not an image that is read. Convert it to one of {', '.join(SUFFIXES)}.")
-    volume = _volume_files.READERS[max(readers, key=len)](path)
+    if path.name.lower().endswith(_GRIDS):
+        return (_dx if path.suffix.lower() == ".dx" else _map)(path)
+    volume = _volume_files.read_raw(path)
     return volume.layers[0], volume.affine
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from igps.mesh._arrays import Floats, Integers
-from igps.mesh.formats._structures import SUFFIXES, gemmi_module, read_structure, suffix
+from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structure, suffix
 from igps.mesh.mesh import MeshError
 from igps.mesh.residues import (
     BACKBONE,
@@ -93,9 +93,8 @@ def read_molecule(
     Each model of an ensemble gives bodies of its own. Water is left out. Of alternative locations that of the highest
     occupancy is taken, the first of equals. Radii are van der Waals radii of the elements (Bondi 1964), and charges
     those of residues at pH 7, without the ends of chains. A PQR file has its own of both, and keeps its hydrogens.
-
-    An amino acid with no atom of its side chain gets a ball of the side chain's volume, which touches Cα on the side of
-    Cβ; one of Cα alone is a ball of its whole volume (Zamyatnin 1972). So backbones and traces are bodies, too.
+    Where all atoms of a side chain are missing, a ball of its volume touches Cα on the side of Cβ; a residue of Cα
+    alone is a ball of its whole volume (Zamyatnin 1972). So backbones and traces are bodies, too.
 
     Example:
         >>> import tempfile
@@ -109,12 +108,9 @@ def read_molecule(
     Args:
         path: the file.
         bodies: "chains": every chain of every model; "models": every model as a whole; "assembly": of every model the
-            first biological assembly that the file names.
+            first biological assembly that the file names. Those without usable atoms are left out, which is logged.
         ligands: whether what belongs to no polymer belongs to the bodies. In a file without polymers it does.
         hydrogens: whether hydrogens are kept, which most structures lack.
-
-    Returns:
-        At least one. Chains without usable atoms are left out, which is logged.
 
     Raises:
         ValueError: unknown `bodies`.
@@ -125,15 +121,13 @@ def read_molecule(
     if bodies not in get_args(MoleculeBodies):
         raise ValueError(f"bodies: expected one of {', '.join(get_args(MoleculeBodies))}, got {bodies!r}.")
     structure = read_structure(path)
-    parts = list(_parts(structure, bodies, path))
+    parts = list(parts_of(structure, bodies, path))
     found, left_out = _molecules(parts, ligands, hydrogens, suffix(path) == ".pqr")
     if not found and not ligands:
         found, left_out = _molecules(parts, True, hydrogens, suffix(path) == ".pqr")
     if not found:
-        raise MeshError(
-            f"{path}: no atoms of a molecule that have positions, in {len(parts)} {bodies}. Check that the file is "
-            "complete, and not of water alone."
-        )
+        none = f"{path}: no atoms of a molecule that have positions, in {len(parts)} {bodies}."
+        raise MeshError(f"{none} Check that the file is complete, and not of water alone.")
     for name in left_out:
         logger.warning("%s: no atoms of a polymer, left out; read its ligands, or check the file.", name)
     return found
@@ -155,31 +149,11 @@ def _molecules(
         one = _Builder(ligands, hydrogens or is_pqr, is_pqr)
         for chain in chains:
             one.add_chain(chain)
-        if any(radius > 0 for radius in one.radii):
+        if any(radius > 0 for _, radius, _, _ in one.balls):
             found.append(one.molecule(name, notes))
         else:
             left_out.append(name)
     return found, left_out
-
-
-def _parts(
-    structure: gemmi.Structure, bodies: MoleculeBodies, path: Path
-) -> Iterator[tuple[str, list[gemmi.Chain], list[str]]]:
-    """The name of each body, its chains, and notes."""
-    gemmi = gemmi_module()
-    for model in structure:
-        of = f"model {model.num} " if len(structure) > 1 else ""
-        if bodies == "chains":
-            # A chain may come in several pieces.
-            for label in dict.fromkeys(chain.name for chain in model):
-                yield f"{path}#{of}chain {label or 'without name'}", [c for c in model if c.name == label], []
-        elif bodies == "assembly" and len(structure.assemblies):
-            first = structure.assemblies[0]
-            made = gemmi.make_assembly(first, model, gemmi.HowToNameCopiedChain.AddNumber)
-            yield f"{path}#{of}assembly {first.name}", list(made), []
-        else:
-            notes = ["the file names no assembly: the model was taken as it is"] if bodies == "assembly" else []
-            yield f"{path}#{of}".strip("# "), list(model), notes
 
 
 class _Builder:
@@ -187,29 +161,19 @@ class _Builder:
 
     def __init__(self, ligands: bool, hydrogens: bool, is_pqr: bool) -> None:
         self.ligands, self.hydrogens, self.is_pqr = ligands, hydrogens, is_pqr
-        self.radii: list[float] = []
-        self._positions: list[Floats] = []
-        self._charges: list[float] = []
-        self._residue_of: list[int] = []
-        self._names: list[str] = []
-        self._places: list[Floats] = []
-        self._b_factors: list[float] = []
+        self.balls: list[tuple[Floats, float, float, int]] = []  # position, radius, charge, residue
+        self._residues: list[tuple[str, Floats, float]] = []  # name, position, B-factor
         self._count: Counter[str] = Counter()
 
     def molecule(self, name: str, notes: list[str]) -> Molecule:
         own = ["radii and charges are those of the PQR file"] if self.is_pqr else []
         counted = [text.format(self._count[what]) for what, text in _NOTES.items() if self._count[what]]
+        positions, radii, charges, residue_of = map(np.array, zip(*self.balls, strict=True))
+        names, places, b_factors = zip(*self._residues, strict=True)
         return Molecule(
-            name,
-            np.array(self._positions),
-            np.array(self.radii),
-            np.array(self._charges),
-            np.array(self._residue_of, dtype=np.int64),
-            tuple(self._names),
-            np.array(self._places),
-            np.array(self._b_factors),
+            name, positions, radii, charges, residue_of, names, np.array(places), np.array(b_factors),
             (*notes, *own, *counted),
-        )
+        )  # fmt: skip
 
     def add_chain(self, chain: gemmi.Chain) -> None:
         seen: set[str] = set()
@@ -237,9 +201,8 @@ class _Builder:
         self._count["residue"] += in_polymer and not is_known
         at = np.array([atom.pos.tolist() for atom in atoms])
         alpha = next((i for i, atom in enumerate(atoms) if atom.name == "CA"), None) if in_polymer else None
-        self._names.append(name)
-        self._places.append(at.mean(axis=0) if alpha is None else at[alpha])
-        self._b_factors.append(np.nan if self.is_pqr else float(np.mean([atom.b_iso for atom in atoms])))
+        b_factor = np.nan if self.is_pqr else float(np.mean([atom.b_iso for atom in atoms]))
+        self._residues.append((name, at.mean(axis=0) if alpha is None else at[alpha], b_factor))
         charged = (PHOSPHATE_OXYGENS if kind.is_nucleic_acid() else CHARGED_ATOMS.get(name, {})) if in_polymer else {}
         if alpha is not None and not self.is_pqr and (named == {"CA"} or (named <= BACKBONE and name != "GLY")):
             self._add_coarse_ball(name, atoms, at, sum(charged.values()))
@@ -248,12 +211,12 @@ class _Builder:
         for atom, position in zip(atoms, at, strict=True):
             if self.is_pqr:
                 self._add_ball(position, atom.b_iso, atom.occ)
-                continue
-            self._add_ball(position, self._radius(atom), charged.get(atom.name, 0.0))
+            else:
+                self._add_ball(position, self._radius(atom), charged.get(atom.name, 0.0))
         return True
 
     def _radius(self, atom: gemmi.Atom) -> float:
-        """The van der Waals radius of the atom's element, or of that which its name tells."""
+        """The van der Waals radius of the atom's element, which its name tells if need be."""
         if atom.element.atomic_number:
             return float(atom.element.vdw_r)
         if (letter := _letter(atom)) in _ELEMENTS:
@@ -263,13 +226,10 @@ class _Builder:
         return _UNKNOWN_RADIUS
 
     def _add_ball(self, position: Floats, radius: float, charge: float) -> None:
-        self._positions.append(position)
-        self.radii.append(radius)
-        self._charges.append(charge)
-        self._residue_of.append(len(self._names) - 1)
+        self.balls.append((position, radius, charge, len(self._residues) - 1))
 
     def _add_coarse_ball(self, name: str, atoms: list[gemmi.Atom], at: Floats, charge: float) -> None:
-        """That which stands for a missing side chain, or for a residue of Cα alone."""
+        """The ball for a missing side chain, or for a residue of Cα alone."""
         place = {atom.name: position for atom, position in zip(atoms, at, strict=True)}
         if len(place) == 1:
             self._count["alpha"] += 1
@@ -325,7 +285,7 @@ def _letter(atom: gemmi.Atom) -> str:
 
 
 def _standard(name: str, kind: gemmi.ResidueInfo) -> str:
-    """The name of the amino acid that a modified one was; any other name as it is."""
+    """The name of the amino acid that a modified one was; of others their own."""
     if name in STANDARD:
         return STANDARD[name]
     if kind.is_standard() or not kind.is_amino_acid():
