@@ -187,9 +187,8 @@ def _at_corners(faces: Integers, n_vertices: int) -> sparse.csr_array:
 def noise_over_edge(vertices: Floats, faces: Integers) -> float:
     """Standard deviation of the noise along the normals over the root mean square length of edges (if thin, near ones).
 
-    By the lower quartile of what `is_noisy` looks at, each vertex's over what the same operator makes of white noise of
-    one unit there. On generated shapes with 0.1 edges of noise and more it is within a tenth of the truth; a shape
-    without noise passes for 0.01 to 0.04.
+    By what `is_noisy` looks at, over what the same operator makes of white noise. On generated shapes with 0.1 edges of
+    noise and more it is within a tenth of the truth; a shape without noise passes for 0.01 to 0.04.
     """
     vertices = vertices / _unit_of_length(vertices)
     noise, edge = _noise_and_edge(vertices, faces, _Neighbours.of(vertices, faces))

@@ -54,11 +54,9 @@ def voxel_surface(
     are filled.
 
     Example:
-        >>> index = np.indices((24, 24, 24))
-        >>> ball = ((index - 11.3) ** 2).sum(axis=0) < 10**2
+        >>> ball = ((np.indices((24, 24, 24)) - 11.3) ** 2).sum(axis=0) < 10**2
         >>> vertices, faces, _ = voxel_surface(ball)
-        >>> radius = np.linalg.norm(vertices - 11.3, axis=1)
-        >>> bool(abs(radius - 10).max() < 0.4)
+        >>> bool(abs(np.linalg.norm(vertices - 11.3, axis=1) - 10).max() < 0.4)
         True
 
     Args:

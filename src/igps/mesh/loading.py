@@ -24,12 +24,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class BodyRef:
-    """A body that a file holds.
-
-    Args:
-        path: the file.
-        part: its name among the bodies of the file; None where the file is one body.
-    """
+    """A body that a file holds: the file, and its name there, None where the file is one body."""
 
     path: Path
     part: str | None = None
@@ -39,11 +34,7 @@ class BodyRef:
 
 
 def list_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[BodyRef]:
-    """The bodies of a file, without making surfaces of them where the format can tell.
-
-    Raises:
-        MeshError: the file is missing or unreadable.
-    """
+    """The bodies of a file, without making surfaces of them where the format can tell."""
     path = Path(path)
     kind = _format(path)
     how = _bodies(kind, options)
@@ -62,8 +53,8 @@ def load_mesh(
 ) -> Mesh:
     """Read a mesh, a cloud of points, a label volume or a molecule, and make a body of it.
 
-    Polygons are cut into triangles. The vertices of a body keep their order and are not merged, but for an STL file,
-    which has none: there corners in one place are a vertex.
+    Polygons are cut into triangles. Vertices keep their order and are not merged; only in an STL file, which has none,
+    corners in one place are a vertex.
 
     Example:
         >>> import tempfile, trimesh
@@ -87,11 +78,7 @@ def load_mesh(
 
 
 def load_bodies(path: str | Path, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> list[Mesh]:
-    """All bodies of a file that can be used; of the others the log tells.
-
-    Raises:
-        MeshError: the file is missing or unreadable, or none of its bodies is usable.
-    """
+    """All bodies of a file that can be used; of the others the log tells. A MeshError if there is none."""
     found, faults = [], []
     for _, body in each_body(path, options, least_vertices=least_vertices):
         if isinstance(body, MeshError):
@@ -108,11 +95,7 @@ def each_body(
     path: str | Path, options: LoadOptions = LoadOptions(), *, parts: Sequence[str | None] | None = None,
     least_vertices: int = 0,
 ) -> Iterator[tuple[BodyRef, Mesh | MeshError]]:  # fmt: skip
-    """The bodies of a file, read once, or those of the given parts; what is wrong with one stands in its place.
-
-    Raises:
-        MeshError: the file is missing or unreadable.
-    """
+    """The bodies of a file, read once, or those of the given parts; what is wrong with one stands in its place."""
     for ref, raw in each_surface(path, options, parts=parts):
         with one_thread():
             try:
@@ -135,11 +118,7 @@ def each_surface(
 
 
 def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part: str | None = None) -> RawBody:
-    """The surface of a body as the file has it, unchecked.
-
-    Raises:
-        MeshError: the file is missing or unreadable, has several bodies and none is named, or not the one that is.
-    """
+    """The surface of a body as the file has it, unchecked; its only one, if none is named."""
     path = Path(path)
     bodies = _read(path, options, part)
     found = [body for body in bodies if body.part == part] if part is not None else bodies

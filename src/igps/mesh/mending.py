@@ -55,20 +55,18 @@ def mend(
 
     In this order, and no further than needed: the surface as it is; coincident vertices welded, degenerate and doubled
     faces, fins, specks and closed parts inside the body dropped, faces turned; small holes filled; walls inside dropped
-    or closed parts that overlap united (see `_union`), where that makes a body; `watertight`. What is rough with a
-    scanner's noise all over is smoothed, because noise adds area (see `denoising`). What then has fewer than
-    `least_vertices` is subdivided, longest edges first, which leaves the surface where it is.
+    or closed parts that overlap united, where that makes a body; `watertight`. A surface that is rough with a scanner's
+    noise is smoothed, because noise adds area. One of fewer than `least_vertices` is subdivided, longest edges first.
 
     Args:
         vertices: (V, 3) positions, any length unit.
         faces: (F, 3) vertex indices; None or empty for a cloud of points, which is made watertight.
-        how: "auto" for the above; "never" takes bodies only; "always" makes watertight what is not the boundary of one
-            body already: closed, oriented, edge-manifold, of one piece, and not crossing itself, which "auto" lets
-            pass. Such boundaries are only welded, smoothed and subdivided.
+        how: "auto" for the above; "never" takes bodies only; "always" makes watertight what after welding is not the
+            boundary of one body that does not cross itself, which "auto" does not ask.
         least_vertices: such as the number of eigenpairs plus two; not with "never".
         normals: (V, 3) of a cloud of points, if known.
-        cavities: "fill" drops closed parts inside the body; "keep" takes them for the surfaces of hollows. What is made
-            watertight is filled.
+        cavities: "fill" drops closed parts inside the body; "keep" takes them for the surfaces of hollows, unless it is
+            made watertight.
         name: what error messages call the surface, usually its file.
         notes: what was done to it before.
 

@@ -117,10 +117,6 @@ class Mesh:
         Args:
             body: a Mesh, or a closed surface as a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage. Polygons
                 are cut into triangles. Its file, if it knows one, becomes the name.
-
-        Raises:
-            TypeError: it is something else.
-            MeshError: it is not one closed surface, see `Mesh`.
         """
         if isinstance(body, cls):
             return body
@@ -172,11 +168,7 @@ class Mesh:
 
     @property
     def genus(self) -> int:
-        """Number of handles, of a closed mesh; of one with cavities those of all its surfaces.
-
-        Raises:
-            MeshError: the mesh is open.
-        """
+        """Number of handles, of all surfaces together; a MeshError of an open mesh."""
         if len(undirected_edges(self.faces, len(self.vertices))[0]) * 2 != len(self.faces) * 3:
             raise MeshError(f"{self.name}: an open surface has no genus; a closed one was expected. Close the holes.")
         return genus(self.faces, len(self.vertices))

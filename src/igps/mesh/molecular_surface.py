@@ -68,8 +68,7 @@ def molecular_surface(
         probe: radius, Å; that of water is 1.4.
         spacing: of the grid, Å.
         max_vertices: larger surfaces are simplified to so many; None keeps all.
-        pieces: what becomes of a surface in several pieces: "joined" by threads where the gaps are narrowest, and
-            specks dropped; or the "largest" alone.
+        pieces: "joined" by threads where the gaps are narrowest, without specks; or the "largest" alone.
 
     Raises:
         ValueError: a parameter out of range.

@@ -10,11 +10,7 @@ from igps.mesh.formats._format import RawBody, corners_of_rows, triangles
 
 
 def raw_of(thing: Any) -> tuple[str, RawBody]:
-    """Name and surface of a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage, unchecked.
-
-    Raises:
-        TypeError: it is none of them.
-    """
+    """Name and surface of a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage, unchecked; or a TypeError."""
     metadata = getattr(thing, "metadata", None)
     name = str((metadata.get("file_name") if isinstance(metadata, dict) else None) or "mesh")
     if hasattr(thing, "get_arrays_from_intent"):

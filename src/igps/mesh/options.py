@@ -29,20 +29,18 @@ class LoadOptions:
         ('welded 28 coincident vertices',)
 
     Args:
-        mend: "auto" does the least that makes a body of the surface, and leaves a body as it is, see `mend`; "never"
-            refuses what is no body; "always" makes every surface watertight that does not bound one body without
-            crossing itself, for collections of mixed quality.
+        mend: "auto" does the least that makes a body of the surface, see `mend`; "never" refuses what is no body;
+            "always" makes every surface watertight that does not bound one body without crossing itself, for
+            collections of mixed quality.
         component: "largest" keeps only the connected component of the largest area.
         allow_open: accept open boundaries; the winding number then decides what is inside.
         bodies: what of a file is a body. "whole": all of it; "labels" of a volume; "objects" of a scene, solids of a
-            CAD file, files of an archive; "pieces": what is not connected. "chains", "models" or the "assembly" of a
-            molecule. None, or what a format does not have: the labels of a volume, the chains of a molecule, the whole
-            of anything else.
+            CAD file, files of an archive; "pieces": what is not connected; "chains", "models" or the "assembly" of a
+            molecule. None, or what a format does not have: labels, chains, or else the whole.
         max_unpacked: bytes that a file may unpack to.
         names: a table of the names of labels, see `read_label_names`; None for those of the volume, or beside it.
         threshold: a voxel of at least this probability belongs to the body, in volumes of probabilities.
-        cavities: "fill" takes a hollow body for the full one; "keep" lets the surfaces of its hollows bound it too, of
-            meshes and of labels of volumes.
+        cavities: "fill" takes a hollow body for the full one; "keep" lets the surfaces of its hollows bound it too.
 
     Raises:
         ValueError: a value that is not among those.

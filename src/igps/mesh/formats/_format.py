@@ -55,14 +55,12 @@ class Format:
     Args:
         name: for messages.
         suffixes: lower case, with the dot. The longest that ends a file's name decides.
-        read: the bodies of a file, or the one that is named; raises anything where the file is faulty. The names of
-            parts are distinct.
+        read: the bodies of a file, with distinct names, or the one named; raises anything where the file is faulty.
         parts: the names of the bodies, told without making them; None: read them.
-        bodies: what the format itself may call a body, the usual first. "whole" and "pieces" need not be told apart by
-            `read`: they are made of what it gives.
+        bodies: what a body of the file may be, the usual first. "whole" and "pieces" are made of what `read` gives.
         is_searched: whether files below a folder are taken for bodies by their suffix.
         ignored: suffixes of files of the same format that hold no surface.
-        extra: of this package, that has the modules that it needs.
+        extra: the extra of this package with the modules that it needs.
     """
 
     name: str
@@ -144,11 +142,7 @@ def triangles(corners: Integers, n_corners: Integers) -> Integers:
 
 
 def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
-    """The corners of polygons laid end to end, and how many each has, of rows that begin with these numbers.
-
-    Raises:
-        ValueError: the last row is cut short.
-    """
+    """The corners of polygons laid end to end, and how many each has, of rows that begin with these numbers."""
     starts, at = [], 0
     while at < len(rows):
         starts.append(at)
@@ -161,11 +155,7 @@ def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
 
 
 def check_unpacked(n_bytes: int, path: Path, limit: int) -> None:
-    """Refuse what would take more bytes than allowed.
-
-    Raises:
-        MeshError: names the file, both numbers, and the remedy.
-    """
+    """Raise a MeshError for what would take more bytes than allowed."""
     if n_bytes > limit:
         raise MeshError(
             f"{path}: unpacks to {n_bytes / 1e9:.2g} GB or more, and at most {limit / 1e9:.2g} GB are allowed. If you "

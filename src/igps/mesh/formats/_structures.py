@@ -29,12 +29,7 @@ def suffix(path: Path) -> str:
 
 
 def read_structure(path: Path) -> gemmi.Structure:
-    """What the file holds; of a PQR file the charges of atoms are their occupancies, and the radii their B-factors.
-
-    Raises:
-        MeshError: the file is missing, cut short, unreadable, or larger than any structure.
-        ImportError: gemmi is not installed.
-    """
+    """What the file holds; of a PQR file the charges of atoms are their occupancies, and the radii their B-factors."""
     text = _text(path)
     if suffix(path) == ".pqr":
         return _pqr(text, path)

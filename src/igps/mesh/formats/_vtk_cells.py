@@ -21,11 +21,7 @@ _WITHOUT_AREA = (0, 1, 2, 3, 4)
 
 
 def surface(corners: Integers, n_corners: Integers, kinds: Integers) -> Integers:
-    """Triangles (F, 3) of cells, whose corners are laid end to end.
-
-    Raises:
-        ValueError: a kind of cell that is not known, such as a curved one.
-    """
+    """Triangles (F, 3) of cells, whose corners are laid end to end; a ValueError for curved ones and the like."""
     unknown = set(np.unique(kinds).tolist()) - {*_WITHOUT_AREA, TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, *_SIDES}
     if unknown:
         raise ValueError(

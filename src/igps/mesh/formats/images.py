@@ -29,10 +29,6 @@ def read(path: Path, changed: int) -> tuple[NDArray[Any], Floats]:
 
     NIfTI, MGH, NRRD, MetaImage and TIFF are in world coordinates (RAS, millimetres), OpenDX, MRC and CCP4 in ångström.
     The last file is not read again unless it was `changed` at another time.
-
-    Raises:
-        MeshError: another format, an image that does not fit into memory, or a file cut short.
-        ImportError: a module is missing.
     """
     if path.name.lower().endswith(_GRIDS):
         return (_dx if path.suffix.lower() == ".dx" else _map)(path)

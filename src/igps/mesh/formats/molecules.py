@@ -56,9 +56,7 @@ class Molecule:
 
     Args:
         name: of the file, with the model, chain or assembly.
-        positions: (A, 3) of the balls, Å.
-        radii: (A,) van der Waals radii, Å.
-        charges: (A,) elementary charges.
+        positions, radii, charges: (A, 3) and (A,) of the balls: Å, van der Waals radii in Å, elementary charges.
         residue_of: (A,) the residue of each ball, from 0.
         residue_names: of the R residues, three letters; a modified amino acid has the name of the one that it was.
         residue_positions: (R, 3) of the Cα atoms, or else the mean of a residue's atoms, Å.
@@ -107,10 +105,10 @@ def read_molecule(
 
     Args:
         path: the file.
-        bodies: "chains": every chain of every model; "models": every model as a whole; "assembly": of every model the
-            first biological assembly that the file names. Those without usable atoms are left out, which is logged.
-        ligands: whether what belongs to no polymer belongs to the bodies. In a file without polymers it does.
-        hydrogens: whether hydrogens are kept, which most structures lack.
+        bodies: "chains" or "models", each by itself, or of every model the first biological "assembly" that the file
+            names. Those without usable atoms are left out, which is logged.
+        ligands: keep what belongs to no polymer, as is done in a file without polymers.
+        hydrogens: keep hydrogens, which most structures lack.
 
     Raises:
         ValueError: unknown `bodies`.

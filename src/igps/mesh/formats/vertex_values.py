@@ -24,10 +24,7 @@ _VTK = (".vtk", ".vtp", ".vtu")
 
 def read(path: Path) -> Arrays:
     """Arrays (V,) or (V, C) by name: of PLY, VTK, GIFTI, or of FreeSurfer's files of thickness, curvature and the like.
-
-    Raises:
-        ValueError: there is none, or the file is damaged.
-    """
+    A ValueError if there is none, or the file is damaged."""
     name = path.name.lower()
     if name.endswith(_VTK):
         found = vtk.point_values(path, LoadOptions()).values
@@ -43,11 +40,7 @@ def read(path: Path) -> Arrays:
 
 
 def read_tetrahedra(path: Path) -> tuple[Floats, Integers, Arrays]:
-    """Points (V, 3), tetrahedra (T, 4), and arrays (V,) or (V, C) by name, of a VTK file.
-
-    Raises:
-        ValueError: there are no tetrahedra, or the file is damaged.
-    """
+    """Points (V, 3), tetrahedra (T, 4), and arrays (V,) or (V, C) by name, of a VTK file; a ValueError without them."""
     found = vtk.point_values(path, LoadOptions())
     if not len(found.tetrahedra) or not found.values:
         raise MeshError(f"{path}: expected tetrahedra with values at their points. Export both.")
@@ -57,11 +50,7 @@ def read_tetrahedra(path: Path) -> tuple[Floats, Integers, Arrays]:
 
 
 def chosen(arrays: Arrays, name: str, path: Path) -> Floats:
-    """The array of a name, or the only one.
-
-    Raises:
-        MeshError: there is none of that name, or there are several.
-    """
+    """The array of a name, or the only one."""
     if name in arrays:
         return arrays[name]
     if not name and len(arrays) == 1:

@@ -50,8 +50,6 @@ class LabelVolume:
         >>> volume = LabelVolume((labels,), np.diag([1.0, 1.0, 2.0, 1.0]), names={2: "liver"})
         >>> [(body.label, body.name, body.n_voxels) for body in volume.bodies]
         [(1, '1', 2048), (2, 'liver', 2048)]
-        >>> round(label_surface(volume, "liver").volume)
-        4096
 
     Args:
         layers: arrays (X, Y, Z) of whole numbers from 0, the background; several where segments overlap.
@@ -145,11 +143,7 @@ def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) ->
 
 
 def label_surface(volume: LabelVolume, part: int | str, *, how: Mending = "auto", cavities: Cavities = "fill") -> Mesh:
-    """The surface of a label, by its number or name, as a body in the world; see `voxel_surface` and `mend`.
-
-    Raises:
-        MeshError: no such label, too few voxels, or no body can be made of it.
-    """
+    """The surface of a label, by its number or name, as a body in the world; see `voxel_surface` and `mend`."""
     body = volume.body(part)
     name = f"{volume.name}#{body.name}"
     affine = np.array(volume.affine, dtype=np.float64)
