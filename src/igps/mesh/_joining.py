@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from igps.mesh._arrays import Floats, Integers, Surface
-from igps.mesh.surface import face_areas
+from igps.mesh.surface import face_areas, stacked
 
 # A thread takes no more of a triangle than this share of its sides.
 _MOST = 0.5
@@ -21,8 +21,7 @@ def joined_by_threads(parts: Sequence[Surface], share: float) -> Surface:
     may add this share of the whole area.
     """
     starts = np.cumsum([0, *(len(points) for points, _ in parts)])
-    vertices = np.concatenate([points for points, _ in parts])
-    faces = np.concatenate([triangles + start for (_, triangles), start in zip(parts, starts, strict=False)])
+    vertices, faces = stacked(parts)
     links = [(starts[i] + a, starts[j] + b) for i, j, a, b in _nearest([points for points, _ in parts])]
     length = sum(float(np.linalg.norm(vertices[a] - vertices[b])) for a, b in links)
     girth = share * float(face_areas(vertices, faces).sum()) / max(length, 1e-300)

@@ -96,11 +96,7 @@ def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: In
                         more = np.empty((room, 12))
                         more[:n_found] = found
                         found = more
-                    arc = found[n_found]
-                    arc[0], arc[1], arc[2] = mx, my, mz
-                    arc[3], arc[4], arc[5] = ax, ay, az
-                    arc[6], arc[7], arc[8] = ux, uy, uz
-                    arc[9], arc[10], arc[11] = radius, reached, start - reached
+                    found[n_found] = (mx, my, mz, ax, ay, az, ux, uy, uz, radius, reached, start - reached)
                     n_found += 1
                     exposed[i] = exposed[j] = 1
                 if position < n_covered:
@@ -172,9 +168,7 @@ def distances_outside(
                 i = owner[x, y, z]
                 free = exposed[i] == 1
                 if free and first[i] < first[i + 1]:
-                    dx = x * spacing - centres[i, 0]
-                    dy = y * spacing - centres[i, 1]
-                    dz = z * spacing - centres[i, 2]
+                    dx, dy, dz = x * spacing - centres[i, 0], y * spacing - centres[i, 1], z * spacing - centres[i, 2]
                     size = math.sqrt(dx * dx + dy * dy + dz * dz)
                     scale = radii[i] / max(size, 1e-9)
                     px, py, pz = centres[i, 0] + scale * dx, centres[i, 1] + scale * dy, centres[i, 2] + scale * dz
@@ -219,10 +213,9 @@ def distances_outside(
                         if a * ch + b * sh >= narrow * across:
                             square = (across - radius) ** 2 + h * h
                         else:
-                            square = min(
-                                (x * spacing - ex) ** 2 + (y * spacing - ey) ** 2 + (z * spacing - ez) ** 2,
-                                (x * spacing - fx) ** 2 + (y * spacing - fy) ** 2 + (z * spacing - fz) ** 2,
-                            )
+                            square = (x * spacing - ex) ** 2 + (y * spacing - ey) ** 2 + (z * spacing - ez) ** 2
+                            other = (x * spacing - fx) ** 2 + (y * spacing - fy) ** 2 + (z * spacing - fz) ** 2
+                            square = min(square, other)
                         if square < distance[x, y, z] ** 2:
                             distance[x, y, z] = math.sqrt(square)
     return distance
@@ -248,14 +241,10 @@ def cubic_values(field: NDArray[np.float32], points: Floats) -> Floats:
             cell = min(max(math.floor(points[p, axis]), 1), field.shape[axis] - 3)
             t = points[p, axis] - cell
             low[axis] = cell - 1
-            weight[axis, 0] = 0.5 * t * (-1 + t * (2 - t))
-            weight[axis, 1] = 0.5 * (2 + t * t * (3 * t - 5))
-            weight[axis, 2] = 0.5 * t * (1 + t * (4 - 3 * t))
-            weight[axis, 3] = 0.5 * t * t * (t - 1)
-            slope[axis, 0] = 0.5 * (-1 + t * (4 - 3 * t))
-            slope[axis, 1] = 0.5 * t * (9 * t - 10)
-            slope[axis, 2] = 0.5 * (1 + t * (8 - 9 * t))
-            slope[axis, 3] = 0.5 * t * (3 * t - 2)
+            weight[axis, 0], slope[axis, 0] = 0.5 * t * (-1 + t * (2 - t)), 0.5 * (-1 + t * (4 - 3 * t))
+            weight[axis, 1], slope[axis, 1] = 0.5 * (2 + t * t * (3 * t - 5)), 0.5 * t * (9 * t - 10)
+            weight[axis, 2], slope[axis, 2] = 0.5 * t * (1 + t * (4 - 3 * t)), 0.5 * (1 + t * (8 - 9 * t))
+            weight[axis, 3], slope[axis, 3] = 0.5 * t * t * (t - 1), 0.5 * t * (3 * t - 2)
         value = along_x = along_y = along_z = 0.0
         for a in range(4):
             for b in range(4):

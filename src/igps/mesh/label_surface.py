@@ -20,7 +20,7 @@ from igps.mesh._label_field import PAD, filled_share, smooth_field
 from igps.mesh._level_set import LEAST, without_bubbles
 from igps.mesh.limits import check_grid
 from igps.mesh.mesh import MeshError
-from igps.mesh.surface import connected, signed_volume
+from igps.mesh.surface import connected, signed_volume, stacked
 
 MAX_VERTICES = 5000
 """As many vertices a label's surface has at most, where nothing else is said."""
@@ -102,9 +102,8 @@ def voxel_surface(
     matrix = matrix @ np.block([[np.eye(3), low[:, None]], [np.zeros(3), 1]])
     for hollow in hollows:
         points, inwards, _ = voxel_surface(hollow, matrix, max_vertices=max_vertices, name=name)
-        surfaces.append((points, inwards[:, ::-1] + sum(len(other) for other, _ in surfaces)))
-    vertices, faces = (np.concatenate(arrays) for arrays in zip(*surfaces, strict=True))
-    return vertices, faces, tuple(notes)
+        surfaces.append((points, inwards[:, ::-1]))
+    return *stacked(surfaces), tuple(notes)
 
 
 def checked_spacing(affine: Floats, name: str) -> Floats:
@@ -247,13 +246,11 @@ def _meshed(field: Floats, sides: Floats, volume: float, max_vertices: int, name
     vertices = vertices * (sides / cell)
     pieces = connected(vertices, faces)
     volumes = np.abs([signed_volume(*piece) for piece in pieces])
-    parts, n_before = [], 0
+    parts = []
     # Specks between voxels are none of theirs.
     for own in [piece for piece, size in zip(pieces, volumes, strict=True) if size > _SPECK * volumes.sum()]:
         if signed_volume(*own) < 0:
             own = own[0], own[1][:, ::-1]
-        points, triangles = simplified(*own, max(round(max_vertices * len(own[0]) / len(vertices)), 50))
-        parts.append((points, triangles + n_before))
-        n_before += len(points)
-    points, triangles = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        parts.append(simplified(*own, max(round(max_vertices * len(own[0]) / len(vertices)), 50)))
+    points, triangles = stacked(parts)
     return with_volume(points, triangles, volume / cell**3) * cell, np.ascontiguousarray(triangles)

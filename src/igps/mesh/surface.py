@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -135,6 +137,13 @@ def connected(vertices: Floats, faces: Integers) -> list[Surface]:
     """The connected components, each by itself, in the order of their first vertices."""
     count, owner = components(faces, len(vertices))
     return [compact(vertices, faces[owner[faces[:, 0]] == k]) for k in range(count)]
+
+
+def stacked(surfaces: Sequence[Surface]) -> Surface:
+    """Several surfaces as one."""
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces)])
+    faces = [faces + start for (_, faces), start in zip(surfaces, starts, strict=False)]
+    return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(faces)
 
 
 def genus(faces: Integers, n_vertices: int) -> int:

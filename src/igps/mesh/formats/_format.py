@@ -14,7 +14,7 @@ from igps.mesh._label_measures import VoxelMeasures
 from igps.mesh._tidying import are_specks, places
 from igps.mesh.mesh import MeshError, check_arrays
 from igps.mesh.options import BodyKind, LoadOptions
-from igps.mesh.surface import compact, face_parts
+from igps.mesh.surface import compact, face_parts, stacked
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,13 +82,10 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
     kept = meshes or [body for body in bodies if len(body.vertices)]
     if not kept:
         return RawBody(fault=next((body.fault for body in bodies if body.fault), None))
-    starts = np.cumsum([0, *(len(body.vertices) for body in kept)])
-    faces = np.concatenate([body.faces + start for body, start in zip(kept, starts, strict=False)])
     units = {body.unit for body in kept}
     normals = [body.normals for body in kept if body.normals is not None]
     return RawBody(
-        np.concatenate([body.vertices for body in kept]),
-        faces,
+        *stacked([(body.vertices, body.faces) for body in kept]),
         unit=units.pop() if len(units) == 1 else None,
         normals=np.concatenate(normals) if len(normals) == len(kept) else None,
         notes=tuple(dict.fromkeys(note for body in kept for note in body.notes)),

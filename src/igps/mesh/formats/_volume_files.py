@@ -141,11 +141,9 @@ def _highdicom(path: Path) -> RawVolume:
     from highdicom.seg import Segmentation
 
     dataset = pydicom.dcmread(path)
-    if dataset.get("Modality") != "SEG":
-        kind = dataset.get("Modality", "none")
-        raise MeshError(
-            f"{path}: DICOM of modality {kind}, not SEG; labels expected. Export the segmentation as DICOM SEG."
-        )
+    if (kind := dataset.get("Modality", "none")) != "SEG":
+        other = f"{path}: DICOM of modality {kind}, not SEG; labels expected."
+        raise MeshError(f"{other} Export the segmentation as DICOM SEG.")
     segmentation = Segmentation.from_dataset(dataset, copy=False)
     geometry = segmentation.get_volume_geometry()
     if geometry is None:

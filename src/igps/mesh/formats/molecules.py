@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -244,22 +245,16 @@ class _Builder:
 
     def _conformers(self, chain: gemmi.Chain) -> Iterator[gemmi.Residue]:
         """The residues; of several that are alternatives to each other, that of the highest occupancy."""
-        group: list[Any] = []
-        for residue in chain:
-            is_alternative = len(residue) > 0 and all(atom.has_altloc() for atom in residue)
-            if group and not (is_alternative and residue.seqid == group[0].seqid):
-                yield self._best(group)
-                group = []
-            if is_alternative:
-                group.append(residue)
-            else:
-                yield residue
-        if group:
-            yield self._best(group)
 
-    def _best(self, group: list[gemmi.Residue]) -> gemmi.Residue:
-        self._count["alternative"] += len(group) - 1
-        return max(group, key=lambda residue: max(atom.occ for atom in residue))
+        def place(numbered: tuple[int, gemmi.Residue]) -> str | int:
+            number, residue = numbered
+            is_alternative = len(residue) > 0 and all(atom.has_altloc() for atom in residue)
+            return str(residue.seqid) if is_alternative else number
+
+        for _, group in groupby(enumerate(chain), place):
+            residues = [residue for _, residue in group]
+            self._count["alternative"] += len(residues) - 1
+            yield max(residues, key=lambda residue: max((atom.occ for atom in residue), default=0.0))
 
     def _atoms(self, residue: gemmi.Residue) -> list[gemmi.Atom]:
         """Those that have a position, one of each that has alternatives."""
