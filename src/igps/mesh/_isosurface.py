@@ -67,12 +67,9 @@ def simplified(vertices: Floats, faces: Integers, max_vertices: int) -> Surface:
     return with_volume(points, triangles, signed_volume(vertices, faces)), triangles
 
 
-def with_volume(vertices: Floats, faces: Integers, volume: float, most: float = 0.25) -> Floats:
-    """The vertices moved along their normals, all by the same length of at most `most`, to give the volume.
-
-    Collapsed edges cut corners, which takes some percent of the volume of thin limbs.
-    """
-    left = most
+def with_volume(vertices: Floats, faces: Integers, volume: float) -> Floats:
+    """The vertices moved along their normals, all by the same length, to give the volume that cut corners took."""
+    left = 0.25
     for _ in range(3):
         step = (volume - signed_volume(vertices, faces)) / face_areas(vertices, faces).sum()
         step = float(np.clip(step, -left, left))

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._compiled import compiled
-from igps.mesh._arrays import Floats, Integers, Surface
+from igps.mesh._arrays import Floats, Integers
 
 _TURN = 2 * math.pi
 
 
 @compiled()
-def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: Integers) -> Surface:
+def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: Integers) -> tuple[Floats, Integers]:
     """The arcs in which two spheres meet outside all other balls, and (A,) 1 for balls that have one or meet no other.
 
     Args:

@@ -91,7 +91,9 @@ def voxel_surface(
     check_grid(share.size, name)
     sides = spacing * factor
     field = smooth_field(share, sides, is_mask=bool((factor == 1).all()))
-    fineness = _fineness(sides, _n_vertices(mask, sides))
+    # Into how many parts each side goes, so that the parts are about equal and make vertices enough.
+    finer = min(max(math.ceil(math.sqrt(_FEWEST / _n_vertices(mask, sides))), 1), _MOST_REFINED)
+    fineness = np.maximum(np.round(finer * sides / sides.min()), 1).astype(np.int64)
     field = _refined(field, share, fineness, LEAST * float((sides / fineness).min()))
     vertices, faces = _meshed(field, sides / fineness, share.sum() * sides.prod(), max_vertices, name)
     # Index of the first voxel's centre: that of a block of `factor` voxels lies (factor - 1) / 2 further.
@@ -175,7 +177,7 @@ def _n_vertices(mask: Booleans, sides: Floats) -> float:
     return float((cuts * sides.prod() / sides).sum() / sides.min() ** 2)
 
 
-def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> Surface:
+def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Floats, Integers]:
     """Shares of larger voxels, and how many of the given ones each takes along each axis."""
     share, factor = mask.astype(np.float32), np.ones(3, dtype=np.int64)
     n_pieces = ndimage.label(mask, _TOUCHING)[1]
@@ -204,12 +206,6 @@ def _is_thick(mask: Booleans, axes: Booleans) -> bool:
     core = ndimage.minimum_filter(mask, tuple(np.where(axes, 3, 1)), mode="constant")
     reached = ndimage.maximum_filter(core, tuple(np.where(axes, 5, 1)), mode="constant")
     return bool(np.count_nonzero(mask & ~reached) <= _THIN * np.count_nonzero(mask))
-
-
-def _fineness(sides: Floats, n_vertices: float) -> Integers:
-    """Into how many parts each side goes, so that the parts are about equal and make vertices enough."""
-    finer = min(max(math.ceil(math.sqrt(_FEWEST / n_vertices)), 1), _MOST_REFINED)
-    return np.maximum(np.round(finer * sides / sides.min()), 1).astype(np.int64)
 
 
 def _refined(field: Floats, share: Floats, fineness: Integers, least: float) -> Floats:

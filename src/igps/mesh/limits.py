@@ -62,8 +62,9 @@ def available_memory() -> int | None:
 
     None where the system does not tell.
     """
-    found = [value for value in (_of_limits(), _of_group(), _of_machine()) if value is not None]
-    return min(found, default=None)
+    kilobytes = _number(Path("/proc/meminfo"), r"^MemAvailable:\s+")
+    found = (_of_limits(), _of_group(), None if kilobytes is None else 1024 * kilobytes)
+    return min((n_bytes for n_bytes in found if n_bytes is not None), default=None)
 
 
 def _of_limits() -> int | None:
@@ -97,11 +98,6 @@ def _of_group(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/
                 # Files that were read stay in memory only as long as nobody else wants it.
                 found.append(most - current + (_number(folder / "memory.stat", rf"^{cache}\s+") or 0))
     return min(found, default=None)
-
-
-def _of_machine() -> int | None:
-    kilobytes = _number(Path("/proc/meminfo"), r"^MemAvailable:\s+")
-    return None if kilobytes is None else kilobytes * 1024
 
 
 def _number(path: Path, before: str = "^") -> int | None:

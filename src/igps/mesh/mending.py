@@ -87,7 +87,12 @@ def mend(
     else:
         check_arrays(vertices, faces, name)
         vertices, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
-        _check_extent(vertices, triangles, name)
+        if len(triangles) == 1:
+            raise MeshError(f"{name}: a single triangle is no body. Check that the export is complete.")
+        corners = vertices[triangles]
+        if (corners == corners[:, :1]).all():
+            raise MeshError(f"{name}: all faces are in one point; a surface was expected. Check the file.")
+        check_size(corners.reshape(-1, 3), name)  # before squares of its lengths overflow or vanish
         mesh = (_remade if how == "always" else _mended)(vertices, triangles, name, cavities == "keep")
     n_outer = int(mesh.outer()[1].sum())
     if n_outer < least_vertices:
@@ -152,12 +157,3 @@ def _smoothed(vertices: Floats, faces: Integers, notes: list[str]) -> Floats:
         return vertices
     notes.append("smoothed: the surface was rough with noise")
     return denoised(vertices, faces)
-
-
-def _check_extent(vertices: Floats, faces: Integers, name: str) -> None:
-    if len(faces) == 1:
-        raise MeshError(f"{name}: a single triangle is no body. Check that the export is complete.")
-    corners = vertices[faces]
-    if (corners == corners[:, :1]).all():
-        raise MeshError(f"{name}: all faces are in one point; a surface was expected. Check the file.")
-    check_size(corners.reshape(-1, 3), name)  # before squares of its lengths overflow or vanish

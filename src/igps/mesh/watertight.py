@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from igps.mesh._arrays import Floats, Integers, Surface
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh._distance_grid import Grid, cell_sizes, distances, rounded
 from igps.mesh._isosurface import largest, level_surface, simplified
 from igps.mesh._level_set import joined, level_set
@@ -71,8 +71,12 @@ def watertight(
     if faces is None or len(faces) == 0:
         vertices, faces, spacing = splats(vertices, normals, resolution, name)
         notes.append("points joined by small discs")
-    vertices, faces = _with_area(vertices, np.asarray(faces, dtype=np.int64), name)
-    vertices, faces = _without_specks(vertices, faces, notes)
+    faces = np.asarray(faces, dtype=np.int64)
+    faces = faces[face_areas(vertices, faces) > 1e-14 * diagonal(vertices[faces].reshape(-1, 3)) ** 2]
+    if not len(faces):
+        flat = f"{name}: no triangle has an area; a surface was expected."
+        raise MeshError(f"{flat} If the file holds lines, give them thickness.")
+    faces = _without_specks(vertices, faces, notes)
     usual, least = cell_sizes(vertices, faces, resolution, spacing)
     grid = Grid.around(vertices, faces, least)
     vertices = grid.to_cells(vertices)
@@ -107,16 +111,7 @@ def crosses_itself(vertices: Floats, faces: Integers) -> bool:
     return bool(find_self_intersections(*surface, first_only=True)[0])
 
 
-def _with_area(vertices: Floats, faces: Integers, name: str) -> Surface:
-    area = face_areas(vertices, faces)
-    keep = area > 1e-14 * diagonal(vertices[faces].reshape(-1, 3)) ** 2
-    if not keep.any():
-        flat = f"{name}: no triangle has an area; a surface was expected."
-        raise MeshError(f"{flat} If the file holds lines, give them thickness.")
-    return vertices, faces[keep]
-
-
-def _without_specks(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
+def _without_specks(vertices: Floats, faces: Integers, notes: list[str]) -> Integers:
     """The faces without groups that lie apart from everything else and have next to no area."""
     corners = vertices[faces]
     low, side = corners.min(axis=(0, 1)), longest_side(corners.reshape(-1, 3))
@@ -127,7 +122,7 @@ def _without_specks(vertices: Floats, faces: Integers, notes: list[str]) -> Surf
     occupied[tuple(index.T)] = True
     label, count = ndimage.label(occupied, structure=np.ones((3, 3, 3)))
     if count == 1:
-        return vertices, faces
+        return faces
     group = np.zeros(len(faces), dtype=np.int64)
     group[face] = label[tuple(index.T)]
     area = face_areas(vertices, faces)
@@ -135,12 +130,12 @@ def _without_specks(vertices: Floats, faces: Integers, notes: list[str]) -> Surf
     keep = (share >= _SPECK_AREA)[group]
     # Where everything is in crumbs, no crumb is a speck.
     if keep.all() or area[keep].sum() < 0.98 * area.sum():
-        return vertices, faces
+        return faces
     notes.append(f"dropped {len(np.unique(group[~keep]))} specks")
     return _without_specks(vertices, faces[keep], notes)
 
 
-def _spread(corners: Floats, spacing: float) -> Surface:
+def _spread(corners: Floats, spacing: float) -> tuple[Floats, Integers]:
     """Points on triangles, at most about `spacing` apart, and the triangle of each."""
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     n = np.clip(np.ceil(edges / spacing), 1, 4 * _SPECK_CELLS).astype(np.int64)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from igps.mesh._arrays import Booleans, Floats, Integers
+from igps.mesh._arrays import Booleans, Integers
 from igps.mesh.formats._format import Format, RawBody, distinct, triangles
 from igps.mesh.options import LoadOptions
 
@@ -34,7 +34,10 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
             before.append(len(places))
         elif word in starts:
             starts[word].append((len(polygons), rest.strip()))
-    vertices = _vertices(places)
+    if not places:
+        raise ValueError("no vertex in it")
+    # Weights and colours behind the coordinates are passed over
+    vertices = np.loadtxt(places, np.float64, comments="#", usecols=(0, 1, 2), ndmin=2)
     if not polygons:
         return [RawBody(vertices)]
     corners, n_corners, kept = _corners(polygons, np.array(before, dtype=np.int64))
@@ -51,13 +54,6 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
             raise ValueError(f"object {name!r} refers to vertices that are not there")
         bodies.append(RawBody(vertices[used], index.reshape(-1, 3), part=name))
     return bodies
-
-
-def _vertices(places: list[str]) -> Floats:
-    """(V, 3); weights and colours behind the coordinates are passed over."""
-    if not places:
-        raise ValueError("no vertex in it")
-    return np.loadtxt(places, np.float64, comments="#", usecols=(0, 1, 2), ndmin=2)
 
 
 def _corners(polygons: list[str], before: Integers) -> tuple[Integers, Integers, Booleans]:
