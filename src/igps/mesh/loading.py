@@ -12,7 +12,7 @@ import numpy as np
 
 from igps._threads import one_thread
 from igps.mesh.formats import FORMATS, Format, RawBody, format_of
-from igps.mesh.formats._format import joined, pieces
+from igps.mesh.formats._format import faults, joined, pieces
 from igps.mesh.limits import check_memory
 from igps.mesh.mending import mend
 from igps.mesh.mesh import Mesh, MeshError, check_arrays
@@ -188,20 +188,7 @@ def _format(path: Path) -> Format:
 
 @contextmanager
 def _faults(path: Path, kind: Format) -> Iterator[None]:
-    """What a reader raises, told as a fault of the file; memory that is lacking is none."""
     if kind.bodies[0] == "whole":
         check_memory(path)
-    try:
+    with faults(path, kind.name, kind.extra):
         yield
-    except (MeshError, MemoryError):
-        raise
-    except ImportError as error:
-        raise MeshError(
-            f"{path}: {kind.name} needs a module that is not installed ({error}). Install it: pip install "
-            f'"interior-gps[{kind.extra}]"; or convert the file to OFF, OBJ, PLY or STL.'
-        ) from error
-    except Exception as error:  # the loaders of some thirty formats raise whatever they like
-        raise MeshError(
-            f"{path}: not readable as {kind.name} ({type(error).__name__}: {error}). "
-            "Check that the file is complete and in the format that its name tells; or export it again."
-        ) from error

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -149,6 +150,23 @@ def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
     is_corner = np.ones(len(rows), dtype=bool)
     is_corner[starts] = False
     return rows[is_corner], rows[starts]
+
+
+@contextmanager
+def faults(path: Path, name: str, extra: str | None) -> Iterator[None]:
+    """Tell what a reader raises as a fault of the file; memory that is lacking is none."""
+    try:
+        yield
+    except (MeshError, MemoryError):
+        raise
+    except ImportError as error:
+        missing = f"{path}: {name} needs a module that is not installed ({error})."
+        install = f'Install it: pip install "interior-gps[{extra}]"; or convert the file to OFF, OBJ, PLY or STL.'
+        raise MeshError(f"{missing} {install}") from error
+    except Exception as error:  # the loaders of some thirty formats raise whatever they like
+        fault = f"{path}: not readable as {name} ({type(error).__name__}: {' '.join(str(error).split())[:300]})."
+        remedy = "Check that the file is complete and in the format that its name tells; or export it again."
+        raise MeshError(f"{fault} {remedy}") from error
 
 
 def check_unpacked(n_bytes: int, path: Path, limit: int) -> None:

@@ -17,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from igps.mesh._arrays import Booleans, Floats
 from igps.mesh._label_measures import VoxelMeasures, measured
+from igps.mesh.formats._format import faults
 from igps.mesh.formats._volume_files import RawVolume, read_raw, suffix_of
 from igps.mesh.formats.label_names import names_beside, read_label_names
 from igps.mesh.label_surface import checked_spacing, voxel_surface
@@ -123,22 +124,13 @@ def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) ->
     the name of the file.
 
     Raises:
-        MeshError: the file is missing, cut short, too large, or holds no labels in three axes.
-        ImportError: the library that reads the format is not installed.
+        MeshError: the file is missing, cut short, too large, or holds no labels; or its library is missing.
     """
     path = Path(path)
     if not path.is_file():
         raise MeshError(f"{path}: no such file. Check the path.")
-    try:
+    with faults(path, "a label volume", "volumes"):
         raw = read_raw(path)
-    except ModuleNotFoundError as error:
-        raise ImportError(f'{path}: needs {error.name}: pip install "interior-gps[volumes]".') from error
-    except (MeshError, MemoryError):
-        raise
-    except Exception as error:  # whatever the libraries raise
-        why = " ".join(str(error).split())[:300]
-        fault = f"{path}: not readable as a label volume ({type(error).__name__}: {why})."
-        raise MeshError(f"{fault} Check that the file is complete, or export it again.") from error
     return _labelled(raw, path, options)
 
 
