@@ -8,16 +8,7 @@ from numpy.typing import NDArray
 from igps.mesh._arrays import Floats, Integers, Surface
 from igps.mesh._level_set import LEAST, without_bubbles
 from igps.mesh.mesh import MeshError
-from igps.mesh.surface import (
-    area_vectors,
-    compact,
-    components,
-    directed_edges,
-    face_areas,
-    longest_side,
-    signed_volume,
-    vertex_normals,
-)
+from igps.mesh.surface import directed_edges, face_areas, largest, longest_side, signed_volume, vertex_normals
 
 # Least cosine between the normals of triangles in a flat place.
 _FLAT = 0.95
@@ -87,18 +78,6 @@ def _bad_edges(faces: Integers, n_vertices: int) -> Integers:
     forward, n_forward = np.unique(forward, return_counts=True)
     bad = np.concatenate([forward[n_forward > 1], np.setxor1d(forward, backward)])
     return np.stack([bad // n_vertices, bad % n_vertices], axis=1)
-
-
-def largest(vertices: Floats, faces: Integers) -> Surface:
-    """The connected component of the largest volume."""
-    count, label = components(faces, len(vertices))
-    if count > 1:
-        part = label[faces[:, 0]]
-        centred = vertices - vertices.mean(axis=0)
-        six_volumes = np.einsum("ij,ij->i", centred[faces[:, 0]], area_vectors(centred, faces))
-        volume = np.abs(np.bincount(part, weights=six_volumes, minlength=count))
-        faces = faces[part == np.argmax(volume)]
-    return compact(vertices, faces)
 
 
 def _flipped(vertices: Floats, faces: Integers) -> Integers:

@@ -96,15 +96,9 @@ def _bending(sides: Floats) -> tuple[Integers, Floats]:
 
 @compiled(fastmath={"contract", "reassoc", "nsz"})
 def _relax(
-    field: Floats,
-    nodes: Integers,
-    steps: Integers,
-    weights: Floats,
-    centre: float,
-    target: Floats,
-    inside: Booleans,
+    field: Floats, nodes: Integers, steps: Integers, weights: Floats, centre: float, target: Floats, inside: Booleans,
     margin: Floats,
-) -> None:
+) -> None:  # fmt: skip
     """Projected Gauss-Seidel sweeps, forwards and backwards in turn, in place."""
     n = len(nodes)
     for sweep in range(_N_SWEEPS):

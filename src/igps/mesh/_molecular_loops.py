@@ -136,17 +136,9 @@ def depths(
 
 @compiled()
 def distances_outside(
-    depth: NDArray[np.float32],
-    owner: NDArray[np.int32],
-    centres: Floats,
-    radii: Floats,
-    first: Integers,
-    neighbours: Integers,
-    exposed: Integers,
-    arcs: Floats,
-    spacing: float,
-    reach: float,
-) -> NDArray[np.float32]:
+    depth: NDArray[np.float32], owner: NDArray[np.int32], centres: Floats, radii: Floats, first: Integers,
+    neighbours: Integers, exposed: Integers, arcs: Floats, spacing: float, reach: float,
+) -> NDArray[np.float32]:  # fmt: skip
     """The distance of each grid point in the balls from what is outside of all of them.
 
     The nearest place outside lies on a sphere, on an arc of two, or at the end of an arc. On a sphere it can only be

@@ -40,13 +40,9 @@ _TOUCHING = np.ones((3, 3, 3), dtype=bool)  # voxels that share a corner belong 
 
 
 def voxel_surface(
-    inside: ArrayLike,
-    affine: ArrayLike | None = None,
-    *,
-    max_vertices: int = MAX_VERTICES,
-    cavities: bool = False,
+    inside: ArrayLike, affine: ArrayLike | None = None, *, max_vertices: int = MAX_VERTICES, cavities: bool = False,
     name: str = "volume",
-) -> tuple[Floats, Integers, tuple[str, ...]]:
+) -> tuple[Floats, Integers, tuple[str, ...]]:  # fmt: skip
     """The closed, outward surface of the voxels of a body.
 
     It encloses their volume, has the centres of all voxels on their side unless it was put on a coarser grid, and is

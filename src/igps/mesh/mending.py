@@ -41,16 +41,9 @@ _PLENTY = 4
 
 
 def mend(
-    vertices: Floats,
-    faces: Integers | None,
-    *,
-    how: Mending = "auto",
-    least_vertices: int = 0,
-    normals: Floats | None = None,
-    cavities: Cavities = "fill",
-    name: str = "mesh",
-    notes: tuple[str, ...] = (),
-) -> Mesh:
+    vertices: Floats, faces: Integers | None, *, how: Mending = "auto", least_vertices: int = 0,
+    normals: Floats | None = None, cavities: Cavities = "fill", name: str = "mesh", notes: tuple[str, ...] = (),
+) -> Mesh:  # fmt: skip
     """A body from a surface in any state, by the least that helps.
 
     In this order, and no further than needed: the surface as it is; coincident vertices welded, degenerate and doubled

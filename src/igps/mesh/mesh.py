@@ -91,10 +91,9 @@ class Mesh:
         check_size(vertices, self.name)
         volume = signed_volume(vertices, faces)
         if abs(volume) <= _FLAT * diagonal(vertices) ** 3:
-            raise MeshError(
-                f"{self.name}: the surface encloses no volume ({volume:.3g} for a bounding box diagonal of "
-                f"{diagonal(vertices):.3g}); a body was expected. Give a flat sheet some thickness."
-            )
+            found = f"{volume:.3g} for a bounding box diagonal of {diagonal(vertices):.3g}"
+            flat = f"{self.name}: the surface encloses no volume ({found}); a body was expected."
+            raise MeshError(f"{flat} Give a flat sheet some thickness.")
         if volume < 0:
             faces = np.ascontiguousarray(faces[:, ::-1])
             object.__setattr__(self, "notes", (*self.notes, "was inside out: all faces turned"))

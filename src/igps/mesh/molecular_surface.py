@@ -41,14 +41,9 @@ _N_ROUNDS = 2
 
 @one_thread()
 def molecular_surface(
-    molecule: Molecule,
-    kind: SurfaceKind = "excluded",
-    *,
-    probe: float = 1.4,
-    spacing: float = 0.8,
-    max_vertices: int | None = 3000,
-    pieces: Pieces = "joined",
-) -> Mesh:
+    molecule: Molecule, kind: SurfaceKind = "excluded", *, probe: float = 1.4, spacing: float = 0.8,
+    max_vertices: int | None = 3000, pieces: Pieces = "joined",
+) -> Mesh:  # fmt: skip
     """The closed surface of a molecule, in ångström; hollows inside that it does not open to are filled.
 
     At a spacing of 0.5 the area and volume of the excluded surface are within 1 % of closed forms, before vertices are

@@ -139,6 +139,18 @@ def connected(vertices: Floats, faces: Integers) -> list[Surface]:
     return [compact(vertices, faces[owner[faces[:, 0]] == k]) for k in range(count)]
 
 
+def largest(vertices: Floats, faces: Integers) -> Surface:
+    """The connected component of the largest volume."""
+    count, label = components(faces, len(vertices))
+    if count > 1:
+        part = label[faces[:, 0]]
+        centred = vertices - vertices.mean(axis=0)
+        six_volumes = np.einsum("ij,ij->i", centred[faces[:, 0]], area_vectors(centred, faces))
+        volume = np.abs(np.bincount(part, weights=six_volumes, minlength=count))
+        faces = faces[part == np.argmax(volume)]
+    return compact(vertices, faces)
+
+
 def stacked(surfaces: Sequence[Surface]) -> Surface:
     """Several surfaces as one."""
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces)])

@@ -20,12 +20,12 @@ from scipy import ndimage
 
 from igps.mesh._arrays import Floats, Integers
 from igps.mesh._distance_grid import Grid, cell_sizes, distances, rounded
-from igps.mesh._isosurface import largest, level_surface, simplified
+from igps.mesh._isosurface import level_surface, simplified
 from igps.mesh._level_set import joined, level_set
 from igps.mesh._outside import OrientedSurface, outside_of
 from igps.mesh._splats import splats
 from igps.mesh.mesh import Mesh, MeshError, check_places
-from igps.mesh.surface import diagonal, face_areas, longest_side
+from igps.mesh.surface import diagonal, face_areas, largest, longest_side
 
 # Groups of triangles of less than this share of the area are specks, if they are apart in a grid of so many cells.
 _SPECK_AREA, _SPECK_CELLS = 2e-3, 64
@@ -37,14 +37,9 @@ _MANY_FACES = 400_000
 
 
 def watertight(
-    vertices: Floats,
-    faces: Integers | None = None,
-    *,
-    normals: Floats | None = None,
-    resolution: int = 96,
-    max_vertices: int | None = 5000,
-    name: str = "mesh",
-) -> Mesh:
+    vertices: Floats, faces: Integers | None = None, *, normals: Floats | None = None, resolution: int = 96,
+    max_vertices: int | None = 5000, name: str = "mesh",
+) -> Mesh:  # fmt: skip
     """The closed, oriented, edge-manifold surface of one body from triangles in any state, or from points.
 
     Solids keep their surface, sheets get about a cell, small openings are closed, and what cannot be seen from outside

@@ -12,12 +12,9 @@ _TREE_ERROR = 0.01  # of libigl's fast winding numbers; twice the largest found
 
 
 def winding_number(
-    vertices: NDArray[np.floating],
-    faces: NDArray[np.integer],
-    points: NDArray[np.floating],
-    *,
+    vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating], *,
     accuracy: float | None = None,
-) -> Floats:
+) -> Floats:  # fmt: skip
     """Winding number (P,) of a mesh about points (P, 3): the solid angles of its faces over 4π, by libigl.
 
     1 inside and 0 outside a closed, outward oriented surface; fractions for an open one. On the surface itself the

@@ -17,24 +17,10 @@ from igps.mesh.formats._format import Format, RawBody
 __all__ = ["FORMATS", "Format", "RawBody", "format_of", "is_searched", "searched_suffixes"]
 
 FORMATS: tuple[Format, ...] = (
-    off.FORMAT,
-    obj.FORMAT,
-    ply.FORMAT,
-    stl.FORMAT,
-    clouds.FORMAT,
-    threemf.FORMAT,
-    scenes.GLTF,
-    scenes.STEP,
-    scenes.OTHERS,
-    vtk.LEGACY,
-    vtk.XML,
-    brain_surfaces.GIFTI,
-    brain_surfaces.FREESURFER,
-    made_surfaces.VOLUMES,
-    made_surfaces.MOLECULES,
-    archives.ARCHIVE,
-    archives.COMPRESSED,
-)
+    off.FORMAT, obj.FORMAT, ply.FORMAT, stl.FORMAT, clouds.FORMAT, threemf.FORMAT, scenes.GLTF, scenes.STEP,
+    scenes.OTHERS, vtk.LEGACY, vtk.XML, brain_surfaces.GIFTI, brain_surfaces.FREESURFER, made_surfaces.VOLUMES,
+    made_surfaces.MOLECULES, archives.ARCHIVE, archives.COMPRESSED,
+)  # fmt: skip
 
 
 def format_of(path: str | Path) -> Format | None:

@@ -16,15 +16,7 @@ import numpy as np
 from igps.mesh._arrays import Floats, Integers
 from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structure, suffix
 from igps.mesh.mesh import MeshError
-from igps.mesh.residues import (
-    BACKBONE,
-    CHARGED_ATOMS,
-    PHOSPHATE_OXYGENS,
-    STANDARD,
-    WATER,
-    residue_ball,
-    side_chain_ball,
-)
+from igps.mesh.residues import BACKBONE, CHARGED_ATOMS, PHOSPHATES, STANDARD, WATER, residue_ball, side_chain_ball
 
 if TYPE_CHECKING:
     import gemmi
@@ -202,7 +194,7 @@ class _Builder:
         alpha = next((i for i, atom in enumerate(atoms) if atom.name == "CA"), None) if in_polymer else None
         b_factor = np.nan if self.is_pqr else float(np.mean([atom.b_iso for atom in atoms]))
         self._residues.append((name, at.mean(axis=0) if alpha is None else at[alpha], b_factor))
-        charged = (PHOSPHATE_OXYGENS if kind.is_nucleic_acid() else CHARGED_ATOMS.get(name, {})) if in_polymer else {}
+        charged = (PHOSPHATES if kind.is_nucleic_acid() else CHARGED_ATOMS.get(name, {})) if in_polymer else {}
         if alpha is not None and not self.is_pqr and (named == {"CA"} or (named <= BACKBONE and name != "GLY")):
             self._add_coarse_ball(name, atoms, at, sum(charged.values()))
             if named == {"CA"}:
