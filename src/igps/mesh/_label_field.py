@@ -24,7 +24,7 @@ _RELAXATION = 1.4
 _N_SWEEPS = 10
 # Voxels from the border within which the function is free.
 _BAND = 2
-# Standard deviation of the window in which the volume is kept, in voxels: of masks, and of shares, which tell more.
+# Standard deviation of the window in which the volume is kept, in voxels: of masks, and of shares, which are finer.
 _WINDOW, _NARROW_WINDOW = 2.0, 1.0
 _N_CORRECTIONS = 2
 

@@ -1,4 +1,4 @@
-"""What the voxels of a label tell of its body before a surface is made."""
+"""Measures of the voxels of a label, before a surface is made."""
 
 from __future__ import annotations
 

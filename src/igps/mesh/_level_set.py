@@ -72,7 +72,7 @@ def _at(values: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
 
 
 def without_bubbles(field: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What the outside does not reach is filled."""
+    """The field with everything filled that the outside does not reach."""
     label, count = ndimage.label(field > 0)
     if count > 1:
         field[(field > 0) & (label != label[0, 0, 0])] = -LEAST

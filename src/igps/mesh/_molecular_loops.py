@@ -144,12 +144,12 @@ def distances_outside(
     The nearest place outside lies on a sphere, on an arc of two, or at the end of an arc. On a sphere it can only be
     that of the ball in which the point lies deepest: all others end further out.
 
-    For the arguments see `depths` and `exposed_arcs`. Distances beyond `reach` are told as this; outside of the balls
+    For the arguments see `depths` and `exposed_arcs`. Distances are cut at `reach`; outside of the balls
     they are `depth`, which is negative.
     """
     shape = depth.shape
     distance = np.minimum(depth, np.float32(reach))
-    # What is still to be told from arcs.
+    # Points whose distance comes from arcs.
     waiting = np.zeros(shape, np.bool_)
     for x in range(shape[0]):
         for y in range(shape[1]):

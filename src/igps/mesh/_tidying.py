@@ -50,7 +50,7 @@ def places(vertices: Floats) -> Integers:
 
 
 def are_specks(areas: Floats) -> Booleans:
-    """Which of the parts with these areas are crumbs; none if all crumbs together have much area."""
+    """Which of the parts with these areas are specks; none if all specks together have much area."""
     specks = areas < SPECK * areas.sum()
     return specks & (areas[specks].sum() < 10 * SPECK * areas.sum())
 

@@ -67,7 +67,7 @@ def _superfluous(
 
 
 def _places(points: Floats, faces: Integers, patch: Integers) -> tuple[Floats, Integers, Booleans]:
-    """Places (S, 3) on each patch, evenly by area and always the same; the faces (S,) they are on; who sees outside."""
+    """Places (S, 3) on each patch, evenly by area and always the same; their faces (S,); and which see outside."""
     import igl
 
     areas = face_areas(points, faces)

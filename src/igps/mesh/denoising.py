@@ -38,7 +38,7 @@ _THIN = 2.0
 _VERY_THIN = 8.0
 # Of the longest side of the body: shorter edges count as that long, so that none is infinitely short.
 _SHORTEST = 1e-9
-# What is rough with fewer vertices was made so; and what hardly is a surface has no normals to speak of.
+# Surfaces of fewer vertices are rough by design; those with more edges at other than two faces have no clear normals.
 _FEWEST, _REGULAR = 1000, 0.97
 # Taubin's two steps.
 _SHRINK, _GROW = 0.5, -0.53

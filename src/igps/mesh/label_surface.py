@@ -23,10 +23,10 @@ from igps.mesh.mesh import MeshError
 from igps.mesh.surface import connected, signed_volume, stacked
 
 MAX_VERTICES = 5000
-"""As many vertices a label's surface has at most, where nothing else is said."""
+"""Most vertices of a label's surface, by default."""
 
 LEAST_VOXELS = 8
-"""A label of fewer voxels has no shape."""
+"""Fewest voxels that have a shape."""
 
 _ISLAND = 0.02  # share of the voxels below which a piece apart is dropped
 _SPECK = 0.005  # share of the volume below which a piece of the surface is none of the label's
@@ -123,7 +123,7 @@ def _whole(mask: Booleans, notes: list[str], least: int | None) -> tuple[Boolean
         lost = int(size[island].sum())
         pieces = "1 small piece" if len(island) == 1 else f"{len(island)} small pieces"
         notes.append(f"dropped {pieces} apart of {lost} voxels, {lost / size.sum():.1%} of the label")
-    # What is outside shares faces.
+    # Voxels outside are connected by faces.
     hollow, n_hollow = ndimage.label(np.pad(~mask, 1, constant_values=True))
     if n_hollow < 2:
         return mask, []
@@ -145,7 +145,7 @@ def _islands(mask: Booleans) -> tuple[NDArray[np.int32], Integers, Integers]:
 
 
 def _joined(mask: Booleans) -> Booleans:
-    """Where pieces share an edge or a corner only, voxels beside that are added."""
+    """With voxels added beside edges and corners at which pieces only touch."""
     for _ in range(3):
         label, n_pieces = ndimage.label(mask)
         if n_pieces < 2:
@@ -188,7 +188,7 @@ def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Floa
                 coarse = np.concatenate([coarse, np.zeros_like(coarse.take([0], axis))], axis=axis)
             even, odd = (coarse[(slice(None),) * axis + (slice(start, None, 2),)] for start in (0, 1))
             coarse = (even + odd) / np.float32(2)
-        # What hung on a thread and is small now goes, as it would have without the thread.
+        # Small pieces that hung on a thread go, as they would have without it.
         label, island, size = _islands(coarse >= 0.5)
         if np.count_nonzero(size) - len(island) != n_pieces:
             break

@@ -1,4 +1,4 @@
-"""Whether a file, or a grid in a body, fits into memory, told before it takes any."""
+"""Whether a file, or a grid in a body, fits into memory, checked before any is taken."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from pathlib import Path
 
 from igps.mesh.mesh import MeshError
 
-# What reading and mending took of each triangle at most (OFF, OBJ, STL and PLY of 330,000 triangles).
+# Memory for reading and mending, at most, for each triangle (OFF, OBJ, STL and PLY of 330,000 triangles).
 _BYTES_PER_FACE = 1000
-# What a triangle takes in a file whose first lines do not tell the number: OBJ, and text STL.
+# Size of a triangle in files that do not begin with their number: OBJ, and text STL.
 _OBJ_BYTES, _TEXT_STL_BYTES = 35, 200
-# What a cell of a grid takes while it is told whether it is inside.
+# Memory for each cell of a grid while the cells inside are found.
 _BYTES_PER_CELL = 40
-# A file so small is not looked at, nor a grid that takes so little.
+# Smaller files and grids are not checked.
 _SMALL, _SMALL_GRID = 1 << 20, 1 << 26
 
 
@@ -60,7 +60,7 @@ def expected_faces(path: Path) -> int:
 def available_memory() -> int | None:
     """Bytes that the process may still take: of its own limits, its control group's and the machine's, the least.
 
-    None where the system does not tell.
+    None where the system does not say.
     """
     kilobytes = _number(Path("/proc/meminfo"), r"^MemAvailable:\s+")
     found = (_of_limits(), _of_group(), None if kilobytes is None else 1024 * kilobytes)
@@ -95,7 +95,7 @@ def _of_group(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/
         for folder in {place for path in ["", *paths] for place in (mount / path, *(mount / path).parents)}:
             most, current = _number(folder / limit), _number(folder / usage)
             if most is not None and current is not None:
-                # Files that were read stay in memory only as long as nobody else wants it.
+                # Files that were read stay in memory only until it is needed.
                 found.append(most - current + (_number(folder / "memory.stat", rf"^{cache}\s+") or 0))
     return min(found, default=None)
 

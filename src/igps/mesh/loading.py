@@ -78,7 +78,7 @@ def load_mesh(
 
 
 def load_bodies(path: str | Path, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> list[Mesh]:
-    """All bodies of a file that can be used; of the others the log tells. A MeshError if there is none."""
+    """All usable bodies of a file; the others are logged. A MeshError if none is usable."""
     found, faults = [], []
     for _, body in each_body(path, options, least_vertices=least_vertices):
         if isinstance(body, MeshError):

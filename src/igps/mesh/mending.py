@@ -96,7 +96,7 @@ def mend(
 
 
 def mended_by(notes: Iterable[str]) -> tuple[Step, ...]:
-    """The steps that the notes of a `Mesh` or `Signature` tell of, in order, each once."""
+    """The steps behind the notes of a `Mesh` or `Signature`, in order, each once."""
     return tuple(dict.fromkeys(step for note in notes for start, step in _WORDS.items() if note.startswith(start)))
 
 

@@ -28,7 +28,7 @@ from igps.mesh.surface import connected, face_areas, signed_volume, sums, vertex
 SurfaceKind = Literal["excluded", "accessible", "van_der_waals"]
 Pieces = Literal["joined", "largest"]
 
-# Cells around the balls, and on both sides of the surface, in which distances are told.
+# Cells around the balls, and on both sides of the surface, in which distances are computed.
 _MARGIN = 2.5
 _MOST_CELLS = 2**28
 # A step of vertices towards the surface is shorter, in cells.

@@ -1,4 +1,4 @@
-"""Surfaces of other libraries, in memory: told by what they have, so that none of the libraries is needed."""
+"""Surfaces of other libraries, in memory, recognised by their attributes: none of the libraries is imported."""
 
 from __future__ import annotations
 

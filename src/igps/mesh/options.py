@@ -11,7 +11,7 @@ Component = Literal["largest"]
 BodyKind = Literal["whole", "labels", "objects", "pieces", "chains", "models", "assembly"]
 
 MAX_UNPACKED = 2**30
-"""Bytes that a compressed file, an archive or repeated objects may unpack to where nothing else is said."""
+"""Bytes that a compressed file, an archive or repeated objects may unpack to, by default."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class LoadOptions:
             raise ValueError(f"threshold: expected above 0 and at most 1, got {self.threshold}.")
 
     def as_dict(self) -> dict[str, object]:
-        """All on which a body depends, for the keys of caches; later options only where they are not the default."""
+        """The options on which a body depends, for the keys of caches; the later ones only where not default."""
         later = {"bodies": None, "threshold": 0.5, "cavities": "fill"}
         options = {name: value for name, value in asdict(self).items() if name not in ("max_unpacked", "names")}
         return {name: value for name, value in options.items() if name not in later or value != later[name]}

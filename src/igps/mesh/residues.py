@@ -1,4 +1,4 @@
-"""What is known of the residues of proteins and nucleic acids by their names."""
+"""Properties of the residues of proteins and nucleic acids, by their names."""
 
 from __future__ import annotations
 

@@ -29,8 +29,8 @@ from igps.mesh.surface import diagonal, face_areas, largest, longest_side
 
 # Groups of triangles of less than this share of the area are specks, if they are apart in a grid of so many cells.
 _SPECK_AREA, _SPECK_CELLS = 2e-3, 64
-# Volume over area in cells: long thin bodies get cells so small, if there are not too many of them; and what has less
-# than the second is told to be coarse. A rod of so many cells' radius has half of that.
+# Volume over area in cells, half a rod's radius. Cells are made so small that long thin bodies have the first, unless
+# that makes too many; bodies with less than the second get a note that they are coarse.
 _THICK, _COARSE = 1.5, 0.75
 # Faces beyond which vertices are first rounded to a quarter of a cell, so that time and memory stay bounded.
 _MANY_FACES = 400_000
@@ -123,7 +123,7 @@ def _without_specks(vertices: Floats, faces: Integers, notes: list[str]) -> Inte
     area = face_areas(vertices, faces)
     share = np.bincount(group, weights=area, minlength=count + 1) / area.sum()
     keep = (share >= _SPECK_AREA)[group]
-    # Where everything is in crumbs, no crumb is a speck.
+    # Where everything is in pieces that small, none is a speck.
     if keep.all() or area[keep].sum() < 0.98 * area.sum():
         return faces
     notes.append(f"dropped {len(np.unique(group[~keep]))} specks")

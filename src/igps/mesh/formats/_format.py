@@ -94,7 +94,7 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
 
 
 def pieces(whole: RawBody) -> list[RawBody]:
-    """What is not connected, in the order of the file, as "piece 1" and so on; specks are left out."""
+    """The connected components in the order of the file, as "piece 1" and so on; specks are left out."""
     vertices, faces = whole.vertices, whole.faces
     if not len(faces):
         return [whole]
@@ -154,7 +154,7 @@ def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
 
 @contextmanager
 def faults(path: Path, name: str, extra: str | None) -> Iterator[None]:
-    """Tell what a reader raises as a fault of the file; memory that is lacking is none."""
+    """Turn what a reader raises into a MeshError about the file; running out of memory is no fault of it."""
     try:
         yield
     except (MeshError, MemoryError):

@@ -73,7 +73,7 @@ def objects(path: Path, options: LoadOptions, content: bytes | None = None, **lo
 
 
 def _normals(scene: Any, cloud: Any, n_points: int) -> Floats | None:
-    """Those of a PLY file, which trimesh keeps as they were read, (n_points, 3)."""
+    """The normals (n_points, 3) of a PLY file, which trimesh keeps in its metadata."""
     for raw in (scene.metadata.get("_ply_raw", {}), cloud.metadata.get("_ply_raw", {})):
         rows = raw.get("vertex", {}).get("data")
         try:

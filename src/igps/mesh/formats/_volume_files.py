@@ -17,7 +17,7 @@ from igps.mesh.formats.label_names import names_in_extensions
 from igps.mesh.limits import check_fits
 from igps.mesh.mesh import MILLIMETRES, MeshError
 
-# Bytes for each voxel beside those of the file: the labels, and what counts them.
+# Bytes for each voxel beyond those of the file, to hold and count labels.
 _BESIDE = 4
 _FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])  # from LPS, which DICOM and ITK have, to RAS
 _EXPORT = "Export the labels."

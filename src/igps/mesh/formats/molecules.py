@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 MoleculeBodies = Literal["chains", "models", "assembly"]
 
-# What the first letter of an atom's name tells where its element is not given.
+# Elements that the first letter of an atom's name gives where the file does not.
 _ELEMENTS = frozenset("HCNOSP")
 # Radius of an atom whose element is not known, carbon's.
 _UNKNOWN_RADIUS = 1.7
@@ -45,7 +45,7 @@ _NOTES = {
 
 @dataclass(frozen=True, eq=False)
 class Molecule:
-    """The balls of a body, and what is known of its residues.
+    """The balls of a body, and its residues.
 
     Args:
         name: of the file, with the model, chain or assembly.
@@ -134,7 +134,7 @@ def molecules_by_part(path: Path, changed: int, bodies: MoleculeBodies) -> dict[
 def _molecules(
     parts: list[tuple[str, list[gemmi.Chain], list[str]]], ligands: bool, hydrogens: bool, is_pqr: bool
 ) -> tuple[list[Molecule], list[str]]:
-    """Those of the parts, and the names of parts that hold none."""
+    """The molecules of the parts, and the names of parts without one."""
     found, left_out = [], []
     for name, chains, notes in parts:
         one = _Builder(ligands, hydrogens or is_pqr, is_pqr)
@@ -236,7 +236,7 @@ class _Builder:
         self._add_ball(centre, radius, charge)
 
     def _conformers(self, chain: gemmi.Chain) -> Iterator[gemmi.Residue]:
-        """The residues; of several that are alternatives to each other, that of the highest occupancy."""
+        """The residues; of alternatives the one of highest occupancy."""
 
         def place(numbered: tuple[int, gemmi.Residue]) -> str | int:
             number, residue = numbered

@@ -37,7 +37,7 @@ def _text(content: bytes) -> tuple[Floats, tuple[str, ...]]:
 
 
 def _binary(content: bytes, announced: int) -> tuple[Floats, tuple[str, ...]]:
-    """As many triangles as are there, whatever number the header has."""
+    """The triangles that are there, whatever number the header announces."""
     there = max(len(content) - _HEADER, 0) // _TRIANGLE.itemsize
     n = min(there, announced) or there
     notes = () if n == announced else (f"the header announces {announced} triangles: the {n} that are there were read",)

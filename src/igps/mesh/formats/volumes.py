@@ -25,7 +25,7 @@ from igps.mesh.mending import Cavities, Mending, mend
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 
-# More labels are a picture's intensities.
+# More different values are intensities of an image.
 _MOST_LABELS = 20_000
 
 
@@ -85,7 +85,7 @@ class LabelVolume:
 
     @cached_property
     def bodies(self) -> tuple[LabelBody, ...]:
-        """Of every label that any voxel has, in ascending order."""
+        """A body for each label that any voxel has, in ascending order."""
         names, found = self.names or {}, []
         for layer, labels in enumerate(self.layers):
             values, counts, compact = _counted(labels, self.name)
@@ -112,7 +112,7 @@ class LabelVolume:
         return np.asarray(self.layers[body.layer][body.box] == body.value)
 
     def measures(self, part: int | str) -> VoxelMeasures:
-        """Of the voxels of a label."""
+        """Measures of the voxels of a label."""
         return measured(self.mask(part))
 
 

@@ -108,7 +108,7 @@ class _Legacy:
         return vertices, cells, " ".join(words).upper()
 
     def arrays(self, heading: str, n_points: int) -> dict[str, NDArray[np.generic]]:
-        """Those of points, by name; `heading` is the line before."""
+        """The arrays of points, by name; `heading` is the line before."""
         found: dict[str, NDArray[np.generic]] = {}
         is_of_points, n = heading.startswith("POINT_DATA"), n_points
         while words := self.line().split():
@@ -224,7 +224,7 @@ class _Xml:
         return np.frombuffer(self._block("".join(text.split()).encode(), False), kind)
 
     def _block(self, content: bytes, is_raw: bool) -> bytes:
-        """What stands behind a header that tells its size, or the sizes of its compressed blocks."""
+        """The bytes behind a header of their size, or of the sizes of their compressed blocks."""
         size = self._header.itemsize
         (n,) = np.frombuffer(_first(size, content, is_raw), self._header).tolist()
         if self._compressor is None:
