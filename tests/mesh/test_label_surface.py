@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import elliprg
 
-from igps.mesh._isosurface import largest
 from igps.mesh.label_surface import voxel_surface
 from igps.mesh.mesh import Mesh, MeshError
-from igps.mesh.surface import components
+from igps.mesh.surface import components, largest
 
 Array = NDArray[np.float64]
 

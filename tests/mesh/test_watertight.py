@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from training.studies.damages import DAMAGES
 
 from igps.mesh import watertight as module
-from igps.mesh._isosurface import marched
+from igps.mesh._isosurface import level_surface
 from igps.mesh._outside import OrientedSurface
 from igps.mesh.mending import mend
 from igps.mesh.mesh import Mesh, MeshError
@@ -282,7 +282,7 @@ def test_what_is_no_surface_is_refused() -> None:
 
 def test_a_body_between_the_points_of_the_grid_is_refused_by_name() -> None:
     with pytest.raises(MeshError, match=r"wire\.off: no point of the grid lies in the body"):
-        marched(np.ones((4, 4, 4), dtype=np.float32), "wire.off")
+        level_surface(np.ones((4, 4, 4), dtype=np.float32), "wire.off")
 
 
 def test_no_point_of_the_field_is_nearly_on_the_surface(monkeypatch: pytest.MonkeyPatch) -> None:

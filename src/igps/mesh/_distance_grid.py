@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.mesh.surface import face_areas
+from igps.mesh._arrays import Floats, Integers, Surface
+from igps.mesh.surface import face_areas, sums
 
 # How far from the surface exact distances are needed: marching cubes ask for both ends of the edges that cross it.
 BAND = 1.1
@@ -19,28 +20,26 @@ MARGIN = 3
 class Grid:
     """Grid points at whole numbers of cells from the origin."""
 
-    origin: NDArray[np.float64]
+    origin: Floats
     cell: float
     shape: tuple[int, int, int]
 
     @classmethod
-    def around(cls, vertices: NDArray[np.float64], faces: NDArray[np.int64], cell: float) -> Grid:
+    def around(cls, vertices: Floats, faces: Integers, cell: float) -> Grid:
         low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
         counts = np.ceil((high - low) / cell).astype(int) + 1 + 2 * MARGIN
         # The body in the middle, so that moving it moves the grid.
         origin = (low + high) / 2 - (counts - 1) / 2 * cell
         return cls(origin, cell, (int(counts[0]), int(counts[1]), int(counts[2])))
 
-    def to_cells(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_cells(self, points: Floats) -> Floats:
         return (points - self.origin) / self.cell
 
-    def from_cells(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def from_cells(self, points: Floats) -> Floats:
         return points * self.cell + self.origin
 
 
-def cell_sizes(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], resolution: int, spacing: float
-) -> tuple[float, float]:
+def cell_sizes(vertices: Floats, faces: Integers, resolution: int, spacing: float) -> tuple[float, float]:
     """The usual size of a cell, and the least, with as many cells as a cube, and about as many on the surface.
 
     The least is smaller for long bodies alone: the usual grid has twice `resolution` along the longest side at most.
@@ -54,28 +53,22 @@ def cell_sizes(
     return max(least, longest / (2 * resolution)), least
 
 
-def rounded(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def rounded(vertices: Floats, faces: Integers) -> Surface:
     """Vertices put together within quarters of a cell, and the different triangles that remain."""
     lattice = np.round(vertices * 4).astype(np.int64)
     _, index, count = np.unique(lattice, axis=0, return_inverse=True, return_counts=True)
     index = index.ravel()
-    # The mean of those put together: no vertex of the lattice, which would shift the surface.
-    mean = np.stack([np.bincount(index, weights=vertices[:, i]) for i in range(3)], axis=1) / count[:, None]
+    # The mean of those put together: vertices of the lattice would shift the surface.
+    mean = sums(index, vertices, len(count)) / count[:, None]
     faces = np.sort(index[faces], axis=1)
-    faces = np.unique(faces[(np.diff(faces, axis=1) > 0).all(axis=1)], axis=0)
-    return mean, faces
+    return mean, np.unique(faces[(np.diff(faces, axis=1) > 0).all(axis=1)], axis=0)
 
 
 def distances(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], shape: tuple[int, int, int]
+    vertices: Floats, faces: Integers, shape: tuple[int, int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Distance of the grid points in the band around the surface, infinite elsewhere, and the nearest points.
-
-    Blocks of eight cells are halved where the surface may be near.
-
-    Returns:
-        (X, Y, Z) distances and (X, Y, Z, 3) nearest points, cells.
-    """
+    """(X, Y, Z) distances of the grid points in the band around the surface, infinite elsewhere, and the nearest places
+    (X, Y, Z, 3). Blocks of eight cells are halved where the surface may be near."""
     import igl
 
     vertices, faces = np.asfortranarray(vertices), np.asfortranarray(faces)

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
 
+from igps.mesh._arrays import Floats, Integers, Surface
 from igps.mesh.surface import directed_edges, face_parts, undirected_edges
 
 # A hole is small if a circle as long as its rim has at most this share of the area of its part of the surface.
 _SMALL_HOLE = 0.03
 
 
-def with_small_holes_filled(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def with_small_holes_filled(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     """With patches in the small holes."""
     part, areas = face_parts(vertices, faces)
     part_of_vertex = np.zeros(len(vertices), dtype=np.int64)
@@ -32,31 +32,28 @@ def with_small_holes_filled(
     return vertices, faces
 
 
-def _loops(faces: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _loops(faces: Integers) -> list[Integers]:
     """The rims of holes, as the faces that would close them run along them; no loop meets itself.
 
-    Where several rims meet in a vertex, or faces do not agree, the free edges still make loops, if any that end nowhere
-    are left out.
+    Where several rims meet in a vertex, or faces do not agree, free edges still make loops; those that make none are
+    left out.
     """
     end, start = directed_edges(faces)
     _, edge_of_side = undirected_edges(faces, int(faces.max(initial=-1)) + 1)
     free = np.nonzero(np.bincount(edge_of_side)[edge_of_side] == 1)[0]
-    onward: dict[int, list[tuple[int, int]]] = {}
-    backward: dict[int, list[tuple[int, int]]] = {}
+    onward, backward = defaultdict(list), defaultdict(list)
     for edge, a, b in zip(free.tolist(), start[free].tolist(), end[free].tolist(), strict=True):
-        onward.setdefault(a, []).append((edge, b))
-        backward.setdefault(b, []).append((edge, a))
+        onward[a].append((edge, b))
+        backward[b].append((edge, a))
     walked: set[int] = set()
     loops = []
     for first in start[free].tolist():
         path, place = [first], {first: 0}
         while path:
-            here = [*onward.get(path[-1], ()), *backward.get(path[-1], ())]
-            step = next(((edge, vertex) for edge, vertex in here if edge not in walked), None)
-            if step is None:
-                # Home again, or at an end that leads nowhere.
+            here = [*onward[path[-1]], *backward[path[-1]]]
+            edge, vertex = next((step for step in here if step[0] not in walked), (-1, -1))
+            if edge < 0:  # home again, or at an end that leads nowhere
                 break
-            edge, vertex = step
             walked.add(edge)
             if vertex not in place:
                 place[vertex] = len(path)
@@ -71,9 +68,7 @@ def _loops(faces: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return loops
 
 
-def _with_patch(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], loop: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _with_patch(vertices: Floats, faces: Integers, loop: Integers) -> Surface:
     """A patch on a loop, as a disc of rings with the rim's spacing is triangulated, bent like a thin plate."""
     n = len(loop)
     if n == 3:
@@ -92,35 +87,31 @@ def _with_patch(
     points = np.vstack([rim, np.zeros((len(plane) - n, 3))])
     points[n:] = _relaxed(points, patch, n, order=1)
     index = np.concatenate([loop, len(vertices) + np.arange(len(points) - n)])
-    return _fair(np.vstack([vertices, points[n:]]), np.vstack([faces, index[patch]]), len(vertices))
+    faces = np.vstack([faces, index[patch]])
+    return _fair(np.vstack([vertices, points[n:]]), faces, len(vertices)), faces
 
 
-def _circle(turns: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+def _circle(turns: Floats, radius: float) -> Floats:
     return radius * np.stack([np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)], axis=1)
 
 
-def _relaxed(points: NDArray[np.float64], faces: NDArray[np.int64], n_fixed: int, order: int) -> NDArray[np.float64]:
+def _relaxed(points: Floats, faces: Integers, n_fixed: int, order: int) -> Floats:
     """The free points, after the first `n_fixed`, where the `order`-th power of the umbrella operator vanishes."""
     edges, _ = undirected_edges(faces, len(points))
-    size = len(points)
-    graph = sparse.coo_array(
-        (np.ones(2 * len(edges)), (edges.T.ravel(), edges[:, ::-1].T.ravel())), shape=(size, size)
-    ).tocsr()
+    size, ends = len(points), (edges.T.ravel(), edges[:, ::-1].T.ravel())
+    graph = sparse.coo_array((np.ones(2 * len(edges)), ends), shape=(size, size)).tocsr()
     umbrella = sparse.eye_array(size) - sparse.diags_array(1 / graph.sum(axis=1)) @ graph
     operator = (umbrella @ umbrella if order == 2 else umbrella).tocsr()[n_fixed:]
     solved = spsolve(operator[:, n_fixed:].tocsc(), -(operator[:, :n_fixed] @ points[:n_fixed]))
     return np.asarray(solved).reshape(-1, 3)
 
 
-def _fair(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], n_old: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The vertices from `n_old` on moved so that the surface goes on smoothly over the rim (a thin plate)."""
+def _fair(vertices: Floats, faces: Integers, n_old: int) -> Floats:
+    """The vertices, those from `n_old` on moved so that the surface goes on smoothly over the rim (a thin plate)."""
     ring = np.unique(faces[(faces >= n_old).any(axis=1)])
     near = faces[np.isin(faces, ring).any(axis=1)]
     near = faces[np.isin(faces, np.unique(near)).any(axis=1)]
     used = np.unique(near)
     fixed = int((used < n_old).sum())
-    vertices = vertices.copy()
-    vertices[n_old:] = _relaxed(vertices[used], np.searchsorted(used, near), fixed, order=2)
-    return vertices, faces
+    free = _relaxed(vertices[used], np.searchsorted(used, near), fixed, order=2)
+    return np.concatenate([vertices[:n_old], free])

@@ -5,29 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from igps.mesh.surface import face_areas
-
-Surface = tuple[NDArray[np.float64], NDArray[np.int64]]
+from igps.mesh._arrays import Floats, Integers, Surface
+from igps.mesh.surface import face_areas, stacked
 
 # A thread takes no more of a triangle than this share of its sides.
 _MOST = 0.5
 
 
 def joined_by_threads(parts: Sequence[Surface], share: float) -> Surface:
-    """The parts as one closed surface; those that are nearest to each other are joined.
+    """The parts, closed and outward and none within another, as one closed surface; nearest ones are joined.
 
-    A thread is a tube of triangular section between two triangles, the largest at the nearest vertices.
-
-    Args:
-        parts: vertices (V, 3) and faces (F, 3) of each, closed and outward, none within another.
-        share: of the whole area that all threads may add.
+    A thread is a tube of triangular section between two triangles, the largest at the nearest vertices; together they
+    may add this share of the whole area.
     """
     starts = np.cumsum([0, *(len(points) for points, _ in parts)])
-    vertices = np.concatenate([points for points, _ in parts])
-    faces = np.concatenate([triangles + start for (_, triangles), start in zip(parts, starts, strict=False)])
+    vertices, faces = stacked(parts)
     links = [(starts[i] + a, starts[j] + b) for i, j, a, b in _nearest([points for points, _ in parts])]
     length = sum(float(np.linalg.norm(vertices[a] - vertices[b])) for a, b in links)
     girth = share * float(face_areas(vertices, faces).sum()) / max(length, 1e-300)
@@ -36,7 +30,7 @@ def joined_by_threads(parts: Sequence[Surface], share: float) -> Surface:
     return vertices, faces
 
 
-def _nearest(parts: Sequence[NDArray[np.float64]]) -> list[tuple[int, int, int, int]]:
+def _nearest(parts: Sequence[Floats]) -> list[tuple[int, int, int, int]]:
     """Two parts and a vertex of each, for every link of the shortest tree that joins them all."""
     trees, links = [cKDTree(points) for points in parts], []
     best = dict.fromkeys(range(1, len(parts)), (np.inf, 0, 0, 0))
@@ -52,7 +46,7 @@ def _nearest(parts: Sequence[NDArray[np.float64]]) -> list[tuple[int, int, int, 
     return links
 
 
-def _with_thread(vertices: NDArray[np.float64], faces: NDArray[np.int64], a: int, b: int, girth: float) -> Surface:
+def _with_thread(vertices: Floats, faces: Integers, a: int, b: int, girth: float) -> Surface:
     """With a tube of this girth between the largest triangles at two vertices."""
     areas = face_areas(vertices, faces)
     ends = [int(at[areas[at].argmax()]) for at in (np.flatnonzero((faces == v).any(axis=1)) for v in (a, b))]

@@ -1,20 +1,19 @@
 """A smooth function on a grid of voxels that is negative where most of a voxel lies in the body.
 
 Voxels tell where a body is by their centres, or by the share of each that it fills. Of all functions whose signs agree
-with that, one is taken that bends little: between the last voxels inside and the first outside its zero level is free,
-so no stairs are left, and no voxel changes sides, so nothing thin is lost. (Whitaker 2000 and Gibson 1998 hold surfaces
-by the same constraint; Lempitsky 2010 takes second derivatives, which shrink nothing, in place of area.) What bends
-little still cuts the corners of what is convex. The number of voxels tells the volume better than any surface does, so
-the level is moved to give it back: nearby first, then as a whole.
+with that, one is taken that bends little: no stairs are left, since the zero level is free between the last voxels
+inside and the first outside; and nothing thin is lost, since no voxel changes sides. (Whitaker 2000 and Gibson 1998
+hold surfaces by the same constraint; Lempitsky 2010 takes second derivatives, which shrink nothing, in place of area.)
+Convex corners are still cut, so the level is moved to give back the voxels' volume, nearby first, then as a whole.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from igps._compiled import compiled
+from igps.mesh._arrays import Booleans, Floats, Integers
 
 # Least absolute value of a voxel that is wholly inside or outside, in shortest sides; half would be the most that all
 # bodies allow. More keeps edges sharper, less leaves round bodies smoother; this serves descriptors best.
@@ -25,7 +24,7 @@ _RELAXATION = 1.4
 _N_SWEEPS = 10
 # Voxels from the border within which the function is free.
 _BAND = 2
-# Standard deviation of the window in which the volume is kept, in voxels: of masks, and of shares, which tell more.
+# Standard deviation of the window in which the volume is kept, in voxels: of masks, and of shares, which are finer.
 _WINDOW, _NARROW_WINDOW = 2.0, 1.0
 _N_CORRECTIONS = 2
 
@@ -33,13 +32,13 @@ PAD = _BAND + 2
 """Empty voxels that the grid must have on every side."""
 
 
-def smooth_field(share: NDArray[np.float64], spacing: NDArray[np.float64], is_mask: bool) -> NDArray[np.float64]:
+def smooth_field(share: Floats, spacing: Floats, is_mask: bool) -> Floats:
     """The function at the centres of the voxels, in units of length, about the distance to the surface nearby.
 
     Args:
         share: (X, Y, Z) the share of each voxel that lies in the body, 0 to 1; with `PAD` empty layers around.
         spacing: (3,) sides of a voxel, length.
-        is_mask: whether the shares are only 0 or 1, and tell whether the centre is in the body.
+        is_mask: the shares are 0 or 1, and tell whether the centre is in the body.
     """
     scale = float(spacing.min())
     sides = spacing / scale
@@ -66,7 +65,7 @@ def smooth_field(share: NDArray[np.float64], spacing: NDArray[np.float64], is_ma
     return field * scale
 
 
-def filled_share(field: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def filled_share(field: Floats) -> tuple[Floats, Floats]:
     """The share of each voxel on which the field is negative, and how fast it grows as the level does."""
     width = np.full(field.shape, 1e-3)
     for axis in range(3):
@@ -75,11 +74,11 @@ def filled_share(field: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
     return np.clip(share, 0, 1), np.where((share > 0) & (share < 1), 1 / width, 0.0)
 
 
-def _bending(sides: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _bending(sides: Floats) -> tuple[Integers, Floats]:
     """Gradient of the sum of squared second differences: offsets (25, 3), the centre's first, and weights (25,)."""
     weights = {(0, 0, 0): 0.0}
 
-    def add(one: NDArray[np.float64], two: NDArray[np.float64], axes: tuple[int, int], factor: float) -> None:
+    def add(one: Floats, two: Floats, axes: tuple[int, int], factor: float) -> None:
         for i, a in enumerate(one):
             for j, b in enumerate(two):
                 offset = [0, 0, 0]
@@ -97,15 +96,9 @@ def _bending(sides: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.
 
 @compiled(fastmath={"contract", "reassoc", "nsz"})
 def _relax(
-    field: NDArray[np.float64],
-    nodes: NDArray[np.int64],
-    steps: NDArray[np.int64],
-    weights: NDArray[np.float64],
-    centre: float,
-    target: NDArray[np.float64],
-    inside: NDArray[np.bool_],
-    margin: NDArray[np.float64],
-) -> None:
+    field: Floats, nodes: Integers, steps: Integers, weights: Floats, centre: float, target: Floats, inside: Booleans,
+    margin: Floats,
+) -> None:  # fmt: skip
     """Projected Gauss-Seidel sweeps, forwards and backwards in turn, in place."""
     n = len(nodes)
     for sweep in range(_N_SWEEPS):

@@ -1,12 +1,13 @@
-"""What the voxels of a label tell of its body before a surface is made."""
+"""Measures of the voxels of a label, before a surface is made."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
+
+from igps.mesh._arrays import Booleans
 
 # Share of the voxels that must lie near balls of a diameter for no part to be thinner; and how near, in radii: corners
 # of a box as thick are no thinner.
@@ -18,23 +19,20 @@ _SMALL = 1 << 20
 
 @dataclass(frozen=True)
 class VoxelMeasures:
-    """Of a label: how many voxels, pieces that share no corner, and how many voxels thick the thinnest part is.
-
-    No thickness above ten voxels is told from ten.
-    """
+    """Of a label: how many voxels, pieces that share no corner, and the thickness of the thinnest part in voxels."""
 
     n_voxels: int
     n_pieces: int
     thinnest: int
 
 
-def measured(mask: NDArray[np.bool_]) -> VoxelMeasures:
+def measured(mask: Booleans) -> VoxelMeasures:
     """The measures of a mask (X, Y, Z)."""
-    n_pieces = ndimage.label(mask, np.ones((3, 3, 3), dtype=bool))[1]
+    n_pieces = ndimage.label(mask, np.ones((3, 3, 3)))[1]
     return VoxelMeasures(int(np.count_nonzero(mask)), int(n_pieces), thinnest_part(mask))
 
 
-def thinnest_part(mask: NDArray[np.bool_]) -> int:
+def thinnest_part(mask: Booleans) -> int:
     """The largest diameter up to ten voxels of which balls fit into the mask nearly everywhere, at least 1."""
     mask = np.pad(mask, 1)
     parts = 2 if mask.size < _SMALL else 1  # thickness of even numbers of voxels is seen in halves alone

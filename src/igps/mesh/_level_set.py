@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 
+from igps.mesh._arrays import Booleans, Floats, Integers
 from igps.mesh._distance_grid import BAND
 from igps.mesh._outside import WALL, OrientedSurface
 
@@ -22,7 +23,7 @@ SPECK_VOLUME = 2e-3
 
 
 def level_set(
-    distance: NDArray[np.float32], nearest: NDArray[np.float32], outside: NDArray[np.bool_], surface: OrientedSurface
+    distance: NDArray[np.float32], nearest: NDArray[np.float32], outside: Booleans, surface: OrientedSurface
 ) -> NDArray[np.float32]:
     """The signed distance of solids and, for what has no inside, the distance to a sheet of a cell's thickness."""
     from skimage.segmentation import watershed
@@ -32,8 +33,8 @@ def level_set(
     at = np.nonzero(band)
     foot, away = nearest[at], distance[at]
     way = (np.stack(at, axis=1) - foot) / np.maximum(away, 1e-6)[:, None]
-    # A point of the wall belongs to the side that lies beyond it, away from the surface; where that is all wall, to
-    # that of its deepest neighbours.
+    # A point of the wall belongs to the side that lies beyond it, away from the surface, or that of its deepest
+    # neighbours where all beyond is wall.
     markers = np.where(wall, 0, np.where(outside, 1, 2)).astype(np.int32)
     doubtful = np.nonzero(away <= WALL)[0]
     for step in (0.75, 1.0, 1.25):
@@ -56,12 +57,7 @@ def level_set(
     return without_bubbles(field.astype(np.float32))
 
 
-def _has_inside(
-    inside: NDArray[np.bool_],
-    at: tuple[NDArray[np.int64], ...],
-    foot: NDArray[np.floating[Any]],
-    way: NDArray[np.floating[Any]],
-) -> NDArray[np.bool_]:
+def _has_inside(inside: Booleans, at: tuple[Integers, ...], foot: NDArray[Any], way: NDArray[Any]) -> Booleans:
     """Whether a point is inside or sees an inside when it looks through the surface where that is nearest."""
     solid = inside[at]
     for step in (0.25, 0.5, 0.75, 1.0):
@@ -69,14 +65,14 @@ def _has_inside(
     return np.asarray(solid)
 
 
-def _at(values: NDArray[Any], points: NDArray[np.floating[Any]]) -> NDArray[Any]:
+def _at(values: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
     """The values at the grid points nearest to `points`."""
     index = np.clip(np.round(points).astype(np.int64), 0, np.array(values.shape) - 1)
     return np.asarray(values[tuple(index.T)])
 
 
 def without_bubbles(field: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What the outside does not reach is filled."""
+    """The field with everything filled that the outside does not reach."""
     label, count = ndimage.label(field > 0)
     if count > 1:
         field[(field > 0) & (label != label[0, 0, 0])] = -LEAST
@@ -101,18 +97,14 @@ def joined(field: NDArray[np.float32], notes: list[str]) -> NDArray[np.float32]:
         return field
     away, index = ndimage.distance_transform_edt(label == 0, return_indices=True)
     owner = label[tuple(index)]
-    first, second, gap, here, there = [], [], [], [], []
+    neighbours = []
     positions = np.arange(field.size).reshape(field.shape)
     for axis in range(3):
         a = tuple(slice(None, -1) if i == axis else slice(None) for i in range(3))
         b = tuple(slice(1, None) if i == axis else slice(None) for i in range(3))
-        differ = owner[a] != owner[b]
-        first.append(owner[a][differ])
-        second.append(owner[b][differ])
-        gap.append((away[a] + away[b])[differ] + 1)
-        here.append(positions[a][differ])
-        there.append(positions[b][differ])
-    i, j, width, p, q = (np.concatenate(part) for part in (first, second, gap, here, there))
+        found = (owner[a], owner[b], away[a] + away[b] + 1, positions[a], positions[b])
+        neighbours.append([values[owner[a] != owner[b]] for values in found])
+    i, j, width, p, q = (np.concatenate(values) for values in zip(*neighbours, strict=True))
     order = np.argsort(width, kind="stable")
     pair = np.minimum(i, j).astype(np.int64) * (count + 1) + np.maximum(i, j)
     _, narrowest = np.unique(pair[order], return_index=True)
@@ -122,17 +114,16 @@ def joined(field: NDArray[np.float32], notes: list[str]) -> NDArray[np.float32]:
     lookup = {(int(i[k]), int(j[k])): k for k in chosen}
     for row, column in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
         k = lookup[row, column]
-        ends = [np.array([index[d].ravel()[position] for d in range(3)], dtype=np.float64) for position in (p[k], q[k])]
-        _add_bar(field, ends[0], ends[1])
+        _add_bar(field, *(index.reshape(3, -1)[:, place].astype(np.float64) for place in (p[k], q[k])))
     notes.append(f"joined {len(pieces)} pieces by bars")
     return without_bubbles(field)
 
 
-def _add_bar(field: NDArray[np.float32], a: NDArray[np.float64], b: NDArray[np.float64]) -> None:
+def _add_bar(field: NDArray[np.float32], a: Floats, b: Floats) -> None:
     low = np.maximum(np.minimum(a, b).astype(int) - 2, 0)
     high = np.minimum(np.maximum(a, b).astype(int) + 3, field.shape)
-    box = tuple(slice(low[d], high[d]) for d in range(3))
-    points = np.stack(np.meshgrid(*(np.arange(low[d], high[d]) for d in range(3)), indexing="ij"), axis=-1)
+    box = tuple(map(slice, low, high))
+    points = np.moveaxis(np.indices(high - low), 0, -1) + low
     along = np.clip(((points - a) @ (b - a)) / max(float((b - a) @ (b - a)), 1e-9), 0, 1)
     distance = np.linalg.norm(points - a - along[..., None] * (b - a), axis=-1)
     field[box] = np.minimum(field[box], distance - _BAR)

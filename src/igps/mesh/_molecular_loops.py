@@ -8,26 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._compiled import compiled
+from igps.mesh._arrays import Floats, Integers
 
 _TURN = 2 * math.pi
 
 
 @compiled()
-def exposed_arcs(
-    centres: NDArray[np.float64],
-    radii: NDArray[np.float64],
-    first: NDArray[np.int64],
-    neighbours: NDArray[np.int64],
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The arcs in which two spheres meet outside all other balls.
+def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: Integers) -> tuple[Floats, Integers]:
+    """The arcs in which two spheres meet outside all other balls, and (A,) 1 for balls that have one or meet no other.
 
     Args:
         centres, radii: (A, 3) and (A,) of the balls, none in another.
         first, neighbours: those that meet ball i are `neighbours[first[i]:first[i + 1]]`.
 
     Returns:
-        (arcs, 12): centre of the circle, first axis, normal, radius, angle of the start from the first axis, and angle
-        from start to end, up to 2π; and (A,) 1 for balls that have an arc or meet none.
+        Arcs (N, 12): centre of the circle, first axis, normal, radius, angle of the start from the first axis, and
+        angle from start to end, up to 2π.
     """
     room = 256
     found = np.empty((room, 12))
@@ -100,11 +96,7 @@ def exposed_arcs(
                         more = np.empty((room, 12))
                         more[:n_found] = found
                         found = more
-                    arc = found[n_found]
-                    arc[0], arc[1], arc[2] = mx, my, mz
-                    arc[3], arc[4], arc[5] = ax, ay, az
-                    arc[6], arc[7], arc[8] = ux, uy, uz
-                    arc[9], arc[10], arc[11] = radius, reached, start - reached
+                    found[n_found] = (mx, my, mz, ax, ay, az, ux, uy, uz, radius, reached, start - reached)
                     n_found += 1
                     exposed[i] = exposed[j] = 1
                 if position < n_covered:
@@ -114,22 +106,10 @@ def exposed_arcs(
 
 @compiled()
 def depths(
-    centres: NDArray[np.float64],
-    radii: NDArray[np.float64],
-    shape: tuple[int, int, int],
-    spacing: float,
-    margin: float,
+    centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, margin: float
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """How deep each grid point lies in the ball in which it lies deepest, and in which that is.
-
-    Args:
-        centres, radii: (A, 3) and (A,), the first grid point is the origin.
-        shape, spacing: of the grid.
-        margin: how far outside of the balls depths, negative there, are told.
-
-    Returns:
-        Depths, at least `-margin`, and the balls, -1 where there is none within `margin`.
-    """
+    """How deep each grid point lies in the ball in which it lies deepest, at least `-margin` (outside of all, it is
+    negative), and in which that is, -1 where there is none within `margin`. The first grid point is the origin."""
     depth = np.full(shape, -margin, np.float32)
     owner = np.full(shape, -1, np.int32)
     for i in range(len(radii)):
@@ -156,35 +136,20 @@ def depths(
 
 @compiled()
 def distances_outside(
-    depth: NDArray[np.float32],
-    owner: NDArray[np.int32],
-    centres: NDArray[np.float64],
-    radii: NDArray[np.float64],
-    first: NDArray[np.int64],
-    neighbours: NDArray[np.int64],
-    exposed: NDArray[np.int64],
-    arcs: NDArray[np.float64],
-    spacing: float,
-    reach: float,
-) -> NDArray[np.float32]:
+    depth: NDArray[np.float32], owner: NDArray[np.int32], centres: Floats, radii: Floats, first: Integers,
+    neighbours: Integers, exposed: Integers, arcs: Floats, spacing: float, reach: float,
+) -> NDArray[np.float32]:  # fmt: skip
     """The distance of each grid point in the balls from what is outside of all of them.
 
     The nearest place outside lies on a sphere, on an arc of two, or at the end of an arc. On a sphere it can only be
     that of the ball in which the point lies deepest: all others end further out.
 
-    Args:
-        depth, owner: see `depths`.
-        centres, radii, first, neighbours: see `exposed_arcs`.
-        exposed, arcs: what it returned.
-        spacing: of the grid.
-        reach: distances beyond are told as this.
-
-    Returns:
-        The distances up to `reach`; outside of the balls `depth`, which is negative.
+    For the arguments see `depths` and `exposed_arcs`. Distances are cut at `reach`; outside of the balls
+    they are `depth`, which is negative.
     """
     shape = depth.shape
     distance = np.minimum(depth, np.float32(reach))
-    # What is still to be told from arcs.
+    # Points whose distance comes from arcs.
     waiting = np.zeros(shape, np.bool_)
     for x in range(shape[0]):
         for y in range(shape[1]):
@@ -195,9 +160,7 @@ def distances_outside(
                 i = owner[x, y, z]
                 free = exposed[i] == 1
                 if free and first[i] < first[i + 1]:
-                    dx = x * spacing - centres[i, 0]
-                    dy = y * spacing - centres[i, 1]
-                    dz = z * spacing - centres[i, 2]
+                    dx, dy, dz = x * spacing - centres[i, 0], y * spacing - centres[i, 1], z * spacing - centres[i, 2]
                     size = math.sqrt(dx * dx + dy * dy + dz * dz)
                     scale = radii[i] / max(size, 1e-9)
                     px, py, pz = centres[i, 0] + scale * dx, centres[i, 1] + scale * dy, centres[i, 2] + scale * dz
@@ -242,10 +205,9 @@ def distances_outside(
                         if a * ch + b * sh >= narrow * across:
                             square = (across - radius) ** 2 + h * h
                         else:
-                            square = min(
-                                (x * spacing - ex) ** 2 + (y * spacing - ey) ** 2 + (z * spacing - ez) ** 2,
-                                (x * spacing - fx) ** 2 + (y * spacing - fy) ** 2 + (z * spacing - fz) ** 2,
-                            )
+                            square = (x * spacing - ex) ** 2 + (y * spacing - ey) ** 2 + (z * spacing - ez) ** 2
+                            other = (x * spacing - fx) ** 2 + (y * spacing - fy) ** 2 + (z * spacing - fz) ** 2
+                            square = min(square, other)
                         if square < distance[x, y, z] ** 2:
                             distance[x, y, z] = math.sqrt(square)
     return distance
@@ -258,12 +220,10 @@ def _span(low: float, high: float, spacing: float, size: int) -> tuple[int, int]
 
 
 @compiled()
-def cubic_values(field: NDArray[np.float32], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A function on a grid and its gradient, (P, 4), between its points by cubic convolution (Keys 1981).
+def cubic_values(field: NDArray[np.float32], points: Floats) -> Floats:
+    """A function on a grid and its gradient, (P, 4), at points (P, 3) in cells, by cubic convolution (Keys 1981).
 
-    Args:
-        field: at the grid points, at least four along each axis.
-        points: (P, 3), in cells.
+    The grid has at least four points along each axis.
     """
     values = np.empty((len(points), 4))
     weight, slope = np.empty((3, 4)), np.empty((3, 4))
@@ -273,14 +233,10 @@ def cubic_values(field: NDArray[np.float32], points: NDArray[np.float64]) -> NDA
             cell = min(max(math.floor(points[p, axis]), 1), field.shape[axis] - 3)
             t = points[p, axis] - cell
             low[axis] = cell - 1
-            weight[axis, 0] = 0.5 * t * (-1 + t * (2 - t))
-            weight[axis, 1] = 0.5 * (2 + t * t * (3 * t - 5))
-            weight[axis, 2] = 0.5 * t * (1 + t * (4 - 3 * t))
-            weight[axis, 3] = 0.5 * t * t * (t - 1)
-            slope[axis, 0] = 0.5 * (-1 + t * (4 - 3 * t))
-            slope[axis, 1] = 0.5 * t * (9 * t - 10)
-            slope[axis, 2] = 0.5 * (1 + t * (8 - 9 * t))
-            slope[axis, 3] = 0.5 * t * (3 * t - 2)
+            weight[axis, 0], slope[axis, 0] = 0.5 * t * (-1 + t * (2 - t)), 0.5 * (-1 + t * (4 - 3 * t))
+            weight[axis, 1], slope[axis, 1] = 0.5 * (2 + t * t * (3 * t - 5)), 0.5 * t * (9 * t - 10)
+            weight[axis, 2], slope[axis, 2] = 0.5 * t * (1 + t * (4 - 3 * t)), 0.5 * (1 + t * (8 - 9 * t))
+            weight[axis, 3], slope[axis, 3] = 0.5 * t * t * (t - 1), 0.5 * t * (3 * t - 2)
         value = along_x = along_y = along_z = 0.0
         for a in range(4):
             for b in range(4):

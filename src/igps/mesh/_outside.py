@@ -1,13 +1,14 @@
 """Which points of a grid lie outside a surface that may have holes; lengths are in cells.
 
-**A hole, or a cup?** Where a surface is nearly closed, which its own faces tell by their winding numbers, the winding
-number says what is inside (Jacobson et al. 2013). It is if their mean distance to whole numbers is below 1/20: bodies
-with 2 % missing have 0.01 to 0.03, a cup as deep as wide has 0.10. Where a body was put together of overlapping solids,
-the faces hidden between them are left out first, or thin bodies would have up to 0.10, too. Anywhere else an opening is
-a hole, and what lies behind it inside, if a ball that passes through it has less than half the radius of the largest
-ball behind it. Anything wider is the mouth of a cup, a trouser leg or a bell, and stays open, with about a cell of
-wall. A wall with two sides, as of a vase that was modelled as a solid, stays open whatever the width of its mouth,
-since the winding number behind is near zero. Openings narrower than a cell are always closed.
+**A hole, or a cup?** Where a surface is nearly closed, the winding number says what is inside (Jacobson et al. 2013).
+It is if the winding numbers beside its faces are on average within 1/20 of whole numbers: bodies with 2 % missing have
+0.01 to 0.03, a cup as deep as wide has 0.10. Of overlapping solids the faces hidden between them are left out first, or
+thin bodies would have up to 0.10, too.
+
+Anywhere else an opening is a hole, and what lies behind it inside, if a ball that passes through it has less than half
+the radius of the largest ball behind it. Anything wider is the mouth of a cup, a trouser leg or a bell, and stays open,
+with about a cell of wall. A wall with two sides, as of a vase that was modelled as a solid, stays open whatever the
+width of its mouth, since the winding number behind is near zero. Openings narrower than a cell are always closed.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from igps.mesh._arrays import Booleans, Floats, Integers
 from igps.mesh._distance_grid import MARGIN
 from igps.mesh.surface import area_vectors, face_areas, signed_volume, unit
 
@@ -44,12 +46,12 @@ _FEW_PAIRS = 10**7
 class OrientedSurface:
     """The surface with each connected part turned outward as a whole, for its winding numbers."""
 
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    vertices: Floats
+    faces: Integers
     is_nearly_closed: bool
 
     @classmethod
-    def of(cls, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> OrientedSurface:
+    def of(cls, vertices: Floats, faces: Integers) -> OrientedSurface:
         import igl
 
         _, first, index = np.unique(np.round(vertices, 4), axis=0, return_index=True, return_inverse=True)
@@ -60,8 +62,7 @@ class OrientedSurface:
         faces, part = igl.bfs_orient(faces)
         faces, _ = igl.orient_outward(vertices, faces, part[:, None])
         faces = np.asarray(faces, dtype=np.int64)
-        middle, normals = _probes(vertices, faces)
-        points = np.concatenate([middle + 0.25 * normals, middle - 0.25 * normals])
+        points = _beside(vertices, faces)
         # Outward is a guess where a part is bent. Turning one negates its share of the winding numbers: those of the
         # largest are turned that bring these closer to whole numbers.
         area = np.bincount(part, weights=face_areas(vertices, faces))
@@ -69,10 +70,10 @@ class OrientedSurface:
         shares = [cls(vertices, faces[part == k], False).winding(points) for k in large]
         rest = cls(vertices, faces[~np.isin(part, large)], False).winding(points)
         total = np.sum([rest, *shares], axis=0)
-        for _ in range(_TURNED):
+        for _ in range(_TURNED if len(large) > 1 else 0):
             turned = [total - 2 * share for share in shares]
-            best = min(range(len(large)), key=lambda i: _defect(turned[i]), default=None)
-            if len(large) < 2 or best is None or _defect(turned[best]) >= _defect(total) - 1e-3:
+            best = min(range(len(large)), key=lambda i: _defect(turned[i]))
+            if _defect(turned[best]) >= _defect(total) - 1e-3:
                 break
             total, shares[best] = turned[best], -shares[best]
             faces = np.where((part == large[best])[:, None], faces[:, ::-1], faces)
@@ -90,7 +91,7 @@ class OrientedSurface:
         """Volume over area, cells: half of a plate's thickness, half of a rod's radius, a third of a ball's."""
         return signed_volume(self.vertices, self.faces) / float(face_areas(self.vertices, self.faces).sum())
 
-    def winding(self, points: NDArray[Any]) -> NDArray[np.float64]:
+    def winding(self, points: NDArray[Any]) -> Floats:
         if not len(points) or not len(self.faces):
             return np.zeros(len(points))
         import igl
@@ -103,36 +104,35 @@ class OrientedSurface:
     def _without_hidden(self) -> OrientedSurface:
         """Without the faces that have the inside on both sides, such as walls between solids put together.
 
-        Where these share some of their outer surface, which has lost its doubles, each alone is open there, which
-        spoils the winding numbers around.
+        Solids that share some of their outer surface are each open there, which spoils the winding numbers around.
         """
         normals, middle = unit(area_vectors(self.vertices, self.faces)), self.vertices[self.faces].mean(axis=1)
         least = np.minimum(*(self.winding(middle + side * normals) for side in (0.25, -0.25)))
         faces = self.faces[least <= 0.5]
         if not len(faces):
             return self
-        middle, normals = _probes(self.vertices, faces)
         bare = OrientedSurface(self.vertices, faces, False)
-        points = np.concatenate([middle + 0.25 * normals, middle - 0.25 * normals])
-        return replace(bare, is_nearly_closed=_defect(bare.winding(points)) < _NEARLY_CLOSED)
+        defect = _defect(bare.winding(_beside(self.vertices, faces)))
+        return replace(bare, is_nearly_closed=defect < _NEARLY_CLOSED)
 
 
-def _probes(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Middles of faces, chosen evenly by area from the first to the last, and their unit normals."""
+def _beside(vertices: Floats, faces: Integers) -> Floats:
+    """Points outside, then inside of the middles of faces, chosen evenly by area from the first to the last."""
     normals = area_vectors(vertices, faces)
     area = np.linalg.norm(normals, axis=1)
     at = (np.arange(_PROBES) + 0.5) / _PROBES * area.sum()
     face = np.minimum(np.searchsorted(np.cumsum(area), at), len(area) - 1)
     face = face[area[face] > 0]
-    return vertices[faces[face]].mean(axis=1), normals[face] / area[face, None]
+    middle, step = vertices[faces[face]].mean(axis=1), 0.25 * (normals[face] / area[face, None])
+    return np.concatenate([middle + step, middle - step])
 
 
-def _defect(winding: NDArray[np.float64]) -> float:
+def _defect(winding: Floats) -> float:
     """Mean distance to 0, 1, 2, ...: zero beside closed surfaces that are turned outward."""
     return float(np.abs(winding - np.maximum(np.round(winding), 0)).mean())
 
 
-def outside_of(distance: NDArray[np.float32], surface: OrientedSurface) -> tuple[NDArray[np.bool_], int]:
+def outside_of(distance: NDArray[np.float32], surface: OrientedSurface) -> tuple[Booleans, int]:
     """Which grid points the flood reaches, walls excepted, and how many openings were closed to it."""
     label, _ = ndimage.label(distance > WALL)
     outside = label == label[0, 0, 0]
@@ -146,14 +146,14 @@ def outside_of(distance: NDArray[np.float32], surface: OrientedSurface) -> tuple
 
     # Both sides spread in the order of the distance to the wall, so that they meet in the narrowest place.
     depth = ndimage.distance_transform_edt(outside)
-    markers = np.where(cavities, 2, 0)
-    markers[_border(outside.shape)] = 1
+    markers = np.ones(outside.shape, dtype=np.int64)
+    markers[1:-1, 1:-1, 1:-1] = np.where(cavities, 2, 0)[1:-1, 1:-1, 1:-1]
     return watershed(-depth, markers, mask=outside) == 1, count
 
 
 def _outside_by_winding(
-    outside: NDArray[np.bool_], distance: NDArray[np.float32], surface: OrientedSurface
-) -> tuple[NDArray[np.bool_], int]:
+    outside: Booleans, distance: NDArray[np.float32], surface: OrientedSurface
+) -> tuple[Booleans, int]:
     near = np.argwhere(outside & np.isfinite(distance))
     # A third of the points beside the surface, in all directions, shows whether the flood went in anywhere.
     probe = near[near.sum(axis=1) % 3 == 0]
@@ -161,10 +161,8 @@ def _outside_by_winding(
     if not len(leaked):
         return outside, 0
     # Where it went in, all it reached near the leak is asked.
-    margin = 4
-    low = np.maximum(leaked.min(axis=0) - margin, 0)
-    high = np.minimum(leaked.max(axis=0) + margin + 1, outside.shape)
-    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    low, high = np.maximum(leaked.min(axis=0) - 4, 0), np.minimum(leaked.max(axis=0) + 5, outside.shape)
+    box = tuple(map(slice, low, high))
     points = np.argwhere(outside[box]) + low
     inside = np.zeros_like(outside)
     # No body reaches beyond its bounding box, as the winding number does where a base is missing.
@@ -174,11 +172,9 @@ def _outside_by_winding(
     return outside & ~inside, count
 
 
-def _cavities(outside: NDArray[np.bool_], surface: OrientedSurface) -> NDArray[np.bool_]:
-    """The middles of what lies behind holes: connected to the outside only by passages of less than half their width.
-
-    The passages are measured by balls of a growing radius.
-    """
+def _cavities(outside: Booleans, surface: OrientedSurface) -> Booleans:
+    """The middles of what lies behind holes: what only passages of less than half its width, measured by balls of a
+    growing radius, connect with the outside."""
     depth = ndimage.distance_transform_edt(outside)
     found = np.zeros_like(outside)
     radius = 1.0
@@ -186,8 +182,7 @@ def _cavities(outside: NDArray[np.bool_], surface: OrientedSurface) -> NDArray[n
         # Around the grid everything is outside.
         label, count = ndimage.label(np.pad(depth > radius, 1, constant_values=True))
         if count > 1:
-            reached = label[0, 0, 0]
-            label = label[1:-1, 1:-1, 1:-1]
+            reached, label = label[0, 0, 0], label[1:-1, 1:-1, 1:-1]
             peak = ndimage.maximum(depth, label, np.arange(count + 1))
             for k in np.nonzero(peak * _MOUTH >= radius)[0]:
                 if k not in (0, reached):
@@ -197,9 +192,3 @@ def _cavities(outside: NDArray[np.bool_], surface: OrientedSurface) -> NDArray[n
                         found |= core
         radius *= 1.3
     return found
-
-
-def _border(shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    border = np.ones(shape, dtype=bool)
-    border[1:-1, 1:-1, 1:-1] = False
-    return border

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import compact, diagonal, face_areas, face_parts, signed_volume, undirected_edges
 from igps.mesh.winding import winding_number
@@ -19,9 +17,7 @@ SPECK = 2e-3
 _FINS = 0.05
 
 
-def welded(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def welded(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     """Coincident vertices made one, degenerate and doubled faces and unused vertices dropped, neighbours turned alike.
 
     Vertices and faces that stay keep their order. What was done is added to `notes`.
@@ -31,10 +27,10 @@ def welded(
     if n_places < len(vertices):
         notes.append(f"welded {len(vertices) - n_places} coincident vertices")
         faces = place[faces]
-    sharp = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    if not sharp.all():
-        notes.append(f"dropped {int((~sharp).sum())} degenerate faces")
-        faces = faces[sharp]
+    is_degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    if is_degenerate.any():
+        notes.append(f"dropped {int(is_degenerate.sum())} degenerate faces")
+        faces = faces[~is_degenerate]
     _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     if len(once) < len(faces):
         notes.append(f"dropped {len(faces) - len(once)} duplicate faces")
@@ -46,23 +42,20 @@ def welded(
     return vertices, oriented(faces, notes)
 
 
-def places(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(V,) of each vertex the first that is in the same place.
-
-    On a lattice in units of the bounding box, so that the unit of length does not matter.
-    """
+def places(vertices: Floats) -> Integers:
+    """(V,) of each vertex the first that is in the same place, on a lattice in units of the bounding box."""
     lattice = np.round((vertices - vertices.mean(axis=0)) / (_WELD * max(diagonal(vertices), np.finfo(float).tiny)))
     _, first, index = np.unique(lattice.astype(np.int64), axis=0, return_index=True, return_inverse=True)
     return np.asarray(first[index.ravel()])
 
 
-def are_specks(areas: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of some parts with these areas are crumbs beside the others; none if all of them together are many."""
+def are_specks(areas: Floats) -> Booleans:
+    """Which of the parts with these areas are specks; none if all specks together have much area."""
     specks = areas < SPECK * areas.sum()
     return specks & (areas[specks].sum() < 10 * SPECK * areas.sum())
 
 
-def oriented(faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.int64]:
+def oriented(faces: Integers, notes: list[str]) -> Integers:
     """The faces turned so that neighbours agree, as far as the surface can be oriented; the smaller side is turned."""
     if not len(faces):
         return faces
@@ -70,18 +63,15 @@ def oriented(faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.int64]:
 
     agreeing, part = igl.bfs_orient(faces)
     turn = (agreeing != faces).any(axis=1)
-    mostly = np.bincount(part, weights=turn) > np.bincount(part) / 2
-    turn ^= mostly[part]
+    turn ^= (np.bincount(part, weights=turn) > np.bincount(part) / 2)[part]
     if turn.any():
         notes.append(f"turned {int(turn.sum())} faces to orient the surface")
         faces = np.where(turn[:, None], faces[:, ::-1], faces)
     return faces
 
 
-def tidied(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Without fins and specks."""
+def tidied(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
+    """Without fins and specks, and turned alike once it is plain which faces are neighbours."""
     kept = _without_fins(vertices, faces)
     if len(kept) < len(faces):
         notes.append(f"dropped {len(faces) - len(kept)} faces of fins")
@@ -91,35 +81,31 @@ def tidied(
     if specks.any():
         notes.append(f"dropped {int(specks.sum())} specks")
         faces = faces[~specks[part]]
-    # Only now is it plain which faces are neighbours.
     vertices, faces = compact(vertices, faces)
     return vertices, oriented(faces, notes)
 
 
-def _without_fins(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Without the faces that hang on an edge of two others, peeled from their free edges; all, if they are many."""
+def _without_fins(vertices: Floats, faces: Integers) -> Integers:
+    """The faces but for those that hang on an edge of two others, peeled from their free edges; all, if they are many.
+
+    A face with a second free edge that is left of a larger fin does no harm: it hangs on nothing crowded.
+    """
     kept = faces
     while len(kept):
         _, edge_of_side = undirected_edges(kept, len(vertices))
         count = np.bincount(edge_of_side)[edge_of_side].reshape(-1, 3)
         fin = (count == 1).any(axis=1) & (count > 2).any(axis=1)
         if not fin.any():
-            # A face with a second free edge that was left of a larger fin does no harm: it hangs on nothing crowded.
             break
         kept = kept[~fin]
     left = face_areas(vertices, kept).sum()
     return kept if left >= (1 - _FINS) * face_areas(vertices, faces).sum() else faces
 
 
-def without_hidden(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str], *, cavities: bool = False
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def without_hidden(vertices: Floats, faces: Integers, notes: list[str], *, cavities: bool = False) -> Surface:
     """Without the parts that lie inside the largest, if that is closed.
 
-    Args:
-        vertices, faces: the surface.
-        notes: what was done is added.
-        cavities: keep those of them that are closed and lie in no other, turned so that they bound hollows.
+    With `cavities` those of them stay that are closed and lie in no other, turned so that they bound hollows.
     """
     part, areas = face_parts(vertices, faces)
     if len(areas) < 2:
@@ -140,15 +126,18 @@ def without_hidden(
         kept: list[Mesh] = []
         for k in sorted(np.flatnonzero(hidden), key=lambda k: -areas[k]):
             own = part == k
-            with contextlib.suppress(MeshError):
-                cavity = Mesh(*compact(vertices, faces[own]))
-                if any((winding_number(one.vertices, one.faces, cavity.vertices) > 0.5).any() for one in kept):
-                    continue
-                kept.append(cavity)
-                hidden[k] = False
-                if signed_volume(*compact(vertices, faces[own])) > 0:
-                    notes.append("turned the surface of a cavity towards the inside")
-                    faces[own] = faces[own][:, ::-1]
+            surface = compact(vertices, faces[own])
+            try:
+                cavity = Mesh(*surface)
+            except MeshError:
+                continue
+            if any((winding_number(one.vertices, one.faces, cavity.vertices) > 0.5).any() for one in kept):
+                continue
+            kept.append(cavity)
+            hidden[k] = False
+            if signed_volume(*surface) > 0:
+                notes.append("turned the surface of a cavity towards the inside")
+                faces[own] = faces[own][:, ::-1]
     if hidden.any():
         notes.append(f"dropped {int(hidden.sum())} parts hidden inside")
     return compact(vertices, faces[~hidden[part]])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh._hole_filling import with_small_holes_filled
 from igps.mesh._tidying import SPECK, oriented, tidied, welded
 from igps.mesh.mesh import Mesh, MeshError
@@ -19,68 +19,57 @@ _COINCIDENT = 1e-6
 _MOST_PATCHES, _MOST_PARTS = 200, 200
 
 
-def without_walls(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def without_walls(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     """Without the walls inside the body, and the sheets that lie on another, where more than two faces meet in an edge.
 
-    Parts that overlap and have vertices in common leave them, as a body does that was cut and put together again. A
-    patch, faces that share an edge with each other alone, goes only if that opens no hole, because two others meet
-    wherever it ends, and if nothing is lost that sees the outside, because what of it does is covered by the others.
-    What sees the least goes first, then the smallest.
+    Parts that overlap and share vertices leave them, as does a body that was cut and put together again. A patch (see
+    `face_patches`) goes only if that opens no hole, because two others meet wherever it ends, and if the others cover
+    what of it sees the outside. What sees the least goes first, then the smallest.
     """
-    n_patches = int(face_patches(faces, len(vertices))[0].max()) + 1
-    if not 1 < n_patches <= _MOST_PATCHES:
+    patch, ends_at_others = face_patches(faces, len(vertices))
+    if not 1 < len(ends_at_others) <= _MOST_PATCHES:
         return vertices, faces
     points = np.ascontiguousarray((vertices - vertices.mean(axis=0)) / diagonal(vertices))
-    places, at, sees = _places(points, faces)
-    areas, kept = face_areas(points, faces), np.arange(len(faces))
+    seen = _places(points, faces, patch)
     n_dropped = 0
-    while (number := _superfluous(points, faces[kept], areas[kept], places, _inverse(kept, len(faces))[at], sees)) >= 0:
-        kept = kept[face_patches(faces[kept], len(points))[0] != number]
+    while (number := _superfluous(points, faces, patch, ends_at_others, *seen)) >= 0:
+        kept = (patch >= 0) & (patch != number)
+        patch = np.full(len(faces), -1)
+        patch[kept], ends_at_others = face_patches(faces[kept], len(points))
         n_dropped += 1
     if not n_dropped:
         return vertices, faces
     notes.append(f"dropped {n_dropped} walls inside")
-    vertices, faces = compact(vertices, faces[kept])
+    vertices, faces = compact(vertices, faces[patch >= 0])
     return vertices, oriented(faces, notes)
 
 
 def _superfluous(
-    points: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    areas: NDArray[np.float64],
-    places: NDArray[np.float64],
-    at: NDArray[np.int64],
-    sees: NDArray[np.bool_],
-) -> int:
-    """The patch that may go first, or −1; `places` lie on the faces `at`, −1 on one that is gone."""
+    points: Floats, faces: Integers, patch: Integers, ends_at_others: Booleans, places: Floats, at: Integers,
+    sees: Booleans,
+) -> int:  # fmt: skip
+    """The patch that may go first, or −1; faces that are gone are of patch −1, and `places` lie on the faces `at`."""
     import igl
 
-    patch, ends_at_others = face_patches(faces, len(points))
-    size = np.bincount(patch, areas)
-    of_patch = np.where(at >= 0, patch[at], -1)
-    there = of_patch >= 0
-    n_places = np.maximum(np.bincount(of_patch[there], minlength=len(size)), 1)
-    seeing = np.bincount(of_patch[there], sees[there], len(size)) / n_places
+    of_patch, there = patch[at], patch >= 0
+    size = np.bincount(patch[there], face_areas(points, faces[there]))
+    n_places = np.maximum(np.bincount(of_patch[of_patch >= 0], minlength=len(size)), 1)
+    seeing = np.bincount(of_patch[of_patch >= 0], sees[of_patch >= 0], len(size)) / n_places
     for number in np.lexsort((size, seeing)).tolist():
         if not ends_at_others[number]:
             continue
         shown = np.ascontiguousarray(places[(of_patch == number) & sees])
-        rest = faces[patch != number]
+        rest = faces[there & (patch != number)]
         squared = igl.point_mesh_squared_distance(shown, points, rest)[0] if len(shown) else np.zeros(1)
         if np.max(squared) <= _COINCIDENT**2:
             return number
     return -1
 
 
-def _places(
-    points: NDArray[np.float64], faces: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Places (S, 3) on each patch, evenly by area and always the same; the faces (S,) they are on; who sees outside."""
+def _places(points: Floats, faces: Integers, patch: Integers) -> tuple[Floats, Integers, Booleans]:
+    """Places (S, 3) on each patch, evenly by area and always the same; their faces (S,); and which see outside."""
     import igl
 
-    patch, _ = face_patches(faces, len(points))
     areas = face_areas(points, faces)
     generator = np.random.default_rng(0)
     chosen = []
@@ -89,8 +78,7 @@ def _places(
         if len(members):
             chosen.append(generator.choice(members, _PLACES_PER_PATCH, p=areas[members] / areas[members].sum()))
     at = np.concatenate(chosen)
-    weights = generator.dirichlet(np.ones(3), len(at))
-    places = np.einsum("sc,scx->sx", weights, points[faces[at]])
+    places = np.einsum("sc,scx->sx", generator.dirichlet(np.ones(3), len(at)), points[faces[at]])
     normals = unit(area_vectors(points, faces[at]))
     occluded = [
         np.asarray(igl.ambient_occlusion(points, faces, places, np.ascontiguousarray(side), _DIRECTIONS)).ravel()
@@ -99,16 +87,7 @@ def _places(
     return places, at, 1 - np.minimum(*occluded) > _OPEN
 
 
-def _inverse(kept: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """Where each of `n` is among those kept, −1 if it is not."""
-    where = np.full(n, -1)
-    where[kept] = np.arange(len(kept))
-    return where
-
-
-def united(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def united(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     """The outer surface of parts that are closed each by itself and overlap, by manifold3d.
 
     Each part is tidied on its own, and turned outward. The surface as it is, and no note, if a part is not closed, if

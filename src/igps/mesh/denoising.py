@@ -1,17 +1,13 @@
 """Whether a surface is rough with noise, and the surface without it.
 
-Noise of a scanner moves neighbouring vertices independently, shape does not: what is left of a vertex's height over its
-neighbours when their mean height is taken off is small on a shape, and neighbours have it in common; on noise it is
-large, and neighbours have it in opposite directions more often than not. Only where both are so on most of the surface
-is anything changed.
+Noise of a scanner moves neighbouring vertices independently, shape does not. Take a vertex's height over its
+neighbours, less the mean of theirs: on a shape what is left is small and has the same sign at neighbours; on noise it
+is large and more often has opposite signs. Only where both hold on most of the surface is anything changed: it is
+smoothed, and the normals of the smooth surface lead a filter of the noisy one's, by which edges and volume come back.
 
-What is noisy is smoothed, and the normals of the smooth surface lead a filter of the noisy one's, by which it gets back
-its edges and its volume.
-
-On the long thin triangles of turned and drawn parts, whose rims are fine and whose ends are far from each other, a
-neighbour counts by the inverse square of its distance: what is looked at and smoothed there runs along the rims, where
-noise wrinkles the surface, and the steps from rim to rim stay sharp. The normals of such triangles say little where
-noise is as wide as they are, so that smoothing is all.
+On the long thin triangles of turned and drawn parts a neighbour counts by the inverse square of its distance: so the
+surface is looked at and smoothed along the fine rims, where noise wrinkles it, and the steps from rim to rim stay
+sharp. The normals of such triangles say little where noise is as wide as they are: there smoothing is all.
 """
 
 from __future__ import annotations
@@ -19,24 +15,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh.surface import area_vectors, longest_side, undirected_edges, unit, vertex_normals
 
-# The lower quartile of that remainder over the mean length of a vertex's edges: up to 0.014 on generated shapes of more
-# than 2,000 vertices and up to 0.028 on those of 1,000 to 2,000, 0.034 to 0.092 with noise of 0.2 % of the diagonal,
-# but for thick bodies of few triangles, which it hardly changes. The quartile, because noise is everywhere and details
-# are not.
+# Calibrated on generated shapes and parts of thin triangles, clean and with noise of 0.1 to 0.4 % of the diagonal.
+# The lower quartile of what is left over the mean length of a vertex's edges, because noise is everywhere and details
+# are not: up to 0.028 on clean shapes of 1,000 vertices and more (thin triangles 0.012), 0.034 to 0.092 with noise
+# (0.027 to 0.24).
 _ROUGH = 0.035
-# The share of neighbours on which it has the same sign: from 0.50 to 0.57 on those shapes, 0.39 to 0.45 with noise. Of
-# 34 of 1,000 to 2,600 vertices 31 are noisy by both; 0.45 would be all, and take some clean scans for noisy. On 33
-# generated parts of thin triangles the first is at most 0.012 and 0.027 to 0.24 with noise, the second at least 0.53
-# and at most 0.37.
+# The share of neighbours on which it has the same sign: 0.50 to 0.57 on clean shapes, 0.39 to 0.45 with noise (thin
+# triangles at least 0.53, at most 0.37). 0.45 would miss none, and take some clean scans for noisy.
 _IN_COMMON = 0.43
-# Noise leaves hardly two neighbouring triangles in one plane: 0.2 to 0.5 % of them within a tenth of a degree on
-# generated bodies, up to 5 % on parts of thin triangles. Drawn houses and bicycles, whose ornaments are as rough as
-# noise, have 14 % and more.
+# Noise leaves hardly two neighbouring triangles in one plane: up to 0.5 % of them within a tenth of a degree, 5 % on
+# thin triangles. Drawn houses and bicycles, whose ornaments are as rough as noise, have 14 % and more.
 _FLAT, _FLAT_ANGLE = 0.1, np.radians(0.1)
 # By how much the mean length of a vertex's edges exceeds that by which the inverse squares are averaged, at the median
 # vertex: 1.02 to 1.11 on generated bodies, 4.2 to 300 on parts of thin triangles, the same with noise.
@@ -45,24 +38,20 @@ _THIN = 2.0
 _VERY_THIN = 8.0
 # Of the longest side of the body: shorter edges count as that long, so that none is infinitely short.
 _SHORTEST = 1e-9
-# What is rough with fewer vertices was made so; and what hardly is a surface has no normals to speak of.
+# Surfaces of fewer vertices are rough by design; those with more edges at other than two faces have no clear normals.
 _FEWEST, _REGULAR = 1000, 0.97
 # Taubin's two steps.
 _SHRINK, _GROW = 0.5, -0.53
-# Their number for noise as large as an edge is long, and bounds for it. What a number of passes n leaves of the noise
-# has waves longer than about n^(1/4) edges, and adds a share of the area in proportion to (noise / edge)² / n: as many
-# passes go as leave the same share of every surface, 0.1 to 0.6 %. On generated shapes of 1,700 to 14,000 vertices with
-# noise of 0.06 to 0.31 edges the normals came nearest to the clean ones' with 3 to 5 passes at 0.1, 10 at 0.15, 20 at
-# 0.22 and 40 at 0.3. Fewer leave noise, more take thin limbs. Of the area that noise adds to parts of thin triangles,
-# 2 to 170 %, they leave about a tenth, and a fifth where it is larger than the triangles are narrow.
+# Their number for noise as large as an edge is long, and bounds for it. n passes leave of the noise waves longer than
+# about n^(1/4) edges, and a share of the area in proportion to (noise / edge)² / n: so as many go as leave the same
+# share of every surface, 0.1 to 0.6 %. Normals came nearest to the clean ones' so. Fewer leave noise, more take thin
+# limbs.
 _PASSES, _FEWEST_PASSES, _MOST_PASSES = 430, 3, 60
-# No vertex goes farther than so many times the noise. On turned parts hardly one would; of plates with holes and thin
-# triangles, whose vertices have their near neighbours on one side, half the volume would go.
+# No vertex goes farther than so many times the noise: plates with holes and thin triangles, whose vertices have their
+# near neighbours on one side, would lose half their volume.
 _FARTHEST = 5
-# Width of the filter of normals, as their difference, how often it is run, and how often the vertices follow. On 15
-# generated bodies and 12 machine parts with noise of 0.1, 0.2 and 0.4 % of the diagonal, 3 runs at 0.35 leave normals
-# 2.9, 4.1 and 6.0 degrees off on the bodies (the smooth surface itself 3.8, 4.3 and 5.3) and 2.3, 4.4 and 8.8 on the
-# parts (6.6, 9.6 and 12.6). 0.3 keeps more noise, 0.4 rounds more edges; weights by distance made no difference.
+# Width of the filter of normals, as their difference, how often it is run, and how often the vertices follow. Width 0.3
+# keeps more noise, 0.4 rounds more edges; weights by distance made no difference.
 _WIDTH, _RUNS, _STEPS = 0.35, 3, 10
 # Faces whose neighbours are gathered at a time, and the most faces around a vertex that all count as neighbours of each
 # other: those around a hub of thousands would be millions of pairs.
@@ -71,13 +60,8 @@ _FACES_AT_ONCE, _MOST_AROUND = 2**15, 64
 _QUARTILE = 0.3186
 
 
-def is_noisy(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
-    """Whether most of a surface is rough with noise that neighbouring vertices do not share.
-
-    Args:
-        vertices: (V, 3) positions, any length unit.
-        faces: (F, 3) welded and turned alike.
-    """
+def is_noisy(vertices: Floats, faces: Integers) -> bool:
+    """Whether most of a surface of welded faces that are turned alike is rough with noise."""
     if len(vertices) < _FEWEST:
         return False
     vertices = vertices / _unit_of_length(vertices)
@@ -86,23 +70,27 @@ def is_noisy(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
         return False
     # Of the averaged surface: where noise is larger than the triangles, theirs say nothing.
     normals = vertex_normals(around.averaging @ (around.averaging @ vertices), faces)
-    rough, in_common = _statistics(vertices, normals, around)
-    return rough > _ROUGH and in_common < _IN_COMMON and _share_of_flat_edges(vertices, faces, around.edge_of) < _FLAT
+    edges, averaging = around.edges, around.averaging
+    height = np.einsum("ij,ij->i", vertices - averaging @ vertices, normals)
+    rest = (height - averaging @ height) / np.maximum(around.length, np.finfo(float).tiny)
+    weights = averaging[edges[:, 0], edges[:, 1]] + averaging[edges[:, 1], edges[:, 0]]
+    in_common = np.average(rest[edges[:, 0]] * rest[edges[:, 1]] > 0, weights=weights)
+    is_rough = np.quantile(np.abs(rest), 0.25) > _ROUGH and in_common < _IN_COMMON
+    return bool(is_rough) and _share_of_flat_edges(vertices, faces, around.edge_of) < _FLAT
 
 
 @dataclass(frozen=True)
 class _Neighbours:
     """Of each vertex; where most are among thin triangles, the near ones: by the inverse squares of their distances."""
 
-    edges: NDArray[np.int64]  # (E, 2)
-    edge_of: NDArray[np.int64]  # (3F,): of every side of every face
+    edges: Integers  # (E, 2)
+    edge_of: Integers  # (3F,): of every side of every face
     averaging: sparse.csr_array  # (V, V): averages over the neighbours
-    length: NDArray[np.float64]  # (V,): of a vertex's edges
-    stretch: NDArray[np.float64]  # (V,): mean length of a vertex's edges over that of the near ones
+    length: Floats  # (V,): of a vertex's edges
+    stretch: Floats  # (V,): mean length of a vertex's edges over that of the near ones
 
     @staticmethod
-    def of(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> _Neighbours:
-        """Of vertices in units of `_unit_of_length`."""
+    def of(vertices: Floats, faces: Integers) -> _Neighbours:
         n = len(vertices)
         edges, edge_of = undirected_edges(faces, n)
         rows, columns = edges.T.ravel(), edges[:, ::-1].T.ravel()
@@ -121,24 +109,12 @@ class _Neighbours:
         return _Neighbours(edges, edge_of, averaging, of_vertex, stretch)
 
     @property
-    def faces_at_sides(self) -> NDArray[np.int64]:
+    def faces_at_sides(self) -> Integers:
         """(F, 3) how many faces share the side from each corner to the next."""
         return np.asarray(np.bincount(self.edge_of)[self.edge_of].reshape(-1, 3))
 
 
-def _statistics(
-    vertices: NDArray[np.float64], normals: NDArray[np.float64], around: _Neighbours
-) -> tuple[float, float]:
-    """The lower quartile of the remainder over the edges' lengths, and the share of neighbours that have its sign."""
-    edges, averaging, length = around.edges, around.averaging, around.length
-    height = np.einsum("ij,ij->i", vertices - averaging @ vertices, normals)
-    rest = (height - averaging @ height) / np.maximum(length, np.finfo(float).tiny)
-    weights = averaging[edges[:, 0], edges[:, 1]] + averaging[edges[:, 1], edges[:, 0]]
-    alike = rest[edges[:, 0]] * rest[edges[:, 1]] > 0
-    return float(np.quantile(np.abs(rest), 0.25)), float(np.average(alike, weights=weights))
-
-
-def denoised(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+def denoised(vertices: Floats, faces: Integers) -> Floats:
     """(V, 3) vertices of a smoother surface of the same size; those on boundaries stay where they are.
 
     Taubin's λ|μ passes (1995), as many as the noise asks for, see `noise_over_edge`. Where triangles are thin, that is
@@ -167,13 +143,9 @@ def denoised(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray
     return unit_length * (vertices + move)
 
 
-def _filtered_normals(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], smooth: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(F, 3) unit normals: means over the faces that share a vertex, by area and by how alike a guide's normals are.
-
-    The guide is the smooth surface at first, then what came of the run before.
-    """
+def _filtered_normals(vertices: Floats, faces: Integers, smooth: Floats) -> Floats:
+    """(F, 3) unit normals: means over the faces that share a vertex, by area and by how alike a guide's normals are,
+    at first the smooth surface's, then those of the run before."""
     n_around = np.bincount(faces.ravel(), minlength=len(vertices))
     at_corners = _at_corners(faces, len(vertices))[:, n_around <= _MOST_AROUND]
     areas = area_vectors(smooth, faces)
@@ -193,9 +165,7 @@ def _filtered_normals(
     return normals
 
 
-def _with_normals(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], normals: NDArray[np.float64], free: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _with_normals(vertices: Floats, faces: Integers, normals: Floats, free: Floats) -> Floats:
     """(V, 3) vertices moved, as far as they are free (V, 1), until their faces have about these normals (F, 3)."""
     to_vertices = _at_corners(faces, len(vertices)).T.tocsr()
     projections = (to_vertices @ (normals[:, :, None] * normals[:, None]).reshape(-1, 9)).reshape(-1, 3, 3)
@@ -208,30 +178,24 @@ def _with_normals(
     return vertices
 
 
-def _at_corners(faces: NDArray[np.int64], n_vertices: int) -> sparse.csr_array:
+def _at_corners(faces: Integers, n_vertices: int) -> sparse.csr_array:
     """(F, V) ones where a face has a vertex."""
     begins = 3 * np.arange(len(faces) + 1)
     return sparse.csr_array((np.ones(faces.size), faces.ravel(), begins), shape=(len(faces), n_vertices))
 
 
-def noise_over_edge(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
-    """Standard deviation of the noise along the normals over the root of the mean squared length of the noisy edges.
+def noise_over_edge(vertices: Floats, faces: Integers) -> float:
+    """Standard deviation of the noise along the normals over the root mean square length of edges (if thin, near ones).
 
-    On thin triangles, of the near ones.
-
-    By the lower quartile of what `is_noisy` looks at, each vertex's over what the same operator makes of white noise of
-    one unit there. On generated shapes with 0.1 edges of noise and more it is within a tenth of the truth; a shape
-    without noise passes for 0.01 to 0.04.
+    By what `is_noisy` looks at, over what the same operator makes of white noise. On generated shapes with 0.1 edges of
+    noise and more it is within a tenth of the truth; a shape without noise passes for 0.01 to 0.04.
     """
     vertices = vertices / _unit_of_length(vertices)
     noise, edge = _noise_and_edge(vertices, faces, _Neighbours.of(vertices, faces))
     return noise / edge
 
 
-def _noise_and_edge(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], around: _Neighbours
-) -> tuple[float, float]:
-    """The two lengths of `noise_over_edge`, in the unit of the vertices."""
+def _noise_and_edge(vertices: Floats, faces: Integers, around: _Neighbours) -> tuple[float, float]:
     normals = vertex_normals(around.averaging @ (around.averaging @ vertices), faces)
     high_pass = (sparse.eye_array(len(vertices), format="csr") - around.averaging).tocsr()
     rest = high_pass @ np.einsum("ij,ij->i", high_pass @ vertices, normals)
@@ -240,13 +204,13 @@ def _noise_and_edge(
     return float(noise), float(max(np.sqrt(np.mean(around.length**2)), np.finfo(float).tiny))
 
 
-def _unit_of_length(vertices: NDArray[np.float64]) -> float:
+def _unit_of_length(vertices: Floats) -> float:
     """The longest side, up to a power of two: squares of lengths are numbers in it, and to divide by it is exact."""
     _, exponent = np.frexp(max(longest_side(vertices), np.finfo(float).tiny))
     return float(np.ldexp(1.0, int(exponent) - 1))
 
 
-def _share_of_flat_edges(vertices: NDArray[np.float64], faces: NDArray[np.int64], edge_of: NDArray[np.int64]) -> float:
+def _share_of_flat_edges(vertices: Floats, faces: Integers, edge_of: Integers) -> float:
     """The share of edges whose two triangles lie in one plane, of faces whose sides (3F,) are these edges."""
     normals = unit(area_vectors(vertices, faces))
     order = np.argsort(edge_of, kind="stable")

@@ -14,18 +14,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from igps.mesh._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh._isosurface import level_surface, simplified, with_volume
 from igps.mesh._label_field import PAD, filled_share, smooth_field
 from igps.mesh._level_set import LEAST, without_bubbles
 from igps.mesh.limits import check_grid
 from igps.mesh.mesh import MeshError
-from igps.mesh.surface import compact, components, signed_volume
+from igps.mesh.surface import connected, signed_volume, stacked
 
 MAX_VERTICES = 5000
-"""As many vertices a label's surface has at most, where nothing else is said."""
+"""Most vertices of a label's surface, by default."""
 
 LEAST_VOXELS = 8
-"""A label of fewer voxels has no shape."""
+"""Fewest voxels that have a shape."""
 
 _ISLAND = 0.02  # share of the voxels below which a piece apart is dropped
 _SPECK = 0.005  # share of the volume below which a piece of the surface is none of the label's
@@ -39,25 +40,19 @@ _TOUCHING = np.ones((3, 3, 3), dtype=bool)  # voxels that share a corner belong 
 
 
 def voxel_surface(
-    inside: ArrayLike,
-    affine: ArrayLike | None = None,
-    *,
-    max_vertices: int = MAX_VERTICES,
-    cavities: bool = False,
+    inside: ArrayLike, affine: ArrayLike | None = None, *, max_vertices: int = MAX_VERTICES, cavities: bool = False,
     name: str = "volume",
-) -> tuple[NDArray[np.float64], NDArray[np.int64], tuple[str, ...]]:
+) -> tuple[Floats, Integers, tuple[str, ...]]:  # fmt: skip
     """The closed, outward surface of the voxels of a body.
 
-    It encloses the volume of the voxels, has every centre of a voxel on its side (unless it was put on a coarser grid),
-    and is closed where the body ends at the border of the volume. Voxels that share only a corner are one piece. Holes
-    inside are filled.
+    It encloses their volume, has the centres of all voxels on their side unless it was put on a coarser grid, and is
+    closed where the body ends at the border of the volume. Voxels that share only a corner are one piece. Holes inside
+    are filled.
 
     Example:
-        >>> index = np.indices((24, 24, 24))
-        >>> ball = ((index - 11.3) ** 2).sum(axis=0) < 10**2
+        >>> ball = ((np.indices((24, 24, 24)) - 11.3) ** 2).sum(axis=0) < 10**2
         >>> vertices, faces, _ = voxel_surface(ball)
-        >>> radius = np.linalg.norm(vertices - 11.3, axis=1)
-        >>> bool(abs(radius - 10).max() < 0.4)
+        >>> bool(abs(np.linalg.norm(vertices - 11.3, axis=1) - 10).max() < 0.4)
         True
 
     Args:
@@ -68,8 +63,7 @@ def voxel_surface(
         name: what error messages call the body.
 
     Returns:
-        Vertices (V, 3) in the world; faces (F, 3), counter-clockwise seen from outside, of one or several closed
-        pieces; and notes of what was done.
+        Vertices (V, 3) in the world, faces (F, 3) of one or several closed pieces, and notes of what was done.
 
     Raises:
         MeshError: too few voxels, or an affine that is singular.
@@ -79,23 +73,23 @@ def voxel_surface(
         raise MeshError(f"{name}: expected an array of three axes, got shape {mask.shape}.")
     matrix = np.eye(4) if affine is None else np.asarray(affine, dtype=np.float64)
     spacing = checked_spacing(matrix, name)
-    box = ndimage.find_objects(mask.view(np.uint8))
     n_voxels = int(np.count_nonzero(mask))
     if n_voxels < LEAST_VOXELS:
-        raise MeshError(
-            f"{name}: {n_voxels} voxels, at least {LEAST_VOXELS} expected: they tell no shape. Leave it out, or label "
-            "it on a finer grid."
-        )
-    low = np.array([part.start for part in box[0]], dtype=np.float64)
+        few = f"{name}: {n_voxels} voxels, at least {LEAST_VOXELS} expected: they tell no shape."
+        raise MeshError(f"{few} Leave it out, or label it on a finer grid.")
+    (box,) = ndimage.find_objects(mask.view(np.uint8))
+    low = np.array([side.start for side in box], dtype=np.float64)
     notes: list[str] = []
-    mask, hollows = _whole(mask[box[0]], notes, LEAST_VOXELS if cavities else None)
+    mask, hollows = _whole(mask[box], notes, LEAST_VOXELS if cavities else None)
     share, factor = _coarsened(mask, spacing, max_vertices)
     mask = _joined(share >= 0.5)
     share = np.pad(np.where(mask, np.maximum(share, 0.5), share), PAD)
     check_grid(share.size, name)
     sides = spacing * factor
     field = smooth_field(share, sides, is_mask=bool((factor == 1).all()))
-    fineness = _fineness(sides, _n_vertices(mask, sides))
+    # Into how many parts each side goes, so that the parts are about equal and make vertices enough.
+    finer = min(max(math.ceil(math.sqrt(_FEWEST / _n_vertices(mask, sides))), 1), _MOST_REFINED)
+    fineness = np.maximum(np.round(finer * sides / sides.min()), 1).astype(np.int64)
     field = _refined(field, share, fineness, LEAST * float((sides / fineness).min()))
     vertices, faces = _meshed(field, sides / fineness, share.sum() * sides.prod(), max_vertices, name)
     # Index of the first voxel's centre: that of a block of `factor` voxels lies (factor - 1) / 2 further.
@@ -106,31 +100,22 @@ def voxel_surface(
     matrix = matrix @ np.block([[np.eye(3), low[:, None]], [np.zeros(3), 1]])
     for hollow in hollows:
         points, inwards, _ = voxel_surface(hollow, matrix, max_vertices=max_vertices, name=name)
-        surfaces.append((points, inwards[:, ::-1] + sum(len(other) for other, _ in surfaces)))
-    vertices, faces = (np.concatenate(arrays) for arrays in zip(*surfaces, strict=True))
-    return vertices, faces, tuple(notes)
+        surfaces.append((points, inwards[:, ::-1]))
+    return *stacked(surfaces), tuple(notes)
 
 
-def checked_spacing(affine: NDArray[np.float64], name: str) -> NDArray[np.float64]:
-    """(3,) sides of a voxel, length.
-
-    Raises:
-        MeshError: the affine is no invertible matrix (4, 4) of finite numbers.
-    """
+def checked_spacing(affine: Floats, name: str) -> Floats:
+    """(3,) sides of a voxel, length; a MeshError if the affine is no invertible matrix (4, 4) of finite numbers."""
     if affine.shape != (4, 4) or not np.isfinite(affine).all():
         raise MeshError(f"{name}: affine: expected a finite matrix of shape (4, 4), got {affine.tolist()}.")
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not spacing.all() or abs(np.linalg.det(affine[:3, :3] / np.where(spacing, spacing, 1))) < 1e-6:
-        raise MeshError(
-            f"{name}: the affine is singular, so the voxels have no volume. Write the file again with the spacing and "
-            "the directions of its axes."
-        )
+        singular = f"{name}: the affine is singular, so the voxels have no volume."
+        raise MeshError(f"{singular} Write the file again with the spacing and the directions of its axes.")
     return spacing
 
 
-def _whole(
-    mask: NDArray[np.bool_], notes: list[str], least: int | None
-) -> tuple[NDArray[np.bool_], list[NDArray[np.bool_]]]:
+def _whole(mask: Booleans, notes: list[str], least: int | None) -> tuple[Booleans, list[Booleans]]:
     """Without islands, and with holes filled; and the holes of at least so many voxels, none if None."""
     label, island, size = _islands(mask)
     if len(island):
@@ -138,22 +123,20 @@ def _whole(
         lost = int(size[island].sum())
         pieces = "1 small piece" if len(island) == 1 else f"{len(island)} small pieces"
         notes.append(f"dropped {pieces} apart of {lost} voxels, {lost / size.sum():.1%} of the label")
-    # What is outside shares faces.
+    # Voxels outside are connected by faces.
     hollow, n_hollow = ndimage.label(np.pad(~mask, 1, constant_values=True))
-    if n_hollow > 1:
-        hollow_outside = hollow[0, 0, 0]
-        hollow = hollow[1:-1, 1:-1, 1:-1]
-        filled = hollow != hollow_outside
-        size = np.bincount(hollow.reshape(-1))
-        size[[0, hollow_outside]] = 0
-        kept = [] if least is None else np.flatnonzero(size >= least).tolist()
-        if n_filled := int(size.sum() - size[kept].sum()):
-            notes.append(f"filled holes of {n_filled} voxels")
-        return np.asarray(filled), [hollow == k for k in kept]
-    return mask, []
+    if n_hollow < 2:
+        return mask, []
+    outside, hollow = hollow[0, 0, 0], hollow[1:-1, 1:-1, 1:-1]
+    size = np.bincount(hollow.reshape(-1))
+    size[[0, outside]] = 0
+    kept = [] if least is None else np.flatnonzero(size >= least).tolist()
+    if n_filled := int(size.sum() - size[kept].sum()):
+        notes.append(f"filled holes of {n_filled} voxels")
+    return np.asarray(hollow != outside), [hollow == k for k in kept]
 
 
-def _islands(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64]]:
+def _islands(mask: Booleans) -> tuple[NDArray[np.int32], Integers, Integers]:
     """The piece of each voxel, from 1; the pieces that are too small to stay; and the voxels of each, of 0 none."""
     label, _ = ndimage.label(mask, _TOUCHING)
     size = np.bincount(label.reshape(-1))
@@ -161,8 +144,8 @@ def _islands(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int
     return label, np.nonzero(size < _ISLAND * size.sum())[0][1:], size
 
 
-def _joined(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Where pieces share an edge or a corner only, voxels beside that are added."""
+def _joined(mask: Booleans) -> Booleans:
+    """With voxels added beside edges and corners at which pieces only touch."""
     for _ in range(3):
         label, n_pieces = ndimage.label(mask)
         if n_pieces < 2:
@@ -176,7 +159,6 @@ def _joined(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
             moved = padded[tuple(slice(1 + d, 1 + d + n) for d, n in zip(offset, mask.shape, strict=True))]
             at = np.argwhere((label > 0) & (moved > 0) & (label != moved))
             for axis in np.nonzero(offset)[0][:-1]:
-                at = at.copy()
                 at[:, axis] += offset[axis]
                 extra[tuple(at.T)] = True
         if not extra.any():
@@ -185,18 +167,13 @@ def _joined(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return mask
 
 
-def _n_vertices(mask: NDArray[np.bool_], sides: NDArray[np.float64]) -> float:
+def _n_vertices(mask: Booleans, sides: Floats) -> float:
     """About how many vertices marching cubes make on a grid as fine as the shortest side."""
-    area = 0.0
-    for axis in range(3):
-        crossings = np.count_nonzero(np.diff(mask.view(np.int8), axis=axis, prepend=0, append=0))
-        area += crossings * sides.prod() / sides[axis]
-    return float(area / sides.min() ** 2)
+    cuts = [np.count_nonzero(np.diff(mask.view(np.int8), axis=axis, prepend=0, append=0)) for axis in range(3)]
+    return float((cuts * sides.prod() / sides).sum() / sides.min() ** 2)
 
 
-def _coarsened(
-    mask: NDArray[np.bool_], spacing: NDArray[np.float64], max_vertices: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Floats, Integers]:
     """Shares of larger voxels, and how many of the given ones each takes along each axis."""
     share, factor = mask.astype(np.float32), np.ones(3, dtype=np.int64)
     n_pieces = ndimage.label(mask, _TOUCHING)[1]
@@ -211,7 +188,7 @@ def _coarsened(
                 coarse = np.concatenate([coarse, np.zeros_like(coarse.take([0], axis))], axis=axis)
             even, odd = (coarse[(slice(None),) * axis + (slice(start, None, 2),)] for start in (0, 1))
             coarse = (even + odd) / np.float32(2)
-        # What hung on a thread and is small now goes, as it would have without the thread.
+        # Small pieces that hung on a thread go, as they would have without it.
         label, island, size = _islands(coarse >= 0.5)
         if np.count_nonzero(size) - len(island) != n_pieces:
             break
@@ -220,23 +197,14 @@ def _coarsened(
     return share.astype(np.float64), factor
 
 
-def _is_thick(mask: NDArray[np.bool_], axes: NDArray[np.bool_]) -> bool:
+def _is_thick(mask: Booleans, axes: Booleans) -> bool:
     """Whether hardly any of the body is less than three voxels thick along the axes."""
-    size = np.where(axes, 3, 1)
-    core = ndimage.minimum_filter(mask, tuple(size), mode="constant")
+    core = ndimage.minimum_filter(mask, tuple(np.where(axes, 3, 1)), mode="constant")
     reached = ndimage.maximum_filter(core, tuple(np.where(axes, 5, 1)), mode="constant")
     return bool(np.count_nonzero(mask & ~reached) <= _THIN * np.count_nonzero(mask))
 
 
-def _fineness(sides: NDArray[np.float64], n_vertices: float) -> NDArray[np.int64]:
-    """Into how many parts each side goes, so that the parts are about equal and make vertices enough."""
-    finer = min(max(math.ceil(math.sqrt(_FEWEST / n_vertices)), 1), _MOST_REFINED)
-    return np.maximum(np.round(finer * sides / sides.min()), 1).astype(np.int64)
-
-
-def _refined(
-    field: NDArray[np.float64], share: NDArray[np.float64], fineness: NDArray[np.int64], least: float
-) -> NDArray[np.float64]:
+def _refined(field: Floats, share: Floats, fineness: Integers, least: float) -> Floats:
     """The field between the centres of the voxels, at the level that gives their volume.
 
     It is negative between neighbours in the body, which therefore hold together.
@@ -262,24 +230,19 @@ def _refined(
     return field
 
 
-def _meshed(
-    field: NDArray[np.float64], sides: NDArray[np.float64], volume: float, max_vertices: int, name: str
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _meshed(field: Floats, sides: Floats, volume: float, max_vertices: int, name: str) -> Surface:
     """The zero level of a field as closed pieces, in the unit of the sides, which are about equal."""
     cell = float(sides.min())
     level = np.where(field < 0, np.minimum(field, -LEAST * cell), np.maximum(field, LEAST * cell)) / cell
     vertices, faces = level_surface(without_bubbles(level.astype(np.float32)), name)
     vertices = vertices * (sides / cell)
-    n_pieces, piece_of = components(faces, len(vertices))
-    pieces = [compact(vertices, faces[piece_of[faces[:, 0]] == piece]) for piece in range(n_pieces)]
+    pieces = connected(vertices, faces)
     volumes = np.abs([signed_volume(*piece) for piece in pieces])
-    parts, n_before = [], 0
+    parts = []
     # Specks between voxels are none of theirs.
     for own in [piece for piece, size in zip(pieces, volumes, strict=True) if size > _SPECK * volumes.sum()]:
         if signed_volume(*own) < 0:
             own = own[0], own[1][:, ::-1]
-        points, triangles = simplified(*own, max(round(max_vertices * len(own[0]) / len(vertices)), 50))
-        parts.append((points, triangles + n_before))
-        n_before += len(points)
-    points, triangles = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        parts.append(simplified(*own, max(round(max_vertices * len(own[0]) / len(vertices)), 50)))
+    points, triangles = stacked(parts)
     return with_volume(points, triangles, volume / cell**3) * cell, np.ascontiguousarray(triangles)

@@ -12,7 +12,7 @@ import numpy as np
 
 from igps._threads import one_thread
 from igps.mesh.formats import FORMATS, Format, RawBody, format_of
-from igps.mesh.formats._format import joined, pieces
+from igps.mesh.formats._format import faults, joined, pieces
 from igps.mesh.limits import check_memory
 from igps.mesh.mending import mend
 from igps.mesh.mesh import Mesh, MeshError, check_arrays
@@ -24,12 +24,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class BodyRef:
-    """A body that a file holds.
-
-    Args:
-        path: the file.
-        part: its name among the bodies of the file; None where the file is one body.
-    """
+    """A body that a file holds: the file, and its name there, None where the file is one body."""
 
     path: Path
     part: str | None = None
@@ -39,11 +34,7 @@ class BodyRef:
 
 
 def list_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[BodyRef]:
-    """The bodies of a file, without making surfaces of them where the format can tell.
-
-    Raises:
-        MeshError: the file is missing or unreadable.
-    """
+    """The bodies of a file, without making surfaces of them where the format can tell."""
     path = Path(path)
     kind = _format(path)
     how = _bodies(kind, options)
@@ -62,8 +53,8 @@ def load_mesh(
 ) -> Mesh:
     """Read a mesh, a cloud of points, a label volume or a molecule, and make a body of it.
 
-    Polygons are cut into triangles. The vertices of a body keep their order and are not merged, but for an STL file,
-    which has none: there corners in one place are a vertex.
+    Polygons are cut into triangles. Vertices keep their order and are not merged; only in an STL file, which has none,
+    corners in one place are a vertex.
 
     Example:
         >>> import tempfile, trimesh
@@ -87,11 +78,7 @@ def load_mesh(
 
 
 def load_bodies(path: str | Path, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> list[Mesh]:
-    """All bodies of a file that can be used; of the others the log tells.
-
-    Raises:
-        MeshError: the file is missing or unreadable, or none of its bodies is usable.
-    """
+    """All usable bodies of a file; the others are logged. A MeshError if none is usable."""
     found, faults = [], []
     for _, body in each_body(path, options, least_vertices=least_vertices):
         if isinstance(body, MeshError):
@@ -105,19 +92,10 @@ def load_bodies(path: str | Path, options: LoadOptions = LoadOptions(), *, least
 
 
 def each_body(
-    path: str | Path,
-    options: LoadOptions = LoadOptions(),
-    *,
-    parts: Sequence[str | None] | None = None,
+    path: str | Path, options: LoadOptions = LoadOptions(), *, parts: Sequence[str | None] | None = None,
     least_vertices: int = 0,
-) -> Iterator[tuple[BodyRef, Mesh | MeshError]]:
-    """The bodies of a file, or those of the given parts, one after the other; what is wrong with one in its place.
-
-    The file is read once.
-
-    Raises:
-        MeshError: the file is missing or unreadable.
-    """
+) -> Iterator[tuple[BodyRef, Mesh | MeshError]]:  # fmt: skip
+    """The bodies of a file, read once, or those of the given parts; what is wrong with one stands in its place."""
     for ref, raw in each_surface(path, options, parts=parts):
         with one_thread():
             try:
@@ -130,11 +108,7 @@ def each_body(
 def each_surface(
     path: str | Path, options: LoadOptions = LoadOptions(), *, parts: Sequence[str | None] | None = None
 ) -> Iterator[tuple[BodyRef, RawBody]]:
-    """The surfaces of the bodies of a file, or of the given parts, unchecked, one after the other; see `each_body`.
-
-    Raises:
-        MeshError: the file is missing or unreadable.
-    """
+    """The surfaces of the bodies of a file, or of the given parts, unchecked, one after the other; see `each_body`."""
     path = Path(path)
     for raw in _read(path, options, parts[0] if parts and len(parts) == 1 else None):
         if parts is None or raw.part in parts:
@@ -144,18 +118,14 @@ def each_surface(
 
 
 def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part: str | None = None) -> RawBody:
-    """The surface of a body as the file has it, unchecked.
-
-    Raises:
-        MeshError: the file is missing or unreadable, has several bodies and none is named, or not the one that is.
-    """
+    """The surface of a body as the file has it, unchecked; its only one, if none is named."""
     path = Path(path)
     bodies = _read(path, options, part)
     found = [body for body in bodies if body.part == part] if part is not None else bodies
     if len(found) == 1:
         with _faults(path, _format(path)):
             return found[0].made()
-    names = [body.part for body in bodies] if part is None else [one.part for one in list_bodies(path, options)]
+    names = [body.part for body in (bodies if part is None else list_bodies(path, options))]
     shown = ", ".join(repr(name) for name in names[:8]) + (", ..." if len(names) > 8 else "")
     if part is None:
         raise MeshError(f"{path}: holds {len(names)} bodies: {shown}. Name one as part=, or read all by load_bodies.")
@@ -163,11 +133,7 @@ def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part
 
 
 def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> Mesh:
-    """The body that the options make of a surface; see `load_mesh`.
-
-    Raises:
-        MeshError: the surface is not usable.
-    """
+    """The body that the options make of a surface, see `load_mesh`; a MeshError if it is not usable."""
     if raw.fault is not None:
         raise raw.fault
     name = str(ref)
@@ -179,8 +145,8 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
         if len(areas) > 1:
             n_before = len(vertices)
             vertices, faces = compact(vertices, faces[owner == int(np.argmax(areas))])
-            kept = f"kept the largest of {len(areas)} components ({len(vertices)} of {n_before} vertices)"
-            notes = (*notes, kept)
+            kept = f"{len(vertices)} of {n_before} vertices"
+            notes = (*notes, f"kept the largest of {len(areas)} components ({kept})")
     if options.allow_open and options.mend != "always":
         try:
             return Mesh(vertices, faces, name=name, allow_open=True, notes=notes, unit=raw.unit)
@@ -188,23 +154,16 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
             if options.mend == "never":
                 raise
     mesh = mend(
-        vertices,
-        faces,
-        how=options.mend,
-        least_vertices=least_vertices,
-        normals=raw.normals,
-        cavities=options.cavities,
-        name=name,
-        notes=notes,
-    )
+        vertices, faces, how=options.mend, least_vertices=least_vertices, normals=raw.normals,
+        cavities=options.cavities, name=name, notes=notes,
+    )  # fmt: skip
     return mesh.told(unit=raw.unit)
 
 
 def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[RawBody]:
-    """The bodies of a file, or at least the one that is named."""
     kind = _format(path)
     how = _bodies(kind, options)
-    with _faults(path, kind):
+    with _faults(path, kind):  # of the bodies at least the one that is named
         bodies = list(kind.read(path, replace(options, bodies=how), part if how not in ("whole", "pieces") else None))
         if how == "whole":
             return [joined(bodies)]
@@ -212,9 +171,7 @@ def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[Raw
 
 
 def _bodies(kind: Format, options: LoadOptions) -> BodyKind:
-    """What of a file is a body: what is asked for, if the format has it."""
-    known = (*kind.bodies, "whole", "pieces")
-    return options.bodies if options.bodies in known else kind.bodies[0]
+    return options.bodies if options.bodies in (*kind.bodies, "whole", "pieces") else kind.bodies[0]
 
 
 def _format(path: Path) -> Format:
@@ -231,20 +188,7 @@ def _format(path: Path) -> Format:
 
 @contextmanager
 def _faults(path: Path, kind: Format) -> Iterator[None]:
-    """What a reader raises, told as a fault of the file; memory that is lacking is none."""
     if kind.bodies[0] == "whole":
         check_memory(path)
-    try:
+    with faults(path, kind.name, kind.extra):
         yield
-    except (MeshError, MemoryError):
-        raise
-    except ImportError as error:
-        raise MeshError(
-            f"{path}: {kind.name} needs a module that is not installed ({error}). Install it: pip install "
-            f'"interior-gps[{kind.extra}]"; or convert the file to OFF, OBJ, PLY or STL.'
-        ) from error
-    except Exception as error:  # the loaders of some thirty formats raise whatever they like
-        raise MeshError(
-            f"{path}: not readable as {kind.name} ({type(error).__name__}: {error}). "
-            "Check that the file is complete and in the format that its name tells; or export it again."
-        ) from error

@@ -10,16 +10,16 @@ import logging
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh._hole_filling import with_small_holes_filled
 from igps.mesh._tidying import tidied, welded, without_hidden
 from igps.mesh._union import united, without_walls
 from igps.mesh.denoising import denoised, is_noisy
-from igps.mesh.mesh import Mesh, MeshError, check_arrays, check_size
+from igps.mesh.mesh import Mesh, MeshError, check_arrays, check_places, check_size
 from igps.mesh.subdivision import subdivided
 from igps.mesh.watertight import crosses_itself, watertight
 
@@ -33,69 +33,59 @@ MENDING_VERSION = 5
 """Raised whenever a surface that is mended would give another body: part of the cache keys of such bodies alone."""
 
 # The first words of the notes of each step.
-_WORDS: dict[str, Step] = {
-    "welded": "welded",
-    "dropped": "welded",
-    "turned": "welded",
-    "filled": "filled",
-    "united": "united",
-    "smoothed": "smoothed",
-    "subdivided": "subdivided",
-    "made watertight": "watertight",
-}
+_WORDS: dict[str, Step] = {step: step for step in get_args(Step)}
+_WORDS |= {"dropped": "welded", "turned": "welded", "made watertight": "watertight"}
 # A mesh that is subdivided gets so many vertices for each that is needed: with just enough the last eigenfunctions
 # would be those of the triangles.
 _PLENTY = 4
 
 
 def mend(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int64] | None,
-    *,
-    how: Mending = "auto",
-    least_vertices: int = 0,
-    normals: NDArray[np.float64] | None = None,
-    cavities: Cavities = "fill",
-    name: str = "mesh",
-    notes: tuple[str, ...] = (),
-) -> Mesh:
+    vertices: Floats, faces: Integers | None, *, how: Mending = "auto", least_vertices: int = 0,
+    normals: Floats | None = None, cavities: Cavities = "fill", name: str = "mesh", notes: tuple[str, ...] = (),
+) -> Mesh:  # fmt: skip
     """A body from a surface in any state, by the least that helps.
 
     In this order, and no further than needed: the surface as it is; coincident vertices welded, degenerate and doubled
     faces, fins, specks and closed parts inside the body dropped, faces turned; small holes filled; walls inside dropped
-    or closed parts that overlap united (see `union`), where that makes a body; `watertight`. What
-    is rough with a scanner's noise all over is smoothed, because noise adds area (see `denoising`). What then has fewer
-    than `least_vertices` is subdivided, longest edges first, which leaves the surface where it is.
+    or closed parts that overlap united, where that makes a body; `watertight`. A surface that is rough with a scanner's
+    noise is smoothed, because noise adds area. One of fewer than `least_vertices` is subdivided, longest edges first.
 
     Args:
         vertices: (V, 3) positions, any length unit.
         faces: (F, 3) vertex indices; None or empty for a cloud of points, which is made watertight.
-        how: "auto" for the above; "never" takes bodies only; "always" makes watertight whatever is not the boundary of
-            one body already: closed, oriented, edge-manifold, of one piece, and not crossing itself, which "auto" lets
-            pass. Only welding, smoothing and subdividing change those that are. A grid would join what lies side by
-            side nearer than a cell, as the coils of a spring do.
+        how: "auto" for the above; "never" takes bodies only; "always" makes watertight what after welding is not the
+            boundary of one body that does not cross itself, which "auto" does not ask.
         least_vertices: such as the number of eigenpairs plus two; not with "never".
         normals: (V, 3) of a cloud of points, if known.
-        cavities: "fill" drops closed parts inside the body; "keep" takes them for the surfaces of hollows. What is made
-            watertight is filled.
+        cavities: "fill" drops closed parts inside the body; "keep" takes them for the surfaces of hollows, unless it is
+            made watertight.
         name: what error messages call the surface, usually its file.
         notes: what was done to it before.
 
     Raises:
-        MeshError: the surface is not a body (with "never"), or nothing can be made of it; names what is wrong and the
-            remedy.
+        MeshError: the surface is not a body (with "never"), or nothing can be made of it.
     """
     if how not in ("auto", "never", "always"):
         raise ValueError(f"how: expected 'auto', 'never' or 'always', got {how!r}.")
     if how == "never":
         return Mesh(vertices, np.asarray(faces), name=name, notes=notes, cavities=cavities == "keep")
     if faces is None or np.size(faces) == 0:
-        _check_cloud(vertices, name)
+        vertices = np.asarray(vertices, dtype=np.float64)
+        if vertices.size == 0:
+            raise MeshError(f"{name}: the file is empty: no vertices and no faces. Export it again.")
+        check_places(vertices, name)
+        check_size(vertices, name)
         mesh = watertight(vertices, normals=normals, name=name)
     else:
         check_arrays(vertices, faces, name)
         vertices, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
-        _check_extent(vertices, triangles, name)
+        if len(triangles) == 1:
+            raise MeshError(f"{name}: a single triangle is no body. Check that the export is complete.")
+        corners = vertices[triangles]
+        if (corners == corners[:, :1]).all():
+            raise MeshError(f"{name}: all faces are in one point; a surface was expected. Check the file.")
+        check_size(corners.reshape(-1, 3), name)  # before squares of its lengths overflow or vanish
         mesh = (_remade if how == "always" else _mended)(vertices, triangles, name, cavities == "keep")
     n_outer = int(mesh.outer()[1].sum())
     if n_outer < least_vertices:
@@ -106,12 +96,11 @@ def mend(
 
 
 def mended_by(notes: Iterable[str]) -> tuple[Step, ...]:
-    """The steps that the notes of a `Mesh` or `Signature` tell of, in order, each once."""
-    steps = (step for note in notes for start, step in _WORDS.items() if note.startswith(start))
-    return tuple(dict.fromkeys(steps))
+    """The steps behind the notes of a `Mesh` or `Signature`, in order, each once."""
+    return tuple(dict.fromkeys(step for note in notes for start, step in _WORDS.items() if note.startswith(start)))
 
 
-def _mended(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str, cavities: bool) -> Mesh:
+def _mended(vertices: Floats, faces: Integers, name: str, cavities: bool) -> Mesh:
     notes: list[str] = []
     given = vertices, faces
     hidden = partial(without_hidden, cavities=cavities)
@@ -128,9 +117,7 @@ def _mended(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str, 
     return body.told(notes=tuple(notes))
 
 
-def _body(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str], name: str, cavities: bool
-) -> Mesh | None:
+def _body(vertices: Floats, faces: Integers, notes: list[str], name: str, cavities: bool) -> Mesh | None:
     """The body that these are, smoothed if it is noisy; None if they are none."""
     try:
         mesh = Mesh(vertices, faces, name=name, notes=tuple(notes), cavities=cavities)
@@ -140,47 +127,26 @@ def _body(
     return mesh if smooth is mesh.vertices else replace(mesh, vertices=smooth, notes=tuple(notes))
 
 
-def _remade(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str, cavities: bool) -> Mesh:
-    """The surface as it is, welded or smoothed, if it bounds one body then; otherwise what a grid makes of it."""
+def _remade(vertices: Floats, faces: Integers, name: str, cavities: bool) -> Mesh:
+    """The surface as it is, welded or smoothed, if it bounds one body then; otherwise what a grid makes of it.
+
+    A grid would join what lies side by side nearer than a cell, as the coils of a spring do.
+    """
     notes: list[str] = []
-    neat, triangles = vertices, faces
+    neat = vertices, faces
     for step in (None, welded):
         if step is not None:
-            neat, triangles = step(vertices, faces, notes)
-        if (body := _body(neat, triangles, notes, name, cavities)) and not crosses_itself(body.vertices, body.faces):
+            neat = step(vertices, faces, notes)
+        if (body := _body(*neat, notes, name, cavities)) and not crosses_itself(body.vertices, body.faces):
             return body
         notes = []
-    smooth = _smoothed(neat, triangles, notes)
-    body = watertight(smooth, triangles, name=name) if notes else watertight(vertices, faces, name=name)
+    smooth = _smoothed(*neat, notes)
+    body = watertight(smooth, neat[1], name=name) if notes else watertight(vertices, faces, name=name)
     return body.told(notes=tuple(notes))
 
 
-def _smoothed(vertices: NDArray[np.float64], faces: NDArray[np.int64], notes: list[str]) -> NDArray[np.float64]:
+def _smoothed(vertices: Floats, faces: Integers, notes: list[str]) -> Floats:
     if not len(faces) or not is_noisy(vertices, faces):
         return vertices
     notes.append("smoothed: the surface was rough with noise")
     return denoised(vertices, faces)
-
-
-def _check_cloud(vertices: NDArray[np.float64], name: str) -> None:
-    points = np.asarray(vertices, dtype=np.float64)
-    if points.size == 0:
-        raise MeshError(f"{name}: the file is empty: no vertices and no faces. Export it again.")
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise MeshError(f"{name}: vertices: expected shape (V, 3), got {points.shape}.")
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
-        raise MeshError(
-            f"{name}: {int((~finite).sum())} points have NaN or infinite coordinates, the first is point "
-            f"{int(np.argmin(finite))}. Remove them or export the file again."
-        )
-    check_size(points, name)
-
-
-def _check_extent(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> None:
-    if len(faces) == 1:
-        raise MeshError(f"{name}: a single triangle is no body. Check that the export is complete.")
-    corners = vertices[faces]
-    if (corners == corners[:, :1]).all():
-        raise MeshError(f"{name}: all faces are in one point; a surface was expected. Check the file.")
-    check_size(corners.reshape(-1, 3), name)  # before squares of its lengths overflow or vanish

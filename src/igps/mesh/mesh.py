@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from igps.mesh._arrays import Booleans, Floats, Integers
 from igps.mesh.surface import (
-    compact,
     components,
+    connected,
     diagonal,
     directed_edges,
     face_areas,
@@ -31,30 +32,19 @@ MILLIMETRES: Mapping[str, float] = {
     "inch": 25.4, "inches": 25.4, "ft": 304.8, "feet": 304.8, "meter": 1e3, "meters": 1e3, "centimeters": 10.0,
     "millimeter": 1.0, "millimeters": 1.0, "\\u00b5m": 1e-3,
 }  # fmt: skip
-"""Of a unit of length, by the names that files and libraries call it."""
+"""In a unit of length, by the names that files and libraries give it."""
 
-# What the reader of a message is to do.
 _REPAIR = 'LoadOptions(mend="auto"), on the command line --mend auto,'
-# A closed surface whose volume is below this share of its bounding sphere's cube is a folded sheet, not a body.
+# A closed surface with less volume than this share of its diagonal's cube is a folded sheet, not a body.
 _FLAT = 1e-10
-# Diagonals of the bounding box for which areas, volumes and, in single precision, eigenfunctions neither overflow nor
-# lose digits, whatever the unit.
+# Between these, areas, volumes and eigenfunctions in single precision neither overflow nor lose digits.
 _SMALLEST, _LARGEST = 1e-30, 1e30
 # A mesh so many diagonals away from the origin keeps nine digits of its coordinates, and enough of its triangles.
 _FARTHEST = 1e6
 
 
 class MeshError(ValueError):
-    """A mesh cannot be used; the message names the file, what is wrong, and the remedy.
-
-    Example:
-        >>> try:
-        ...     Mesh(np.zeros((3, 3)), np.array([[0, 1, 5], [0, 2, 5]]))
-        ... except MeshError as error:
-        ...     print(error)  # names the file, if it is of one
-        mesh: 2 faces refer to vertices out of range (0 to 2 exist, 0 to 5 are used). The file is damaged; export it
-        again.
-    """
+    """A mesh cannot be used; the message names the file, what is wrong, and the remedy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +74,8 @@ class Mesh:
             a distance from the origin at which numbers lose their digits.
     """
 
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    vertices: Floats
+    faces: Integers
     name: str = "mesh"
     allow_open: bool = False
     notes: tuple[str, ...] = field(default=())
@@ -101,10 +91,9 @@ class Mesh:
         check_size(vertices, self.name)
         volume = signed_volume(vertices, faces)
         if abs(volume) <= _FLAT * diagonal(vertices) ** 3:
-            raise MeshError(
-                f"{self.name}: the surface encloses no volume ({volume:.3g} for a bounding box diagonal of "
-                f"{diagonal(vertices):.3g}); a body was expected. Give a flat sheet some thickness."
-            )
+            found = f"{volume:.3g} for a bounding box diagonal of {diagonal(vertices):.3g}"
+            flat = f"{self.name}: the surface encloses no volume ({found}); a body was expected."
+            raise MeshError(f"{flat} Give a flat sheet some thickness.")
         if volume < 0:
             faces = np.ascontiguousarray(faces[:, ::-1])
             object.__setattr__(self, "notes", (*self.notes, "was inside out: all faces turned"))
@@ -127,10 +116,6 @@ class Mesh:
         Args:
             body: a Mesh, or a closed surface as a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage. Polygons
                 are cut into triangles. Its file, if it knows one, becomes the name.
-
-        Raises:
-            TypeError: it is something else.
-            MeshError: it is not one closed surface, see `Mesh`.
         """
         if isinstance(body, cls):
             return body
@@ -141,32 +126,29 @@ class Mesh:
 
     def told(self, *, notes: tuple[str, ...] = (), unit: str | None = None) -> Mesh:
         """The same mesh with more notes, before its own, and with a unit if one is given; nothing is checked again."""
-        other = copy.copy(self)
-        object.__setattr__(other, "notes", (*notes, *self.notes))
-        object.__setattr__(other, "unit", unit or self.unit)
-        return other
+        return self._changed(notes=(*notes, *self.notes), unit=unit or self.unit)
 
     def numbered_by_faces(self) -> Mesh:
         """The same mesh with its vertices in the order in which the faces first use them."""
         used, first = np.unique(self.faces, return_index=True)
         order = used[np.argsort(first)]
-        rank = np.empty(len(self.vertices), dtype=np.int64)
-        rank[order] = np.arange(len(order))
+        return self._changed(vertices=self.vertices[order], faces=np.argsort(order)[self.faces])
+
+    def _changed(self, **fields: object) -> Mesh:
         other = copy.copy(self)
-        object.__setattr__(other, "vertices", self.vertices[order])
-        object.__setattr__(other, "faces", rank[self.faces])
+        for name, value in fields.items():
+            object.__setattr__(other, name, value)
         return other
 
-    def outer(self) -> tuple[Mesh, NDArray[np.bool_]]:
+    def outer(self) -> tuple[Mesh, Booleans]:
         """The body without its cavities, and which of the vertices (V,) are its."""
-        n_components, owner = components(self.faces, len(self.vertices)) if self.cavities else (1, None)
-        if n_components == 1:
+        surfaces = connected(self.vertices, self.faces) if self.cavities else []
+        if len(surfaces) < 2:
             return self, np.ones(len(self.vertices), dtype=bool)
-        assert owner is not None
-        surfaces = [self.faces[owner[self.faces[:, 0]] == k] for k in range(n_components)]
-        outermost = int(np.argmax([signed_volume(self.vertices, faces) for faces in surfaces]))
-        vertices, faces = compact(self.vertices, surfaces[outermost])
-        return replace(self, vertices=vertices, faces=faces, cavities=False), owner == outermost
+        outermost = int(np.argmax([signed_volume(*surface) for surface in surfaces]))
+        vertices, faces = surfaces[outermost]
+        own = components(self.faces, len(self.vertices))[1] == outermost
+        return replace(self, vertices=vertices, faces=faces, cavities=False), own
 
     @cached_property
     def area(self) -> float:
@@ -185,11 +167,7 @@ class Mesh:
 
     @property
     def genus(self) -> int:
-        """Number of handles, of a closed mesh; of one with cavities those of all its surfaces.
-
-        Raises:
-            MeshError: the mesh is open.
-        """
+        """Number of handles, of all surfaces together; a MeshError of an open mesh."""
         if len(undirected_edges(self.faces, len(self.vertices))[0]) * 2 != len(self.faces) * 3:
             raise MeshError(f"{self.name}: an open surface has no genus; a closed one was expected. Close the holes.")
         return genus(self.faces, len(self.vertices))
@@ -201,8 +179,7 @@ class Mesh:
 def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
     """Raise a MeshError unless the arrays have the shapes of a mesh, indices in range and finite coordinates."""
     v, f = np.asarray(vertices), np.asarray(faces)
-    if v.ndim != 2 or v.shape[1] != 3:
-        raise MeshError(f"{name}: vertices: expected shape (V, 3), got {v.shape}.")
+    _check_shape(v, name)
     if f.size == 0:
         raise MeshError(f"{name}: no faces. A surface is needed; a point cloud must be meshed first.")
     if f.ndim != 2 or f.shape[1] != 3 or not np.issubdtype(f.dtype, np.integer):
@@ -210,10 +187,16 @@ def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
     if f.min() < 0 or f.max() >= len(v):
         bad = int(((f < 0) | (f >= len(v))).any(axis=1).sum())
         raise MeshError(
-            f"{name}: {bad} faces refer to vertices out of range (0 to {len(v) - 1} exist, "
-            f"{f.min()} to {f.max()} are used). The file is damaged; export it again."
+            f"{name}: {bad} faces refer to vertices out of range (0 to {len(v) - 1} exist, {f.min()} to {f.max()} are "
+            "used). The file is damaged; export it again."
         )
-    finite = np.isfinite(v).all(axis=1)
+    check_places(v, name)
+
+
+def check_places(vertices: NDArray[Any], name: str) -> None:
+    """Raise a MeshError unless these are finite coordinates (V, 3)."""
+    _check_shape(vertices, name)
+    finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         raise MeshError(
             f"{name}: {int((~finite).sum())} vertices have NaN or infinite coordinates, the first is vertex "
@@ -221,7 +204,12 @@ def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
         )
 
 
-def check_size(vertices: NDArray[np.float64], name: str) -> None:
+def _check_shape(vertices: NDArray[Any], name: str) -> None:
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise MeshError(f"{name}: vertices: expected shape (V, 3), got {vertices.shape}.")
+
+
+def check_size(vertices: Floats, name: str) -> None:
     """Raise a MeshError where a surface is too small, too large or too far away to compute with."""
     with np.errstate(over="ignore"):
         length, distance = diagonal(vertices), float(np.abs(vertices).max())
@@ -238,60 +226,47 @@ def check_size(vertices: NDArray[np.float64], name: str) -> None:
         )
 
 
-def _check_topology(faces: NDArray[np.int64], n_vertices: int, name: str, allow_open: bool, cavities: bool) -> None:
-    repeated = int((faces == np.roll(faces, 1, axis=1)).any(axis=1).sum())
-    if repeated:
-        raise MeshError(f"{name}: {repeated} faces use a vertex twice. Read the file with {_REPAIR} to drop them.")
-    unused = n_vertices - len(np.unique(faces))
-    if unused:
-        raise MeshError(f"{name}: {unused} vertices belong to no face. Read the file with {_REPAIR} to drop them.")
+def _check_topology(faces: Integers, n_vertices: int, name: str, allow_open: bool, cavities: bool) -> None:
+    n_repeated = int((faces == np.roll(faces, 1, axis=1)).any(axis=1).sum())
+    n_unused = n_vertices - len(np.unique(faces))
     start, end = directed_edges(faces)
-    _, edge_of = undirected_edges(faces, n_vertices)
+    edge_of = undirected_edges(faces, n_vertices)[1]
     count = np.bincount(edge_of)
-    crowded = int((count > 2).sum())
-    if crowded:
-        raise MeshError(
-            f"{name}: {crowded} non-manifold edges (shared by more than two faces). Read the file with {_REPAIR} "
-            "to drop duplicate faces; if edges remain, separate the sheets that meet there in a modelling tool."
-        )
-    boundary = int((count == 1).sum())
-    if boundary and not allow_open:
-        raise MeshError(
-            f"{name}: open surface with {boundary} boundary edges. Close the holes; or read the file with "
-            f"{_REPAIR} if vertices are only duplicated there (as in every STL file); or with allow_open=True, "
-            "--allow_open, to tell inside from outside by the winding number."
-        )
+    n_crowded, n_free = int((count > 2).sum()), int((count == 1).sum())
     balance = np.bincount(edge_of, weights=np.where(start < end, 1.0, -1.0), minlength=len(count))
-    twisted = int(((count == 2) & (balance != 0)).sum())
-    if twisted:
-        raise MeshError(
-            f"{name}: inconsistent orientation, {twisted} edges are run through twice in the same direction. "
-            f"Read the file with {_REPAIR} to orient the faces."
-        )
+    n_twisted = int(((count == 2) & (balance != 0)).sum())
     n_components, _ = components(faces, n_vertices)
-    if n_components > 1 and not cavities:
-        raise MeshError(
-            f"{name}: {n_components} connected components; the commute time between them is infinite. Read the "
-            "file with LoadOptions(component='largest'), on the command line --component largest, to keep one; with "
-            f"{_REPAIR} if coincident vertices are merely not welded; or join them."
-        )
+    read = f"Read the file with {_REPAIR}"
+    for is_wrong, what in (
+        (n_repeated, f"{n_repeated} faces use a vertex twice. {read} to drop them."),
+        (n_unused, f"{n_unused} vertices belong to no face. {read} to drop them."),
+        (n_crowded, f"{n_crowded} non-manifold edges (shared by more than two faces). {read} to drop duplicate faces; "
+                    "if edges remain, separate the sheets that meet there in a modelling tool."),
+        (n_free and not allow_open, f"open surface with {n_free} boundary edges. Close the holes; or read the file "
+         f"with {_REPAIR} if vertices are only duplicated there (as in every STL file); or with allow_open=True, "
+         "--allow_open, to tell inside from outside by the winding number."),
+        (n_twisted, f"inconsistent orientation, {n_twisted} edges are run through twice in the same direction. {read} "
+                    "to orient the faces."),
+        (n_components > 1 and not cavities, f"{n_components} connected components; the commute time between them is "
+         "infinite. Read the file with LoadOptions(component='largest'), on the command line --component largest, to "
+         f"keep one; with {_REPAIR} if coincident vertices are merely not welded; or join them."),
+    ):  # fmt: skip
+        if is_wrong:
+            raise MeshError(f"{name}: {what}")
 
 
-def _check_cavities(vertices: NDArray[np.float64], faces: NDArray[np.int64], name: str) -> None:
-    n_components, owner = components(faces, len(vertices))
-    if n_components == 1:
-        return
-    owner = owner[faces[:, 0]]
-    surfaces = [compact(vertices, faces[owner == k]) for k in range(n_components)]
+def _check_cavities(vertices: Floats, faces: Integers, name: str) -> None:
+    surfaces = connected(vertices, faces)
     volumes = [signed_volume(*surface) for surface in surfaces]
     outer = int(np.argmax(volumes))
     for k, (points, _) in enumerate(surfaces):
+        if k == outer:
+            continue
         # About a point of a cavity's own surface the winding number of that surface is anything from 0 to 1
-        around = {other: winding_number(*surfaces[other], points) for other in range(n_components) if other != k}
-        if k != outer and (volumes[k] >= 0 or around.pop(outer).min() < 0.5 or any(
-            abs(winding).max() > 0.5 for winding in around.values()
-        )):  # fmt: skip
+        around = {i: winding_number(one[0], one[1], points) for i, one in enumerate(surfaces) if i != k}
+        lies_inside = around.pop(outer).min() >= 0.5
+        if volumes[k] >= 0 or not lies_inside or any(abs(winding).max() > 0.5 for winding in around.values()):
             raise MeshError(
-                f"{name}: one of {n_components} closed surfaces is no cavity of the body: it is turned outwards, lies "
+                f"{name}: one of {len(surfaces)} closed surfaces is no cavity of the body: it is turned outwards, lies "
                 f"outside the largest, or in another cavity. Read the file with {_REPAIR}, or without cavities."
             )

@@ -16,18 +16,19 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from igps._threads import one_thread
+from igps.mesh._arrays import Floats, Integers, Surface
 from igps.mesh._isosurface import level_surface, simplified
 from igps.mesh._joining import joined_by_threads
 from igps.mesh._level_set import LEAST, SPECK_VOLUME, without_bubbles
 from igps.mesh._molecular_loops import cubic_values, depths, distances_outside, exposed_arcs
 from igps.mesh.formats.molecules import Molecule
 from igps.mesh.mesh import Mesh, MeshError
-from igps.mesh.surface import compact, components, face_areas, signed_volume, vertex_normals
+from igps.mesh.surface import connected, face_areas, signed_volume, sums, vertex_normals
 
 SurfaceKind = Literal["excluded", "accessible", "van_der_waals"]
 Pieces = Literal["joined", "largest"]
 
-# Cells around the balls, and on both sides of the surface, in which distances are told.
+# Cells around the balls, and on both sides of the surface, in which distances are computed.
 _MARGIN = 2.5
 _MOST_CELLS = 2**28
 # A step of vertices towards the surface is shorter, in cells.
@@ -40,19 +41,14 @@ _N_ROUNDS = 2
 
 @one_thread()
 def molecular_surface(
-    molecule: Molecule,
-    kind: SurfaceKind = "excluded",
-    *,
-    probe: float = 1.4,
-    spacing: float = 0.8,
-    max_vertices: int | None = 3000,
-    pieces: Pieces = "joined",
-) -> Mesh:
+    molecule: Molecule, kind: SurfaceKind = "excluded", *, probe: float = 1.4, spacing: float = 0.8,
+    max_vertices: int | None = 3000, pieces: Pieces = "joined",
+) -> Mesh:  # fmt: skip
     """The closed surface of a molecule, in ångström; hollows inside that it does not open to are filled.
 
     At a spacing of 0.5 the area and volume of the excluded surface are within 1 % of closed forms, before vertices are
-    taken away; afterwards the volume still is. Pieces, such as two balls of which each ends in a cusp, are joined by
-    threads, which add 0.3 % of the area at most; a neck of radius less than about half the spacing is a thread, too.
+    taken away; afterwards the volume still is. Threads between pieces, such as two balls that each end in a cusp, add
+    0.3 % of the area at most; a neck of radius less than about half the spacing is a thread, too.
 
     Example:
         >>> at, none = np.zeros((1, 3)), np.zeros(1)
@@ -62,28 +58,32 @@ def molecular_surface(
 
     Args:
         molecule: its balls.
-        kind: "excluded": what no probe enters; "accessible": where no centre of a probe can be, all balls larger by its
-            radius; "van_der_waals": the balls themselves.
+        kind: "excluded": what no probe enters; "accessible": where no centre of a probe can be; "van_der_waals": the
+            balls themselves.
         probe: radius, Å; that of water is 1.4.
         spacing: of the grid, Å.
         max_vertices: larger surfaces are simplified to so many; None keeps all.
-        pieces: what becomes of a surface in several pieces: "joined" by threads where the gaps are narrowest, and
-            specks dropped; or the "largest" alone.
+        pieces: "joined" by threads where the gaps are narrowest, without specks; or the "largest" alone.
 
     Raises:
         ValueError: a parameter out of range.
         MeshError: the balls lie too far apart for a grid, or give no closed surface.
     """
-    _check(kind, probe, spacing, pieces)
+    if kind not in get_args(SurfaceKind):
+        raise ValueError(f"kind: expected one of {', '.join(get_args(SurfaceKind))}, got {kind!r}.")
+    if pieces not in get_args(Pieces):
+        raise ValueError(f"pieces: expected 'joined' or 'largest', got {pieces!r}.")
+    if not 0 <= probe < math.inf:
+        raise ValueError(f"probe: expected a radius of at least 0 Å, got {probe}.")
+    if not 0 < spacing < math.inf:
+        raise ValueError(f"spacing: expected more than 0 Å, got {spacing}.")
     centres, radii = _outermost(molecule.positions, molecule.radii + (0.0 if kind == "van_der_waals" else probe))
     margin = _MARGIN * spacing
     low = (centres - radii[:, None]).min(axis=0) - margin
     sides = np.ceil(((centres + radii[:, None]).max(axis=0) + margin - low) / spacing) + 1
     if sides.prod() > _MOST_CELLS:
-        raise MeshError(
-            f"{molecule.name}: a grid of {sides.prod():.3g} cells of {spacing} Å would be needed, at most "
-            f"{_MOST_CELLS:.3g} are made. Raise the spacing, or remove stray atoms."
-        )
+        needed = f"{molecule.name}: a grid of {sides.prod():.3g} cells of {spacing} Å would be needed, at most"
+        raise MeshError(f"{needed} {_MOST_CELLS:.3g} are made. Raise the spacing, or remove stray atoms.")
     shape = (int(sides[0]), int(sides[1]), int(sides[2]))
     exact = _field(centres - low, radii, shape, spacing, probe if kind == "excluded" else 0.0)
     notes = [f"{kind.replace('_', ' ')} surface, probe {probe:g} Å, grid of {spacing:g} Å"]
@@ -98,20 +98,7 @@ def molecular_surface(
     return Mesh(vertices * spacing + low, faces, name=molecule.name, notes=(*molecule.notes, *notes))
 
 
-def _check(kind: str, probe: float, spacing: float, pieces: str) -> None:
-    if kind not in get_args(SurfaceKind):
-        raise ValueError(f"kind: expected one of {', '.join(get_args(SurfaceKind))}, got {kind!r}.")
-    if pieces not in get_args(Pieces):
-        raise ValueError(f"pieces: expected 'joined' or 'largest', got {pieces!r}.")
-    if not 0 <= probe < math.inf:
-        raise ValueError(f"probe: expected a radius of at least 0 Å, got {probe}.")
-    if not 0 < spacing < math.inf:
-        raise ValueError(f"spacing: expected more than 0 Å, got {spacing}.")
-
-
-def _outermost(
-    centres: NDArray[np.float64], radii: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
     """The balls that lie in no other, largest first; of equal ones the first. What has no radius is left out."""
     order = np.argsort(-radii, kind="stable")
     order = order[radii[order] > 0]
@@ -126,7 +113,7 @@ def _outermost(
 
 
 def _field(
-    centres: NDArray[np.float64], radii: NDArray[np.float64], shape: tuple[int, int, int], spacing: float, probe: float
+    centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, probe: float
 ) -> NDArray[np.float32]:
     """How far each grid point is from the surface, in cells, negative inside; with `probe` of 0 that of the balls."""
     margin = _MARGIN * spacing
@@ -139,9 +126,7 @@ def _field(
     return ((np.float32(probe) - depth) / np.float32(spacing)).astype(np.float32)
 
 
-def _neighbours(
-    centres: NDArray[np.float64], radii: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _neighbours(centres: Floats, radii: Floats) -> tuple[Integers, Integers]:
     """Those balls that meet ball i are `neighbours[first[i]:first[i + 1]]`, nearest first."""
     pairs = cKDTree(centres).query_pairs(2 * radii.max(), output_type="ndarray")
     apart = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
@@ -153,14 +138,13 @@ def _neighbours(
 
 
 def _one_piece(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], pieces: Pieces, max_vertices: int | None, notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    vertices: Floats, faces: Integers, pieces: Pieces, max_vertices: int | None, notes: list[str]
+) -> Surface:
     """The surface of the largest piece, or of all but specks, joined; each with its share of the vertices."""
-    n_pieces, owner = components(faces, len(vertices))
-    parts = [compact(vertices, faces[owner[faces[:, 0]] == k]) for k in range(n_pieces)]
+    parts = connected(vertices, faces)
     sizes = [abs(signed_volume(*part)) for part in parts]
-    if n_pieces > 1 and pieces == "largest":
-        notes.append(f"the largest of {n_pieces} pieces was kept")
+    if len(parts) > 1 and pieces == "largest":
+        notes.append(f"the largest of {len(parts)} pieces was kept")
     least = max(sizes) if pieces == "largest" else SPECK_VOLUME * sum(sizes)
     parts = [part for part, size in zip(parts, sizes, strict=True) if size >= least]
     if max_vertices is not None:
@@ -171,9 +155,7 @@ def _one_piece(
     return joined_by_threads(parts, _THREADS)
 
 
-def _settled(
-    field: NDArray[np.float32], vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _settled(field: NDArray[np.float32], vertices: Floats, faces: Integers) -> Floats:
     """The vertices moved to where the field is zero, and evenly apart along it; faces neither cut corners nor bulge.
 
     Triangles with their corners on a curved surface lie on one side of it. How far, at their centres, tells by how much
@@ -182,8 +164,7 @@ def _settled(
     steps, normals = _steps(field, vertices)
     vertices = vertices - steps
     for _ in range(_N_ROUNDS):
-        means = _at_vertices(vertices[faces].mean(axis=1), vertices, faces)
-        shift = means - vertices
+        shift = _at_vertices(vertices[faces].mean(axis=1), vertices, faces) - vertices
         vertices = vertices + shift - np.einsum("ij,ij->i", shift, normals)[:, None] * normals
         steps, normals = _steps(field, vertices)
         vertices = vertices - steps
@@ -194,7 +175,7 @@ def _settled(
     return vertices - 0.75 * _at_vertices(heights, vertices, faces) * vertex_normals(vertices, faces)
 
 
-def _steps(field: NDArray[np.float32], points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _steps(field: NDArray[np.float32], points: Floats) -> tuple[Floats, Floats]:
     """How far points lie off the surface, as vectors (P, 3) in cells, and their directions; both point outwards."""
     found = cubic_values(field, points)
     # The slope of a distance is 1; where it is not, as in the middle between two surfaces, it leads nowhere.
@@ -203,11 +184,9 @@ def _steps(field: NDArray[np.float32], points: NDArray[np.float64]) -> tuple[NDA
     return np.clip(found[:, 0] / slope, -_STEP, _STEP)[:, None] * normals, normals
 
 
-def _at_vertices(
-    values: NDArray[np.float64], vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _at_vertices(values: Floats, vertices: Floats, faces: Integers) -> Floats:
     """(V, D) means of the values (F, D) of the faces around each vertex, by their areas."""
-    areas, corners = face_areas(vertices, faces), faces.ravel()
-    total = np.maximum(np.bincount(corners, np.repeat(areas, 3), len(vertices)), np.finfo(float).tiny)
-    columns = [np.bincount(corners, np.repeat(areas * column, 3), len(vertices)) / total for column in values.T]
-    return np.stack(columns, axis=1)
+    areas = face_areas(vertices, faces)[:, None]
+    rows = np.repeat(np.concatenate([areas, areas * values], axis=1), 3, axis=0)
+    totals = sums(faces.ravel(), rows, len(vertices))
+    return totals[:, 1:] / np.maximum(totals[:, :1], np.finfo(float).tiny)

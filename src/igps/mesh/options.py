@@ -11,7 +11,7 @@ Component = Literal["largest"]
 BodyKind = Literal["whole", "labels", "objects", "pieces", "chains", "models", "assembly"]
 
 MAX_UNPACKED = 2**30
-"""Bytes that a compressed file, an archive or repeated objects may unpack to where nothing else is said."""
+"""Bytes that a compressed file, an archive or repeated objects may unpack to, by default."""
 
 
 @dataclass(frozen=True)
@@ -29,20 +29,18 @@ class LoadOptions:
         ('welded 28 coincident vertices',)
 
     Args:
-        mend: "auto" does the least that makes a body of the surface, and leaves a body as it is, see `mend`; "never"
-            refuses what is no body; "always" makes every surface watertight that does not bound one body without
-            crossing itself, for collections of mixed quality.
+        mend: "auto" does the least that makes a body of the surface, see `mend`; "never" refuses what is no body;
+            "always" makes every surface watertight that does not bound one body without crossing itself, for
+            collections of mixed quality.
         component: "largest" keeps only the connected component of the largest area.
         allow_open: accept open boundaries; the winding number then decides what is inside.
         bodies: what of a file is a body. "whole": all of it; "labels" of a volume; "objects" of a scene, solids of a
-            CAD file, files of an archive; "pieces": what is not connected. "chains", "models" or the "assembly" of a
-            molecule. None, or what a format does not have: the labels of a volume, the chains of a molecule, the whole
-            of anything else.
+            CAD file, files of an archive; "pieces": what is not connected; "chains", "models" or the "assembly" of a
+            molecule. None, or what a format does not have: labels, chains, or else the whole.
         max_unpacked: bytes that a file may unpack to.
         names: a table of the names of labels, see `read_label_names`; None for those of the volume, or beside it.
         threshold: a voxel of at least this probability belongs to the body, in volumes of probabilities.
-        cavities: "fill" takes a hollow body for the full one; "keep" lets the surfaces of its hollows bound it too, of
-            meshes and of labels of volumes.
+        cavities: "fill" takes a hollow body for the full one; "keep" lets the surfaces of its hollows bound it too.
 
     Raises:
         ValueError: a value that is not among those.
@@ -58,25 +56,21 @@ class LoadOptions:
     cavities: Cavities = "fill"
 
     def __post_init__(self) -> None:
-        if self.mend not in get_args(Mending):
-            raise ValueError(f"mend: expected 'auto', 'never' or 'always', got {self.mend!r}.")
-        if self.cavities not in get_args(Cavities):
-            raise ValueError(f"cavities: expected 'fill' or 'keep', got {self.cavities!r}.")
-        if self.component is not None and self.component not in get_args(Component):
-            raise ValueError(f"component: expected 'largest' or None, got {self.component!r}.")
-        if self.bodies is not None and self.bodies not in get_args(BodyKind):
-            raise ValueError(f"bodies: expected one of {', '.join(get_args(BodyKind))}, or None, got {self.bodies!r}.")
+        for name, kinds, expected in (
+            ("mend", get_args(Mending), "'auto', 'never' or 'always'"),
+            ("cavities", get_args(Cavities), "'fill' or 'keep'"),
+            ("component", (*get_args(Component), None), "'largest' or None"),
+            ("bodies", (*get_args(BodyKind), None), f"one of {', '.join(get_args(BodyKind))}, or None"),
+        ):
+            if getattr(self, name) not in kinds:
+                raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)!r}.")
         if self.max_unpacked < 1:
             raise ValueError(f"max_unpacked: expected a positive number of bytes, got {self.max_unpacked}.")
         if not 0 < self.threshold <= 1:
             raise ValueError(f"threshold: expected above 0 and at most 1, got {self.threshold}.")
 
     def as_dict(self) -> dict[str, object]:
-        """All on which a body depends, for the keys of caches; what says no more than the default is left out."""
-        said = {
-            "bodies": self.bodies is not None,
-            "threshold": self.threshold != 0.5,
-            "cavities": self.cavities != "fill",
-        }
-        left_out = {"max_unpacked", "names", *(name for name, is_said in said.items() if not is_said)}
-        return {name: value for name, value in asdict(self).items() if name not in left_out}
+        """The options on which a body depends, for the keys of caches; the later ones only where not default."""
+        later = {"bodies": None, "threshold": 0.5, "cavities": "fill"}
+        options = {name: value for name, value in asdict(self).items() if name not in ("max_unpacked", "names")}
+        return {name: value for name, value in options.items() if name not in later or value != later[name]}

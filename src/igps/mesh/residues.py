@@ -1,4 +1,4 @@
-"""What is known of the residues of proteins and nucleic acids by their names."""
+"""Properties of the residues of proteins and nucleic acids, by their names."""
 
 from __future__ import annotations
 
@@ -19,15 +19,12 @@ HYDROPATHY = {
 """Hydropathy index, from -4.5 for what prefers water to 4.5 (Kyte and Doolittle 1982)."""
 
 CHARGED_ATOMS: dict[str, dict[str, float]] = {
-    "ASP": {"OD1": -0.5, "OD2": -0.5},
-    "GLU": {"OE1": -0.5, "OE2": -0.5},
-    "LYS": {"NZ": 1.0},
-    "ARG": {"NH1": 0.5, "NH2": 0.5},
-    "HIS": {"ND1": 0.05, "NE2": 0.05},
-}
+    "ASP": {"OD1": -0.5, "OD2": -0.5}, "GLU": {"OE1": -0.5, "OE2": -0.5}, "LYS": {"NZ": 1.0},
+    "ARG": {"NH1": 0.5, "NH2": 0.5}, "HIS": {"ND1": 0.05, "NE2": 0.05},
+}  # fmt: skip
 """Where the charges of amino acids at pH 7 are, in elementary charges: a tenth of histidines has one (pKa 6)."""
 
-PHOSPHATE_OXYGENS = {"OP1": -0.5, "OP2": -0.5, "O1P": -0.5, "O2P": -0.5}
+PHOSPHATES = {"OP1": -0.5, "OP2": -0.5, "O1P": -0.5, "O2P": -0.5}
 """Where the charges of nucleotides are."""
 
 DONORS = {"ARG": 3, "ASN": 1, "GLN": 1, "HIS": 1, "LYS": 1, "SER": 1, "THR": 1, "TRP": 1, "TYR": 1}

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers, Surface
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import undirected_edges
 
@@ -27,41 +27,28 @@ def subdivided(mesh: Mesh, n_vertices: int) -> Mesh:
     return replace(mesh, vertices=vertices, faces=faces, notes=(*mesh.notes, note))
 
 
-def _cut(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    edges: NDArray[np.int64],
-    edge_of_side: NDArray[np.int64],
-    cut: NDArray[np.int64],
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _cut(vertices: Floats, faces: Integers, edges: Integers, edge_of_side: Integers, cut: Integers) -> Surface:
     """New vertices in the middles of the edges `cut`, and every face with such edges cut accordingly."""
     middle = np.full(len(edges), -1)
     middle[cut] = len(vertices) + np.arange(len(cut))
     vertices = np.vstack([vertices, vertices[edges[cut]].mean(axis=1)])
     m = middle[edge_of_side].reshape(-1, 3)
     n_cut = (m >= 0).sum(axis=1)
-    pieces = [faces[n_cut == 0], faces[n_cut == 0][:0]]
-    for n, first in ((1, 0), (2, 0), (3, 0)):
-        chosen = n_cut == n
-        f, k = faces[chosen], m[chosen]
+    pieces = [faces[n_cut == 0]]
+    for n in (1, 2, 3):
+        f, k = faces[n_cut == n], m[n_cut == n]
         # Turned so that the cut sides come first.
         turn = np.argmax(k >= 0, axis=1) if n == 1 else (np.argmin(k >= 0, axis=1) + 1 if n == 2 else 0)
-        order = (np.arange(3) + np.reshape(turn, (-1, 1)) + first) % 3
-        rows = np.arange(len(f))[:, None]
-        a, b, c = f[rows, order].T
-        p, q, r = k[rows, order].T
+        order = (np.arange(3) + np.reshape(turn, (-1, 1))) % 3
+        a, b, c = np.take_along_axis(f, np.broadcast_to(order, f.shape), axis=1).T
+        p, q, r = np.take_along_axis(k, np.broadcast_to(order, k.shape), axis=1).T
         if n == 1:
             corners = [(a, p, c), (p, b, c)]
         elif n == 2:
             # The quadrilateral a p q c by its shorter diagonal.
-            corners = [(p, b, q)]
-            across = np.linalg.norm(vertices[a] - vertices[q], axis=1) < np.linalg.norm(
-                vertices[p] - vertices[c], axis=1
-            )
-            corners += [
-                (a, np.where(across, q, p), np.where(across, c, c)),
-                (np.where(across, a, p), np.where(across, p, q), np.where(across, q, c)),
-            ]
+            by_a = np.linalg.norm(vertices[a] - vertices[q], axis=1) < np.linalg.norm(vertices[p] - vertices[c], axis=1)
+            corners = [(p, b, q), (a, np.where(by_a, q, p), c)]
+            corners.append((np.where(by_a, a, p), np.where(by_a, p, q), np.where(by_a, q, c)))
         else:
             corners = [(a, p, r), (p, b, q), (r, q, c), (p, q, r)]
         pieces.extend(np.stack(corner, axis=1) for corner in corners)

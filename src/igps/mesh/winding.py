@@ -5,18 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh.surface import has_area
 
 _TREE_ERROR = 0.01  # of libigl's fast winding numbers; twice the largest found
 
 
 def winding_number(
-    vertices: NDArray[np.floating],
-    faces: NDArray[np.integer],
-    points: NDArray[np.floating],
-    *,
+    vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating], *,
     accuracy: float | None = None,
-) -> NDArray[np.float64]:
+) -> Floats:  # fmt: skip
     """Winding number (P,) of a mesh about points (P, 3): the solid angles of its faces over 4π, by libigl.
 
     1 inside and 0 outside a closed, outward oriented surface; fractions for an open one. On the surface itself the
@@ -45,12 +43,8 @@ def winding_number(
 
 def checked_places(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """The vertices of a mesh, its faces and points, in double precision and 64 bits.
-
-    Raises:
-        ValueError: a shape, an index or a value of an argument is invalid.
-    """
+) -> tuple[Floats, Integers, Floats]:
+    """The vertices of a mesh, its faces and points, in double precision and 64 bits; a ValueError if one is invalid."""
     at, index, where = np.asarray(vertices, np.float64), np.asarray(faces), np.asarray(points, np.float64)
     for name, array in (("vertices", at), ("faces", index), ("points", where)):
         if array.ndim != 2 or array.shape[1] != 3:

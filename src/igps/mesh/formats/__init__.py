@@ -1,4 +1,4 @@
-"""Formats: a file becomes bodies. A module each, and `FORMATS` tells of all.
+"""Formats: a file becomes bodies. Each has a module, and `FORMATS` lists them.
 
 **To add a format**, write a module here with a function `read(path, options, part)` that returns a list of `RawBody`
 and raises anything where the file is faulty; make it a `Format` with its suffixes; and add that to `FORMATS` below.
@@ -17,24 +17,10 @@ from igps.mesh.formats._format import Format, RawBody
 __all__ = ["FORMATS", "Format", "RawBody", "format_of", "is_searched", "searched_suffixes"]
 
 FORMATS: tuple[Format, ...] = (
-    off.FORMAT,
-    obj.FORMAT,
-    ply.FORMAT,
-    stl.FORMAT,
-    clouds.FORMAT,
-    threemf.FORMAT,
-    scenes.GLTF,
-    scenes.STEP,
-    scenes.OTHERS,
-    vtk.LEGACY,
-    vtk.XML,
-    brain_surfaces.GIFTI,
-    brain_surfaces.FREESURFER,
-    made_surfaces.VOLUMES,
-    made_surfaces.MOLECULES,
-    archives.ARCHIVE,
-    archives.COMPRESSED,
-)
+    off.FORMAT, obj.FORMAT, ply.FORMAT, stl.FORMAT, clouds.FORMAT, threemf.FORMAT, scenes.GLTF, scenes.STEP,
+    scenes.OTHERS, vtk.LEGACY, vtk.XML, brain_surfaces.GIFTI, brain_surfaces.FREESURFER, made_surfaces.VOLUMES,
+    made_surfaces.MOLECULES, archives.ARCHIVE, archives.COMPRESSED,
+)  # fmt: skip
 
 
 def format_of(path: str | Path) -> Format | None:
@@ -46,11 +32,11 @@ def format_of(path: str | Path) -> Format | None:
 
 
 def is_searched(path: str | Path) -> bool:
-    """Whether a file that lies in a folder is taken for bodies, by its name."""
+    """Whether a file of this name is read where it lies in a folder."""
     found = format_of(path)
     return found is not None and found.is_searched
 
 
 def searched_suffixes() -> list[str]:
-    """Those of files that are taken for bodies where they lie in a folder, in order."""
+    """The suffixes of files that are read where they lie in a folder, sorted."""
     return sorted(suffix for kind in FORMATS if kind.is_searched for suffix in kind.suffixes)

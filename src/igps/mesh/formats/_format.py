@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh._label_measures import VoxelMeasures
 from igps.mesh._tidying import are_specks, places
 from igps.mesh.mesh import MeshError, check_arrays
 from igps.mesh.options import BodyKind, LoadOptions
-from igps.mesh.surface import compact, face_parts
-
-
-def no_vertices() -> NDArray[np.float64]:
-    """Those of a body of which there is no surface, (0, 3)."""
-    return np.zeros((0, 3))
-
-
-def no_faces() -> NDArray[np.int64]:
-    """Those of a cloud of points, (0, 3)."""
-    return np.zeros((0, 3), dtype=np.int64)
+from igps.mesh.surface import compact, face_parts, stacked
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +34,11 @@ class RawBody:
         voxels: measures the voxels that the surface was made of.
     """
 
-    vertices: NDArray[np.float64] = field(default_factory=no_vertices)
-    faces: NDArray[np.int64] = field(default_factory=no_faces)
+    vertices: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    faces: Integers = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
     part: str | None = None
     unit: str | None = None
-    normals: NDArray[np.float64] | None = None
+    normals: Floats | None = None
     notes: tuple[str, ...] = ()
     fault: MeshError | None = None
     make: Callable[[], RawBody] | None = None
@@ -65,14 +56,12 @@ class Format:
     Args:
         name: for messages.
         suffixes: lower case, with the dot. The longest that ends a file's name decides.
-        read: the bodies of a file, or the one that is named; raises anything where the file is faulty. The names of
-            parts are distinct.
+        read: the bodies of a file, with distinct names, or the one named; raises anything where the file is faulty.
         parts: the names of the bodies, told without making them; None: read them.
-        bodies: what the format itself may call a body, the usual first. "whole" and "pieces" need not be told apart by
-            `read`: they are made of what it gives.
+        bodies: what a body of the file may be, the usual first. "whole" and "pieces" are made of what `read` gives.
         is_searched: whether files below a folder are taken for bodies by their suffix.
         ignored: suffixes of files of the same format that hold no surface.
-        extra: of this package, that has the modules that it needs.
+        extra: the extra of this package with the modules that it needs.
     """
 
     name: str
@@ -94,13 +83,10 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
     kept = meshes or [body for body in bodies if len(body.vertices)]
     if not kept:
         return RawBody(fault=next((body.fault for body in bodies if body.fault), None))
-    starts = np.cumsum([0, *(len(body.vertices) for body in kept)])
-    faces = np.concatenate([body.faces + start for body, start in zip(kept, starts, strict=False)])
     units = {body.unit for body in kept}
     normals = [body.normals for body in kept if body.normals is not None]
     return RawBody(
-        np.concatenate([body.vertices for body in kept]),
-        faces,
+        *stacked([(body.vertices, body.faces) for body in kept]),
         unit=units.pop() if len(units) == 1 else None,
         normals=np.concatenate(normals) if len(normals) == len(kept) else None,
         notes=tuple(dict.fromkeys(note for body in kept for note in body.notes)),
@@ -108,7 +94,7 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
 
 
 def pieces(whole: RawBody) -> list[RawBody]:
-    """What is not connected, in the order of the file, as "piece 1" and so on; specks are left out."""
+    """The connected components in the order of the file, as "piece 1" and so on; specks are left out."""
     vertices, faces = whole.vertices, whole.faces
     if not len(faces):
         return [whole]
@@ -135,7 +121,7 @@ def distinct(names: Iterable[str]) -> list[str]:
     return found
 
 
-def triangles(corners: NDArray[np.int64], n_corners: NDArray[np.int64]) -> NDArray[np.int64]:
+def triangles(corners: Integers, n_corners: Integers) -> Integers:
     """Polygons, with their corners laid end to end, cut into triangles from their first corners, (F, 3).
 
     Triangles come first, then the first and the second halves of quadrilaterals, then larger polygons.
@@ -153,12 +139,38 @@ def triangles(corners: NDArray[np.int64], n_corners: NDArray[np.int64]) -> NDArr
     return np.concatenate(pieces)
 
 
-def check_unpacked(n_bytes: int, path: Path, limit: int) -> None:
-    """Refuse what would take more bytes than allowed.
+def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
+    """The corners of polygons laid end to end, and how many each has, of rows that begin with these numbers."""
+    starts, at = [], 0
+    while at < len(rows):
+        starts.append(at)
+        at += max(int(rows[at]), 0) + 1
+    if at != len(rows):
+        raise ValueError("the numbers of corners do not add up")
+    is_corner = np.ones(len(rows), dtype=bool)
+    is_corner[starts] = False
+    return rows[is_corner], rows[starts]
 
-    Raises:
-        MeshError: names the file, both numbers, and the remedy.
-    """
+
+@contextmanager
+def faults(path: Path, name: str, extra: str | None) -> Iterator[None]:
+    """Turn what a reader raises into a MeshError about the file; running out of memory is no fault of it."""
+    try:
+        yield
+    except (MeshError, MemoryError):
+        raise
+    except ImportError as error:
+        missing = f"{path}: {name} needs a module that is not installed ({error})."
+        install = f'Install it: pip install "interior-gps[{extra}]"; or convert the file to OFF, OBJ, PLY or STL.'
+        raise MeshError(f"{missing} {install}") from error
+    except Exception as error:  # the loaders of some thirty formats raise whatever they like
+        fault = f"{path}: not readable as {name} ({type(error).__name__}: {' '.join(str(error).split())[:300]})."
+        remedy = "Check that the file is complete and in the format that its name tells; or export it again."
+        raise MeshError(f"{fault} {remedy}") from error
+
+
+def check_unpacked(n_bytes: int, path: Path, limit: int) -> None:
+    """Raise a MeshError for what would take more bytes than allowed."""
     if n_bytes > limit:
         raise MeshError(
             f"{path}: unpacks to {n_bytes / 1e9:.2g} GB or more, and at most {limit / 1e9:.2g} GB are allowed. If you "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import re
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,12 +29,7 @@ def suffix(path: Path) -> str:
 
 
 def read_structure(path: Path) -> gemmi.Structure:
-    """Of a PQR file the charges of atoms are their occupancies, and the radii their B-factors.
-
-    Raises:
-        MeshError: the file is missing, cut short, unreadable, or larger than any structure.
-        ImportError: gemmi is not installed.
-    """
+    """What the file holds; of a PQR file the charges of atoms are their occupancies, and the radii their B-factors."""
     text = _text(path)
     if suffix(path) == ".pqr":
         return _pqr(text, path)
@@ -44,10 +40,26 @@ def read_structure(path: Path) -> gemmi.Structure:
         blocks = gemmi.cif.read_string(text.decode("utf-8", "replace"))
         return gemmi.make_structure_from_block(next((b for b in blocks if b.find_values("_atom_site.id")), blocks[0]))
     except (RuntimeError, ValueError, IndexError) as error:
-        reason = " ".join(str(error).split())
-        raise MeshError(
-            f"{path}: not readable as a structure, or cut short ({reason}). Download or export it again."
-        ) from error
+        fault = f"{path}: not readable as a structure, or cut short ({' '.join(str(error).split())})."
+        raise MeshError(f"{fault} Download or export it again.") from error
+
+
+def parts_of(structure: gemmi.Structure, bodies: str, path: Path) -> Iterator[tuple[str, list[gemmi.Chain], list[str]]]:
+    """The name of each body, its chains, and notes."""
+    gemmi = gemmi_module()
+    for model in structure:
+        of = f"model {model.num} " if len(structure) > 1 else ""
+        if bodies == "chains":
+            # A chain may come in several pieces.
+            for label in dict.fromkeys(chain.name for chain in model):
+                yield f"{path}#{of}chain {label or 'without name'}", [c for c in model if c.name == label], []
+        elif bodies == "assembly" and len(structure.assemblies):
+            first = structure.assemblies[0]
+            made = gemmi.make_assembly(first, model, gemmi.HowToNameCopiedChain.AddNumber)
+            yield f"{path}#{of}assembly {first.name}", list(made), []
+        else:
+            notes = ["the file names no assembly: the model was taken as it is"] if bodies == "assembly" else []
+            yield f"{path}#{of}".strip("# "), list(model), notes
 
 
 def gemmi_module() -> Any:
@@ -80,11 +92,10 @@ def _with_numbers(line: re.Match[bytes]) -> bytes:
     """A line of a PDB file, with NaN where a coordinate is no number: gemmi would read a zero there."""
     whole = line.group()
     for start in (30, 38, 46):
-        number = whole[start : start + 8]
         try:
-            float(number)
+            float(whole[start : start + 8])
         except ValueError:
-            if len(number) == 8:
+            if len(whole) >= start + 8:
                 whole = whole[:start] + b"     nan" + whole[start + 8 :]
     return whole
 
@@ -107,9 +118,8 @@ def _pqr(text: bytes, path: Path) -> gemmi.Structure:
             if len(chain) > 1 or found is None or not radius >= 0:
                 raise ValueError("10 or 11 fields, the last a radius of at least 0, were expected")
         except ValueError as error:
-            raise MeshError(
-                f"{path}: line {number} is no atom of a PQR file ({error}). It may be cut short; write it again."
-            ) from error
+            fault = f"{path}: line {number} is no atom of a PQR file ({error})."
+            raise MeshError(f"{fault} It may be cut short; write it again.") from error
         residues = chains.setdefault(chain[0] if chain else "", [])
         key = gemmi.SeqId(int(found[1]), found[2] or " ")
         if not residues or residues[-1].seqid != key or residues[-1].name != residue:
@@ -124,15 +134,14 @@ def _pqr(text: bytes, path: Path) -> gemmi.Structure:
 
 
 def _add_model(structure: gemmi.Structure, chains: dict[str, list[Any]]) -> None:
-    """The chains as a model, if there are any; none are left in `chains`."""
+    """Move the chains, if there are any, to a new model."""
     gemmi = gemmi_module()
-    if not chains:
-        return
     model = gemmi.Model(len(structure) + 1)
     for name, residues in chains.items():
         chain = gemmi.Chain(name)
         for residue in residues:
             chain.add_residue(residue)
         model.add_chain(chain)
-    structure.add_model(model)
-    chains.clear()
+    if chains:
+        structure.add_model(model)
+        chains.clear()

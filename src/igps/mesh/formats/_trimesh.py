@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats
 from igps.mesh.formats._format import RawBody, check_unpacked, distinct, joined
 from igps.mesh.options import LoadOptions
 
-# What a file has against it is told by an error that names it; a traceback on the terminal, from trimesh's last resort
-# where nobody has set up logging, says nothing to its reader
+# An error names the file and its fault; tracebacks that trimesh logs where nobody has set up logging say nothing more
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
@@ -52,7 +51,7 @@ def objects(path: Path, options: LoadOptions, content: bytes | None = None, **lo
     stream = BytesIO(path.read_bytes() if content is None else content)
     scene = trimesh.load_scene(stream, resolver=_Beside(path.parent), process=False, **loading)
     nodes = [(node, *scene.graph.get(node)) for node in scene.graph.nodes_geometry]
-    sizes = {name: _n_bytes(geometry) for name, geometry in scene.geometry.items()}
+    sizes = {name: 24 * (len(one.vertices) + len(getattr(one, "faces", ()))) for name, one in scene.geometry.items()}
     check_unpacked(sum(sizes[name] for _, _, name in nodes), path, options.max_unpacked)
     bodies = []
     for part, (_, matrix, name) in zip(distinct(str(node) for node, _, _ in nodes), nodes, strict=True):
@@ -73,12 +72,8 @@ def objects(path: Path, options: LoadOptions, content: bytes | None = None, **lo
     return bodies
 
 
-def _n_bytes(geometry: Any) -> int:
-    return 24 * (len(geometry.vertices) + len(getattr(geometry, "faces", ())))
-
-
-def _normals(scene: Any, cloud: Any, n_points: int) -> NDArray[np.float64] | None:
-    """Those of a PLY file, which trimesh keeps as they were read, (n_points, 3)."""
+def _normals(scene: Any, cloud: Any, n_points: int) -> Floats | None:
+    """The normals (n_points, 3) of a PLY file, which trimesh keeps in its metadata."""
     for raw in (scene.metadata.get("_ply_raw", {}), cloud.metadata.get("_ply_raw", {})):
         rows = raw.get("vertex", {}).get("data")
         try:

@@ -12,13 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats
 from igps.mesh.formats.label_names import names_in_extensions
-from igps.mesh.limits import available_memory
+from igps.mesh.limits import check_fits
 from igps.mesh.mesh import MILLIMETRES, MeshError
 
-# Bytes for each voxel beside those of the file: the labels, and what counts them.
+# Bytes for each voxel beyond those of the file, to hold and count labels.
 _BESIDE = 4
 _FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])  # from LPS, which DICOM and ITK have, to RAS
+_EXPORT = "Export the labels."
 
 
 @dataclass
@@ -30,42 +32,44 @@ class RawVolume:
     """
 
     layers: list[NDArray[Any]]
-    affine: NDArray[np.float64]
+    affine: Floats
     names: dict[int, str] = field(default_factory=dict)
     segments: list[tuple[str, int, int]] = field(default_factory=list)
     unit: str | None = "mm"
 
 
-def check_voxels(path: Path, shape: Sequence[int], n_bytes: int, n_components: int = 1) -> None:
-    """Refuse what is no volume, or does not fit into memory.
+def read_raw(path: Path) -> RawVolume:
+    """What a file holds, read by the library for its suffix."""
+    if (reader := READERS.get(suffix_of(path))) is None:
+        raise MeshError(f"{path}: no format of volumes. Convert it to one of {', '.join(READERS)}.")
+    return reader(path)
 
-    Raises:
-        MeshError: an array of other than three axes, a single slice, several values for each voxel, or too many voxels.
-    """
+
+def suffix_of(path: Path) -> str:
+    """The suffix in lower case, ".nii.gz" as a whole."""
+    name = path.name.lower()
+    return ".nii.gz" if name.endswith(".nii.gz") else path.suffix.lower()
+
+
+def check_voxels(path: Path, shape: Sequence[int], n_bytes: int, n_components: int = 1) -> None:
+    """Raise a MeshError for other than three axes, a single slice, several values in a voxel, or too many voxels."""
     if n_components != 1:
-        raise MeshError(
-            f"{path}: {n_components} values in each voxel, as of colours; one label expected. Export labels."
-        )
-    size = [*shape]
+        raise MeshError(f"{path}: {n_components} values in each voxel, as of colours; one label expected. {_EXPORT}")
+    size = [int(n) for n in shape]
     while len(size) > 3 and size[-1] == 1:
         size.pop()
+    shown = " × ".join(map(str, size))
     if len(size) != 3:
-        raise MeshError(
-            f"{path}: an array of {len(size)} axes, {' × '.join(map(str, size))}; three expected. Export each volume "
-            "to a file of its own."
-        )
+        axes = f"{path}: an array of {len(size)} axes, {shown}; three expected."
+        raise MeshError(f"{axes} Export each volume to a file of its own.")
     if min(size) < 2:
-        raise MeshError(
-            f"{path}: {' × '.join(map(str, size))} voxels are a single slice, which has no volume. Export "
-            "the whole stack."
-        )
-    needed, free = math.prod(map(int, size)) * (n_bytes + _BESIDE), available_memory()
-    if free is not None and needed > free:
-        raise MeshError(
-            f"{path}: {math.prod(map(int, size)):,} voxels need {needed / 1e9:,.1f} GB of memory, and "
-            f"{max(free, 0) / 1e9:.1f} GB are free. Crop or resample the volume; if it is "
-            "smaller, its header is damaged."
-        )
+        raise MeshError(f"{path}: {shown} voxels are a single slice, which has no volume. Export the whole stack.")
+    remedy = "Crop or resample the volume; if it is smaller, its header is damaged."
+    check_fits(math.prod(size) * (n_bytes + _BESIDE), f"{path}: {math.prod(size):,} voxels need", remedy)
+
+
+def _no_numbers(path: Path, what: str) -> MeshError:
+    return MeshError(f"{path}: voxels of {what}; whole numbers expected. {_EXPORT}")
 
 
 def _nibabel(path: Path) -> RawVolume:
@@ -74,18 +78,15 @@ def _nibabel(path: Path) -> RawVolume:
     image: Any = nibabel.load(path)
     dtype = np.dtype(image.get_data_dtype())
     if dtype.fields or dtype.kind not in "biuf":
-        kind = "colours" if dtype.fields else "complex numbers"
-        raise MeshError(f"{path}: voxels of {kind} ({dtype}); whole numbers expected. Export the labels.")
+        raise _no_numbers(path, f"{'colours' if dtype.fields else 'complex numbers'} ({dtype})")
     check_voxels(path, image.shape, max(dtype.itemsize, 1))
     values = np.asanyarray(image.dataobj).reshape(image.shape[:3])
     affine, names = np.array(image.affine, dtype=np.float64), {}
     if isinstance(image, nibabel.Nifti1Image):
         affine[:3] *= MILLIMETRES.get(image.header.get_xyzt_units()[0], 1.0)
         names = names_in_extensions(
-            bytes(extension.get_content_bytes())
-            if hasattr(extension, "get_content_bytes")
-            else str(extension.get_content()).encode()
-            for extension in image.header.extensions
+            bytes(one.get_content_bytes()) if hasattr(one, "get_content_bytes") else str(one.get_content()).encode()
+            for one in image.header.extensions
         )
     return RawVolume([values], affine, names)
 
@@ -102,7 +103,7 @@ def _simple_itk(path: Path) -> RawVolume:
     segments = _slicer_segments(about)
     n_layers = reader.GetNumberOfComponents() if segments else 1
     if "complex" in SimpleITK.GetPixelIDValueAsString(reader.GetPixelID()):
-        raise MeshError(f"{path}: voxels of complex numbers; whole numbers expected. Export the labels.")
+        raise _no_numbers(path, "complex numbers")
     check_voxels(path, reader.GetSize(), 8 * n_layers, 1 if segments else reader.GetNumberOfComponents())
     image = reader.Execute()
     values = SimpleITK.GetArrayFromImage(image)  # (Z, Y, X), and layers last
@@ -118,10 +119,8 @@ def _slicer_segments(about: dict[str, str]) -> list[tuple[str, int, int]]:
     segments = []
     for key, value in about.items():
         if (found := re.fullmatch(r"Segment(\d+)_LabelValue", key)) and value.strip().isdigit():
-            layer = about.get(f"Segment{found[1]}_Layer", "0").strip()
-            segments.append(
-                (about.get(f"Segment{found[1]}_Name", ""), int(layer) if layer.isdigit() else 0, int(value))
-            )
+            name, layer = about.get(f"Segment{found[1]}_Name", ""), about.get(f"Segment{found[1]}_Layer", "0").strip()
+            segments.append((name, int(layer) if layer.isdigit() else 0, int(value)))
     return segments
 
 
@@ -133,10 +132,8 @@ def _check_detached(path: Path) -> None:
     lines = re.findall(key, head.split(b"\n\n")[0], re.MULTILINE | re.IGNORECASE)
     for name in (line.decode("utf-8", "replace") for line in lines):
         if "/" in name or "\\" in name or name.upper().startswith("LIST"):
-            raise MeshError(
-                f"{path}: its voxels are said to lie in {name!r}; a file of its own folder expected. Save the "
-                "volume as one file."
-            )
+            elsewhere = f"{path}: its voxels are said to lie in {name!r}; a file of its own folder expected."
+            raise MeshError(f"{elsewhere} Save the volume as one file.")
 
 
 def _highdicom(path: Path) -> RawVolume:
@@ -144,11 +141,9 @@ def _highdicom(path: Path) -> RawVolume:
     from highdicom.seg import Segmentation
 
     dataset = pydicom.dcmread(path)
-    if dataset.get("Modality") != "SEG":
-        raise MeshError(
-            f"{path}: DICOM of modality {dataset.get('Modality', 'none')}, not SEG; labels expected. Export the "
-            "segmentation as DICOM SEG."
-        )
+    if (kind := dataset.get("Modality", "none")) != "SEG":
+        other = f"{path}: DICOM of modality {kind}, not SEG; labels expected."
+        raise MeshError(f"{other} Export the segmentation as DICOM SEG.")
     segmentation = Segmentation.from_dataset(dataset, copy=False)
     geometry = segmentation.get_volume_geometry()
     if geometry is None:
@@ -156,23 +151,18 @@ def _highdicom(path: Path) -> RawVolume:
     numbers = [int(number) for number in segmentation.segment_numbers]
     check_voxels(path, geometry.spatial_shape, 4)
     try:
-        layers = [_volume(segmentation, combine_segments=True)]
+        layers = [np.asarray(segmentation.get_volume(combine_segments=True).array)]
     except (RuntimeError, ValueError):  # segments overlap, or are fractional
         check_voxels(path, geometry.spatial_shape, 8 * len(numbers))
         # What was tried keeps its tables locked
         segmentation = Segmentation.from_dataset(pydicom.dcmread(path), copy=False)
-        layers = [_volume(segmentation, segment_numbers=[number])[..., 0] for number in numbers]
+        layers = [np.asarray(segmentation.get_volume(segment_numbers=[n]).array)[..., 0] for n in numbers]
     alone = (len(layers) == len(numbers) and len(numbers) > 1) or layers[0].dtype.kind == "f"
-    segments = [
-        (str(segmentation.get_segment_description(number).segment_label), at if alone else 0, 1 if alone else number)
-        for at, number in enumerate(numbers)
-    ]
+    names = [str(segmentation.get_segment_description(number).segment_label) for number in numbers]
+    places = [(at, 1) for at in range(len(numbers))] if alone else [(0, number) for number in numbers]
+    segments = [(name, *place) for name, place in zip(names, places, strict=True)]
     # The slices come first, and rows before columns
     return RawVolume(layers, _FLIP @ np.array(geometry.affine, dtype=np.float64), segments=segments)
-
-
-def _volume(segmentation: Any, **options: Any) -> NDArray[Any]:
-    return np.asarray(segmentation.get_volume(**options).array)
 
 
 def _tifffile(path: Path) -> RawVolume:
@@ -184,7 +174,7 @@ def _tifffile(path: Path) -> RawVolume:
         if "S" in axes:
             check_voxels(path, series.shape[:3], dtype.itemsize, series.shape[axes.index("S")])
         if dtype.kind not in "biuf":
-            raise MeshError(f"{path}: voxels of {dtype}; whole numbers expected. Export the labels.")
+            raise _no_numbers(path, str(dtype))
         shape = [n for n in series.shape if n > 1] if len(series.shape) > 3 else list(series.shape)
         check_voxels(path, shape if len(shape) > 2 else [1, *shape], dtype.itemsize)
         values = series.asarray().reshape(shape).T
@@ -208,23 +198,15 @@ def _tiff_spacing(file: Any) -> tuple[float, float, float] | None:
     scale = MILLIMETRES.get(str(about.get("unit", "")))
     if scale is None or not about.get("spacing") or "XResolution" not in tags or "YResolution" not in tags:
         return None
-    sides = [tags[f"{axis}Resolution"].value for axis in "XY"]
-    if not all(count for count, _ in sides):
-        return None
-    x, y = (scale * per / count for count, per in sides)
-    return x, y, scale * abs(float(about["spacing"]))
+    (n_x, per_x), (n_y, per_y) = (tags[f"{axis}Resolution"].value for axis in "XY")
+    return (scale * per_x / n_x, scale * per_y / n_y, scale * abs(float(about["spacing"]))) if n_x and n_y else None
 
 
 READERS: dict[str, Callable[[Path], RawVolume]] = {
-    ".nii": _nibabel,
-    ".nii.gz": _nibabel,
-    ".mgh": _nibabel,
-    ".mgz": _nibabel,
-    ".nrrd": _simple_itk,
-    ".mha": _simple_itk,
-    ".mhd": _simple_itk,
+    **dict.fromkeys((".nii", ".nii.gz", ".mgh", ".mgz"), _nibabel),
+    **dict.fromkeys((".nrrd", ".mha", ".mhd"), _simple_itk),
     ".dcm": _highdicom,
     ".tif": _tifffile,
     ".tiff": _tifffile,
 }
-"""Who reads files of which suffix."""
+"""The reader of files of each suffix."""

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Integers
 from igps.mesh.formats._format import triangles
-
-Integers = NDArray[np.int64]
 
 TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, TETRAHEDRON = 5, 6, 7, 8, 9, 10
 # Sides of volumes, seen from outside, as VTK orders their corners: of tetrahedra, voxels, hexahedra, wedges, pyramids.
@@ -23,11 +21,7 @@ _WITHOUT_AREA = (0, 1, 2, 3, 4)
 
 
 def surface(corners: Integers, n_corners: Integers, kinds: Integers) -> Integers:
-    """Triangles (F, 3) of cells, whose corners are laid end to end.
-
-    Raises:
-        ValueError: a kind of cell that is not known, such as a curved one.
-    """
+    """Triangles (F, 3) of cells, whose corners are laid end to end; a ValueError for curved ones and the like."""
     unknown = set(np.unique(kinds).tolist()) - {*_WITHOUT_AREA, TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, *_SIDES}
     if unknown:
         raise ValueError(

@@ -1,11 +1,17 @@
-"""XML of strangers: it declares no entities, and nothing from elsewhere is read."""
+"""XML of strangers: no entities, nothing from elsewhere, and arrays that unpack to no more than they announce."""
 
 from __future__ import annotations
 
+import base64
+import lzma
+import zlib
 from collections.abc import Callable
 from typing import Any
 from xml.etree import ElementTree
 from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import NDArray
 
 
 def parse(content: bytes) -> ElementTree.Element:
@@ -33,3 +39,24 @@ def _parser(start: Callable[[str, dict[str, str]], Any]) -> expat.XMLParserType:
 
 def _refuse(name: str, *_: object) -> None:
     raise ValueError(f"its XML declares the entity {name!r}, which such files do without")
+
+
+def from_text(text: str, kind: np.dtype) -> NDArray[np.generic]:
+    """Numbers separated by white space."""
+    return np.array(text.split(), dtype="U").astype(kind) if text.split() else np.zeros(0, kind)
+
+
+def from_base64(text: str) -> bytes:
+    """Bytes, white space passed over."""
+    return base64.b64decode("".join(text.split()), validate=True)
+
+
+def inflated(content: bytes, n_bytes: int, name: str = "zlib") -> bytes:
+    """The bytes of a compressed block; a ValueError if they are not as many as expected."""
+    if name == "lzma":
+        unpacked = lzma.LZMADecompressor().decompress(content, n_bytes + 1)
+    else:
+        unpacked = zlib.decompressobj(wbits=47).decompress(content, n_bytes + 1)  # with a header of zlib or gzip
+    if len(unpacked) != n_bytes:
+        raise ValueError(f"a block unpacks to {len(unpacked)} bytes or more, not to the {n_bytes} that it announces")
+    return unpacked

@@ -9,7 +9,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.mesh.formats import _data_arrays, _xml
+from igps.mesh.formats import _xml
 from igps.mesh.formats._format import Format, RawBody, check_unpacked
 from igps.mesh.options import LoadOptions
 
@@ -49,10 +49,10 @@ def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.gen
     check_unpacked(n_bytes, path, options.max_unpacked)
     encoding, text = element.get("Encoding"), element.findtext("Data") or ""
     if encoding == "ASCII":
-        values = _data_arrays.from_text(text, kind)
+        values = _xml.from_text(text, kind)
     elif encoding in ("Base64Binary", "GZipBase64Binary"):
-        content = _data_arrays.from_base64(text)
-        content = _data_arrays.inflated(content, n_bytes) if encoding.startswith("GZip") else content
+        content = _xml.from_base64(text)
+        content = _xml.inflated(content, n_bytes) if encoding.startswith("GZip") else content
         values = np.frombuffer(content, kind.newbyteorder("<" if element.get("Endian") == "LittleEndian" else ">"))
     else:
         raise ValueError(f"its numbers are encoded as {encoding}, which is not read")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats
 from igps.mesh.formats import _volume_files
 from igps.mesh.mesh import MeshError
 
@@ -23,30 +24,19 @@ _MODES = {0: 1, 1: 2, 2: 4, 4: 8, 6: 2, 12: 2}
 
 
 @lru_cache(maxsize=1)
-def read(path: Path, changed: int) -> tuple[NDArray[Any], NDArray[np.float64]]:
+def read(path: Path, changed: int) -> tuple[NDArray[Any], Floats]:
     """Values (X, Y, Z) of an image or grid, and the affine (4, 4) from voxels to coordinates.
 
     NIfTI, MGH, NRRD, MetaImage and TIFF are in world coordinates (RAS, millimetres), OpenDX, MRC and CCP4 in ångström.
-
-    Args:
-        path: the file.
-        changed: when that was, so that the last file need not be read again.
-
-    Raises:
-        MeshError: another format, an image that does not fit into memory, or a file cut short.
-        ImportError: a module is missing.
+    The last file is not read again unless it was `changed` at another time.
     """
-    name = path.name.lower()
-    if name.endswith(_GRIDS):
-        return (_dx if name.endswith(".dx") else _map)(path)
-    readers = [suffix for suffix in _volume_files.READERS if name.endswith(suffix)]
-    if not readers:
-        raise MeshError(f"{path}: not an image that is read. Convert it to one of {', '.join(SUFFIXES)}.")
-    volume = _volume_files.READERS[max(readers, key=len)](path)
+    if path.name.lower().endswith(_GRIDS):
+        return (_dx if path.suffix.lower() == ".dx" else _map)(path)
+    volume = _volume_files.read_raw(path)
     return volume.layers[0], volume.affine
 
 
-def _dx(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
+def _dx(path: Path) -> tuple[NDArray[Any], Floats]:
     """Of an OpenDX file, as APBS writes it; GridDataFormats does not return from one that is cut short."""
     text = path.read_bytes()
     head, _, rest = text.partition(b"data follows")
@@ -67,7 +57,7 @@ def _dx(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
     return np.array(words, dtype=np.float32).reshape(sizes), affine
 
 
-def _map(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
+def _map(path: Path) -> tuple[NDArray[Any], Floats]:
     """Of an MRC or CCP4 file."""
     try:
         import mrcfile

@@ -14,9 +14,7 @@ from igps.mesh.mesh import MeshError
 
 logger = logging.getLogger(__name__)
 
-TABLE_SUFFIXES = (".label", ".ctbl", ".lut", ".txt", ".csv", ".json")
-"""Suffixes of tables that are looked for beside a volume, under its name."""
-
+_SUFFIXES = (".label", ".ctbl", ".lut", ".txt", ".csv", ".json")  # of tables for a volume
 _BESIDE = ("FreeSurferColorLUT.txt", "dataset.json")  # for all volumes of a folder
 _MOST_BYTES = 1 << 24
 # ITK-SNAP: index, three colours, opacity, visibility, mesh visibility, "name".
@@ -30,9 +28,9 @@ _KEY = re.compile(rb"""\bKey\s*=\s*["'](\d+)["']""")
 def read_label_names(path: str | Path) -> dict[int, str]:
     """The names that a table gives to labels.
 
-    Label descriptions of ITK-SNAP, colour tables of 3D Slicer and FreeSurfer, JSON from numbers to names or from names
-    to numbers, also under "labels" as nnU-Net has it, and CSV whose first line names a column of labels (label,
-    LabelValue, index, id or value) and one of names (name or label_name).
+    Label descriptions of ITK-SNAP, colour tables of 3D Slicer and FreeSurfer, JSON from numbers to names or back, also
+    under "labels" as nnU-Net has it, and CSV whose first line names a column of labels (label, LabelValue, index, id or
+    value) and one of names (name or label_name).
 
     Example:
         >>> import tempfile
@@ -61,9 +59,9 @@ def read_label_names(path: str | Path) -> dict[int, str]:
 
 
 def names_beside(path: Path) -> dict[int, str]:
-    """Those of the first table beside a volume: under its name, or one of FreeSurfer or nnU-Net; else none."""
+    """Those of the first table beside a volume: under its name, or of FreeSurfer or nnU-Net for the folder; or none."""
     stem = re.sub(r"(\.seg)?\.[^.]+(\.gz)?$", "", path.name, flags=re.IGNORECASE)
-    for name in (*(stem + suffix for suffix in TABLE_SUFFIXES), *_BESIDE):
+    for name in (*(stem + suffix for suffix in _SUFFIXES), *_BESIDE):
         table = path.with_name(name)
         if table != path and table.is_file():
             try:
@@ -74,10 +72,7 @@ def names_beside(path: Path) -> dict[int, str]:
 
 
 def names_in_extensions(contents: Iterable[bytes]) -> dict[int, str]:
-    """Those of a label table of Connectome Workbench's form in the extensions of a NIfTI header, else none.
-
-    TotalSegmentator writes such tables, too.
-    """
+    """Those in the extensions of a NIfTI header, as Connectome Workbench and TotalSegmentator write them; or none."""
     names: dict[int, str] = {}
     for content in contents:
         for attributes, name in _WORKBENCH.findall(content):
@@ -94,11 +89,8 @@ def _clean(names: dict[int, str]) -> dict[int, str]:
 
 
 def _of_lines(text: str) -> dict[int, str]:
-    names: dict[int, str] = {}
-    for line in text.splitlines():
-        if found := _SNAP.match(line.strip()) or _COLOURS.match(line.strip()):
-            names[int(found[1])] = found[2].strip('"')
-    return _clean(names)
+    rows = (_SNAP.match(line.strip()) or _COLOURS.match(line.strip()) for line in text.splitlines())
+    return _clean({int(row[1]): row[2].strip('"') for row in rows if row})
 
 
 def _of_csv(text: str) -> dict[int, str]:
@@ -109,7 +101,7 @@ def _of_csv(text: str) -> dict[int, str]:
     if number is None or name is None:
         return {}
     pairs = ((str(row[number] or "").strip(), str(row[name] or "")) for row in rows)
-    return _clean({int(label): words for label, words in pairs if label.isascii() and label.isdigit()})
+    return _clean({int(label): words for label, words in pairs if _is_number(label)})
 
 
 def _of_json(text: str) -> dict[int, str]:
@@ -118,9 +110,10 @@ def _of_json(text: str) -> dict[int, str]:
     except (ValueError, RecursionError):
         return {}
     table = content.get("labels", content) if isinstance(content, dict) else {}
-    names: dict[int, str] = {}
-    for key, value in table.items() if isinstance(table, dict) else ():
-        label, name = (value, key) if isinstance(value, int) else (key, value)
-        if str(label).isascii() and str(label).isdigit() and isinstance(name, str):
-            names[int(label)] = name
-    return _clean(names)
+    rows = table.items() if isinstance(table, dict) else ()
+    pairs = ((value, key) if isinstance(value, int) else (key, value) for key, value in rows)
+    return _clean({int(label): name for label, name in pairs if _is_number(str(label)) and isinstance(name, str)})
+
+
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdigit()

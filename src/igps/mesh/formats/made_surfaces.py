@@ -18,14 +18,13 @@ from igps.mesh.options import LoadOptions
 
 if TYPE_CHECKING:
     from igps.mesh.formats.molecules import Molecule, MoleculeBodies
-    from igps.mesh.formats.volumes import VolumeOptions
 
 
 def read_volume(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The surfaces of the labels of a volume; or of all of them together as the whole."""
     from igps.mesh.formats.volumes import label_surface, read_label_volume
 
-    volume = read_label_volume(path, _volume_options(options))
+    volume = read_label_volume(path, options)
     if options.bodies in ("whole", "pieces"):
         labelled = np.any([layer > 0 for layer in volume.layers], axis=0).astype(np.uint8)
         volume = replace(volume, layers=(labelled,), names=None, segments=None)
@@ -40,13 +39,7 @@ def volume_parts(path: Path, options: LoadOptions) -> list[str]:
     """The names of the labels of a volume."""
     from igps.mesh.formats.volumes import read_label_volume
 
-    return [body.name for body in read_label_volume(path, _volume_options(options)).bodies]
-
-
-def _volume_options(options: LoadOptions) -> VolumeOptions:
-    from igps.mesh.formats.volumes import VolumeOptions
-
-    return VolumeOptions(options.threshold, options.names)
+    return [body.name for body in read_label_volume(path, options).bodies]
 
 
 def read_structure(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
@@ -54,11 +47,8 @@ def read_structure(path: Path, options: LoadOptions, part: str | None) -> list[R
     from igps.mesh.molecular_surface import molecular_surface
 
     found = _molecules(path, options)
-    return [
-        _body(partial(molecular_surface, molecule), name, "Å")
-        for name, molecule in found.items()
-        if part in (None, name)
-    ]
+    names = [name for name in found if part in (None, name)]
+    return [_body(partial(molecular_surface, found[name]), name, "Å") for name in names]
 
 
 def structure_parts(path: Path, options: LoadOptions) -> list[str]:
@@ -76,19 +66,16 @@ def _molecules(path: Path, options: LoadOptions) -> dict[str, Molecule]:
 def _body(
     make: Callable[[], Mesh], part: str | None, unit: str | None, voxels: Callable[[], VoxelMeasures] | None = None
 ) -> RawBody:
-    """A body whose surface is made when it is asked for."""
-    return RawBody(part=part, make=partial(_made, make, part, unit, voxels))
+    """A body whose surface is made when it is asked for; a fault of it leaves the others."""
 
+    def made() -> RawBody:
+        try:
+            mesh = make()
+        except MeshError as fault:
+            return RawBody(part=part, fault=fault, voxels=voxels)
+        return RawBody(mesh.vertices, mesh.faces, part, unit, notes=mesh.notes, voxels=voxels)
 
-def _made(
-    make: Callable[[], Mesh], part: str | None, unit: str | None, voxels: Callable[[], VoxelMeasures] | None
-) -> RawBody:
-    """A body, or why there is none: the others are made all the same."""
-    try:
-        mesh = make()
-    except MeshError as fault:
-        return RawBody(part=part, fault=fault, voxels=voxels)
-    return RawBody(mesh.vertices, mesh.faces, part, unit, notes=mesh.notes, voxels=voxels)
+    return RawBody(part=part, make=made)
 
 
 _STRUCTURES = tuple(sorted(suffix + packed for suffix in _structures.SUFFIXES for packed in ("", ".gz")))

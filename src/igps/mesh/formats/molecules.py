@@ -7,23 +7,16 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-from igps.mesh.formats._structures import SUFFIXES, gemmi_module, read_structure, suffix
+from igps.mesh._arrays import Floats, Integers
+from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structure, suffix
 from igps.mesh.mesh import MeshError
-from igps.mesh.residues import (
-    BACKBONE,
-    CHARGED_ATOMS,
-    PHOSPHATE_OXYGENS,
-    STANDARD,
-    WATER,
-    residue_ball,
-    side_chain_ball,
-)
+from igps.mesh.residues import BACKBONE, CHARGED_ATOMS, PHOSPHATES, STANDARD, WATER, residue_ball, side_chain_ball
 
 if TYPE_CHECKING:
     import gemmi
@@ -32,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 MoleculeBodies = Literal["chains", "models", "assembly"]
 
-# What the first letter of an atom's name tells where its element is not given.
+# Elements that the first letter of an atom's name gives where the file does not.
 _ELEMENTS = frozenset("HCNOSP")
 # Radius of an atom whose element is not known, carbon's.
 _UNKNOWN_RADIUS = 1.7
@@ -52,13 +45,11 @@ _NOTES = {
 
 @dataclass(frozen=True, eq=False)
 class Molecule:
-    """The balls of a body, and what is known of its residues.
+    """The balls of a body, and its residues.
 
     Args:
         name: of the file, with the model, chain or assembly.
-        positions: (A, 3) of the balls, Å.
-        radii: (A,) van der Waals radii, Å.
-        charges: (A,) elementary charges.
+        positions, radii, charges: (A, 3) and (A,) of the balls: Å, van der Waals radii in Å, elementary charges.
         residue_of: (A,) the residue of each ball, from 0.
         residue_names: of the R residues, three letters; a modified amino acid has the name of the one that it was.
         residue_positions: (R, 3) of the Cα atoms, or else the mean of a residue's atoms, Å.
@@ -67,13 +58,13 @@ class Molecule:
     """
 
     name: str
-    positions: NDArray[np.float64]
-    radii: NDArray[np.float64]
-    charges: NDArray[np.float64]
-    residue_of: NDArray[np.int64]
+    positions: Floats
+    radii: Floats
+    charges: Floats
+    residue_of: Integers
     residue_names: tuple[str, ...]
-    residue_positions: NDArray[np.float64]
-    b_factors: NDArray[np.float64]
+    residue_positions: Floats
+    b_factors: Floats
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -93,9 +84,8 @@ def read_molecule(
     Each model of an ensemble gives bodies of its own. Water is left out. Of alternative locations that of the highest
     occupancy is taken, the first of equals. Radii are van der Waals radii of the elements (Bondi 1964), and charges
     those of residues at pH 7, without the ends of chains. A PQR file has its own of both, and keeps its hydrogens.
-
-    An amino acid with no atom of its side chain gets a ball of the side chain's volume, which touches Cα on the side of
-    Cβ; one of Cα alone is a ball of its whole volume (Zamyatnin 1972). So backbones and traces are bodies, too.
+    Where all atoms of a side chain are missing, a ball of its volume touches Cα on the side of Cβ; a residue of Cα
+    alone is a ball of its whole volume (Zamyatnin 1972). So backbones and traces are bodies, too.
 
     Example:
         >>> import tempfile
@@ -108,13 +98,10 @@ def read_molecule(
 
     Args:
         path: the file.
-        bodies: "chains": every chain of every model; "models": every model as a whole; "assembly": of every model the
-            first biological assembly that the file names.
-        ligands: whether what belongs to no polymer belongs to the bodies. In a file without polymers it does.
-        hydrogens: whether hydrogens are kept, which most structures lack.
-
-    Returns:
-        At least one. Chains without usable atoms are left out, which is logged.
+        bodies: "chains" or "models", each by itself, or of every model the first biological "assembly" that the file
+            names. Those without usable atoms are left out, which is logged.
+        ligands: keep what belongs to no polymer, as is done in a file without polymers.
+        hydrogens: keep hydrogens, which most structures lack.
 
     Raises:
         ValueError: unknown `bodies`.
@@ -125,15 +112,13 @@ def read_molecule(
     if bodies not in get_args(MoleculeBodies):
         raise ValueError(f"bodies: expected one of {', '.join(get_args(MoleculeBodies))}, got {bodies!r}.")
     structure = read_structure(path)
-    parts = list(_parts(structure, bodies, path))
+    parts = list(parts_of(structure, bodies, path))
     found, left_out = _molecules(parts, ligands, hydrogens, suffix(path) == ".pqr")
     if not found and not ligands:
         found, left_out = _molecules(parts, True, hydrogens, suffix(path) == ".pqr")
     if not found:
-        raise MeshError(
-            f"{path}: no atoms of a molecule that have positions, in {len(parts)} {bodies}. Check that the file is "
-            "complete, and not of water alone."
-        )
+        none = f"{path}: no atoms of a molecule that have positions, in {len(parts)} {bodies}."
+        raise MeshError(f"{none} Check that the file is complete, and not of water alone.")
     for name in left_out:
         logger.warning("%s: no atoms of a polymer, left out; read its ligands, or check the file.", name)
     return found
@@ -149,37 +134,17 @@ def molecules_by_part(path: Path, changed: int, bodies: MoleculeBodies) -> dict[
 def _molecules(
     parts: list[tuple[str, list[gemmi.Chain], list[str]]], ligands: bool, hydrogens: bool, is_pqr: bool
 ) -> tuple[list[Molecule], list[str]]:
-    """Those of the parts, and the names of parts that hold none."""
+    """The molecules of the parts, and the names of parts without one."""
     found, left_out = [], []
     for name, chains, notes in parts:
         one = _Builder(ligands, hydrogens or is_pqr, is_pqr)
         for chain in chains:
             one.add_chain(chain)
-        if any(radius > 0 for radius in one.radii):
+        if any(radius > 0 for _, radius, _, _ in one.balls):
             found.append(one.molecule(name, notes))
         else:
             left_out.append(name)
     return found, left_out
-
-
-def _parts(
-    structure: gemmi.Structure, bodies: MoleculeBodies, path: Path
-) -> Iterator[tuple[str, list[gemmi.Chain], list[str]]]:
-    """The name of each body, its chains, and notes."""
-    gemmi = gemmi_module()
-    for model in structure:
-        of = f"model {model.num} " if len(structure) > 1 else ""
-        if bodies == "chains":
-            # A chain may come in several pieces.
-            for label in dict.fromkeys(chain.name for chain in model):
-                yield f"{path}#{of}chain {label or 'without name'}", [c for c in model if c.name == label], []
-        elif bodies == "assembly" and len(structure.assemblies):
-            first = structure.assemblies[0]
-            made = gemmi.make_assembly(first, model, gemmi.HowToNameCopiedChain.AddNumber)
-            yield f"{path}#{of}assembly {first.name}", list(made), []
-        else:
-            notes = ["the file names no assembly: the model was taken as it is"] if bodies == "assembly" else []
-            yield f"{path}#{of}".strip("# "), list(model), notes
 
 
 class _Builder:
@@ -187,29 +152,19 @@ class _Builder:
 
     def __init__(self, ligands: bool, hydrogens: bool, is_pqr: bool) -> None:
         self.ligands, self.hydrogens, self.is_pqr = ligands, hydrogens, is_pqr
-        self.radii: list[float] = []
-        self._positions: list[NDArray[np.float64]] = []
-        self._charges: list[float] = []
-        self._residue_of: list[int] = []
-        self._names: list[str] = []
-        self._places: list[NDArray[np.float64]] = []
-        self._b_factors: list[float] = []
+        self.balls: list[tuple[Floats, float, float, int]] = []  # position, radius, charge, residue
+        self._residues: list[tuple[str, Floats, float]] = []  # name, position, B-factor
         self._count: Counter[str] = Counter()
 
     def molecule(self, name: str, notes: list[str]) -> Molecule:
         own = ["radii and charges are those of the PQR file"] if self.is_pqr else []
         counted = [text.format(self._count[what]) for what, text in _NOTES.items() if self._count[what]]
+        positions, radii, charges, residue_of = map(np.array, zip(*self.balls, strict=True))
+        names, places, b_factors = zip(*self._residues, strict=True)
         return Molecule(
-            name,
-            np.array(self._positions),
-            np.array(self.radii),
-            np.array(self._charges),
-            np.array(self._residue_of, dtype=np.int64),
-            tuple(self._names),
-            np.array(self._places),
-            np.array(self._b_factors),
+            name, positions, radii, charges, residue_of, names, np.array(places), np.array(b_factors),
             (*notes, *own, *counted),
-        )
+        )  # fmt: skip
 
     def add_chain(self, chain: gemmi.Chain) -> None:
         seen: set[str] = set()
@@ -237,10 +192,9 @@ class _Builder:
         self._count["residue"] += in_polymer and not is_known
         at = np.array([atom.pos.tolist() for atom in atoms])
         alpha = next((i for i, atom in enumerate(atoms) if atom.name == "CA"), None) if in_polymer else None
-        self._names.append(name)
-        self._places.append(at.mean(axis=0) if alpha is None else at[alpha])
-        self._b_factors.append(np.nan if self.is_pqr else float(np.mean([atom.b_iso for atom in atoms])))
-        charged = (PHOSPHATE_OXYGENS if kind.is_nucleic_acid() else CHARGED_ATOMS.get(name, {})) if in_polymer else {}
+        b_factor = np.nan if self.is_pqr else float(np.mean([atom.b_iso for atom in atoms]))
+        self._residues.append((name, at.mean(axis=0) if alpha is None else at[alpha], b_factor))
+        charged = (PHOSPHATES if kind.is_nucleic_acid() else CHARGED_ATOMS.get(name, {})) if in_polymer else {}
         if alpha is not None and not self.is_pqr and (named == {"CA"} or (named <= BACKBONE and name != "GLY")):
             self._add_coarse_ball(name, atoms, at, sum(charged.values()))
             if named == {"CA"}:
@@ -248,12 +202,12 @@ class _Builder:
         for atom, position in zip(atoms, at, strict=True):
             if self.is_pqr:
                 self._add_ball(position, atom.b_iso, atom.occ)
-                continue
-            self._add_ball(position, self._radius(atom), charged.get(atom.name, 0.0))
+            else:
+                self._add_ball(position, self._radius(atom), charged.get(atom.name, 0.0))
         return True
 
     def _radius(self, atom: gemmi.Atom) -> float:
-        """The van der Waals radius of the atom's element, or of that which its name tells."""
+        """The van der Waals radius of the atom's element, which its name tells if need be."""
         if atom.element.atomic_number:
             return float(atom.element.vdw_r)
         if (letter := _letter(atom)) in _ELEMENTS:
@@ -262,14 +216,11 @@ class _Builder:
         self._count["element"] += 1
         return _UNKNOWN_RADIUS
 
-    def _add_ball(self, position: NDArray[np.float64], radius: float, charge: float) -> None:
-        self._positions.append(position)
-        self.radii.append(radius)
-        self._charges.append(charge)
-        self._residue_of.append(len(self._names) - 1)
+    def _add_ball(self, position: Floats, radius: float, charge: float) -> None:
+        self.balls.append((position, radius, charge, len(self._residues) - 1))
 
-    def _add_coarse_ball(self, name: str, atoms: list[gemmi.Atom], at: NDArray[np.float64], charge: float) -> None:
-        """That which stands for a missing side chain, or for a residue of Cα alone."""
+    def _add_coarse_ball(self, name: str, atoms: list[gemmi.Atom], at: Floats, charge: float) -> None:
+        """The ball for a missing side chain, or for a residue of Cα alone."""
         place = {atom.name: position for atom, position in zip(atoms, at, strict=True)}
         if len(place) == 1:
             self._count["alpha"] += 1
@@ -285,23 +236,17 @@ class _Builder:
         self._add_ball(centre, radius, charge)
 
     def _conformers(self, chain: gemmi.Chain) -> Iterator[gemmi.Residue]:
-        """The residues; of several that are alternatives to each other, that of the highest occupancy."""
-        group: list[Any] = []
-        for residue in chain:
-            is_alternative = len(residue) > 0 and all(atom.has_altloc() for atom in residue)
-            if group and not (is_alternative and residue.seqid == group[0].seqid):
-                yield self._best(group)
-                group = []
-            if is_alternative:
-                group.append(residue)
-            else:
-                yield residue
-        if group:
-            yield self._best(group)
+        """The residues; of alternatives the one of highest occupancy."""
 
-    def _best(self, group: list[gemmi.Residue]) -> gemmi.Residue:
-        self._count["alternative"] += len(group) - 1
-        return max(group, key=lambda residue: max(atom.occ for atom in residue))
+        def place(numbered: tuple[int, gemmi.Residue]) -> str | int:
+            number, residue = numbered
+            is_alternative = len(residue) > 0 and all(atom.has_altloc() for atom in residue)
+            return str(residue.seqid) if is_alternative else number
+
+        for _, group in groupby(enumerate(chain), place):
+            residues = [residue for _, residue in group]
+            self._count["alternative"] += len(residues) - 1
+            yield max(residues, key=lambda residue: max((atom.occ for atom in residue), default=0.0))
 
     def _atoms(self, residue: gemmi.Residue) -> list[gemmi.Atom]:
         """Those that have a position, one of each that has alternatives."""
@@ -325,7 +270,7 @@ def _letter(atom: gemmi.Atom) -> str:
 
 
 def _standard(name: str, kind: gemmi.ResidueInfo) -> str:
-    """The name of the amino acid that a modified one was; any other name as it is."""
+    """The name of the amino acid that a modified one was; of others their own."""
     if name in STANDARD:
         return STANDARD[name]
     if kind.is_standard() or not kind.is_amino_acid():

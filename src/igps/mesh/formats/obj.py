@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Booleans, Integers
 from igps.mesh.formats._format import Format, RawBody, distinct, triangles
 from igps.mesh.options import LoadOptions
 
@@ -34,7 +34,10 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
             before.append(len(places))
         elif word in starts:
             starts[word].append((len(polygons), rest.strip()))
-    vertices = _vertices(places)
+    if not places:
+        raise ValueError("no vertex in it")
+    # Weights and colours behind the coordinates are passed over
+    vertices = np.loadtxt(places, np.float64, comments="#", usecols=(0, 1, 2), ndmin=2)
     if not polygons:
         return [RawBody(vertices)]
     corners, n_corners, kept = _corners(polygons, np.array(before, dtype=np.int64))
@@ -53,16 +56,7 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     return bodies
 
 
-def _vertices(places: list[str]) -> NDArray[np.float64]:
-    """(V, 3); weights and colours behind the coordinates are passed over."""
-    if not places:
-        raise ValueError("no vertex in it")
-    return np.loadtxt(places, np.float64, comments="#", usecols=(0, 1, 2), ndmin=2)
-
-
-def _corners(
-    polygons: list[str], before: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+def _corners(polygons: list[str], before: Integers) -> tuple[Integers, Integers, Booleans]:
     """The corners of polygons laid end to end, counted from zero; how many each has; and which of all are polygons."""
     text = "\n".join(polygons)
     if "#" in text:
@@ -77,7 +71,7 @@ def _corners(
     return corners[np.repeat(kept, n_corners)], n_corners[kept], kept
 
 
-def _owners(starts: dict[str, list[tuple[int, str]]], n_polygons: int) -> tuple[list[str], NDArray[np.int64]]:
+def _owners(starts: dict[str, list[tuple[int, str]]], n_polygons: int) -> tuple[list[str], Integers]:
     """Names of objects, or else of groups, that have polygons, and the number of each polygon's, (P,)."""
     found = [(0, "unnamed"), *(starts["o"] or starts["g"])]
     ends = [*(first for first, _ in found[1:]), n_polygons]

@@ -39,13 +39,15 @@ def read_gltf(path: Path, options: LoadOptions, part: str | None) -> list[RawBod
 
 def read_step(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The solids of a STEP file, in millimetres, each with the name of the part that it belongs to."""
-    parts = objects(path, options, _converted(path), file_type="glb", merge_primitives=True)
-    solids = [(str(part.part), solid) for part in parts for solid in _solids(part)]
-    names = distinct(name for name, _ in solids)
-    return [
-        replace(solid, vertices=1000 * solid.vertices, part=name, unit="mm")
-        for name, (_, solid) in zip(names, solids, strict=True)
-    ]
+    solids, names = [], []
+    for body in objects(path, options, _converted(path), file_type="glb", merge_primitives=True):
+        found = pieces(body)
+        if any(signed_volume(one.vertices, one.faces) <= 0 for one in found):  # one is the wall of a hollow
+            found = [body]
+        solids += found
+        names += [str(body.part)] * len(found)
+    named = zip(solids, distinct(names), strict=True)
+    return [replace(solid, vertices=1000 * solid.vertices, part=name, unit="mm") for solid, name in named]
 
 
 def _converted(path: Path) -> bytes:
@@ -59,12 +61,6 @@ def _converted(path: Path) -> bytes:
         if not scene.is_file():
             raise MeshError(f"{path}: OpenCASCADE finds no solid in it. Check that it is complete, or export it again.")
         return scene.read_bytes()
-
-
-def _solids(part: RawBody) -> list[RawBody]:
-    """The pieces of a part; but all of it where one of them is inside out, the wall of a hollow."""
-    found = pieces(part)
-    return found if all(signed_volume(one.vertices, one.faces) > 0 for one in found) else [part]
 
 
 GLTF = Format("glTF", (".glb", ".gltf"), read_gltf, bodies=("whole", "objects"))

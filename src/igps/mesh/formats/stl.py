@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Surface
 from igps.mesh.formats._format import Format, RawBody
 from igps.mesh.options import LoadOptions
 
@@ -28,7 +28,7 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     return [RawBody(*merged(corners), notes=notes)]
 
 
-def _text(content: bytes) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+def _text(content: bytes) -> tuple[Floats, tuple[str, ...]]:
     rows = b"\n".join(_VERTEX.findall(content)).split()
     corners = np.array(rows, dtype="S").astype(np.float64) if rows else np.zeros(0)
     if len(corners) % 9:
@@ -36,8 +36,8 @@ def _text(content: bytes) -> tuple[NDArray[np.float64], tuple[str, ...]]:
     return corners.reshape(-1, 3), ()
 
 
-def _binary(content: bytes, announced: int) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """As many triangles as are there, whatever number the header has."""
+def _binary(content: bytes, announced: int) -> tuple[Floats, tuple[str, ...]]:
+    """The triangles that are there, whatever number the header announces."""
     there = max(len(content) - _HEADER, 0) // _TRIANGLE.itemsize
     n = min(there, announced) or there
     notes = () if n == announced else (f"the header announces {announced} triangles: the {n} that are there were read",)
@@ -45,7 +45,7 @@ def _binary(content: bytes, announced: int) -> tuple[NDArray[np.float64], tuple[
     return rows["corners"].reshape(-1, 3).astype(np.float64), notes
 
 
-def merged(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def merged(corners: Floats) -> Surface:
     """The places (V, 3) of corners (3F, 3), in the order in which they first come, and the triangles (F, 3)."""
     corners = corners + 0.0  # of two zeros, one
     order = np.lexsort(corners.T)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats
 from igps.mesh.formats import _xml
 from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct, joined
 from igps.mesh.options import LoadOptions
@@ -29,7 +29,7 @@ class _Placed:
     """An object at a place: vertices (V, 3) times `matrix` (4, 3), with a column of ones."""
 
     key: Key
-    matrix: NDArray[np.float64]
+    matrix: Floats
     name: str = ""
 
 

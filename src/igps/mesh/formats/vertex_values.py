@@ -11,11 +11,12 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from igps.mesh._arrays import Floats, Integers
 from igps.mesh.formats import brain_surfaces, vtk
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
-Arrays = Mapping[str, NDArray[np.float64]]
+Arrays = Mapping[str, Floats]
 
 _MAGIC = b"\xff\xff\xff"
 _VTK = (".vtk", ".vtp", ".vtu")
@@ -23,10 +24,7 @@ _VTK = (".vtk", ".vtp", ".vtu")
 
 def read(path: Path) -> Arrays:
     """Arrays (V,) or (V, C) by name: of PLY, VTK, GIFTI, or of FreeSurfer's files of thickness, curvature and the like.
-
-    Raises:
-        ValueError: there is none, or the file is damaged.
-    """
+    A ValueError if there is none, or the file is damaged."""
     name = path.name.lower()
     if name.endswith(_VTK):
         found = vtk.point_values(path, LoadOptions()).values
@@ -41,12 +39,8 @@ def read(path: Path) -> Arrays:
     return {one: np.asarray(values, dtype=np.float64) for one, values in found.items()}
 
 
-def read_tetrahedra(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], Arrays]:
-    """Points (V, 3), tetrahedra (T, 4), and arrays (V,) or (V, C) by name, of a VTK file.
-
-    Raises:
-        ValueError: there are no tetrahedra, or the file is damaged.
-    """
+def read_tetrahedra(path: Path) -> tuple[Floats, Integers, Arrays]:
+    """Points (V, 3), tetrahedra (T, 4), and arrays (V,) or (V, C) by name, of a VTK file; a ValueError without them."""
     found = vtk.point_values(path, LoadOptions())
     if not len(found.tetrahedra) or not found.values:
         raise MeshError(f"{path}: expected tetrahedra with values at their points. Export both.")
@@ -55,12 +49,8 @@ def read_tetrahedra(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64],
     return found.vertices, found.tetrahedra, {name: values.astype(float) for name, values in found.values.items()}
 
 
-def chosen(arrays: Arrays, name: str, path: Path) -> NDArray[np.float64]:
-    """The array of a name, or the only one.
-
-    Raises:
-        MeshError: there is none of that name, or there are several.
-    """
+def chosen(arrays: Arrays, name: str, path: Path) -> Floats:
+    """The array of a name, or the only one."""
     if name in arrays:
         return arrays[name]
     if not name and len(arrays) == 1:

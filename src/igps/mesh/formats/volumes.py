@@ -5,7 +5,6 @@ The world is RAS, x to the patient's right, y to the front and z up, in millimet
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,40 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
+from igps.mesh._arrays import Booleans, Floats
 from igps.mesh._label_measures import VoxelMeasures, measured
-from igps.mesh.formats._volume_files import READERS, RawVolume
+from igps.mesh.formats._format import faults
+from igps.mesh.formats._volume_files import RawVolume, read_raw, suffix_of
 from igps.mesh.formats.label_names import names_beside, read_label_names
-from igps.mesh.label_surface import MAX_VERTICES, checked_spacing, voxel_surface
+from igps.mesh.label_surface import checked_spacing, voxel_surface
 from igps.mesh.mending import Cavities, Mending, mend
 from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.options import LoadOptions
 
-logger = logging.getLogger(__name__)
-
-SUFFIXES = tuple(READERS)
-"""Of the files that hold label volumes."""
-
-# More labels are a picture's intensities.
+# More different values are intensities of an image.
 _MOST_LABELS = 20_000
-
-
-@dataclass(frozen=True)
-class VolumeOptions:
-    """How a label volume is read.
-
-    Args:
-        threshold: a voxel of probability at least this belongs to the body; only for values between 0 and 1.
-        names: a table of names, see `read_label_names`; None for those of the file, or of a table beside it.
-
-    Raises:
-        ValueError: a threshold that is not above 0 and at most 1.
-    """
-
-    threshold: float = 0.5
-    names: str | Path | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 < self.threshold <= 1:
-            raise ValueError(f"threshold: expected above 0 and at most 1, got {self.threshold}.")
 
 
 @dataclass(frozen=True)
@@ -74,8 +51,6 @@ class LabelVolume:
         >>> volume = LabelVolume((labels,), np.diag([1.0, 1.0, 2.0, 1.0]), names={2: "liver"})
         >>> [(body.label, body.name, body.n_voxels) for body in volume.bodies]
         [(1, '1', 2048), (2, 'liver', 2048)]
-        >>> round(label_surface(volume, "liver").volume)
-        4096
 
     Args:
         layers: arrays (X, Y, Z) of whole numbers from 0, the background; several where segments overlap.
@@ -91,7 +66,7 @@ class LabelVolume:
     """
 
     layers: tuple[NDArray[Any], ...]
-    affine: NDArray[np.float64]
+    affine: Floats
     name: str = "volume"
     names: dict[int, str] | None = None
     segments: tuple[tuple[int, int, int], ...] | None = None
@@ -104,16 +79,13 @@ class LabelVolume:
             raise MeshError(f"{self.name}: no voxel has a label, all are 0. Check that the right file was exported.")
         seen: dict[str, int] = {}
         for body in self.bodies:
-            if body.name in seen:
-                raise MeshError(
-                    f"{self.name}: labels {seen[body.name]} and {body.label} are both named {body.name!r}. Rename one, "
-                    "or give names by a table."
-                )
-            seen[body.name] = body.label
+            if (other := seen.setdefault(body.name, body.label)) != body.label:
+                both = f"{self.name}: labels {other} and {body.label} are both named {body.name!r}."
+                raise MeshError(f"{both} Rename one, or give names by a table.")
 
     @cached_property
     def bodies(self) -> tuple[LabelBody, ...]:
-        """Of every label that any voxel has, in ascending order."""
+        """A body for each label that any voxel has, in ascending order."""
         names, found = self.names or {}, []
         for layer, labels in enumerate(self.layers):
             values, counts, compact = _counted(labels, self.name)
@@ -127,33 +99,24 @@ class LabelVolume:
         return tuple(sorted(found, key=lambda body: body.label))
 
     def body(self, part: int | str) -> LabelBody:
-        """The body of a label, or of a name.
-
-        Raises:
-            MeshError: there is none; names those that there are.
-        """
+        """The body of a label, or of a name; a MeshError with the names that there are, if there is none."""
         for body in self.bodies:
             if part in (body.label, body.name) or part == str(body.label):
                 return body
         known = ", ".join(body.name for body in self.bodies[:10]) + (", …" if len(self.bodies) > 10 else "")
         raise MeshError(f"{self.name}: no label {part!r}. It has {len(self.bodies)}: {known}.")
 
-    def mask(self, part: int | str) -> NDArray[np.bool_]:
+    def mask(self, part: int | str) -> Booleans:
         """Where the label is, within `LabelBody.box`."""
         body = self.body(part)
         return np.asarray(self.layers[body.layer][body.box] == body.value)
 
     def measures(self, part: int | str) -> VoxelMeasures:
-        """Of the voxels of a label."""
+        """Measures of the voxels of a label."""
         return measured(self.mask(part))
 
 
-def is_label_volume(path: str | Path) -> bool:
-    """Whether a file has the suffix of a label volume."""
-    return _suffix(Path(path)) in READERS
-
-
-def read_label_volume(path: str | Path, options: VolumeOptions = VolumeOptions()) -> LabelVolume:
+def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) -> LabelVolume:
     """Read a label volume: `.nii`, `.nii.gz`, `.mgh`, `.mgz`, `.nrrd`, `.mha`, `.mhd`, `.dcm` (SEG), `.tif`, `.tiff`.
 
     Names of labels come from `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, extensions of NIfTI), else
@@ -161,66 +124,28 @@ def read_label_volume(path: str | Path, options: VolumeOptions = VolumeOptions()
     the name of the file.
 
     Raises:
-        MeshError: the file is missing, cut short, too large, or holds no labels in three axes.
-        ImportError: the library that reads the format is not installed.
+        MeshError: the file is missing, cut short, too large, or holds no labels; or its library is missing.
     """
     path = Path(path)
     if not path.is_file():
         raise MeshError(f"{path}: no such file. Check the path.")
-    reader = READERS.get(_suffix(path))
-    if reader is None:
-        raise MeshError(f"{path}: no format of label volumes. Expected one of {', '.join(READERS)}.")
-    try:
-        raw = reader(path)
-    except ModuleNotFoundError as error:
-        raise ImportError(f'{path}: needs {error.name}: pip install "interior-gps[volumes]".') from error
-    except (MeshError, MemoryError):
-        raise
-    except Exception as error:  # whatever the libraries raise
-        why = " ".join(str(error).split())[:300]
-        raise MeshError(
-            f"{path}: not readable as a label volume ({type(error).__name__}: {why}). Check that the file is complete, "
-            "or export it again."
-        ) from error
+    with faults(path, "a label volume", "volumes"):
+        raw = read_raw(path)
     return _labelled(raw, path, options)
 
 
-def label_bodies(volume: LabelVolume) -> list[tuple[int, str, int]]:
-    """(label, name, number of voxels) of every label that any voxel has, in ascending order."""
-    return [(body.label, body.name, body.n_voxels) for body in volume.bodies]
-
-
-def label_surface(
-    volume: LabelVolume,
-    part: int | str,
-    *,
-    how: Mending = "auto",
-    max_vertices: int = MAX_VERTICES,
-    cavities: Cavities = "fill",
-) -> Mesh:
-    """The surface of a label as a body in the world, in the unit of the volume, see `voxel_surface`.
-
-    Args:
-        volume: the labels.
-        part: a label, or a name.
-        how: what is done to a label of several pieces, see `mend`.
-        max_vertices: about so many vertices at most.
-        cavities: "keep" gives hollows a surface, too.
-
-    Raises:
-        MeshError: no such label, too few voxels, or no body can be made of it.
-    """
+def label_surface(volume: LabelVolume, part: int | str, *, how: Mending = "auto", cavities: Cavities = "fill") -> Mesh:
+    """The surface of a label, by its number or name, as a body in the world; see `voxel_surface` and `mend`."""
     body = volume.body(part)
     name = f"{volume.name}#{body.name}"
     affine = np.array(volume.affine, dtype=np.float64)
     affine[:3, 3] += affine[:3, :3] @ [side.start for side in body.box]
     mask, affine = _canonical(volume.mask(part), affine)
-    kept = cavities == "keep"
-    vertices, faces, notes = voxel_surface(mask, affine, max_vertices=max_vertices, cavities=kept, name=name)
+    vertices, faces, notes = voxel_surface(mask, affine, cavities=cavities == "keep", name=name)
     return mend(vertices, faces, how=how, cavities=cavities, name=name, notes=(*volume.notes, *notes))
 
 
-def _canonical(mask: NDArray[np.bool_], affine: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def _canonical(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
     """With axes that run as nearly along x, y and z as they can: formats store the same voxels in different orders."""
     order = linear_sum_assignment(-np.abs(affine[:3, :3]) / np.linalg.norm(affine[:3, :3], axis=0))[1]
     mask, affine = mask.transpose(order), affine[:, [*order, 3]]
@@ -231,12 +156,7 @@ def _canonical(mask: NDArray[np.bool_], affine: NDArray[np.float64]) -> tuple[ND
     return np.ascontiguousarray(mask), affine
 
 
-def _suffix(path: Path) -> str:
-    name = path.name.lower()
-    return ".nii.gz" if name.endswith(".nii.gz") else path.suffix.lower()
-
-
-def _labelled(raw: RawVolume, path: Path, options: VolumeOptions) -> LabelVolume:
+def _labelled(raw: RawVolume, path: Path, options: LoadOptions) -> LabelVolume:
     notes: list[str] = []
     layers = tuple(_whole_numbers(values, path, options.threshold, notes) for values in raw.layers)
     segments, names = None, raw.names
@@ -252,42 +172,37 @@ def _labelled(raw: RawVolume, path: Path, options: VolumeOptions) -> LabelVolume
     elif not names:
         names = names_beside(path)
         if not names and not raw.segments and layers[0].max(initial=0) == 1:  # a mask is called by its file
-            names = {1: path.name[: -len(_suffix(path))]}
+            names = {1: path.name[: -len(suffix_of(path))]}
     return LabelVolume(layers, raw.affine, str(path), names, segments, raw.unit, tuple(dict.fromkeys(notes)))
 
 
 def _whole_numbers(values: NDArray[Any], path: Path, threshold: float, notes: list[str]) -> NDArray[Any]:
     """Labels from 0, of the smallest type; probabilities are cut at the threshold."""
     if values.dtype.kind == "f":
-        n_bad = int(np.count_nonzero(~np.isfinite(values)))
-        if n_bad:
+        if n_bad := int(np.count_nonzero(~np.isfinite(values))):
             raise MeshError(f"{path}: {n_bad} voxels are NaN or infinite; labels expected. Set them to 0.")
-        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
-        n_odd = int(np.count_nonzero(values != np.round(values)))
-        if n_odd and low >= 0 and high <= 1:
+        odd = values[values != np.round(values)]
+        if len(odd) and values.min() >= 0 and values.max() <= 1:
             notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
             return (values >= threshold).astype(np.uint8)
-        if n_odd:
-            odd = float(values[values != np.round(values)][0])
+        if len(odd):
             raise MeshError(
-                f"{path}: {n_odd} voxels have fractional labels, such as {odd:g}. Resample labels to the nearest "
+                f"{path}: {len(odd)} voxels have fractional labels, such as {odd[0]:g}. Resample labels to the nearest "
                 "neighbour, or give probabilities between 0 and 1."
             )
-        if low < 0 or high >= 2**31:
-            values = values.astype(np.float64)
-    if values.size and values.dtype.kind in "if" and values.min() < 0:
+    low, high = (int(values.min()), int(values.max())) if values.size else (0, 0)
+    if low < 0:
         raise MeshError(
-            f"{path}: {int(np.count_nonzero(values < 0))} voxels have negative labels, such as {int(values.min())}; "
-            "0 for the background and positive numbers expected. Is it an image? Export its labels."
+            f"{path}: {int(np.count_nonzero(values < 0))} voxels have negative labels, such as {low}; 0 for the "
+            "background and positive numbers expected. Is it an image? Export its labels."
         )
-    if values.size and values.max() >= 2**31:
-        raise MeshError(f"{path}: label {int(values.max())} is too large; below 2³¹ expected. Number the labels anew.")
-    highest = int(values.max()) if values.size else 0
-    return np.asarray(values, dtype=np.min_scalar_type(highest))
+    if high >= 2**31:
+        raise MeshError(f"{path}: label {high} is too large; below 2³¹ expected. Number the labels anew.")
+    return np.asarray(values, dtype=np.min_scalar_type(high))
 
 
 def _counted(labels: ArrayLike, name: str) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """The values that occur, without 0; how often; and labels below 65536: the given ones, or else from 1 in order."""
+    """The values that occur, without 0; how often; and labels below 2¹⁶: the given ones, or else from 1 in order."""
     array = np.asarray(labels)
     if array.ndim != 3 or array.dtype.kind not in "biu":
         raise MeshError(f"{name}: expected whole numbers of shape (X, Y, Z), got {array.dtype} of shape {array.shape}.")
@@ -307,7 +222,6 @@ def _counted(labels: ArrayLike, name: str) -> tuple[NDArray[Any], NDArray[Any], 
         compact = index.reshape(array.shape) + (1 - start)
         values, counts = values[start:], counts[start:]
     if len(values) > _MOST_LABELS:
-        raise MeshError(
-            f"{name}: {len(values)} different values, which look like an image and not like labels. Export the labels."
-        )
+        many = f"{name}: {len(values)} different values, which look like an image and not like labels."
+        raise MeshError(f"{many} Export the labels.")
     return values, counts, compact

@@ -16,36 +16,27 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.mesh.formats import _data_arrays, _vtk_cells, _xml
-from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct
+from igps.mesh._arrays import Floats, Integers
+from igps.mesh.formats import _vtk_cells, _xml
+from igps.mesh.formats._format import Format, RawBody, check_unpacked, corners_of_rows
 from igps.mesh.options import LoadOptions
 
 _LEGACY_TYPES = {
-    "float": "f4",
-    "double": "f8",
-    "int": "i4",
-    "unsigned_int": "u4",
-    "long": "i8",
-    "vtktypeint64": "i8",
-    "vtktypeint32": "i4",
-    "short": "i2",
-    "unsigned_short": "u2",
-    "char": "i1",
-    "unsigned_char": "u1",
-    "vtkidtype": "i8",
-}
+    "float": "f4", "double": "f8", "int": "i4", "unsigned_int": "u4", "long": "i8", "vtktypeint64": "i8",
+    "vtktypeint32": "i4", "short": "i2", "unsigned_short": "u2", "char": "i1", "unsigned_char": "u1", "vtkidtype": "i8",
+}  # fmt: skip
 _CELLS = {"POLYGONS": _vtk_cells.POLYGON, "TRIANGLE_STRIPS": _vtk_cells.STRIP}
 _POLYS = {"Polys": _vtk_cells.POLYGON, "Strips": _vtk_cells.STRIP}
 _COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
-Cells = tuple[NDArray[np.int64], NDArray[np.int64]]  # corners laid end to end, and how many each cell has
+Cells = tuple[Integers, Integers, Integers]  # corners laid end to end; how many each cell has; kinds of cells
 
 
 @dataclass(frozen=True, eq=False)
 class PointValues:
     """Points (V, 3) of a file, tetrahedra (T, 4) between them, and arrays (V,) or (V, C) by name."""
 
-    vertices: NDArray[np.float64]
-    tetrahedra: NDArray[np.int64]
+    vertices: Floats
+    tetrahedra: Integers
     values: Mapping[str, NDArray[np.generic]]
 
 
@@ -85,8 +76,8 @@ class _Legacy:
         self._at = len(self._content) - len(rest)
         return np.array(words, dtype="S").astype(kind) if n else np.zeros(0, kind)
 
-    def cells(self, n: int, size: int) -> Cells:
-        """Of a section of n cells: in later versions two arrays, in earlier ones each with its number of corners."""
+    def cells(self, n: int, size: int) -> tuple[Integers, Integers]:
+        """Corners of n cells laid end to end, and how many each has; written as two arrays, or as rows before VTK 5."""
         before = self._at
         words = self.line().split()
         if words[:1] == ["OFFSETS"]:
@@ -94,22 +85,15 @@ class _Legacy:
             kind = self.line().split()[1]
             return self.numbers(size, kind).astype(np.int64), np.diff(offsets)
         self._at = before
-        row, at = self.numbers(size, "int").astype(np.int64), 0
-        n_corners: list[int] = []
-        while at < size and len(n_corners) < n:
-            n_corners.append(int(row[at]))
-            at += max(n_corners[-1], 0) + 1
-        if len(n_corners) != n or at != size:
+        corners, n_corners = corners_of_rows(self.numbers(size, "int").astype(np.int64))
+        if len(n_corners) != n:
             raise ValueError("the numbers of corners do not add up")
-        counts = np.array(n_corners, dtype=np.int64)
-        is_corner = np.ones(size, dtype=bool)
-        is_corner[np.cumsum(counts + 1) - counts - 1] = False
-        return row[is_corner], counts
+        return corners, n_corners
 
-    def geometry(self) -> tuple[NDArray[np.float64], list[tuple[Cells, NDArray[np.int64]]], str]:
-        """Points, cells with their kinds, and the first line behind them."""
+    def geometry(self) -> tuple[Floats, list[Cells], str]:
+        """Points, cells, and the first line behind them."""
         vertices = np.zeros((0, 3))
-        cells: list[tuple[Cells, NDArray[np.int64]]] = []
+        cells: list[Cells] = []
         while (words := self.line().split()) and words[0].upper() not in ("POINT_DATA", "CELL_DATA"):
             word = words[0].upper()
             if word == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
@@ -117,14 +101,14 @@ class _Legacy:
             if word == "POINTS":
                 vertices = self.numbers(3 * int(words[1]), words[2]).astype(np.float64).reshape(-1, 3)
             elif word in ("POLYGONS", "TRIANGLE_STRIPS", "CELLS", "VERTICES", "LINES"):
-                found = self.cells(int(words[1]), int(words[2]))
-                cells.append((found, np.full(len(found[1]), _CELLS.get(word, 0), dtype=np.int64)))
+                corners, n_corners = self.cells(int(words[1]), int(words[2]))
+                cells.append((corners, n_corners, np.full(len(n_corners), _CELLS.get(word, 0))))
             elif word == "CELL_TYPES" and cells:
-                cells[-1] = (cells[-1][0], self.numbers(int(words[1]), "int").astype(np.int64))
+                cells[-1] = (*cells[-1][:2], self.numbers(int(words[1]), "int").astype(np.int64))
         return vertices, cells, " ".join(words).upper()
 
     def arrays(self, heading: str, n_points: int) -> dict[str, NDArray[np.generic]]:
-        """Those of points, by name; `heading` is the line before."""
+        """The arrays of points, by name; `heading` is the line before."""
         found: dict[str, NDArray[np.generic]] = {}
         is_of_points, n = heading.startswith("POINT_DATA"), n_points
         while words := self.line().split():
@@ -132,31 +116,29 @@ class _Legacy:
             if word in ("POINT_DATA", "CELL_DATA"):
                 is_of_points, n = word == "POINT_DATA", int(words[1])
                 continue
-            rows = [(words[1], 3, n, words[2])] if word in ("VECTORS", "NORMALS") else []
-            if word == "SCALARS":
-                rows = [(words[1], int(words[3]) if len(words) > 3 else 1, n, words[2])]
-                before = self._at
-                if not self.line().upper().startswith("LOOKUP_TABLE"):
-                    self._at = before
-            for number in range(int(words[2]) if word == "FIELD" else len(rows)):
+            n_arrays = int(words[2]) if word == "FIELD" else word in ("VECTORS", "NORMALS", "SCALARS")
+            for _ in range(n_arrays):
                 if word == "FIELD":
                     name, width, length, kind = self.line().split()
-                    rows.append((name, int(width), int(length), kind))
-                name, n_columns, n_rows, kind = rows[number]
-                values = self.numbers(n_columns * n_rows, kind).reshape(n_rows, n_columns)
-                if is_of_points and n_rows == n_points:
-                    found[name] = values[:, 0] if n_columns == 1 else values
+                else:
+                    name, width, length, kind = words[1], "3", str(n), words[2]
+                if word == "SCALARS":
+                    width, before = words[3] if len(words) > 3 else "1", self._at
+                    if not self.line().upper().startswith("LOOKUP_TABLE"):
+                        self._at = before
+                values = self.numbers(int(width) * int(length), kind).reshape(int(length), int(width))
+                if is_of_points and int(length) == n_points:
+                    found[name] = _columns(values)
         return found
 
 
 def read_legacy(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The surface of a legacy file of polygons or cells."""
-    vertices, cells, _ = _Legacy(path.read_bytes()).geometry()
-    return [_body(vertices, cells)]
+    return [_body(*_Legacy(path.read_bytes()).geometry()[:2])]
 
 
 def point_values(path: Path, options: LoadOptions) -> PointValues:
-    """What a file of VTK knows of its points; of several pieces laid end to end."""
+    """What a file of VTK of one piece knows of its points."""
     if path.suffix.lower() == ".vtk":
         legacy = _Legacy(path.read_bytes())
         vertices, cells, heading = legacy.geometry()
@@ -169,13 +151,17 @@ def point_values(path: Path, options: LoadOptions) -> PointValues:
     arrays: dict[str, NDArray[np.generic]] = {}
     for element in pieces[0].findall("PointData/DataArray"):
         values = file.array(element).reshape(len(vertices), -1)
-        arrays[element.get("Name") or f"array {len(arrays) + 1}"] = values[:, 0] if values.shape[1] == 1 else values
+        arrays[element.get("Name") or f"array {len(arrays) + 1}"] = _columns(values)
     return PointValues(vertices, _tetrahedra(cells), arrays)
 
 
-def _tetrahedra(cells: list[tuple[Cells, NDArray[np.int64]]]) -> NDArray[np.int64]:
+def _columns(values: NDArray[np.generic]) -> NDArray[np.generic]:
+    return values[:, 0] if values.shape[1] == 1 else values
+
+
+def _tetrahedra(cells: list[Cells]) -> Integers:
     found = [np.zeros((0, 4), dtype=np.int64)]
-    for (corners, n_corners), kinds in cells:
+    for corners, n_corners, kinds in cells:
         if len(kinds) == len(n_corners) and (n_corners >= 0).all() and n_corners.sum() == len(corners):
             starts = np.cumsum(n_corners) - n_corners
             found.append(corners[starts[(kinds == _vtk_cells.TETRAHEDRON) & (n_corners == 4), None] + np.arange(4)])
@@ -186,10 +172,9 @@ def read_xml(path: Path, options: LoadOptions, part: str | None) -> list[RawBody
     """The surface of an XML file of polygons or cells, a body for each of its pieces."""
     file = _Xml(path, options)
     pieces = list(file.root.iter("Piece"))
-    if len(pieces) > 1:
-        names = distinct(f"piece {i}" for i in range(1, len(pieces) + 1))
-        return [file.body(piece, name) for piece, name in zip(pieces, names, strict=True)]
-    return [file.body(piece) for piece in pieces]
+    if len(pieces) == 1:
+        return [_body(*file.geometry(pieces[0]))]
+    return [_body(*file.geometry(piece), f"piece {number}") for number, piece in enumerate(pieces, 1)]
 
 
 class _Xml:
@@ -212,23 +197,19 @@ class _Xml:
             raise ValueError(f"it is compressed by {name}, which is not read; write it with zlib or without")
         self._compressor = None if name is None else _COMPRESSORS[name]
 
-    def body(self, piece: Element, part: str | None = None) -> RawBody:
-        return _body(*self.geometry(piece), part)
-
-    def geometry(self, piece: Element) -> tuple[NDArray[np.float64], list[tuple[Cells, NDArray[np.int64]]]]:
-        """Points, and cells with their kinds."""
+    def geometry(self, piece: Element) -> tuple[Floats, list[Cells]]:
+        """Points and cells."""
         points = piece.find("Points/DataArray")
         if points is None:
             raise ValueError("no points in it")
         vertices = self.array(points).astype(np.float64).reshape(-1, 3)
-        cells: list[tuple[Cells, NDArray[np.int64]]] = []
+        cells: list[Cells] = []
         for group in (*_POLYS, "Cells"):
             arrays = {one.get("Name"): self.array(one) for one in piece.findall(f"{group}/DataArray")}
             if len(arrays) >= 2:
-                offsets = arrays["offsets"].astype(np.int64)
-                n_corners = np.asarray(np.diff(offsets, prepend=0), dtype=np.int64)
+                n_corners = np.asarray(np.diff(arrays["offsets"].astype(np.int64), prepend=0), dtype=np.int64)
                 kinds = arrays.get("types", np.full(len(n_corners), _POLYS.get(group, 0)))
-                cells.append(((arrays["connectivity"].astype(np.int64), n_corners), kinds.astype(np.int64)))
+                cells.append((arrays["connectivity"].astype(np.int64), n_corners, kinds.astype(np.int64)))
         return vertices, cells
 
     def array(self, element: Element) -> NDArray[np.generic]:
@@ -237,13 +218,13 @@ class _Xml:
         kind = kind.newbyteorder(self._order)
         where, text = element.get("format"), element.text or ""
         if where == "ascii":
-            return _data_arrays.from_text(text, kind)
+            return _xml.from_text(text, kind)
         if where == "appended":
             return np.frombuffer(self._block(self._appended[int(element.get("offset", "0")) :], self._is_raw), kind)
         return np.frombuffer(self._block("".join(text.split()).encode(), False), kind)
 
     def _block(self, content: bytes, is_raw: bool) -> bytes:
-        """What stands behind a header that tells its size, or the sizes of its compressed blocks."""
+        """The bytes behind a header of their size, or of the sizes of their compressed blocks."""
         size = self._header.itemsize
         (n,) = np.frombuffer(_first(size, content, is_raw), self._header).tolist()
         if self._compressor is None:
@@ -255,7 +236,7 @@ class _Xml:
         blocks, at = [], 0
         for number, n_packed in enumerate(packed):
             unpacked = n_last if number == n - 1 and n_last else n_bytes
-            blocks.append(_data_arrays.inflated(rest[at : at + n_packed], unpacked, self._compressor))
+            blocks.append(_xml.inflated(rest[at : at + n_packed], unpacked, self._compressor))
             at += n_packed
         return b"".join(blocks)
 
@@ -272,12 +253,10 @@ def _n_letters(n_bytes: int) -> int:
     return 4 * -(-n_bytes // 3)
 
 
-def _body(
-    vertices: NDArray[np.float64], cells: list[tuple[Cells, NDArray[np.int64]]], part: str | None = None
-) -> RawBody:
+def _body(vertices: Floats, cells: list[Cells], part: str | None = None) -> RawBody:
     """The surface of some cells, whose corners are checked: they are laid end to end."""
     faces = [np.zeros((0, 3), dtype=np.int64)]
-    for (corners, n_corners), kinds in cells:
+    for corners, n_corners, kinds in cells:
         if len(kinds) != len(n_corners) or (n_corners < 0).any() or n_corners.sum() != len(corners):
             raise ValueError("numbers of cells and corners do not agree")
         faces.append(_vtk_cells.surface(corners, n_corners, kinds))
