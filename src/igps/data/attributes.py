@@ -17,6 +17,8 @@ from igps.signature.signature import Signature
 
 ROOMS = ("interior", "surface")
 
+PointFunction = Callable[..., NDArray[np.floating[Any]]]
+
 
 @runtime_checkable
 class AttributeSource(Protocol):
@@ -67,7 +69,7 @@ class FunctionAttribute:
         return self.function(body, points)
 
 
-def takes_body(function: Callable[..., Any]) -> bool:
+def _takes_body(function: Callable[..., Any]) -> bool:
     """Whether a function has to be given two things, a body and points."""
     try:
         given = inspect.signature(function).parameters.values()
@@ -77,6 +79,22 @@ def takes_body(function: Callable[..., Any]) -> bool:
         sum(one.default is one.empty and one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in given)
         == 2
     )
+
+
+def sorted_out(
+    given: Mapping[str, AttributeSource | PointFunction],
+) -> tuple[dict[str, AttributeSource], dict[str, PointFunction]]:
+    """Attributes that are kept in the cache, and functions of points, which are called at each reading."""
+    sources: dict[str, AttributeSource] = {}
+    functions: dict[str, PointFunction] = {}
+    for name, one in given.items():
+        if isinstance(one, AttributeSource):
+            sources[name] = one
+        elif _takes_body(one):
+            sources[name] = FunctionAttribute(one)
+        else:
+            functions[name] = one
+    return sources, functions
 
 
 def with_attribute(signature: Signature, name: str, values: Mapping[str, ArrayLike]) -> Signature:

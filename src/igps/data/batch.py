@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -175,15 +175,8 @@ class SignatureBatch:
         """One shape as a `Body` by its number; some as a batch by a slice, numbers, or a mask."""
         if isinstance(index, int | np.integer):
             return self._body(range(len(self))[index])
-        rows: slice | Tensor
-        if isinstance(index, slice):
-            chosen, rows = list(range(len(self))[index]), index
-        else:
-            given = torch.as_tensor(index)
-            if given.dtype == torch.bool and given.shape != (len(self),):
-                raise IndexError(f"mask: expected {len(self)} entries, got a tensor of shape {tuple(given.shape)}.")
-            chosen = torch.arange(len(self))[given.cpu() if given.numel() else given.long()].tolist()
-            rows = torch.tensor(chosen, dtype=torch.int64, device=self.labels.device)
+        chosen = chosen_of(index, len(self))
+        rows = index if isinstance(index, slice) else torch.tensor(chosen, dtype=torch.int64, device=self.labels.device)
         return replace(
             self.map(lambda values: values[rows]),
             ids=tuple(self.ids[i] for i in chosen),
@@ -258,6 +251,21 @@ class SignatureBatch:
         )
 
 
+def chosen_of(index: slice | Sequence[Any] | Tensor | NDArray[Any], n: int) -> list[int]:
+    """The numbers that a slice, numbers, or a mask choose among n.
+
+    Raises:
+        IndexError: a mask of another length, or a number that is too large.
+    """
+    if isinstance(index, slice):
+        return list(range(n))[index]
+    given = index.cpu() if isinstance(index, Tensor) else torch.as_tensor(np.asarray(index))
+    if given.dtype == torch.bool and given.shape != (n,):
+        raise IndexError(f"mask: expected {n} entries, got an array of shape {tuple(given.shape)}.")
+    found: list[int] = torch.arange(n)[given if given.numel() else given.long()].tolist()
+    return found
+
+
 def _joined(parts: Sequence[Tensor], padding: float = 0) -> Tensor:
     """(N₁ + N₂ + …, ...), padded up to the largest size along each further dimension."""
     shape = [max(sizes) for sizes in zip(*(part.shape[1:] for part in parts), strict=True)]
@@ -276,12 +284,11 @@ def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:
             raise ValueError(
                 f"batches: all must carry the same sample attributes, got {names} and {sorted(part.attributes)}."
             )
-    return SampleBatch(
-        points=_joined([part.points for part in parts]),
-        eigenfunctions=_joined([part.eigenfunctions for part in parts]),
-        mask=_joined([part.mask for part in parts]),
-        attributes={name: _joined([part.attributes[name] for part in parts]) for name in names},
+    points, eigenfunctions, mask = (
+        _joined([getattr(part, name) for part in parts]) for name in ("points", "eigenfunctions", "mask")
     )
+    attributes = {name: _joined([part.attributes[name] for part in parts]) for name in names}
+    return SampleBatch(points, eigenfunctions, mask, attributes)
 
 
 def _samples_of(batch: SampleBatch, i: int, n_eigenpairs: int) -> Samples:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
-import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self, overload
 
@@ -16,39 +14,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
-from tqdm import tqdm
 
 from igps._parallel import Failed, Limits
-from igps.data.attributes import ROOMS, AttributeSource, FunctionAttribute, takes_body, with_attribute
-from igps.data.batch import LabelledSignature, SignatureBatch
+from igps.data.attributes import ROOMS, AttributeSource, PointFunction, sorted_out, with_attribute
+from igps.data.batch import LabelledSignature, SignatureBatch, chosen_of
 from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.collation import collate
 from igps.data.collection import About, CollectionFile, write_collection
-from igps.data.file_stat_cache import FileStatCache
-from igps.data.filling import check_visible, filled, hits_in_cache
+from igps.data.filling import Failure, fill, hits_in_cache
 from igps.data.pipeline import CacheHit, PreTransform, SignaturePipeline
 from igps.data.requirements import Requirements, Requiring, requirements_of
-from igps.data.sources import Bodies, ClassRule, find_bodies, given_bodies
-from igps.mesh.loading import BodyRef
+from igps.data.sources import Bodies, ClassRule, bodies_of
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature, SignatureConfig
 
-logger = logging.getLogger(__name__)
-
-_REMEMBERED_AT_ONCE = 1000
-
-PointFunction = Callable[..., NDArray[np.floating[Any]]]
-Index = int | str | slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A body that could not be used, and why."""
-
-    id: str
-    path: Path
-    error: str
+Several = slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
 
 
 class SignatureDataset(Dataset[LabelledSignature]):
@@ -112,16 +93,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
         if descriptor is not None:
             requirements = requirements_of(descriptor)
             config, given = requirements.apply_to(config), {**requirements.sources, **given}
-        sources: dict[str, AttributeSource] = {}
-        self._functions: dict[str, PointFunction] = {}
-        for name, one in given.items():
-            if isinstance(one, AttributeSource):
-                sources[name] = one
-            elif takes_body(one):
-                sources[name] = FunctionAttribute(one)
-            else:
-                self._functions[name] = one
-        self.bodies = _bodies(root_or_paths, labels, reading, sources.values()).classed(classes or "folder")
+        sources, self._functions = sorted_out(given)
+        bodies = bodies_of(root_or_paths, labels, reading, sources.values())
+        self.bodies = bodies.classed(classes or "folder")
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
         if pre_transform is not None and pre_transform.cache_tag and self._functions:
             raise ValueError("pre_transform: expected attributes with a cache_tag beside it, got a function of points.")
@@ -171,24 +145,16 @@ class SignatureDataset(Dataset[LabelledSignature]):
     @overload
     def __getitem__(self, index: int | str) -> LabelledSignature: ...  # type: ignore[overload-overlap]
     @overload
-    def __getitem__(
-        self, index: slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
-    ) -> Self: ...
-    def __getitem__(self, index: Index) -> LabelledSignature | Self:
+    def __getitem__(self, index: Several) -> Self: ...
+    def __getitem__(self, index: int | str | Several) -> LabelledSignature | Self:
         """An item by number or name; the dataset of some of the bodies by slice, numbers, names, or mask."""
         if isinstance(index, str):
-            return self._item(self._number(index))
+            index = self._number(index)
         if isinstance(index, int | np.integer):
             return self._item(range(len(self))[index])
-        if isinstance(index, slice):
-            return self.subset(range(len(self))[index])
-        found = list(index)
-        if found and all(isinstance(one, str) for one in found):
-            return self.subset([self._number(str(one)) for one in found])
-        numbers = torch.as_tensor(np.asarray(index))
-        if numbers.dtype == torch.bool and numbers.shape != (len(self),):
-            raise IndexError(f"mask: expected {len(self)} entries, got an array of shape {tuple(numbers.shape)}.")
-        return self.subset(torch.arange(len(self))[numbers if found else numbers.long()].tolist())
+        if not isinstance(index, slice | Tensor):
+            index = [self._number(one) if isinstance(one, str) else one for one in index]
+        return self.subset(chosen_of(index, len(self)))
 
     def _number(self, name: str) -> int:
         try:
@@ -311,19 +277,10 @@ class SignatureDataset(Dataset[LabelledSignature]):
         Raises:
             MeshError: a body that cannot be used; see `usable`.
         """
-        hits = [hit if hit is not None else self.pipeline.hit(self.bodies[i]) for i, hit in enumerate(self._hits)]
-        about = About(
-            names=self.bodies.names,
-            parts=self.bodies.parts,
-            labels=self.bodies.labels,
-            classes=self.classes,
-            keys=tuple(hit.whole_key for hit in hits),
-            reading=asdict(self.reading),
-            config=asdict(self.config),
-            columns=dict(self.bodies.columns),
-        )
         whole = copy.copy(self)
+        hits = [hit or self.pipeline.hit(body) for hit, body in zip(self._hits, self.bodies, strict=True)]
         whole._hits = tuple(hits)
+        about = About(self.bodies, self.classes, tuple(hit.whole_key for hit in hits), self.reading, self.config)
         write_collection(Path(path), about, whole._signature)
 
     @classmethod
@@ -359,19 +316,13 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """
         file = CollectionFile(path)
         about = file.about
-        try:
-            config = SignatureConfig(**{**about.config, "attributes": tuple(about.config["attributes"])})
-            reading = LoadOptions(**about.reading)
-        except (TypeError, KeyError, ValueError) as error:
-            raise ValueError(f"{path}: parameters of another version ({error}). Export it again.") from error
         if descriptor is not None:
-            requirements_of(descriptor).check_config(config)
-        paths = tuple(Path(name.removesuffix(f"#{part}")) for name, part in zip(about.names, about.parts, strict=True))
-        bodies = Bodies(paths, about.names, about.labels, about.parts, about.columns)
+            requirements_of(descriptor).check_config(about.config)
         dataset = cls.__new__(cls)
-        SignatureDataset.__init__(dataset, bodies, config, cache_dir, reading=reading, transform=transform)
-        dataset.classes = about.classes
-        dataset._at_hand = file
+        SignatureDataset.__init__(
+            dataset, about.bodies, about.config, cache_dir, reading=about.reading, transform=transform
+        )
+        dataset.classes, dataset._at_hand = about.classes, file
         dataset._hits = tuple(CacheHit(key, 0, file.notes(i), (0, 0, 0)) for i, key in enumerate(about.keys))
         return dataset
 
@@ -403,37 +354,12 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """
         if self._at_hand is not None:
             return []
-        SignatureCache(self.pipeline.cache_dir).remove_abandoned()
-        known = FileStatCache(self.pipeline)
-        found = hits_in_cache(self.pipeline, self.bodies, look=executor is None)
-        failures: dict[int, Failure] = {}
-        new: dict[BodyRef, CacheHit] = {}
-        missing = [i for i, hit in enumerate(found) if hit is None]
-        outcomes = filled(
-            self.pipeline, self.bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits()
-        )
-        with (
-            tqdm(total=len(self), initial=len(self) - len(missing), desc="signatures", disable=not progress) as bar,
-            contextlib.closing(outcomes),
-            contextlib.ExitStack() as at_the_end,
-        ):
-            at_the_end.callback(lambda: known.remember(new))
-            for i, outcome in outcomes:
-                bar.update()
-                if not isinstance(outcome, Failed):
-                    if not new:
-                        check_visible(self.pipeline, outcome)
-                    new[self.bodies[i]] = found[i] = outcome
-                    if len(new) >= _REMEMBERED_AT_ONCE:
-                        known.remember(new)
-                        new.clear()
-                    continue
-                failures[i] = self.failure(i, outcome)
-                if strict:
-                    raise MeshError(failures[i].error)
-                logger.warning("skipped: %s", failures[i].error)
-        self._hits = tuple(found)
-        return [failures[i] for i in sorted(failures)]
+        hits, failures = fill(
+            self.pipeline, self.bodies, executor=executor, n_workers=n_workers, strict=strict, progress=progress,
+            limits=limits or Limits(),
+        )  # fmt: skip
+        self._hits = tuple(hits)
+        return failures
 
     def _found(self) -> list[CacheHit | None]:
         """What serves each body, as far as something does."""
@@ -444,19 +370,4 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def failure(self, index: int, failed: Failed) -> Failure:
         """What failed of a body, in a sentence that names its file."""
-        path, reason = self.bodies.paths[index], failed.reason
-        named = reason if reason.startswith(str(path)) else f"{self.bodies[index]}: {reason}"
-        return Failure(self.bodies.names[index], path, named)
-
-
-def _bodies(
-    given: str | Path | Sequence[str | Path] | Bodies,
-    labels: Sequence[str] | None,
-    reading: LoadOptions,
-    attributes: Iterable[AttributeSource],
-) -> Bodies:
-    if isinstance(given, Bodies):
-        return given
-    if isinstance(given, str | Path) and Path(given).is_dir():
-        return find_bodies(given, reading, attributes=attributes)
-    return given_bodies([given] if isinstance(given, str | Path) else given, labels, reading)
+        return Failure.of(self.bodies, index, failed)

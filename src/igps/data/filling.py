@@ -1,14 +1,17 @@
-"""The cache is filled: what it has of many bodies, and the rest computed by processes here or elsewhere."""
+"""The cache is filled: what it has of many bodies serves, the rest is computed by processes here or elsewhere."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+
+from tqdm import tqdm
 
 from igps._parallel import Failed, Limits, MachineError, n_cores, run
 from igps.data.cache import SignatureCache
@@ -18,8 +21,66 @@ from igps.data.sources import Bodies
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import MeshError
 
+logger = logging.getLogger(__name__)
+
+_REMEMBERED_AT_ONCE = 1000
 # Seconds until a file that another machine wrote is seen here, by a file system for many.
 _SHARED_WITHIN = 60.0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A body that could not be used, and why."""
+
+    id: str
+    path: Path
+    error: str
+
+    @staticmethod
+    def of(bodies: Bodies, i: int, failed: Failed) -> Failure:
+        """What failed of a body, in a sentence that names its file."""
+        path, reason = bodies.paths[i], failed.reason
+        return Failure(bodies.names[i], path, reason if reason.startswith(str(path)) else f"{bodies[i]}: {reason}")
+
+
+def fill(
+    pipeline: SignaturePipeline,
+    bodies: Bodies,
+    *,
+    executor: Executor | None,
+    n_workers: int | None,
+    strict: bool,
+    progress: bool,
+    limits: Limits,
+) -> tuple[list[CacheHit | None], list[Failure]]:
+    """What serves each body, after computing what was missing; and what failed, see `SignatureDataset.precompute`."""
+    SignatureCache(pipeline.cache_dir).remove_abandoned()
+    known = FileStatCache(pipeline)
+    found = hits_in_cache(pipeline, bodies, look=executor is None)
+    failures: dict[int, Failure] = {}
+    new: dict[BodyRef, CacheHit] = {}
+    missing = [i for i, hit in enumerate(found) if hit is None]
+    outcomes = filled(pipeline, bodies, missing, n_workers=n_workers, executor=executor, limits=limits)
+    bar = tqdm(total=len(bodies), initial=len(bodies) - len(missing), desc="signatures", disable=not progress)
+    with bar, contextlib.closing(outcomes):
+        try:
+            for i, outcome in outcomes:
+                bar.update()
+                if isinstance(outcome, Failed):
+                    failures[i] = Failure.of(bodies, i, outcome)
+                    if strict:
+                        raise MeshError(failures[i].error)
+                    logger.warning("skipped: %s", failures[i].error)
+                    continue
+                if not new:
+                    check_visible(pipeline, outcome)
+                new[bodies[i]] = found[i] = outcome
+                if len(new) >= _REMEMBERED_AT_ONCE:
+                    known.remember(new)
+                    new.clear()
+        finally:
+            known.remember(new)
+    return found, [failures[i] for i in sorted(failures)]
 
 
 def hits_in_cache(pipeline: SignaturePipeline, bodies: Bodies, look: bool = True) -> list[CacheHit | None]:
@@ -67,14 +128,14 @@ def filled(
     """
     most = 1 if limits != Limits() else at_once or max(1, -(-len(numbers) // (n_workers or n_cores())))
     jobs = [group[start : start + most] for group in _by_file(bodies, numbers) for start in range(0, len(group), most)]
-    fill: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
+    work: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
     given = [[bodies[i] for i in job] for job in jobs]
     if executor is not None:  # elsewhere, and from another folder
         there = replace(pipeline, cache_dir=pipeline.cache_dir.absolute())
-        fill = partial(fill_elsewhere, there.fill, version())
+        work = partial(fill_elsewhere, there.fill, version())
         given = [[replace(body, path=body.path.absolute()) for body in job] for job in given]
     lost: list[int] = []
-    results = run(fill, given, n_workers=n_workers, executor=executor, limits=limits)
+    results = run(work, given, n_workers=n_workers, executor=executor, limits=limits)
     with contextlib.closing(results):
         for number, outcome in results:
             job = jobs[number]
