@@ -29,24 +29,16 @@ _FOUND, _OTHER = PALETTE[0], "#777777"
 
 
 def write_answer(out: Path, name: str, rows: Sequence[Mapping[str, Any]], figure: Figure | None = None) -> None:
-    """Write NAME.csv, a line a row, NAME.json with the same, and the picture as NAME.svg and NAME.png.
-
-    Args:
-        out: the folder.
-        name: of the files.
-        rows: of one table.
-        figure: without one, or without rows, there is no picture.
-    """
+    """Write NAME.csv, a line a row, NAME.json with the same, and the picture, if any, as NAME.svg and NAME.png."""
     out.mkdir(parents=True, exist_ok=True)
     (out / f"{name}.json").write_text(json.dumps(list(rows), indent=2) + "\n")
     with (out / f"{name}.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else [])
         writer.writeheader()
         writer.writerows(rows)
-    if figure is None:
-        return
-    for kind in ("svg", "png"):
-        figure.savefig(out / f"{name}.{kind}", dpi=150)
+    if figure is not None:
+        figure.savefig(out / f"{name}.svg")
+        figure.savefig(out / f"{name}.png", dpi=150)
 
 
 def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:

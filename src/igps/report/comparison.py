@@ -8,32 +8,25 @@ from pathlib import Path
 from igps.report.drawing import PALETTE, new_figure
 from igps.retrieval import PrecisionRecallCurve
 
-# Told apart by every kind of colour vision (Okabe and Ito 2008), without their yellow, which is too light for a line.
-# The second and third round of colours.
+# The second and third round of colours
 _STYLES = ("-", "--", ":")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
 
 
 def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> None:
-    """Draw the precision of systems at equal levels of recall, both in percent.
+    """Draw the precision of systems at equal levels of recall, both in percent, as a PNG file.
 
     Args:
         curves: of each system by name, in the order of the legend.
-        out: the PNG file.
+        out: the file.
     """
     figure = new_figure(8.5, 5.2)
     axes = figure.add_subplot()
     for i, (name, curve) in enumerate(curves.items()):
-        axes.plot(
-            100 * curve.recall.numpy(),
-            100 * curve.precision.numpy(),
-            label=name,
-            color=PALETTE[i % len(PALETTE)],
-            linestyle=_STYLES[i // len(PALETTE) % len(_STYLES)],
-            marker=_MARKERS[i % len(_MARKERS)],
-            markersize=4,
-            linewidth=1.4,
-        )
+        colour, line = PALETTE[i % len(PALETTE)], _STYLES[i // len(PALETTE) % len(_STYLES)]
+        recall, precision = 100 * curve.recall.numpy(), 100 * curve.precision.numpy()
+        (drawn,) = axes.plot(recall, precision, label=name, color=colour, linestyle=line, linewidth=1.4)
+        drawn.set(marker=_MARKERS[i % len(_MARKERS)], markersize=4)
     axes.set(xlim=(0, 102), ylim=(0, 102))
     axes.set_xlabel("recall: share of the query's class that is found (%)")
     axes.set_ylabel("precision: share of the query's class among the found (%)")

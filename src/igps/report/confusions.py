@@ -15,18 +15,11 @@ _N_WRONG = 3
 
 @dataclass(frozen=True)
 class Confusion:
-    """A query, and the wrong shapes that come too early in its ranking. Ranks count from 1, without the query itself.
+    """A query, and the wrong shapes that come too early in its ranking; ranks count from 1, without the query."""
 
-    Args:
-        query: its number.
-        rank: of the first shape of its class.
-        wrong: ranks of the nearest shapes of other classes before that one; where that one is nearest, of those in the
-            first tier. At most three.
-    """
-
-    query: int
-    rank: int
-    wrong: tuple[int, ...]
+    query: int  # its number
+    rank: int  # of the first shape of its class
+    wrong: tuple[int, ...]  # ranks of the nearest, at most three, of other classes before it; or in the first tier
 
 
 def worst_confusions(
@@ -39,8 +32,7 @@ def worst_confusions(
 
     Args:
         order: (N, N − 1) the ranking of each shape, see `System.ranked`.
-        labels: N classes.
-        names: N names.
+        labels, names: of the N shapes.
         first_tier: (N,) shares; NaN for a shape without another of its class.
     """
     _, codes = np.unique(np.asarray(labels), return_inverse=True)

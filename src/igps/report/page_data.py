@@ -21,6 +21,7 @@ from igps.retrieval import RetrievalScores
 
 _LEAST_RANKED = 48
 _DECIMALS = 5
+_OF_QUERIES = ("nn", "ft", "st", "map")
 # Fewer are no map; more take too long to lay out, and no browser draws them well
 _LEAST_MAPPED, _MOST_MAPPED = 3, 3000
 
@@ -84,11 +85,9 @@ def _shapes(
             place += 1
         if name in explanations:
             painted = explanations[name]
-            shape["explained"] = {
-                "other": results.names.index(painted.other),
-                "told": painted.told,
-                "values": [letters(values.tobytes()) for values in painted.values],
-            }
+            values = [letters(one.tobytes()) for one in painted.values]
+            other = results.names.index(painted.other)
+            shape["explained"] = {"other": other, "told": painted.told, "values": values}
         found.append(shape)
     return found
 
@@ -111,7 +110,7 @@ def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str],
         "distances": letters(distances.astype("<f4").tobytes()),
         "scores": None if scores is None else _rounded(scores.mean()),
         "per_class": None if scores is None else _per_class(scores, classes),
-        "per_query": None if scores is None else _per_query(scores),
+        "per_query": None if scores is None else {one: _numbers(getattr(scores, one).tolist()) for one in _OF_QUERIES},
         "curve": None if curve is None else [_numbers(curve.recall.tolist()), _numbers(curve.precision.tolist())],
         "confusion": None if system.labels is None else _confusion(order, system.labels, classes),
         "worst": None if scores is None else _worst(system, order, scores, places),
@@ -138,10 +137,6 @@ def _per_class(scores: RetrievalScores, classes: Sequence[str]) -> list[dict[str
     """In the order of the classes; None for one without a scored query."""
     found = {str(label): values for label, values in scores.per_class().items()}
     return [_rounded(found[name]) if name in found else None for name in classes]
-
-
-def _per_query(scores: RetrievalScores) -> dict[str, list[float | None]]:
-    return {name: _numbers(getattr(scores, name).tolist()) for name in ("nn", "ft", "st", "map")}
 
 
 def _confusion(
