@@ -18,15 +18,11 @@ _MOST_ENTRIES, _MOST_ROUNDS = 10**9, 300
 
 @dataclass(frozen=True, eq=False)
 class BodyMap:
-    """Where bodies lie.
+    """Where bodies lie."""
 
-    Args:
-        points: (N, 2), in units of the distances for "mds", in none for "umap".
-        stress: root of the squared errors of all distances over their squares (Kruskal 1964), after the best scaling:
-            0 where the map tells every distance, above 0.2 it distorts much.
-    """
-
-    points: Values
+    points: Values  # (N, 2), in units of the distances for "mds", in none for "umap"
+    # Root of the squared errors of all distances over their squares (Kruskal 1964), after the best scaling: 0 where the
+    # map tells every distance, above 0.2 it distorts much
     stress: float
 
 

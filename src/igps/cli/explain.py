@@ -10,8 +10,7 @@ import numpy as np
 from igps.analysis.explanation import KINDS, Explanation, explain_groups, on_surface
 from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import squared_distances
-from igps.cli.reading import Folder
-from igps.cli.retrieval import described
+from igps.cli.reading import Folder, described
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
 from igps.mesh.mesh import Mesh
@@ -20,11 +19,7 @@ from igps.report.answers import explanation_figure, write_answer
 
 
 def explain(
-    meshes: list[Path],
-    descriptor: str = "pretrained",
-    level: float = 0.05,
-    out: Path | None = None,
-    **reading: Any,
+    meshes: list[Path], descriptor: str = "pretrained", level: float = 0.05, out: Path | None = None, **reading: Any
 ) -> dict[str, Any]:
     """Tell where two bodies differ, or two groups of bodies: their distance, shared out and painted on both.
 
@@ -39,22 +34,21 @@ def explain(
     module = descriptor_of(descriptor)
     if len(meshes) == 1 and meshes[0].is_dir():
         inner = module.descriptor if isinstance(module, EmbeddedDescriptor) else module
-        dataset, descriptions, _, _ = described(Folder(meshes[0], labelled=True), inner, **reading)
-        labels = np.array(dataset.bodies.labels)
-        names = sorted(set(labels))
-        if len(names) != 2:
-            raise ValueError(f"meshes: expected a folder of two classes, got {len(names)}.")
-        members = [np.flatnonzero(labels == name) for name in names]
+        bodies = described(Folder(meshes[0], labelled=True), inner, **reading)
+        dataset, descriptions, labels = bodies.dataset, bodies.descriptions, np.array(bodies.dataset.bodies.labels)
+        classes = sorted(set(labels))
+        if len(classes) != 2:
+            raise ValueError(f"meshes: expected a folder of two classes, got {len(classes)}.")
+        members = [np.flatnonzero(labels == name) for name in classes]
         squares = squared_distances(descriptions.flatten(1).double().sqrt().numpy())
         chosen = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]  # the medoids
         batches = [dataset.batch([i]) for i in chosen]
         found, kept = explain_groups(module, descriptions[members[0]], descriptions[members[1]], batches, level=level)
         print(f"{int(kept.sum())} of {len(kept)} cells differ by more than chance; painted: the middle of each group")
     else:
-        dataset, _, _, _ = described(meshes, module, **{**reading, "strict": True})
+        dataset, chosen = described(meshes, module, **{**reading, "strict": True}).dataset, [0, 1]
         if len(dataset) != 2:
             raise ValueError(f"meshes: expected two bodies, got {len(dataset)}. Name two files, or FILE#PART.")
-        chosen = [0, 1]
         found = explain_pair(module, *(dataset.batch([i]) for i in chosen))
     names = [dataset.bodies.names[i] for i in chosen]
     print(f"{' and '.join(names)}: {found.distance:.4g} by {descriptor}: {found.told()}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,10 +9,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from igps.analysis.groups import GroupTest, group_test, vectors_of, with_discovery_rates
-from igps.cli.reading import Folder
-from igps.cli.retrieval import described
-from igps.descriptors import descriptor as descriptor_of
+from igps.analysis.groups import group_test, vectors_of, with_discovery_rates
+from igps.cli.reading import Folder, described, print_failures
 from igps.report.answers import groups_figure, write_answer
 from igps.report.tables import groups_table
 
@@ -37,7 +34,6 @@ def groups(
 
     Args:
         root: folder with one subfolder per group, or with files and a labels.csv (columns file,label and more).
-        descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
         group: a column of labels.csv that tells the groups; the class if not given.
         strata: a column within whose values bodies are permuted, such as scanner.
         covariate: columns of numbers that are regressed out first, such as age.
@@ -46,13 +42,11 @@ def groups(
         n_permutations: random ones.
         seed: of what is random.
     """
-    folder = Folder(root, labelled=group is None)
-    dataset, descriptions, failures, name = described(folder, descriptor, size="ignore", **reading)
-    chosen = descriptor_of(name)
-    bodies = dataset.bodies
-    vectors = {"": vectors_of(chosen, descriptions)}
+    found = described(Folder(root, labelled=group is None), descriptor, size="ignore", **reading)
+    bodies = found.dataset.bodies
+    vectors = {"": vectors_of(found.descriptor, found.descriptions)}
     if size:
-        vectors[", size"] = np.log([[dataset[i].signature.volume] for i in range(len(dataset))])
+        vectors[", size"] = np.log([[one.volume] for one in found.dataset.signatures()])
     labels = np.array(bodies.labels if group is None else bodies.column(group))
     of_strata = None if strata is None else np.array(bodies.column(strata))
     of_covariates = np.array([bodies.numbers(name) for name in covariate]).T if covariate else None
@@ -60,27 +54,20 @@ def groups(
     for i, part in enumerate(bodies.parts):
         members.setdefault(part or "all", []).append(i)
     jobs = [(body + what, places, rows[places]) for body, places in members.items() for what, rows in vectors.items()]
-    tests = [
+    tests = with_discovery_rates([
         group_test(
-            rows,
-            labels[places].tolist(),
+            rows, labels[places].tolist(), body=body, n_permutations=n_permutations, seed=seed,
             strata=None if of_strata is None else of_strata[places].tolist(),
             covariates=None if of_covariates is None else of_covariates[places],
-            body=body,
-            n_permutations=n_permutations,
-            seed=seed,
         )
         for body, places, rows in tqdm(jobs, desc="tests")
-    ]
-    tests = with_discovery_rates(tests)
+    ])  # fmt: skip
     print(groups_table(tests))
-    if failures:
-        print(f"{len(failures)} bodies could not be used.")
+    print_failures(found.failures, len(bodies))
     if out is not None:
-        write_answer(out, "groups", _rows(tests), groups_figure(tests))
+        rows = [asdict(one) for one in tests]
+        for row in rows:
+            row["sizes"] = " ".join(f"{name}:{count}" for name, count in row["sizes"].items())
+        write_answer(out, "groups", rows, groups_figure(tests))
         print(f"written to {out}")
     return [asdict(one) for one in tests]
-
-
-def _rows(tests: Sequence[GroupTest]) -> list[dict[str, Any]]:
-    return [{**asdict(one), "sizes": " ".join(f"{name}:{count}" for name, count in one.sizes.items())} for one in tests]

@@ -8,9 +8,7 @@ from typing import Any
 from igps.analysis.groups import squared_distances, vectors_of
 from igps.analysis.outliers import measures_of
 from igps.analysis.outliers import outliers as find_outliers
-from igps.cli.reading import Folder
-from igps.cli.retrieval import described
-from igps.descriptors import descriptor as descriptor_of
+from igps.cli.reading import Folder, described, print_failures
 from igps.report.answers import outliers_figure, write_answer
 
 
@@ -19,7 +17,6 @@ def outliers(
     descriptor: str = "pretrained",
     top: int = 20,
     out: Path | None = None,
-    n_workers: int | None = None,
     **reading: Any,
 ) -> list[dict[str, Any]]:
     """List the bodies that are most unlike their class, to look at before the collection is trusted.
@@ -30,15 +27,13 @@ def outliers(
 
     Args:
         root: folder with one subfolder per class, or with files and a labels.csv (columns file,label).
-        descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
         top: how many to list.
         out: folder for outliers.csv and outliers.json with all, and pictures of the first as outliers.svg and .png.
-        n_workers: processes that compute; all cores if not given.
     """
-    reading = {"size": "ignore", **reading, "n_workers": n_workers}
-    dataset, descriptions, failures, name = described(Folder(root, labelled=True), descriptor, **reading)
-    distances = squared_distances(vectors_of(descriptor_of(name), descriptions)) ** 0.5
-    measures = measures_of(dataset, n_workers=n_workers)
+    bodies = described(Folder(root, labelled=True), descriptor, **reading)
+    dataset = bodies.dataset
+    distances = squared_distances(vectors_of(bodies.descriptor, bodies.descriptions)) ** 0.5
+    measures = measures_of(dataset, n_workers=reading.get("n_workers"))
     found = find_outliers(distances, dataset.bodies.labels or (), measures, dataset.all_notes())
     rows: list[dict[str, Any]] = [
         {"body": dataset.bodies.names[one.body], "class": one.label, "score": round(one.score, 3), "reason": one.reason,
@@ -50,8 +45,7 @@ def outliers(
     for row in rows[:top]:
         print(f"{row['score']:>7.1f}  {row['body']:<{width}}  {row['class']}: {row['reason']}")
     print(f"{sum(one.is_outlier for one in found)} of {len(rows)} bodies have a score above what chance explains")
-    if failures:
-        print(f"{len(failures)} bodies could not be used, the first: {failures[0].error}")
+    print_failures(bodies.failures, len(dataset))
     if out is not None:
         pictured = [(one, dataset.mesh(one.body)) for one in found[: min(top, 12)]]
         write_answer(out, "outliers", rows, outliers_figure(pictured))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -86,16 +86,13 @@ def fill(
 def hits_in_cache(pipeline: SignaturePipeline, bodies: Bodies, look: bool = True) -> list[CacheHit | None]:
     """What in the cache serves each body, None where nothing does.
 
-    Args:
-        pipeline: how a body becomes a Signature.
-        bodies: N bodies.
-        look: read the files that are not known or have changed; otherwise nothing serves these.
+    Files that are not known or have changed are read only if `look`; otherwise nothing serves their bodies.
     """
     known = FileStatCache(pipeline)
     ready = known.ready(bodies)
     found = [ready.get(body) for body in bodies]
     new: dict[BodyRef, CacheHit] = {}
-    for group in _by_file(bodies, (i for i, hit in enumerate(found) if hit is None and look)):
+    for group in by_file(bodies, (i for i, hit in enumerate(found) if hit is None and look)):
         with contextlib.suppress(MeshError):  # computing it will say why
             for i, hit in zip(group, pipeline.served([bodies[i] for i in group]), strict=True):
                 if hit is not None:
@@ -120,14 +117,12 @@ def filled(
     process, each of the chunk is tried again alone. With limits, which are of one body, every body is.
 
     Args:
-        pipeline: how a body becomes a Signature.
-        bodies: N bodies.
-        numbers: of those that are computed.
+        numbers: of the bodies that are computed.
         n_workers, executor, limits: see `igps._parallel.run`.
         at_once: bodies in a chunk; so many that every worker has one if None.
     """
     most = 1 if limits != Limits() else at_once or max(1, -(-len(numbers) // (n_workers or n_cores())))
-    jobs = [group[start : start + most] for group in _by_file(bodies, numbers) for start in range(0, len(group), most)]
+    jobs = [group[start : start + most] for group in by_file(bodies, numbers) for start in range(0, len(group), most)]
     work: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
     given = [[bodies[i] for i in job] for job in jobs]
     if executor is not None:  # elsewhere, and from another folder
@@ -162,8 +157,9 @@ def check_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
         time.sleep(0.1)
 
 
-def _by_file(bodies: Bodies, numbers: Iterable[int]) -> Iterator[list[int]]:
+def by_file(bodies: Bodies, numbers: Iterable[int]) -> list[list[int]]:
+    """The numbers of bodies, those of one file together."""
     groups: dict[Path, list[int]] = {}
     for i in numbers:
         groups.setdefault(bodies.paths[i], []).append(i)
-    yield from groups.values()
+    return list(groups.values())
