@@ -114,9 +114,12 @@ def test_further_columns_stay_with_their_bodies(root: Path, tmp_path: Path) -> N
     with pytest.raises(ValueError, match=r"scanner: expected numbers, got 'A' of 2\.obj#spleen"):
         bodies.subset([0]).numbers("scanner")
     dataset = SignatureDataset(bodies, CONFIG, tmp_path / "cache", reading=OBJECTS)
-    assert dataset[["1.obj#spleen", "2.obj#spleen"]].columns["age"] == ("41.5", "30")
+    assert dataset[["1.obj#spleen", "2.obj#spleen"]].bodies.columns["age"] == ("41.5", "30")
     dataset[[0, 1]].to_file(tmp_path / "some.igps")
-    assert SignatureDataset.from_file(tmp_path / "some.igps").columns == {"age": ("30", "41.5"), "scanner": ("A", None)}
+    assert SignatureDataset.from_file(tmp_path / "some.igps").bodies.columns == {
+        "age": ("30", "41.5"),
+        "scanner": ("A", None),
+    }
 
 
 def test_a_table_of_columns_alone_tells_no_classes(root: Path) -> None:

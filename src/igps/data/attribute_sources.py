@@ -59,11 +59,7 @@ class ResidueAttribute:
         return f"residues 1 {self.name}"
 
     def __call__(self, body: BodyRef, points: Values) -> Values:
-        """(P,) or (P, C) at points (P, 3), Å.
-
-        Raises:
-            MeshError: the body is no molecule, or its residues have no such value.
-        """
+        """(P,) or (P, C) at points (P, 3), Å; a MeshError of what is no molecule, or has no such value."""
         if not is_structure(body.path):
             raise MeshError(
                 f"{body}: has no atoms, which {self.name!r} is known of. Give a PDB, mmCIF or PQR file, or choose "
@@ -103,20 +99,12 @@ class FileAttribute(ABC):
     root: Path | None = None
 
     def cache_tag(self, body: BodyRef) -> str:
-        """The kind of source, the array's name, and the content of the file.
-
-        Raises:
-            MeshError: there is no such file.
-        """
+        """The kind of source, the array's name, and the content of the file; a MeshError where there is none."""
         file, name = self.file(body)
         return f"{type(self).__name__} 1 {name} {_checksum(file, stamp_of(file))}"
 
     def __call__(self, body: BodyRef, points: Values) -> Values:
-        """(P,) or (P, C) at points (P, 3).
-
-        Raises:
-            MeshError: the file cannot be used, or knows too few of the points.
-        """
+        """(P,) or (P, C) at points (P, 3); a MeshError where the file is of no use, or knows too few of them."""
         file, name = self.file(body)
         try:
             values = self.values(body, file, name, points)
@@ -269,11 +257,7 @@ def attribute_source(path: str, root: Path | None = None) -> AttributeSource:
 
 
 def attribute_sources(given: Sequence[str], root: Path | None) -> dict[str, AttributeSource]:
-    """Sources by name, of words such as ``ct=images/{stem}.nii.gz``.
-
-    Raises:
-        ValueError: a word without a name or a path.
-    """
+    """Sources by name, of words such as ``ct=images/{stem}.nii.gz``; a ValueError of one without a name or a path."""
     found = {}
     for word in given:
         name, _, path = word.partition("=")

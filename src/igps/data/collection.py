@@ -26,21 +26,13 @@ _KINDS = {"float64": "F64", "float32": "F32"}
 
 @dataclass(frozen=True)
 class About:
-    """What a collection tells of itself.
+    """What a collection tells of itself."""
 
-    Args:
-        bodies: without folders.
-        classes: all names of classes, in the order of their numbers.
-        keys: of the Signatures in the cache that they come from.
-        reading: how the meshes were read.
-        config: of the Signatures.
-    """
-
-    bodies: Bodies
-    classes: tuple[str, ...]
-    keys: tuple[str, ...]
-    reading: LoadOptions
-    config: SignatureConfig
+    bodies: Bodies  # without folders
+    classes: tuple[str, ...]  # all names of classes, in the order of their numbers
+    keys: tuple[str, ...]  # of the Signatures in the cache that they come from
+    reading: LoadOptions  # how the meshes were read
+    config: SignatureConfig  # of the Signatures
 
     def written(self) -> str:
         """All of it as JSON; of the paths, what their names tell."""
@@ -50,11 +42,7 @@ class About:
 
     @staticmethod
     def read(text: str) -> About:
-        """What was written.
-
-        Raises:
-            ValueError, KeyError, TypeError: it does not fit together, or is of another version.
-        """
+        """What was written; a ValueError, KeyError or TypeError where it does not fit together."""
         told: dict[str, Any] = json.loads(text)
         names, parts, columns = _words(told["names"]), tuple(told["parts"]), dict(told.get("columns", {}))
         labels = None if told["labels"] is None else _words(told["labels"])
@@ -84,9 +72,6 @@ def write_collection(path: Path, about: About, signature: Callable[[int], Signat
         path: the file; one that is there is replaced.
         about: N bodies.
         signature: of each, by its number; asked for several times, and not kept.
-
-    Raises:
-        ValueError: so many that no reader would take the file.
     """
     n = len(about.bodies)
     arrays: list[dict[str, tuple[str, tuple[int, ...], int]]] = []
@@ -127,9 +112,6 @@ class CollectionFile:
 
     Reading runs no code. A worker process that is given one opens the file for itself.
 
-    Args:
-        path: the file.
-
     Raises:
         FileNotFoundError: no such file.
         ValueError: not a collection, or a damaged one.
@@ -163,11 +145,7 @@ class CollectionFile:
         return CollectionFile, (self.path,)
 
     def __getitem__(self, index: int) -> Signature:
-        """A Signature by its number; its arrays are views of the file.
-
-        Raises:
-            ValueError: it is damaged, or of another version of the algorithm.
-        """
+        """A Signature by its number, its arrays views of the file; a ValueError where it is damaged, or out of date."""
         metadata = self._told[index]
         try:
             tensors = {name: self._file.get_tensor(f"{index}.{name}").numpy() for name in self._arrays[index]}

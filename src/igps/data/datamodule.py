@@ -94,13 +94,10 @@ class SignatureDataModule(LightningDataModule):
         if has_configuration():
             self.save_hyperparameters()
         self.dataset = SignatureDataset(labelled_bodies(root), config, cache_dir, reading=reading)
-        self.classes_per_batch = classes_per_batch
-        self.shapes_per_class = shapes_per_class
-        self.n_samples_in_memory = n_samples_in_memory
+        self.classes_per_batch, self.shapes_per_class = classes_per_batch, shapes_per_class
+        self.n_samples_in_memory, self.evaluation_batch_size = n_samples_in_memory, evaluation_batch_size
+        self.n_workers, self.n_loading_workers = n_workers, n_loading_workers
         self._in_memory: SignatureDataset | None = None
-        self.n_workers = n_workers
-        self.n_loading_workers = n_loading_workers
-        self.evaluation_batch_size = evaluation_batch_size
         labels = self.dataset.labels
         if protocol == "seen":
             self.split = split_seen(labels, n_train, n_validation=n_validation, seed=split_seed)

@@ -44,15 +44,9 @@ class Failure:
 
 
 def fill(
-    pipeline: SignaturePipeline,
-    bodies: Bodies,
-    *,
-    executor: Executor | None,
-    n_workers: int | None,
-    strict: bool,
-    progress: bool,
-    limits: Limits,
-) -> tuple[list[CacheHit | None], list[Failure]]:
+    pipeline: SignaturePipeline, bodies: Bodies, executor: Executor | None, n_workers: int | None, strict: bool,
+    progress: bool, limits: Limits | None,
+) -> tuple[list[CacheHit | None], list[Failure]]:  # fmt: skip
     """What serves each body, after computing what was missing; and what failed, see `SignatureDataset.precompute`."""
     SignatureCache(pipeline.cache_dir).remove_abandoned()
     known = FileStatCache(pipeline)
@@ -60,7 +54,7 @@ def fill(
     failures: dict[int, Failure] = {}
     new: dict[BodyRef, CacheHit] = {}
     missing = [i for i, hit in enumerate(found) if hit is None]
-    outcomes = filled(pipeline, bodies, missing, n_workers=n_workers, executor=executor, limits=limits)
+    outcomes = filled(pipeline, bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits())
     bar = tqdm(total=len(bodies), initial=len(bodies) - len(missing), desc="signatures", disable=not progress)
     with bar, contextlib.closing(outcomes):
         try:

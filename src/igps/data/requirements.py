@@ -101,6 +101,9 @@ class Requiring(Protocol):
         """What it needs of a body."""
 
 
+AnyDescriptor = str | Requiring | Requirements
+"""A descriptor's name, itself, or its requirements."""
+
 _by_name: list[Callable[[str], Requiring]] = []
 
 
@@ -109,12 +112,8 @@ def register_descriptors(by_name: Callable[[str], Requiring]) -> None:
     _by_name[:] = [by_name]
 
 
-def requirements_of(descriptor: str | Requiring | Requirements) -> Requirements:
-    """What a descriptor needs of a body.
-
-    Args:
-        descriptor: its name, itself, or its requirements.
-    """
+def requirements_of(descriptor: AnyDescriptor) -> Requirements:
+    """What a descriptor needs of a body."""
     if isinstance(descriptor, Requirements):
         return descriptor
     return (_by_name[0](descriptor) if isinstance(descriptor, str) else descriptor).requirements

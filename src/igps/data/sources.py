@@ -57,6 +57,12 @@ class Bodies:
     def __iter__(self) -> Iterator[BodyRef]:
         return map(BodyRef, self.paths, self.parts)
 
+    def number(self, name: str) -> int:
+        """Of the body of a name; a KeyError where none is called so."""
+        if name not in self.names:
+            raise KeyError(f"no body is called {name!r}; the first is called {self.names[:1]}")
+        return self.names.index(name)
+
     def subset(self, indices: Sequence[int]) -> Bodies:
         """Some of the bodies, in the given order."""
         return Bodies(

@@ -31,11 +31,7 @@ class Transform(ABC):
 
     @property
     def cache_tag(self) -> str:
-        """The transform in words.
-
-        Raises:
-            ValueError: without a seed no two Signatures are alike, so none can be kept.
-        """
+        """The transform in words; a ValueError without a seed, as no two Signatures would be alike."""
         if self.seed is None:
             raise ValueError(f"pre_transform: expected a seed, got {self!r}. What is kept must come out alike again.")
         return repr(self)
@@ -50,11 +46,7 @@ class Transform(ABC):
 
 
 class Compose:
-    """Several changes, one after the other.
-
-    Args:
-        transforms: callables from Signature to Signature.
-    """
+    """Several changes, one after the other: callables from Signature to Signature."""
 
     def __init__(self, *transforms: Callable[[Signature], Signature]) -> None:
         self.transforms = transforms
@@ -76,7 +68,6 @@ class FewerSamples(Transform):
     """A random subset of the samples, in their order.
 
     Args:
-        seed: see `Transform`.
         n_interior: interior samples kept at most; None for all.
         n_surface: surface samples kept at most; None for all.
     """
@@ -92,11 +83,8 @@ class FewerSamples(Transform):
             attributes = {name: values[kept] for name, values in samples.attributes.items()}
             return Samples(samples.points[kept], samples.eigenfunctions[kept], attributes)
 
-        return replace(
-            signature,
-            interior=fewer(signature.interior, self.n_interior),
-            surface=fewer(signature.surface, self.n_surface),
-        )
+        interior, surface = fewer(signature.interior, self.n_interior), fewer(signature.surface, self.n_surface)
+        return replace(signature, interior=interior, surface=surface)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +92,6 @@ class FewerEigenpairs(Transform):
     """A random subset of the eigenpairs, ascending. A descriptor that needs more of them refuses the Signature.
 
     Args:
-        seed: see `Transform`.
         n_eigenpairs: kept at most.
     """
 
@@ -124,7 +111,6 @@ class Noise(Transform):
     """Gaussian noise on positions and on eigenfunctions.
 
     Args:
-        seed: see `Transform`.
         points: its standard deviation over √area.
         eigenfunctions: its standard deviation times √area; an eigenfunction's mean square is 1/area.
     """
@@ -152,7 +138,6 @@ class Scale(Transform):
     """The Signature of the body scaled by a random factor, whose logarithm is uniform.
 
     Args:
-        seed: see `Transform`.
         smallest, largest: the factors between which it is drawn.
 
     Raises:
@@ -173,13 +158,9 @@ class Scale(Transform):
             values = samples.eigenfunctions / np.float32(factor)
             return replace(samples, points=samples.points * factor, eigenfunctions=values)
 
-        return replace(
-            signature,
-            eigenvalues=signature.eigenvalues / factor**2,
-            **_both(signature, scaled),
-            area=signature.area * factor**2,
-            volume=signature.volume * factor**3,
-        )
+        eigenvalues, area, volume = signature.eigenvalues / factor**2, signature.area * factor**2, signature.volume
+        both = _both(signature, scaled)
+        return replace(signature, eigenvalues=eigenvalues, area=area, volume=volume * factor**3, **both)
 
 
 @dataclass(frozen=True, kw_only=True)
