@@ -18,15 +18,13 @@ from jsonargparse import ArgumentParser, Namespace
 from igps._parallel import MachineError, is_machines, machines_words
 from igps._threads import one_thread
 from igps.cli import gallery
+from igps.cli.answers import explain, groups, outliers
 from igps.cli.clusters import clusters, map_bodies
 from igps.cli.compare import compare
 from igps.cli.demo import demo
 from igps.cli.doctor import doctor
 from igps.cli.duplicates import distance, duplicates
-from igps.cli.explain import explain
 from igps.cli.fit import classify, fit
-from igps.cli.groups import groups
-from igps.cli.outliers import outliers
 from igps.cli.precompute import cache_export, precompute
 from igps.cli.reading import FLAGS, LISTS, MEANINGS, Verdict
 from igps.cli.report import report

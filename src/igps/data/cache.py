@@ -45,16 +45,11 @@ class FileCache(ABC, Generic[T]):
     killed run leaves of one is removed a day later, see `remove_abandoned`. Two processes that compute the same value
     write the same bytes. Who may read folders and files is for the umask to say.
 
-    Args:
-        directory: made if it is missing.
-
-    Attributes:
-        what: the values are, in a word.
-        folder: of the values in the directory, "" where they lie in it themselves.
+    The directory is made if it is missing.
     """
 
-    what: ClassVar[str]
-    folder: ClassVar[str] = ""
+    what: ClassVar[str]  # the values are, in a word
+    folder: ClassVar[str] = ""  # of the values in the directory, "" where they lie in it themselves
 
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(directory) / self.folder
@@ -203,28 +198,22 @@ class AttributeCache(FileCache[dict[str, NDArray[np.float32]]]):
     """Attributes of the samples of one Signature by room, beside the Signatures."""
 
     what, folder = "attribute", "attributes"
+    _decode = staticmethod(lambda tensors, metadata: {room: tensors[room] for room in _ROOMS})
 
     @staticmethod
     def _encode(value: dict[str, NDArray[np.float32]]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        return {name: np.ascontiguousarray(values) for name, values in value.items()}, {}
-
-    @staticmethod
-    def _decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> dict[str, NDArray[np.float32]]:
-        return {room: tensors[room] for room in _ROOMS}
+        return {name: np.ascontiguousarray(one) for name, one in value.items()}, {}
 
 
 class DescriptionCache(FileCache[NDArray[np.float32]]):
     """Descriptions by key, beside the Signatures, see `FileCache`."""
 
     what, folder = "description", "descriptions"
+    _decode = staticmethod(lambda tensors, metadata: tensors["values"])
 
     @staticmethod
     def _encode(value: NDArray[np.float32]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         return {"values": np.ascontiguousarray(value)}, {}
-
-    @staticmethod
-    def _decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> NDArray[np.float32]:
-        return tensors["values"]
 
 
 def _remove_abandoned(partials: Iterable[Path]) -> None:

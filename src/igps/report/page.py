@@ -10,9 +10,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from igps.report.confusions import N_WORST
 from igps.report.explanations import Painted
-from igps.report.page_data import data_of, letters
+from igps.report.page_data import N_WORST, data_of, letters
 from igps.report.results import Results
 from igps.report.surfaces import Surface
 from igps.report.tables import TITLES
