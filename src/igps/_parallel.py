@@ -146,11 +146,7 @@ def _alone(function: Callable[[Job], Result], job: Job) -> Result:
 
 
 def attempt(result: Callable[[], Result], limits: Limits = Limits()) -> Result | Failed:
-    """The result; the job's failure in words, where the machine is not at fault.
-
-    Raises:
-        MachineError: where it is.
-    """
+    """The result; the job's failure in words; a MachineError where the machine is at fault."""
     try:
         return result()
     except (BrokenExecutor, CancelledError, MachineError):

@@ -27,11 +27,7 @@ class BodyMap:
 
 
 def checked_distances(distances: Values) -> Values:
-    """(N, N) finite, symmetric, zero on the diagonal: the mean of both directions.
-
-    Raises:
-        ValueError: another shape, or entries that are no finite numbers.
-    """
+    """(N, N) symmetric, zero on the diagonal: the mean of both directions; a ValueError of another shape, or NaN."""
     found = np.asarray(distances, dtype=float)
     if found.ndim != 2 or len(found) != found.shape[-1] or len(found) < 3:
         raise ValueError(f"distances: expected (N, N) between three bodies or more, got {found.shape}.")

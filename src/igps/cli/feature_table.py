@@ -62,11 +62,7 @@ def wide_table(known: Table, measured: Table) -> Table:
 
 
 def write_table(path: Path, table: Table) -> None:
-    """Write a table as CSV or Parquet, by the suffix.
-
-    Raises:
-        ImportError: Parquet without pyarrow.
-    """
+    """Write a table as CSV or Parquet, by the suffix; the latter needs pyarrow."""
     if path.suffix.lower() == ".parquet":
         try:
             import pyarrow.parquet

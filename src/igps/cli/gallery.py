@@ -133,11 +133,7 @@ def restore(gallery: Path, version: int) -> None:
 
 
 def as_described(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of how meshes are read, as they were when the gallery was built.
-
-    Raises:
-        ValueError: others are asked for.
-    """
+    """How meshes are read, as it was when the gallery was built; a ValueError where something else is asked for."""
     given, check = dict(reading), partial(check_alike, gallery.path, gallery.about)
     size, mirror, name = given.pop("size", "auto"), given.pop("mirror", "same"), gallery.about["descriptor"]
     if size != "auto":

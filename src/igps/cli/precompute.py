@@ -81,11 +81,7 @@ def cache_export(root: Path, out: Path, descriptors: list[str] | None = None, **
 
 
 def of_shard(n_bodies: int, shard: str | None) -> range:
-    """Which bodies a shard has: every n-th, so that the shards 1/n to n/n have all, each once; all of them if None.
-
-    Raises:
-        ValueError: not two numbers, or the first not one of the second.
-    """
+    """Which bodies a shard has, all if None: every n-th, so that the shards 1/n to n/n have all, each once."""
     if shard is None:
         return range(n_bodies)
     found = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
@@ -96,11 +92,7 @@ def of_shard(n_bodies: int, shard: str | None) -> range:
 
 @contextlib.contextmanager
 def dask_executor(address: str) -> Iterator[Executor]:
-    """The workers of a Dask scheduler, which must have the version of the library that is here.
-
-    Raises:
-        MachineError: no scheduler answers, or a worker has another version.
-    """
+    """The workers of a Dask scheduler; a MachineError where none answers, or one has another version of the library."""
     try:
         from distributed import Client
     except ImportError as error:

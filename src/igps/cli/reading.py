@@ -58,15 +58,10 @@ MEANINGS = {
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder whose bodies are found as the options say, or a file that `igps cache export` wrote of one.
-
-    Args:
-        root: the folder or file.
-        labelled: whether it must tell classes.
-    """
+    """A folder whose bodies are found as the options say, or a file that `igps cache export` wrote of one."""
 
     root: Path
-    labelled: bool = False
+    labelled: bool = False  # whether it must tell classes
 
 
 @dataclass(frozen=True)
@@ -79,21 +74,13 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class Described:
-    """Bodies and their descriptions.
+    """Bodies and their descriptions."""
 
-    Args:
-        dataset: the N bodies that could be used.
-        descriptions: (N, ...).
-        failures: the other bodies.
-        descriptor: that described them.
-        name: by which it is found again; None where no name tells it, as its centres are the collection's.
-    """
-
-    dataset: SignatureDataset
-    descriptions: Tensor
-    failures: list[Failure]
-    descriptor: Descriptor
-    name: str | None
+    dataset: SignatureDataset  # the N bodies that could be used
+    descriptions: Tensor  # (N, ...)
+    failures: list[Failure]  # the other bodies
+    descriptor: Descriptor  # that described them
+    name: str | None  # by which it is found again; None where its centres are the collection's, which no name tells
 
 
 def signatures(

@@ -133,11 +133,7 @@ class FileAttribute(ABC):
         return found
 
     def file(self, body: BodyRef) -> tuple[Path, str]:
-        """The file of a body, and the name of the array in it, which may be "".
-
-        Raises:
-            MeshError: there is none, or the pattern leads out of the folder.
-        """
+        """The file of a body, and the name of the array in it, which may be ""; a MeshError where there is none."""
         pattern, _, name = self.path.partition("#")
         root = body.path.parent if self.root is None else self.root
         try:

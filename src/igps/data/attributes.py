@@ -98,11 +98,7 @@ def sorted_out(
 
 
 def with_attribute(signature: Signature, name: str, values: Mapping[str, ArrayLike]) -> Signature:
-    """The Signature with an attribute of its samples, by room.
-
-    Raises:
-        ValueError: not one finite row for each sample.
-    """
+    """The Signature with an attribute of its samples, by room; a ValueError without one finite row for each."""
     try:
         interior, surface = (getattr(signature, room).with_attributes({name: values[room]}) for room in ROOMS)
     except ValueError as error:

@@ -226,11 +226,7 @@ class SignatureBatch:
 
 
 def chosen_of(index: Several, n: int) -> list[int]:
-    """The numbers that a slice, numbers, or a mask choose among n.
-
-    Raises:
-        IndexError: a mask of another length, or a number that is too large.
-    """
+    """The numbers that a slice, numbers, or a mask choose among n; an IndexError where they do not fit."""
     if isinstance(index, slice):
         return list(range(n))[index]
     given = index.cpu() if isinstance(index, Tensor) else torch.as_tensor(np.asarray(index))

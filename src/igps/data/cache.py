@@ -149,11 +149,7 @@ def encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]
 
 
 def decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Signature:
-    """The Signature that `encode` was given.
-
-    Raises:
-        ValueError, KeyError, TypeError: they make none of the algorithm's version.
-    """
+    """The Signature that `encode` was given; a ValueError, KeyError or TypeError where there is none."""
     config: dict[str, Any] = json.loads(metadata["config"])
     if config.pop("algorithm_version") != SignatureConfig.ALGORITHM_VERSION:
         raise ValueError("made by another version of the algorithm")

@@ -63,11 +63,7 @@ class SignaturePipeline:
     pre_transform: PreTransform | None = None  # done to the Signature with its attributes before it is kept
 
     def mesh(self, body: BodyRef) -> Mesh:
-        """The checked mesh of a body.
-
-        Raises:
-            MeshError: it cannot be used.
-        """
+        """The checked mesh of a body; a MeshError where it cannot be used."""
         return load_mesh(body.path, self.reading, part=body.part, least_vertices=self.config.n_vertices_read)
 
     def signature(self, body: BodyRef) -> Signature:
@@ -80,12 +76,8 @@ class SignaturePipeline:
     def fill(self, bodies: Sequence[BodyRef]) -> list[CacheHit | Failed]:
         """Put the Signatures of bodies of one file into the cache; they are not returned, to spare the way back.
 
-        Returns:
-            What serves each; of a body that cannot be used, why, if there are several.
-
-        Raises:
-            MeshError: the only one cannot be used.
-            MachineError: the disk is full, or the like.
+        Returned is what serves each, or of one of several that cannot be used, why. A MeshError where the only one
+        cannot be used, a MachineError where the disk is full, or the like.
         """
         if len(bodies) == 1:
             return [self.hit(bodies[0])]
@@ -107,19 +99,11 @@ class SignaturePipeline:
         return [done[body] if body in done else attempt(partial(self._hit, body, file)) for body in bodies]
 
     def hit(self, body: BodyRef) -> CacheHit:
-        """What serves a body, which is in the cache then.
-
-        Raises:
-            MeshError: it cannot be used.
-        """
+        """What serves a body, which is in the cache then; a MeshError where it cannot be used."""
         return self._hit(body, BodyFile.of(body.path))
 
     def served(self, bodies: Sequence[BodyRef]) -> list[CacheHit | None]:
-        """What in the cache serves each of the bodies of one file, None where nothing does.
-
-        Raises:
-            MeshError: the file cannot be read.
-        """
+        """What in the cache serves each body of one file, None where nothing does; a MeshError if unreadable."""
         file = BodyFile.of(bodies[0].path)
         return [self._served(body, file) for body in bodies]
 
@@ -148,11 +132,7 @@ class SignaturePipeline:
         return signature
 
     def key(self, body: BodyRef) -> str:
-        """A Signature's name in the cache: content of the file, how it is read, every parameter and version.
-
-        Raises:
-            MeshError: the file cannot be read.
-        """
+        """A Signature's name in the cache, by all that it depends on; a MeshError where the file cannot be read."""
         return self._key(body, BodyFile.of(body.path), self.config, False)
 
     def _hit(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> CacheHit:
@@ -254,11 +234,7 @@ def version() -> str:
 def fill_elsewhere(
     fill: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]], expected: str, bodies: Sequence[BodyRef]
 ) -> list[CacheHit | Failed]:
-    """`SignaturePipeline.fill` by a worker of a cluster.
-
-    Raises:
-        MachineError: the worker has another version of the library.
-    """
+    """`SignaturePipeline.fill` by a worker of a cluster; a MachineError where that has another version."""
     if version() != expected:
         raise MachineError(
             f"the worker on {socket.gethostname()} has igps {version()}, where {expected} is asked for. Install one "

@@ -24,20 +24,13 @@ ClassRule = Literal["folder", "body", "file"]
 
 @dataclass(frozen=True)
 class Bodies:
-    """Bodies in files, and what is known of them.
+    """Bodies in files, and what is known of them."""
 
-    Args:
-        paths: the file of each.
-        names: a distinct name for each: the path of its file relative to the folder it was found in, and `#part`.
-        labels: the class of each, or None where no classes are known.
-        parts: which body of its file each is; None in a file that is one body. All of them if nothing is given.
-        columns: further columns of the table of labels by name, a value for each body; None where it is missing.
-    """
-
-    paths: tuple[Path, ...]
-    names: tuple[str, ...]
-    labels: tuple[str, ...] | None = None
-    parts: tuple[str | None, ...] = ()
+    paths: tuple[Path, ...]  # the file of each
+    names: tuple[str, ...]  # distinct: the path of the file relative to the folder it was found in, and `#part`
+    labels: tuple[str, ...] | None = None  # the class of each, or None where no classes are known
+    parts: tuple[str | None, ...] = ()  # which body of its file each is; None in a file that is one body
+    # Further columns of the table of labels by name, a value for each body; None where it is missing
     columns: Mapping[str, tuple[str | None, ...]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
@@ -74,11 +67,7 @@ class Bodies:
         )
 
     def column(self, name: str) -> tuple[str, ...]:
-        """The values of a column that every body has, such as of "scanner".
-
-        Raises:
-            ValueError: no such column, or bodies without a value.
-        """
+        """The values of a column that every body has, such as of "scanner"; a ValueError where one has none."""
         if name not in self.columns:
             known = ", ".join(self.columns) or "none"
             raise ValueError(f"{name}: no such column of {LABELS_FILE}; further columns: {known}. Choose one of them.")
@@ -92,11 +81,7 @@ class Bodies:
         return tuple(str(value) for value in values)
 
     def numbers(self, name: str) -> list[float]:
-        """The values of a column of numbers, such as of "age".
-
-        Raises:
-            ValueError: no such column, bodies without a value, or a value that is no finite number.
-        """
+        """The values of a column of numbers, such as of "age"; a ValueError of what is no finite number."""
         values = self.column(name)
         for body, value in zip(self.names, values, strict=True):
             try:
@@ -108,11 +93,7 @@ class Bodies:
         return [float(value) for value in values]
 
     def classed(self, rule: ClassRule) -> Bodies:
-        """The same bodies with the classes that a rule gives them; "folder" leaves them as they are.
-
-        Raises:
-            ValueError: an unknown rule, or bodies without parts to be named by.
-        """
+        """The same bodies with the classes that a rule gives them; "folder" leaves them as they are."""
         if rule not in get_args(ClassRule):
             raise ValueError(f"classes: expected 'folder', 'body' or 'file', got {rule!r}.")
         if rule == "folder":
@@ -178,11 +159,7 @@ def labelled_bodies(
     classes: ClassRule = "folder",
     attributes: Iterable[AttributeSource] = (),
 ) -> Bodies:
-    """`find_bodies` of a folder that tells classes.
-
-    Raises:
-        ValueError: it tells none.
-    """
+    """`find_bodies` of a folder that tells classes; a ValueError where it tells none."""
     bodies = find_bodies(root, options, classes=classes, attributes=attributes)
     if bodies.labels is None:
         raise ValueError(f"{root}: no classes found. Expected one folder per class, or a {LABELS_FILE} (file,label).")
@@ -195,9 +172,6 @@ def given_bodies(
     """The bodies of the given files, in the given order, with the classes given to the files.
 
     ``FILE#PART`` names one body of a file of several.
-
-    Raises:
-        ValueError: no file, or not one label for each.
     """
     files = [file_and_part(Path(path)) for path in paths]
     if not files:

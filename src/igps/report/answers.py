@@ -126,12 +126,7 @@ def clusters_figure(found: Clusters, names: Sequence[str]) -> Figure:
 
 
 def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> None:
-    """Draw the precision of systems at equal levels of recall, both in percent, as a PNG file.
-
-    Args:
-        curves: of each system by name, in the order of the legend.
-        out: the file.
-    """
+    """Draw the precision of systems at equal levels of recall, both in percent, as a PNG file."""
     figure = new_figure(8.5, 5.2)
     axes = figure.add_subplot()
     for i, (name, curve) in enumerate(curves.items()):

@@ -78,11 +78,7 @@ class Results:
 
 
 def read_results(folder: Path) -> Results:
-    """What `igps retrieve`, `compare` or `robustness` wrote to a folder; of several, the last.
-
-    Raises:
-        FileNotFoundError: the folder does not exist, or holds results of none of them.
-    """
+    """What `igps retrieve`, `compare` or `robustness` wrote to a folder; of several, the last."""
     readers = {_RETRIEVAL: _retrieval, _COMPARISON: _comparison, _ROBUSTNESS: _robustness}
     written = {name: (folder / name).stat().st_mtime for name in readers if (folder / name).is_file()}
     if not written:

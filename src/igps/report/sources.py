@@ -34,11 +34,7 @@ def write_sources(folder: Path, dataset: SignatureDataset) -> None:
 
 
 def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset | None:
-    """The meshes of a folder of results, None where it does not tell them; `meshes` is where they were moved to.
-
-    Raises:
-        ValueError: meshes.json is not what `write_sources` writes.
-    """
+    """The meshes of a folder of results, None where it does not tell them; `meshes` is where they were moved to."""
     path = folder / MESHES_FILE
     if not path.is_file():
         return None

@@ -133,11 +133,7 @@ def write_surfaces(path: Path, surfaces: Mapping[str, Surface]) -> None:
 
 
 def read_surfaces(path: Path) -> dict[str, Surface]:
-    """What `write_surfaces` wrote, by name; nothing where there is no file.
-
-    Raises:
-        ValueError: another kind of file.
-    """
+    """What `write_surfaces` wrote, by name; nothing where there is no file; a ValueError of another kind of file."""
     if not path.is_file():
         return {}
     with np.load(path) as archive:
