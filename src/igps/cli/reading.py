@@ -17,7 +17,7 @@ from igps._parallel import Limits
 from igps.data.attribute_sources import attribute_sources
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
-from igps.data.sources import Bodies, ClassRule, find_bodies, labelled_bodies
+from igps.data.sources import Bodies, ClassRule, find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
@@ -213,8 +213,8 @@ def chosen_dataset(
         return dataset
     attributes = attribute_sources(attribute or (), source.root if isinstance(source, Folder) else None)
     if isinstance(source, Folder):
-        find = labelled_bodies if source.labelled else find_bodies
-        source = find(source.root, reading, classes=classes or "folder", attributes=attributes.values())
+        how: dict[str, Any] = {"classes": classes or "folder", "attributes": attributes.values()}
+        source = find_bodies(source.root, reading, labelled=source.labelled, **how)
     return SignatureDataset(
         source, config, cache_dir, descriptor=needs, classes=classes, reading=reading, attributes=attributes
     )

@@ -114,6 +114,7 @@ def find_bodies(
     *,
     classes: ClassRule = "folder",
     attributes: Iterable[AttributeSource] = (),
+    labelled: bool = False,
 ) -> Bodies:
     """The bodies below a folder, with their classes if it tells them.
 
@@ -127,16 +128,23 @@ def find_bodies(
         options: how files are read, which says what bodies there are in one.
         classes: what the class of a body is, see `ClassRule`.
         attributes: what bodies bring along; the files of these are no bodies.
+        labelled: whether it must tell classes.
 
     Raises:
         FileNotFoundError: the folder does not exist, or holds no file that may be a body.
-        ValueError: `labels.csv` cannot be understood, or tells no classes where they are asked of it.
+        ValueError: `labels.csv` cannot be understood, or no classes are told where they must be.
     """
     root, options = Path(root), options or LoadOptions()
     if not root.is_dir():
         raise FileNotFoundError(f"{root}: no such folder.")
-    if (root / LABELS_FILE).is_file():
-        return _from_labels_file(root, options).classed(classes)
+    table = (root / LABELS_FILE).is_file()
+    bodies = (_from_labels_file(root, options) if table else _from_folder(root, options, attributes)).classed(classes)
+    if labelled and bodies.labels is None:
+        raise ValueError(f"{root}: no classes found. Expected one folder per class, or a {LABELS_FILE} (file,label).")
+    return bodies
+
+
+def _from_folder(root: Path, options: LoadOptions, attributes: Iterable[AttributeSource]) -> Bodies:
     files = _files_in(root)
     beside = {file for one in attributes if isinstance(one, FromFiles) for file in one.files(files)}
     folders = sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
@@ -148,22 +156,7 @@ def find_bodies(
             f"{root}: no mesh found. Expected a folder per class, or mesh files with a {LABELS_FILE} (file,label), "
             f"in one of the formats {', '.join(searched_suffixes())}."
         )
-    named = [(path, path.relative_to(root).as_posix(), label, None) for path, label in rows]
-    return _expanded(named, options).classed(classes)
-
-
-def labelled_bodies(
-    root: str | Path,
-    options: LoadOptions | None = None,
-    *,
-    classes: ClassRule = "folder",
-    attributes: Iterable[AttributeSource] = (),
-) -> Bodies:
-    """`find_bodies` of a folder that tells classes; a ValueError where it tells none."""
-    bodies = find_bodies(root, options, classes=classes, attributes=attributes)
-    if bodies.labels is None:
-        raise ValueError(f"{root}: no classes found. Expected one folder per class, or a {LABELS_FILE} (file,label).")
-    return bodies
+    return _expanded([(path, path.relative_to(root).as_posix(), label, None) for path, label in rows], options)
 
 
 def given_bodies(

@@ -10,12 +10,10 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
 
-from igps.data.attributes import ROOMS
 from igps.signature.signature import Samples, Signature
 
 
@@ -99,11 +97,10 @@ class FewerEigenpairs(Transform):
 
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         kept = np.sort(generator.permutation(len(signature.eigenvalues))[: self.n_eigenpairs])
-
-        def fewer(samples: Samples) -> Samples:
-            return replace(samples, eigenfunctions=samples.eigenfunctions[:, kept])
-
-        return replace(signature, eigenvalues=signature.eigenvalues[kept], **_both(signature, fewer))
+        return _changed_samples(
+            replace(signature, eigenvalues=signature.eigenvalues[kept]),
+            lambda samples: replace(samples, eigenfunctions=samples.eigenfunctions[:, kept]),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +127,7 @@ class Noise(Transform):
                 values = values + np.float32(self.eigenfunctions / length) * noise
             return replace(samples, points=points, eigenfunctions=values)
 
-        return replace(signature, **_both(signature, noisy))
+        return _changed_samples(signature, noisy)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,9 +155,9 @@ class Scale(Transform):
             values = samples.eigenfunctions / np.float32(factor)
             return replace(samples, points=samples.points * factor, eigenfunctions=values)
 
-        eigenvalues, area, volume = signature.eigenvalues / factor**2, signature.area * factor**2, signature.volume
-        both = _both(signature, scaled)
-        return replace(signature, eigenvalues=eigenvalues, area=area, volume=volume * factor**3, **both)
+        area, volume = signature.area * factor**2, signature.volume * factor**3
+        whole = replace(signature, eigenvalues=signature.eigenvalues / factor**2, area=area, volume=volume)
+        return _changed_samples(whole, scaled)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,12 +167,10 @@ class FlipSigns(Transform):
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         signs = generator.choice(np.array([-1, 1], np.float32), len(signature.eigenvalues))
 
-        def flipped(samples: Samples) -> Samples:
-            return replace(samples, eigenfunctions=samples.eigenfunctions * signs)
+        return _changed_samples(
+            signature, lambda samples: replace(samples, eigenfunctions=samples.eigenfunctions * signs)
+        )
 
-        return replace(signature, **_both(signature, flipped))
 
-
-def _both(signature: Signature, change: Callable[[Samples], Samples]) -> dict[str, Any]:
-    """Interior and surface samples, changed."""
-    return {room: change(getattr(signature, room)) for room in ROOMS}
+def _changed_samples(signature: Signature, change: Callable[[Samples], Samples]) -> Signature:
+    return replace(signature, interior=change(signature.interior), surface=change(signature.surface))
