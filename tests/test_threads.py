@@ -377,7 +377,7 @@ def test_a_command_leaves_the_settings(monkeypatch: pytest.MonkeyPatch, capsys: 
         seen.append(torch.get_num_threads())
         raise ValueError("no meshes")
 
-    monkeypatch.setattr("igps.cli.reading.labelled_bodies", watched)
+    monkeypatch.setattr("igps.cli.reading.find_bodies", watched)
     monkeypatch.setattr(sys, "argv", ["igps", "retrieve", "nowhere"])
     with pytest.raises(SystemExit):
         main()

@@ -29,19 +29,6 @@ from igps._threads import n_cores, one_thread, stay_on_one_thread
 from igps._threads import n_threads as available_threads
 from igps._workers import MachineError, Worker, workers_environment
 
-__all__ = [
-    "Failed",
-    "Limits",
-    "MachineError",
-    "attempt",
-    "is_machines",
-    "machines_words",
-    "n_cores",
-    "on_threads",
-    "one_thread",
-    "run",
-]
-
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
@@ -73,15 +60,10 @@ class Failed:
 
 @dataclass(frozen=True)
 class Limits:
-    """What one job may use.
+    """What one job may use."""
 
-    Args:
-        seconds: of wall time; None for no limit.
-        memory: bytes of data of its process; None for no limit. Linux alone enforces it.
-    """
-
-    seconds: float | None = None
-    memory: int | None = None
+    seconds: float | None = None  # of wall time; None for no limit
+    memory: int | None = None  # bytes of data of its process; None for no limit. Linux alone enforces it
 
     def __post_init__(self) -> None:
         for name, value in (("time_limit", self.seconds), ("memory_limit", self.memory)):
@@ -136,7 +118,7 @@ def on_threads(
     Args:
         function: may run beside itself.
         jobs: by which it is called.
-        n_threads: as many as `igps._threads.n_threads` if None.
+        n_threads: as many as `n_threads()` if None.
     """
     n_threads = min(available_threads() if n_threads is None else n_threads, len(jobs))
     alone = partial(_alone, function)
@@ -164,16 +146,10 @@ def _alone(function: Callable[[Job], Result], job: Job) -> Result:
 
 
 def attempt(result: Callable[[], Result], limits: Limits = Limits()) -> Result | Failed:
-    """The result; the job's failure in words, where the machine is not at fault.
-
-    Raises:
-        MachineError: where it is.
-    """
+    """The result; the job's failure in words; a MachineError where the machine is at fault."""
     try:
         return result()
-    except (BrokenExecutor, CancelledError):
-        raise
-    except MachineError:
+    except (BrokenExecutor, CancelledError, MachineError):
         raise
     except MemoryError as error:
         if limits.memory is not None:
@@ -201,12 +177,15 @@ def _by_executor(
     numbers: dict[Future[Result], int] = {}
     waiting = enumerate(jobs)
 
+    def broken(error: Exception) -> MachineError:
+        return MachineError(f"the executor broke ({error}). Run again: what is done is kept.")
+
     def submit(n_more: int) -> None:
         for number, job in islice(waiting, n_more):
             try:
                 future = executor.submit(function, job)
             except RuntimeError as error:  # it takes no work any more
-                raise MachineError(f"the executor broke ({error}). Run again: what is done is kept.") from error
+                raise broken(error) from error
             numbers[future] = number
             future.add_done_callback(done.put)
 
@@ -220,7 +199,7 @@ def _by_executor(
             except CancelledError as error:
                 raise MachineError("the executor gave the work up. Run again: what is done is kept.") from error
             except BrokenExecutor as error:
-                raise MachineError(f"the executor broke ({error}). Run again: what is done is kept.") from error
+                raise broken(error) from error
             submit(1)
     finally:
         for future in numbers:

@@ -99,11 +99,15 @@ class Team:
         results: list[Any] = [None] * len(jobs)
         waiting = iter(range(len(jobs)))
 
-        def work() -> None:
-            for number in waiting:  # the interpreter's lock gives each number to one thread
-                results[number] = function(jobs[number])
+        # PyTorch keeps the mode of each thread, and lets no other mode change tensors made in inference mode
+        inference = torch.is_inference_mode_enabled()
 
-        helpers = [self._pool.submit(_in_mode, torch.is_inference_mode_enabled(), work) for _ in range(n_helpers)]
+        def work() -> None:
+            with torch.inference_mode(inference):
+                for number in waiting:  # the interpreter's lock gives each number to one thread
+                    results[number] = function(jobs[number])
+
+        helpers = [self._pool.submit(work) for _ in range(n_helpers)]
         try:
             work()
         finally:
@@ -114,24 +118,14 @@ class Team:
         return results
 
 
-def _in_mode(inference: bool, function: Callable[[], None]) -> None:
-    """PyTorch keeps the mode of each thread, and lets no other mode change tensors that were made in inference mode."""
-    with torch.inference_mode(inference):
-        function()
-
-
 # Does all jobs on the calling thread
 ALONE = Team(1)
 
 
 class _Present(threading.local):
-    """What holds for the calls of one thread.
+    """What holds for the calls of one thread."""
 
-    Attributes:
-        most: `n_threads` inside `one_thread`; None outside.
-    """
-
-    most: int | None = None
+    most: int | None = None  # `n_threads` inside `one_thread`; None outside
 
 
 _present = _Present()

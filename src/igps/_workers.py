@@ -31,12 +31,7 @@ class MachineError(RuntimeError):
 
 
 class Worker(Generic[Job, Result]):
-    """A process, and the job it has.
-
-    Args:
-        seconds: of wall time that a job may take.
-        memory: bytes of data of the process.
-    """
+    """A process, and the job it has, which may take so many seconds of wall time and bytes of data."""
 
     def __init__(self, seconds: float | None, memory: int | None) -> None:
         self._seconds, self._memory = seconds or float("inf"), memory

@@ -16,7 +16,7 @@ from igps import LoadOptions, SignatureConfig, SignatureDataset, descriptor, ret
 from igps.analysis.comparison import pair_distances
 from igps.data.dataset import Failure
 from igps.data.requirements import Requirements
-from igps.data.sources import labelled_bodies
+from igps.data.sources import find_bodies
 from igps.descriptors import NAMES
 from igps.nn.description import describe
 
@@ -35,7 +35,7 @@ def measure(folder: Path, names: list[str], cache_dir: Path | None, n_workers: i
     for one in descriptors.values():
         requirements = requirements | one.requirements
     config = requirements.apply_to(SignatureConfig.paper())
-    dataset = SignatureDataset(labelled_bodies(folder), config, cache_dir, reading=LoadOptions())
+    dataset = SignatureDataset(find_bodies(folder, labelled=True), config, cache_dir, reading=LoadOptions())
     dataset.precompute(n_workers=n_workers, strict=True)
     found = {}
     for name, one in descriptors.items():

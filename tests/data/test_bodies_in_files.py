@@ -12,7 +12,7 @@ import trimesh
 
 import igps.data.pipeline as pipeline_module
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import Bodies, find_bodies, given_bodies, labelled_bodies
+from igps.data.sources import Bodies, find_bodies, given_bodies
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
@@ -114,9 +114,12 @@ def test_further_columns_stay_with_their_bodies(root: Path, tmp_path: Path) -> N
     with pytest.raises(ValueError, match=r"scanner: expected numbers, got 'A' of 2\.obj#spleen"):
         bodies.subset([0]).numbers("scanner")
     dataset = SignatureDataset(bodies, CONFIG, tmp_path / "cache", reading=OBJECTS)
-    assert dataset[["1.obj#spleen", "2.obj#spleen"]].columns["age"] == ("41.5", "30")
+    assert dataset[["1.obj#spleen", "2.obj#spleen"]].bodies.columns["age"] == ("41.5", "30")
     dataset[[0, 1]].to_file(tmp_path / "some.igps")
-    assert SignatureDataset.from_file(tmp_path / "some.igps").columns == {"age": ("30", "41.5"), "scanner": ("A", None)}
+    assert SignatureDataset.from_file(tmp_path / "some.igps").bodies.columns == {
+        "age": ("30", "41.5"),
+        "scanner": ("A", None),
+    }
 
 
 def test_a_table_of_columns_alone_tells_no_classes(root: Path) -> None:
@@ -124,8 +127,8 @@ def test_a_table_of_columns_alone_tells_no_classes(root: Path) -> None:
     bodies = find_bodies(root, OBJECTS)
     assert (bodies.labels, bodies.columns) == (None, {"age": ("30", "30", None, None)})
     with pytest.raises(ValueError, match="no classes found"):
-        labelled_bodies(root, OBJECTS)
-    assert labelled_bodies(root, OBJECTS, classes="body").labels == ("liver", "spleen", "liver", "spleen")
+        find_bodies(root, OBJECTS, labelled=True)
+    assert find_bodies(root, OBJECTS, classes="body", labelled=True).labels == ("liver", "spleen", "liver", "spleen")
 
 
 def test_counts_that_do_not_fit_are_refused() -> None:

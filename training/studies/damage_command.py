@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from igps.cli.reading import signatures
-from igps.data.sources import labelled_bodies
+from igps.data.sources import find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.mesh.mending import Mending
 from training.studies.damage import damage as measure
@@ -44,7 +44,7 @@ def damage(
     if every < 1:
         raise ValueError(f"every: expected at least 1, got {every}.")
     chosen = [descriptor_of(name) for name in descriptors or ("interior", "rich", "pretrained")]
-    files = labelled_bodies(root)
+    files = find_bodies(root, labelled=True)
     files = files.subset(range(0, len(files), every))
     dataset, failures = signatures(files, chosen, n_workers=n_workers, **reading)
     found = measure(dataset, chosen, damages=damages, mending=mend_by, seed=seed, n_workers=n_workers)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps.cli.reading import signatures
-from igps.data.sources import labelled_bodies
+from igps.data.sources import find_bodies
 from igps.mesh.loading import load_mesh
 from igps.mesh.mending import Mending
 from igps.mesh.mesh import Mesh
@@ -29,7 +29,7 @@ def pose(root: Path, classes: list[str] | None = None, out: Path = Path("pose.pn
         classes: which to draw; all if not given.
         out: the picture, a PNG file.
     """
-    files = labelled_bodies(root)
+    files = find_bodies(root, labelled=True)
     labels = files.labels or ()
     known = sorted(set(labels))
     classes = classes or known

@@ -9,7 +9,7 @@ from typing import Any
 from igps.cli.reading import signatures, write_notes, write_rows
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
-from igps.data.sources import Bodies, find_bodies, labelled_bodies
+from igps.data.sources import Bodies, find_bodies
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
 from igps.report.sources import write_sources
@@ -50,7 +50,7 @@ def robustness(
     dataset, failures = signatures(meshes, chosen, **reading)
     between, of_poses = None, None
     if gallery is not None:
-        between, _ = signatures(labelled_bodies(gallery), chosen, **reading)
+        between, _ = signatures(find_bodies(gallery, labelled=True), chosen, **reading)
     if poses is not None:
         files = find_bodies(poses)
         bodies = Bodies(files.paths, files.names, files.labels or ("body",) * len(files))

@@ -18,20 +18,14 @@ _MOST_CLUSTERS = 30
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """A hierarchical clustering, cut.
+    """A hierarchical clustering, cut."""
 
-    Args:
-        numbers: (N,) the cluster of each body, 0 for the largest.
-        middles: of each cluster, the body with the smallest sum of distances to its others.
-        stability: of each cluster, how much of it comes together again when half of the bodies are clustered alone:
-            mean largest Jaccard index with a cluster of them; NaN where too few were drawn.
-        tree: (N − 1, 4) as of `scipy.cluster.hierarchy.linkage`.
-    """
-
-    numbers: NDArray[np.int64]
-    middles: tuple[int, ...]
+    numbers: NDArray[np.int64]  # (N,) the cluster of each body, 0 for the largest
+    middles: tuple[int, ...]  # of each cluster, the body with the smallest sum of distances to its others
+    # Of each cluster, how much of it comes together again when half of the bodies are clustered alone: mean largest
+    # Jaccard index with a cluster of them; NaN where too few were drawn
     stability: tuple[float, ...]
-    tree: Values
+    tree: Values  # (N − 1, 4) as of `scipy.cluster.hierarchy.linkage`
 
 
 def clusters_of(

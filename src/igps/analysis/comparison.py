@@ -7,6 +7,7 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -23,33 +24,24 @@ from igps.retrieval.scores import SCORE_NAMES, RetrievalScores, retrieval_scores
 
 logger = logging.getLogger(__name__)
 
+# A description, and the seconds that it took
+_Description = tuple[NDArray[np.float32], float]
 # Entries of the triples (query, gallery, entry of a description) that one block of distances may hold at once.
 _BLOCK_ENTRIES = 2**26
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """How one descriptor did on a collection.
-
-    Args:
-        descriptor: with its parameters.
-        names: the N meshes that it described, in the order of the collection.
-        labels: their classes.
-        distances: (N, N), row by row from a mesh as the query; None where they could not be computed.
-        scores: leave-one-out among the N meshes; None without distances, and where no two meshes share a class.
-        seconds_per_mesh: mean processor time of a description, without that of the signature; None where N is 0.
-        failures: the meshes that it could not describe.
-        error: why there are no scores; None if there are.
-    """
+    """How one descriptor did on a collection."""
 
     descriptor: Descriptor
-    names: tuple[str, ...]
-    labels: tuple[str, ...]
-    distances: Tensor | None
-    scores: RetrievalScores | None
-    seconds_per_mesh: float | None
-    failures: tuple[Failure, ...]
-    error: str | None
+    names: tuple[str, ...]  # the N meshes that it described, in the order of the collection
+    labels: tuple[str, ...]  # their classes
+    distances: Tensor | None  # (N, N), row by row from a mesh as the query; None where they could not be computed
+    scores: RetrievalScores | None  # leave-one-out; None without distances, and where no two meshes share a class
+    seconds_per_mesh: float | None  # mean processor time, without that of the signature; None where N is 0
+    failures: tuple[Failure, ...]  # the meshes that it could not describe
+    error: str | None  # why there are no scores; None if there are
 
     def row(self) -> dict[str, Any]:
         """The line of a table: mean scores as fractions, None where there are none, and what they cost."""
@@ -82,7 +74,6 @@ def compare(
         descriptors: in the order of the results.
         n_workers: processes that describe; all cores if None.
         strict: raise at the first mesh that cannot be described instead of listing it.
-        progress: show bars.
 
     Raises:
         ValueError: the meshes have no classes, two descriptors one name, or the signatures lack what one needs.
@@ -127,16 +118,11 @@ def check_descriptors(descriptors: Sequence[Descriptor], dataset: SignatureDatas
         descriptor.requirements.check_config(dataset.config)
 
 
-@dataclass(frozen=True, eq=False)
-class _Description:
-    """What a descriptor says of one mesh, and how many seconds of processor time that took."""
-
-    values: NDArray[np.float32]
-    seconds: float
-
-
 def _described(job: tuple[Descriptor, SignatureDataset]) -> _Description:
-    """Of the one mesh of a dataset; timed from the cached signature on, with the reading of a mesh that is needed."""
+    """The description of the one mesh of a dataset, and the seconds of processor time that it took.
+
+    Timed from the cached signature on, with the reading of a mesh that is needed.
+    """
     descriptor, dataset = job
     with one_thread(), torch.inference_mode():
         batch = dataset.batch([0])
@@ -147,52 +133,36 @@ def _described(job: tuple[Descriptor, SignatureDataset]) -> _Description:
         seconds = time.process_time() - start
     if not np.isfinite(values).all():
         raise MeshError(f"{dataset.bodies.paths[0]}: the description has entries that are not finite.")
-    return _Description(values, seconds)
+    return values, seconds
 
 
 def _result(
     descriptor: Descriptor, dataset: SignatureDataset, outcomes: Sequence[_Description | Failure], progress: bool
 ) -> Result:
-    described = [i for i, outcome in enumerate(outcomes) if isinstance(outcome, _Description)]
-    descriptions = [outcome for outcome in outcomes if isinstance(outcome, _Description)]
-    labels = [dataset.bodies.labels[i] for i in described] if dataset.bodies.labels else []
+    failures = tuple(outcome for outcome in outcomes if isinstance(outcome, Failure))
+    bodies = dataset.usable(failures).bodies
+    labels = bodies.labels or ()
+    found = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
     distances, scores, error = None, None, None
     try:
-        if not descriptions:
+        if not found:
             raise ValueError("no mesh could be described.")
-        values = torch.from_numpy(np.stack([one.values for one in descriptions]))
+        values = torch.from_numpy(np.stack([one for one, _ in found]))
         distances = pair_distances(descriptor, values, progress=progress)
         scores = retrieval_scores(distances, labels)
     except Exception as reason:  # the other descriptors go on
         error = f"{type(reason).__name__}: {reason}"
         logger.warning("%s: no scores: %s", descriptor.name, error)
-    return Result(
-        descriptor=descriptor,
-        names=tuple(dataset.bodies.names[i] for i in described),
-        labels=tuple(labels),
-        distances=distances,
-        scores=scores,
-        seconds_per_mesh=float(np.mean([one.seconds for one in descriptions])) if descriptions else None,
-        failures=tuple(outcome for outcome in outcomes if isinstance(outcome, Failure)),
-        error=error,
-    )
+    seconds = fmean(one for _, one in found) if found else None
+    return Result(descriptor, bodies.names, labels, distances, scores, seconds, failures, error)
 
 
 def pair_distances(descriptor: Descriptor, descriptions: Tensor, *, progress: bool = False) -> Tensor:
-    """(N, N) distances of (N, ...) descriptions, by blocks of queries: some need memory for every entry of a pair.
-
-    Args:
-        descriptor: whose distances they are.
-        descriptions: (N, ...).
-        progress: show a bar.
-    """
+    """(N, N) distances of (N, ...) descriptions, by blocks of queries: some need memory for every entry of a pair."""
     rows = max(1, _BLOCK_ENTRIES // max(1, descriptions.numel()))
     blocks = []
-    with (
-        torch.inference_mode(),
-        one_thread(),
-        tqdm(total=len(descriptions), desc=f"distances by {descriptor.name}", disable=not progress) as bar,
-    ):
+    bar = tqdm(total=len(descriptions), desc=f"distances by {descriptor.name}", disable=not progress)
+    with torch.inference_mode(), one_thread(), bar:
         for block in descriptions.split(rows):
             blocks.append(descriptor.distances(block, descriptions).cpu())
             bar.update(len(block))

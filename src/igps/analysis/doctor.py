@@ -7,11 +7,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 from tqdm import tqdm
 
 from igps._parallel import Failed, Limits, run
+from igps.data.filling import by_file
 from igps.data.sources import Bodies, BodyRef
 from igps.mesh.formats import RawBody
 from igps.mesh.formats.volumes import VoxelMeasures
@@ -32,31 +32,18 @@ _BYTES, _BYTES_PER_VERTEX, _BYTES_PER_ENTRY = 4.57e8, 2820.0, 30.0
 
 @dataclass(frozen=True)
 class Finding:
-    """What is known of a body before its signature is computed.
+    """What is known of a body before its signature is computed."""
 
-    Args:
-        id: its name.
-        fault: why the surface as it is in the file is no body; None if it is one.
-        steps: what is done to it.
-        notes: the same in words.
-        n_vertices: in the file, or of the surface made of it; None if it cannot be read.
-        n_vertices_after: of the body; None if there is none.
-        seconds: expected processor time from file to signature.
-        memory: expected peak memory, bytes.
-        error: why the file cannot be used; None if it can.
-        voxels: of a label of a volume; None of anything else.
-    """
-
-    id: str
-    fault: str | None = None
-    steps: tuple[Step, ...] = ()
-    notes: tuple[str, ...] = ()
-    n_vertices: int | None = None
-    n_vertices_after: int | None = None
-    seconds: float | None = None
-    memory: float | None = None
-    error: str | None = None
-    voxels: VoxelMeasures | None = None
+    id: str  # its name
+    fault: str | None = None  # why the surface as it is in the file is no body; None if it is one
+    steps: tuple[Step, ...] = ()  # what is done to it
+    notes: tuple[str, ...] = ()  # the same in words
+    n_vertices: int | None = None  # in the file, or of the surface made of it; None if it cannot be read
+    n_vertices_after: int | None = None  # of the body; None if there is none
+    seconds: float | None = None  # expected processor time from file to signature
+    memory: float | None = None  # expected peak memory, bytes
+    error: str | None = None  # why the file cannot be used; None if it can
+    voxels: VoxelMeasures | None = None  # of a label of a volume; None of anything else
 
 
 def examine(
@@ -74,14 +61,9 @@ def examine(
         files: to be examined.
         reading: how they are read; the default if None.
         config: of the signatures; the default if None.
-        n_workers: processes; all cores if None.
         limits: time and memory of one file.
-        progress: show a bar.
     """
-    groups: dict[Path, list[int]] = {}
-    for i, path in enumerate(files.paths):
-        groups.setdefault(path, []).append(i)
-    jobs = list(groups.values())
+    jobs = by_file(files, range(len(files)))
     one = partial(_examine, reading or LoadOptions(), config or SignatureConfig())
     outcomes = run(one, [[files[i] for i in job] for job in jobs], n_workers=n_workers, limits=limits)
     found: dict[int, Finding] = {}
@@ -128,16 +110,6 @@ def _finding(ref: BodyRef, raw: RawBody, reading: LoadOptions, config: Signature
         return replace(found, error=str(error))
     n_after = min(len(mesh.vertices), config.max_vertices or len(mesh.vertices))
     seconds, memory = expected_cost(n_after, config.n_kept)
-    return replace(
-        found,
-        steps=mended_by(mesh.notes),
-        notes=mesh.notes,
-        n_vertices_after=len(mesh.vertices),
-        seconds=time.process_time() - start + seconds,
-        memory=memory,
-    )
-
-
-def usable(findings: Sequence[Finding]) -> bool:
-    """Whether every file can be used."""
-    return all(finding.error is None for finding in findings)
+    seconds += time.process_time() - start
+    found = replace(found, steps=mended_by(mesh.notes), notes=mesh.notes, n_vertices_after=len(mesh.vertices))
+    return replace(found, seconds=seconds, memory=memory)

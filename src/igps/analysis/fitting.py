@@ -36,21 +36,13 @@ _MOST_MEASURED = 1000
 
 @dataclass(frozen=True, eq=False)
 class Classification:
-    """What N bodies are taken for.
+    """What N bodies are taken for."""
 
-    Args:
-        names: of the bodies.
-        classes: C names.
-        probabilities: (N, C), calibrated.
-        strangeness: (N,), larger for what is like no class.
-        unknown: (N,) whether a body is unlike everything that the classifier knows.
-    """
-
-    names: tuple[str, ...]
-    classes: tuple[str, ...]
-    probabilities: Tensor
-    strangeness: Tensor
-    unknown: Tensor
+    names: tuple[str, ...]  # of the bodies
+    classes: tuple[str, ...]  # C names
+    probabilities: Tensor  # (N, C), calibrated
+    strangeness: Tensor  # (N,), larger for what is like no class
+    unknown: Tensor  # (N,) whether a body is unlike everything that the classifier knows
 
     @property
     def predicted(self) -> list[str | None]:
@@ -193,18 +185,11 @@ def classify(
 
 
 def _histograms(
-    dataset: SignatureDataset,
-    base: Descriptor,
-    failures: list[Failure] | None,
-    n_workers: int | None,
-    progress: bool,
+    dataset: SignatureDataset, base: Descriptor, failures: list[Failure] | None, n_workers: int | None, progress: bool
 ) -> tuple[Tensor, SignatureDataset]:
-    new: list[Failure] | None = None if failures is None else []
-    tag = cache_tag(base)
-    found = describe(dataset, base, failures=new, cache_tag=tag, n_workers=n_workers, progress=progress)
-    if failures is not None and new:
-        failures += new
-    return found.flatten(1), dataset.usable(new or ())
+    tag, found_before = cache_tag(base), len(failures or ())
+    found = describe(dataset, base, failures=failures, cache_tag=tag, n_workers=n_workers, progress=progress)
+    return found.flatten(1), dataset.usable((failures or [])[found_before:])
 
 
 def _held_out(labels: Tensor, goal: Goal, n_folds: int) -> Iterator[Tensor]:

@@ -28,47 +28,31 @@ Rows = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class GroupTest:
-    """Whether groups differ in one kind of body.
+    """Whether groups differ in one kind of body; numbers are None where nothing was tested."""
 
-    Args:
-        body: which, such as an organ.
-        sizes: of the groups by name.
-        permanova_f: pseudo-F (Anderson 2001); this and all that follows is None where nothing was tested.
-        permanova_p: of it, by permutation.
-        kernel: two-sample statistic (Gretton et al. 2012), the squared distance between the kernel means
-            of two groups; of more, their weighted mean square about the mean of all.
-        kernel_p: of it, by the same permutations.
-        permanova_q, kernel_q: smallest false discovery rate at which the body is found (Benjamini and Hochberg 1995).
-        effect: share of the squared distances that the groups explain, without what chance alone explains: 0 on average
-            where there is no difference, at most 1.
-        effect_low, effect_high: its 95 % interval.
-        auc: area under the curve of a ridge classifier by cross-validation, 0.5 for chance; mean over the groups.
-        refused: why nothing was tested.
-    """
-
-    body: str
-    sizes: Mapping[str, int]
-    permanova_f: float | None = None
-    permanova_p: float | None = None
-    permanova_q: float | None = None
+    body: str  # which, such as an organ
+    sizes: Mapping[str, int]  # of the groups by name
+    permanova_f: float | None = None  # pseudo-F (Anderson 2001)
+    permanova_p: float | None = None  # of it, by permutation
+    permanova_q: float | None = None  # smallest false discovery rate to find the body (Benjamini and Hochberg 1995)
+    # Two-sample statistic (Gretton et al. 2012), the squared distance between the kernel means of two groups; of more,
+    # their weighted mean square about the mean of all
     kernel: float | None = None
-    kernel_p: float | None = None
-    kernel_q: float | None = None
+    kernel_p: float | None = None  # of it, by the same permutations
+    kernel_q: float | None = None  # as permanova_q
+    # Share of the squared distances that the groups explain, without what chance alone explains: 0 on average where
+    # there is no difference, at most 1; and its 95 % interval
     effect: float | None = None
     effect_low: float | None = None
     effect_high: float | None = None
-    auc: float | None = None
-    refused: str | None = None
+    auc: float | None = None  # of a ridge classifier by cross-validation, 0.5 for chance; mean over the groups
+    refused: str | None = None  # why nothing was tested
 
 
 def vectors_of(descriptor: Descriptor, descriptions: Tensor) -> Rows:
     """(N, D) vectors whose Euclidean distances are meant: square roots of histograms (Hellinger), or as they are.
 
     A head's own distance may be no Euclidean one; that of `pretrained` hardly tells bodies of one class apart.
-
-    Args:
-        descriptor: whose they are.
-        descriptions: (N, ...).
     """
     rows: Rows = descriptions.flatten(1).double().numpy()
     return np.sqrt(rows) if descriptor.searched_by == "chi_square" else rows
@@ -172,11 +156,10 @@ def with_discovery_rates(tests: Sequence[GroupTest]) -> list[GroupTest]:
     tested = [one for one in tests if one.refused is None]
     if not tested:
         return list(tests)
-    rates = zip(
-        false_discovery_control([one.permanova_p for one in tested]).tolist(),
-        false_discovery_control([one.kernel_p for one in tested]).tolist(),
-        strict=True,
+    of_permanova, of_kernel = (
+        false_discovery_control([getattr(one, name) for one in tested]).tolist() for name in ("permanova_p", "kernel_p")
     )
+    rates = zip(of_permanova, of_kernel, strict=True)
     found = {one.body: replace(one, permanova_q=a, kernel_q=b) for one, (a, b) in zip(tested, rates, strict=True)}
     return [found.get(one.body, one) for one in tests]
 
@@ -269,13 +252,11 @@ def _auc(gram: Rows, group: NDArray[np.int64], n_repeats: int, seed: int) -> flo
     coordinates = axes[:, kept] * np.sqrt(values[kept])
     alphas = values[kept].mean() * np.logspace(-3, 3, 7)
     found = []
-    for training, test in RepeatedStratifiedKFold(n_splits=5, n_repeats=n_repeats, random_state=seed).split(
-        gram, group
-    ):
+    folds = RepeatedStratifiedKFold(n_splits=5, n_repeats=n_repeats, random_state=seed)
+    for training, test in folds.split(gram, group):
         scores = RidgeClassifierCV(alphas).fit(coordinates[training], group[training])
         scores = scores.decision_function(coordinates[test])
-        if scores.ndim == 1:
-            found.append(roc_auc_score(group[test], scores))
-        else:
-            found.append(np.mean([roc_auc_score(group[test] == one, column) for one, column in enumerate(scores.T)]))
+        if scores.ndim == 1:  # of two groups, for the second
+            scores = np.stack([-scores, scores], axis=1)
+        found.append(np.mean([roc_auc_score(group[test] == one, column) for one, column in enumerate(scores.T)]))
     return float(np.mean(found))

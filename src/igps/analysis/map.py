@@ -18,24 +18,16 @@ _MOST_ENTRIES, _MOST_ROUNDS = 10**9, 300
 
 @dataclass(frozen=True, eq=False)
 class BodyMap:
-    """Where bodies lie.
+    """Where bodies lie."""
 
-    Args:
-        points: (N, 2), in units of the distances for "mds", in none for "umap".
-        stress: root of the squared errors of all distances over their squares (Kruskal 1964), after the best scaling:
-            0 where the map tells every distance, above 0.2 it distorts much.
-    """
-
-    points: Values
+    points: Values  # (N, 2), in units of the distances for "mds", in none for "umap"
+    # Root of the squared errors of all distances over their squares (Kruskal 1964), after the best scaling: 0 where the
+    # map tells every distance, above 0.2 it distorts much
     stress: float
 
 
 def checked_distances(distances: Values) -> Values:
-    """(N, N) finite, symmetric, zero on the diagonal: the mean of both directions.
-
-    Raises:
-        ValueError: another shape, or entries that are no finite numbers.
-    """
+    """(N, N) symmetric, zero on the diagonal: the mean of both directions; a ValueError of another shape, or NaN."""
     found = np.asarray(distances, dtype=float)
     if found.ndim != 2 or len(found) != found.shape[-1] or len(found) < 3:
         raise ValueError(f"distances: expected (N, N) between three bodies or more, got {found.shape}.")

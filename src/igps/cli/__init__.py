@@ -10,37 +10,23 @@ import math
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from docstring_parser import parse
 from jsonargparse import ArgumentParser, Namespace
 
 from igps._parallel import MachineError, is_machines, machines_words
 from igps._threads import one_thread
-from igps.cli.cache import cache_export
+from igps.cli import gallery
+from igps.cli.answers import explain, groups, outliers
 from igps.cli.clusters import clusters, map_bodies
 from igps.cli.compare import compare
-from igps.cli.completion import completion
 from igps.cli.demo import demo
 from igps.cli.doctor import doctor
 from igps.cli.duplicates import distance, duplicates
-from igps.cli.explain import explain
 from igps.cli.fit import classify, fit
-from igps.cli.gallery import (
-    gallery_add,
-    gallery_build,
-    gallery_info,
-    gallery_merge,
-    gallery_remove,
-    gallery_restore,
-    gallery_sync,
-    gallery_update,
-    gallery_versions,
-)
-from igps.cli.groups import groups
-from igps.cli.outliers import outliers
-from igps.cli.precompute import precompute
-from igps.cli.reading import FLAGS, LISTS, Verdict
+from igps.cli.precompute import cache_export, precompute
+from igps.cli.reading import FLAGS, LISTS, MEANINGS, Verdict
 from igps.cli.report import report
 from igps.cli.retrieval import extract, query, retrieve
 
@@ -48,39 +34,37 @@ Command = Callable[..., Any]
 Commands = Mapping[str, "Command | Commands"]
 JSON = "json"
 
+
+def completion(shell: Literal["bash", "zsh", "tcsh"]) -> None:
+    """Print a script by which a shell completes commands, options and their choices.
+
+    Where to keep it: igps completion bash > /etc/bash_completion.d/igps, or any file that your shell reads.
+
+    Args:
+        shell: bash, zsh or tcsh.
+    """
+    try:
+        import shtab  # noqa: F401
+    except ImportError as error:
+        raise ImportError('igps completion needs shtab: pip install "interior-gps[completion]".') from error
+    print(command_parser().get_completion_script(f"shtab-{shell}"))
+
+
+def _named(*commands: Command) -> dict[str, Command]:
+    return {command.__name__: command for command in commands}
+
+
 COMMANDS: Commands = {
-    "retrieve": retrieve,
-    "extract": extract,
-    "query": query,
-    "fit": fit,
-    "classify": classify,
-    "precompute": precompute,
+    **_named(retrieve, extract, query, fit, classify, precompute),
     "cache": {"export": cache_export},
-    "gallery": {
-        "build": gallery_build,
-        "add": gallery_add,
-        "sync": gallery_sync,
-        "remove": gallery_remove,
-        "update": gallery_update,
-        "merge": gallery_merge,
-        "query": query,
-        "info": gallery_info,
-        "versions": gallery_versions,
-        "restore": gallery_restore,
-    },
-    "duplicates": duplicates,
-    "distance": distance,
-    "demo": demo,
-    "compare": compare,
-    "doctor": doctor,
-    "groups": groups,
-    "explain": explain,
-    "outliers": outliers,
-    "clusters": clusters,
-    "figure": {"map": map_bodies, "clusters": clusters, "groups": groups, "explain": explain, "outliers": outliers},
-    "report": report,
-    "completion": completion,
-}
+    "gallery": _named(
+        gallery.build, gallery.add, gallery.sync, gallery.remove, gallery.update, gallery.merge, query, gallery.info,
+        gallery.versions, gallery.restore,
+    ),
+    **_named(duplicates, distance, demo, compare, doctor, groups, explain, outliers, clusters),
+    "figure": {"map": map_bodies, **_named(clusters, groups, explain, outliers)},
+    **_named(report, completion),
+}  # fmt: skip
 """What follows `igps`: a function, or the commands of a group by name.
 
 A command that prints a table returns what it tells, for `--json`. Those of `figure` write to `figures` if not told.
@@ -110,23 +94,16 @@ def main(commands: Commands | None = None, program: str = "igps") -> None:
         # With --json, what a reader is told goes where progress goes
         with one_thread(), contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
             found = command(**options)
-    except MachineError as error:
-        print(f"igps: {error}", file=sys.stderr)
-        sys.exit(2)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         # Expected of bad input, and said in full by the message; a traceback would bury it.
-        if isinstance(error, OSError) and is_machines(error):
-            print(f"igps: {machines_words(error)}", file=sys.stderr)
-            sys.exit(2)
-        print(f"igps: {error}", file=sys.stderr)
-        sys.exit(1)
-    status = 0
-    if isinstance(found, Verdict):
-        found, status = found.told, int(not found.is_good)
+        full = isinstance(error, OSError) and is_machines(error)
+        print(f"igps: {machines_words(error) if full else error}", file=sys.stderr)  # type: ignore[arg-type]
+        sys.exit(2 if full or isinstance(error, MachineError) else 1)
+    verdict = found if isinstance(found, Verdict) else Verdict(found, True)
     if as_json:
-        print(json.dumps(_finite(found), indent=2))
-    if status:
-        sys.exit(status)
+        print(json.dumps(_finite(verdict.told), indent=2))
+    if not verdict.is_good:
+        sys.exit(1)
 
 
 def command_parser(commands: Commands | None = None, program: str = "igps") -> ArgumentParser:
@@ -168,14 +145,14 @@ def _add_commands(parser: ArgumentParser, commands: Commands) -> None:
 def _add_options(parser: ArgumentParser, command: Command) -> None:
     """Options from the signature and docstring of a command, written as a shell user expects them.
 
-    A first parameter without default is positional, and so is a first `root` that something else may replace. A list
-    takes several words, and a truth value is a switch.
+    A first parameter without default is positional. A list takes several words, and a truth value is a switch.
     """
     kinds = get_type_hints(command)
-    meanings = {parameter.arg_name: parameter.description for parameter in parse(command.__doc__ or "").params}
+    documented = {parameter.arg_name: parameter.description for parameter in parse(command.__doc__ or "").params}
+    meanings = {**MEANINGS, **documented}
     parameters = inspect.signature(command).parameters
     switches = {name: meanings.get(name) for name in parameters if kinds[name] is bool}
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+    if "reading" in parameters:
         switches = {**FLAGS, **switches}
         for several, told in LISTS.items():
             if several != "with" or {"descriptor", "descriptors"} & set(parameters):
@@ -184,15 +161,15 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
         switches[JSON] = "print what the table tells as JSON, and all else to standard error"
     by_hand: set[str | int] = {*switches, *LISTS}
     for place, (name, parameter) in enumerate(parameters.items()):
-        replaceable = name == "root" and parameter.default is None
-        positional = place == 0 and (parameter.default is parameter.empty or replaceable)
+        positional = place == 0 and parameter.default is parameter.empty
         item = _list_item(kinds[name])
         if positional or item is not None:
             option = name if positional else f"--{name}"
-            n_words = "?" if replaceable else item and "+"
-            parser.add_argument(option, nargs=n_words, type=item or kinds[name], help=meanings[name])
+            parser.add_argument(option, nargs=item and "+", type=item or kinds[name], help=meanings[name])
             by_hand.add(name)
     parser.add_function_arguments(command, skip=by_hand)
+    for action in parser._actions:
+        action.help = action.help or meanings.get(action.dest)
     for name, meaning in switches.items():
         parser.add_argument(f"--{name}", action="store_true", help=meaning)
 

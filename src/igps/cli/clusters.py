@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from igps.analysis.clusters import STABLE, Joining, clusters_of
 from igps.analysis.comparison import pair_distances
 from igps.analysis.map import Layout, body_map
-from igps.cli.reading import Folder
-from igps.cli.retrieval import described
+from igps.cli.reading import Folder, described, print_failures
 from igps.data.dataset import SignatureDataset
-from igps.descriptors import descriptor as descriptor_of
 from igps.report.answers import clusters_figure, map_figure, write_answer
 
 
@@ -36,8 +34,6 @@ def clusters(
     bodies are clustered alone. Below 0.75 it is not to be relied on.
 
     Args:
-        root: folder of bodies, with or without classes.
-        descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
         n_clusters: how many; as many as have the largest mean silhouette if not given.
         joining: two clusters are as far apart as their bodies are in mean (average), at most (complete), or at least
             (single).
@@ -62,10 +58,9 @@ def clusters(
     print(f"{n_stable} of {len(told)} clusters are stable (at least {STABLE})")
     if out is not None:
         rows = [
-            {"body": name, "class": label_of[i], "cluster": int(found.numbers[i]) + 1,
-             "stability": found.stability[found.numbers[i]]}
-            for i, name in enumerate(names)
-        ]  # fmt: skip
+            {"body": name, "class": label_of[i], "cluster": int(number) + 1, "stability": found.stability[number]}
+            for i, (name, number) in enumerate(zip(names, found.numbers, strict=True))
+        ]
         write_answer(out, "clusters", rows, clusters_figure(found, names))
         print(f"written to {out}")
     return told
@@ -83,32 +78,28 @@ def map_bodies(
     """Draw bodies as points in the plane, near to each other where their distances are small.
 
     Args:
-        root: folder of bodies, with or without classes.
-        descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
         colour: class, cluster, volume, or a column of labels.csv.
         layout: mds keeps all distances as well as that goes, umap keeps neighbours (needs umap-learn).
         seed: of umap, and of clusters.
         out: folder for map.csv, map.json, map.svg and map.png.
     """
     dataset, distances, label_of = _compared(root, descriptor, **reading)
-    found = body_map(distances, layout, seed=seed)
+    found, bodies = body_map(distances, layout, seed=seed), dataset.bodies
     values: list[str] | list[float]
     if colour == "class":
         values = label_of
     elif colour == "cluster":
         values = [str(one + 1) for one in clusters_of(distances, n_resamples=0, seed=seed).numbers]
     elif colour == "volume":
-        values = [dataset[i].signature.volume for i in range(len(dataset))]
+        values = [one.volume for one in dataset.signatures()]
     else:
         try:
-            values = dataset.bodies.numbers(colour)
+            values = bodies.numbers(colour)
         except ValueError:  # words
-            values = list(dataset.bodies.column(colour))
+            values = list(bodies.column(colour))
     rows = [
         {"body": name, "x": x, "y": y, "class": label, colour: value}
-        for name, (x, y), label, value in zip(
-            dataset.bodies.names, found.points.tolist(), label_of, values, strict=True
-        )
+        for name, (x, y), label, value in zip(bodies.names, found.points.tolist(), label_of, values, strict=True)
     ]
     print(f"{len(rows)} bodies; stress {found.stress:.2f}: 0 tells every distance, above 0.2 the map distorts much")
     if out is not None:
@@ -119,8 +110,7 @@ def map_bodies(
 
 def _compared(root: Path, descriptor: str, **reading: Any) -> tuple[SignatureDataset, NDArray[np.float64], list[str]]:
     """The bodies, their distances, and the class of each, "" where that is not known."""
-    dataset, descriptions, failures, name = described(Folder(root), descriptor, **reading)
-    if failures:
-        print(f"{len(failures)} bodies could not be used, the first: {failures[0].error}")
-    distances = pair_distances(descriptor_of(name), descriptions, progress=True).double().numpy()
-    return dataset, distances, list(dataset.bodies.labels or [""] * len(dataset))
+    found = described(Folder(root), descriptor, **reading)
+    print_failures(found.failures, len(found.dataset))
+    distances = pair_distances(found.descriptor, found.descriptions, progress=True).double().numpy()
+    return found.dataset, distances, list(found.dataset.bodies.labels or [""] * len(found.dataset))

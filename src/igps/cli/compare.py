@@ -19,6 +19,7 @@ from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import Mirror, Size
 from igps.nn.description import fit_centres
+from igps.report.answers import precision_recall
 from igps.report.sources import write_sources
 from igps.report.tables import comparison_table
 from igps.retrieval import precision_recall_curve
@@ -46,10 +47,6 @@ def compare(
         out: folder for compare.json, distances/NAME.npz, precision_recall.png, meshes.json that tells where the meshes
             lie, and failures.csv if there are any.
         report: make a page of the results in that folder, report.html, see `igps report`
-        size: keep lets differences in size count, ignore does not; auto keeps it where all files have a unit of length.
-        mirror: distinct tells a body from its mirror image.
-        n_workers: processes that compute; all cores if not given.
-        strict: stop at the first mesh that cannot be used instead of skipping it
     """
     check_report(report, out)
     wanted = [with_side(name, mirror) for name in descriptors or NAMES]
@@ -64,13 +61,18 @@ def compare(
         if out is not None:  # after each descriptor, so that a run that is stopped leaves what it has
             _write(out, results, failures)
     print(comparison_table(results))
-    n_failed = len(failures) + sum(len(result.failures) for result in results)
-    if n_failed:
+    if n_failed := len(failures) + sum(len(result.failures) for result in results):
         print(f"{n_failed} meshes could not be used or described.")
     if out is not None:
         write_notes(out / "notes.csv", dataset)
         write_sources(out, dataset)
-        _write_figure(out, results)
+        curves = {
+            result.descriptor.name: precision_recall_curve(result.distances, result.labels)
+            for result in results
+            if result.distances is not None and result.scores is not None
+        }
+        if curves:
+            precision_recall(curves, out / "precision_recall.png")
         print(f"written to {out}")
         if report:
             write_report(out, n_workers=n_workers)
@@ -83,25 +85,13 @@ def _write(out: Path, results: Sequence[Result], failures: Sequence[Failure]) ->
     (out / "compare.json").write_text(json.dumps([result.row() for result in results], indent=2) + "\n")
     last = results[-1]
     if last.distances is not None:
-        np.savez_compressed(
-            out / "distances" / f"{last.descriptor.name}.npz",
-            distances=last.distances.numpy(),
-            names=np.array(last.names),
-            labels=np.array(last.labels),
-        )
+        arrays: dict[str, Any] = {
+            "distances": last.distances.numpy(),
+            "names": np.array(last.names),
+            "labels": np.array(last.labels),
+        }
+        np.savez_compressed(out / "distances" / f"{last.descriptor.name}.npz", **arrays)
     rows = [("all", failure.id, failure.error) for failure in failures]
     for result in results:
         rows += [(result.descriptor.name, failure.id, failure.error) for failure in result.failures]
     write_rows(out / "failures.csv", ("descriptor", "file", "error"), rows)
-
-
-def _write_figure(out: Path, results: Sequence[Result]) -> None:
-    from igps.report.comparison import precision_recall
-
-    curves = {
-        result.descriptor.name: precision_recall_curve(result.distances, result.labels)
-        for result in results
-        if result.distances is not None and result.scores is not None
-    }
-    if curves:
-        precision_recall(curves, out / "precision_recall.png")

@@ -15,7 +15,6 @@ def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> dict[s
 
     Args:
         out: folder for the meshes, the results of `igps retrieve`, ranked.png and report.html.
-        n_workers: processes that compute signatures; all cores if not given.
     """
     from igps.report.gallery import ranked_results
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from igps.cli.gallery import as_described
 from igps.cli.reading import Folder, signatures, write_rows
+from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import Size
 from igps.gallery.about import is_gallery
@@ -27,59 +28,43 @@ def duplicates(
     size: Size = "auto",
     tolerance: float = 0.0,
     out: Path | None = None,
-    cache_dir: Path | None = None,
-    n_workers: int | None = None,
-    strict: bool = False,
     **reading: Any,
 ) -> dict[str, Any]:
     """List the files that show the same body, whatever its mirror image, triangles, detail, format, and unitless scale.
 
     Args:
-        root: folder of meshes, with or without classes, or a gallery of them, see igps gallery.
+        root: folder of meshes, or a gallery of them, see igps gallery.
         poses: take other poses of a body for the same, which mistakes more siblings for it
         size: keep takes files that differ in size for different, ignore does not; auto does where all have a unit.
         tolerance: tell pairs, too, that are not the same and no farther apart, in parts of the root of the area; 0.02
             at most.
         out: a table of the groups, a file ending in .csv.
-        cache_dir: folder where computed signatures are kept; the user's cache directory if not given.
-        n_workers: processes that compute; all cores if not given.
-        strict: stop at the first mesh that cannot be used instead of skipping it
     """
-    calibration, n_skipped = Calibration.load(), 0
     source: Any
+    unread: list[Failure] = []
     if is_gallery(root):
         source = Gallery(root)
         as_described(source, reading)
     else:
-        chosen, files = descriptor_of(DESCRIPTOR), Folder(root)
-        source, unread = signatures(files, [chosen], n_workers=n_workers, strict=strict, cache_dir=cache_dir, **reading)
-        n_skipped = len(unread)
-    found = find_duplicates(
-        source, DESCRIPTOR, poses=poses, size=size, tolerance=tolerance, cache_dir=cache_dir, n_workers=n_workers,
-        progress=True,
-    )  # fmt: skip
-    _print_groups(found, calibration, poses)
-    n_skipped += len(found.failures)
-    if n_skipped:
-        print(f"{n_skipped} files could not be compared" + "".join(f"; {one.error}" for one in found.failures[:1]))
+        source, unread = signatures(Folder(root), [descriptor_of(DESCRIPTOR)], **reading)
+    kept = {name: reading.get(name) for name in ("cache_dir", "n_workers")}
+    found = find_duplicates(source, DESCRIPTOR, poses=poses, size=size, tolerance=tolerance, progress=True, **kept)
+    _print_groups(found, poses)
+    if failures := [*found.failures, *unread]:
+        print(f"{len(failures)} files could not be compared; {failures[0].error}")
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        rows = [(str(n), name, str(found.paths[name])) for n, group in enumerate(found.groups, 1) for name in group]
+        rows = [(n, name, found.paths[name]) for n, group in enumerate(found.groups, 1) for name in group]
         write_rows(out, ("group", "file", "path"), rows)
+    pairs: list[dict[str, Any]] = []
+    for pair, apart in found.pairs.items():
+        largest = dict(zip(("largest", "largest_length", "unit"), found.largest.get(pair, ()), strict=False))
+        pairs.append({"files": list(pair), "distance": apart, "grade": found.grades.get(pair), **largest})
     return {
         "groups": [list(group) for group in found.groups],
-        "pairs": [
-            {
-                "files": list(pair),
-                "distance": distance,
-                "grade": found.grades.get(pair),
-                **dict(zip(("largest", "largest_length", "unit"), found.largest.get(pair, ()), strict=False)),
-            }
-            for pair, distance in found.pairs.items()
-        ],
-        "nearly": [{"files": list(pair), "distance": distance} for pair, distance in found.nearly.items()],
+        "pairs": pairs,
+        "nearly": [{"files": list(pair), "distance": apart} for pair, apart in found.nearly.items()],
         "n_files": found.n_files,
-        "n_skipped": n_skipped,
+        "n_skipped": len(failures),
     }
 
 
@@ -91,9 +76,7 @@ def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
     """
     if len(meshes) != 2:
         raise ValueError(f"meshes: expected two files, got {len(meshes)}.")
-    chosen = descriptor_of(DESCRIPTOR)
-    reading["strict"] = True
-    dataset, _ = signatures(meshes, [chosen], **reading)
+    dataset, _ = signatures(meshes, [descriptor_of(DESCRIPTOR)], **{**reading, "strict": True})
     found = body_distance(dataset, DESCRIPTOR, progress=True)
     print(f"{found.distance:.4g} by {DESCRIPTOR}: {found.meaning}")
     told = "the same shape" if found.same else "not the same shape"
@@ -102,12 +85,12 @@ def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
     return {"descriptor": DESCRIPTOR, **asdict(found)}
 
 
-def _print_groups(found: Duplicates, calibration: Calibration, poses: bool) -> None:
+def _print_groups(found: Duplicates, poses: bool) -> None:
     for number, group in enumerate(found.groups, 1):
         print(f"group {number}: " + "  ".join(group))
     for pair, distance in found.nearly.items():
         print(f"nearly: {'  '.join(pair)}  {distance:.3%} of the root of the area apart")
-    n_alike = sum(map(len, found.groups))
+    calibration, n_alike = Calibration.load(), sum(map(len, found.groups))
     threshold, what = (calibration.pose, "poses") if poses else (calibration.detail, "copies")
     print(
         f"{n_alike} of {found.n_files} files in {len(found.groups)} groups; of generated bodies, {threshold.n_found} "

@@ -47,12 +47,12 @@ def wide_table(known: Table, measured: Table) -> Table:
         rows.setdefault(file, {})[part] = i
     table: dict[str, Sequence[Any]] = {}
     apart: dict[str, Sequence[Any]] = {}
-    for name, values in known.items():
-        per_file = [{values[i] for i in bodies.values()} for bodies in rows.values()]
-        if all(len(found) == 1 for found in per_file) and name not in ("part", "name"):
+    for name in [name for name in known if name not in ("part", "name")]:
+        per_file = [{known[name][i] for i in bodies.values()} for bodies in rows.values()]
+        if all(len(found) == 1 for found in per_file):
             table[name] = [found.pop() for found in per_file]
-        elif name not in ("part", "name"):
-            apart[name] = values
+        else:
+            apart[name] = known[name]
     for part in dict.fromkeys(known["part"]):
         places = [bodies.get(part) for bodies in rows.values()]
         for name, values in {**apart, **measured}.items():
@@ -62,11 +62,7 @@ def wide_table(known: Table, measured: Table) -> Table:
 
 
 def write_table(path: Path, table: Table) -> None:
-    """Write a table as CSV or Parquet, by the suffix.
-
-    Raises:
-        ImportError: Parquet without pyarrow.
-    """
+    """Write a table as CSV or Parquet, by the suffix; the latter needs pyarrow."""
     if path.suffix.lower() == ".parquet":
         try:
             import pyarrow.parquet

@@ -9,7 +9,7 @@ from typing import Any
 from igps.analysis.fitting import Goal, HeadName
 from igps.analysis.fitting import classify as classify_bodies
 from igps.analysis.fitting import fit as fit_head
-from igps.cli.reading import Folder, signatures, write_rows
+from igps.cli.reading import Folder, files_or_folder, print_failures, signatures, write_rows
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors import load
@@ -47,8 +47,6 @@ def fit(
         goal: known for the classes of the folder; new for a metric of classes that come up later.
         head: classifier, whitened, or as_is for the descriptor itself; auto takes the best on held-out bodies.
         no_prior: leave the metric that the descriptor has aside, and take its histograms alone
-        n_workers: processes that compute; all cores if not given.
-        strict: stop at the first mesh that cannot be used instead of skipping it
     """
     if out.suffix != ".safetensors":
         raise ValueError(f"out: expected a file ending in .safetensors, got {out}.")
@@ -62,10 +60,10 @@ def fit(
     card = _card(model, out)
     out.with_suffix(".md").write_text(card)
     print(card.partition("\n\n")[2])
-    if n_lost := len(unread) + len(failures or ()):
-        print(f"{n_lost} meshes could not be used.")
+    refused = [*unread, *(failures or ())]
+    print_failures(refused, len(dataset) - len(failures or ()))
     print(f"written to {out}")
-    return {**model.card, "n_refused": n_lost}
+    return {**model.card, "n_refused": len(refused)}
 
 
 def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading: Any) -> list[dict[str, Any]]:
@@ -76,29 +74,25 @@ def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading
         model: a file that igps fit wrote.
         out: a table of the probabilities of all classes, a file ending in .csv.
     """
-    source = Folder(meshes[0]) if len(meshes) == 1 and meshes[0].is_dir() else meshes
     chosen = load(model)
-    dataset, failures = signatures(source, [chosen], **reading)
+    dataset, failures = signatures(files_or_folder(meshes), [chosen], **reading)
     found = classify_bodies(
         dataset, chosen, failures=None if reading.get("strict") else failures, n_workers=reading.get("n_workers")
     )
     width = max(map(len, found.names))
     print(f"{'mesh':<{width}}  {'probability':>11}  class")
-    best = found.probabilities.max(dim=1)
     rows = []
-    for name, predicted, value, likely in zip(
-        found.names, found.predicted, best.values.tolist(), best.indices.tolist(), strict=True
-    ):
+    best = found.probabilities.max(dim=1)
+    columns = (found.names, found.predicted, best.values.tolist(), best.indices.tolist())
+    for name, predicted, value, likely in zip(*columns, strict=True):
         told = f"unlike everything known, most like {found.classes[likely]}" if predicted is None else predicted
         print(f"{name:<{width}}  {value:>11.1%}  {told}")
         rows.append({"mesh": name, "class": predicted, "most_like": found.classes[likely], "probability": value})
-    if failures:
-        print(f"{len(failures)} meshes could not be used.")
+    print_failures(failures, len(rows))
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
         values = zip(found.names, found.unknown.tolist(), found.probabilities.tolist(), strict=True)
-        header = ("mesh", "unknown", *found.classes)
-        write_rows(out, header, [(n, str(int(new)), *(f"{p:.6f}" for p in of_each)) for n, new, of_each in values])
+        table = [(name, int(new), *(f"{p:.6f}" for p in of_each)) for name, new, of_each in values]
+        write_rows(out, ("mesh", "unknown", *found.classes), table)
     return rows
 
 

@@ -14,12 +14,12 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import SIZE, Mirror, Size
 from igps.gallery.about import about_of, check_alike
 from igps.gallery.gallery import Gallery
-from igps.gallery.sync import sync
+from igps.gallery.sync import sync as sync_folder
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
 
-def gallery_build(
+def build(
     root: Path,
     out: Path,
     descriptor: str = "pretrained",
@@ -34,13 +34,7 @@ def gallery_build(
     A gallery that is there keeps its state until the new one is complete, which then is a version of it.
 
     Args:
-        root: folder of meshes, with or without classes.
         out: the gallery, a folder that will be made, such as gallery.igps.
-        descriptor: a name (a wrong one lists all), or package.module:NAME of one of your own.
-        size: keep lets differences in size count, ignore does not; auto keeps it where all files have a unit of length.
-        mirror: distinct tells a body from its mirror image.
-        n_workers: processes that compute; all cores if not given.
-        strict: stop at the first mesh that cannot be used instead of skipping it
     """
     descriptor = with_side(descriptor, mirror)
     chosen = descriptor_of(descriptor)
@@ -50,15 +44,8 @@ def gallery_build(
     _print_state(gallery, [*unread, *undescribed])
 
 
-def gallery_add(root: Path, gallery: Path, n_workers: int | None = None, strict: bool = False, **reading: Any) -> None:
-    """Add the bodies of a folder to a gallery, by its own descriptor; those that it has already are passed over.
-
-    Args:
-        root: folder of meshes, with or without classes.
-        gallery: the gallery.
-        n_workers: processes that compute; all cores if not given.
-        strict: stop at the first mesh that cannot be used instead of skipping it
-    """
+def add(root: Path, gallery: Path, n_workers: int | None = None, strict: bool = False, **reading: Any) -> None:
+    """Add the bodies of a folder to a gallery, by its own descriptor; those that it has already are passed over."""
     opened = Gallery(gallery)
     reading = as_described(opened, reading)
     dataset, unread = signatures(Folder(root), [opened.descriptor], n_workers=n_workers, strict=strict, **reading)
@@ -66,24 +53,21 @@ def gallery_add(root: Path, gallery: Path, n_workers: int | None = None, strict:
     _print_state(opened, [*unread, *undescribed])
 
 
-def gallery_sync(root: Path, gallery: Path, n_workers: int | None = None, strict: bool = False, **reading: Any) -> None:
+def sync(root: Path, gallery: Path, n_workers: int | None = None, strict: bool = False, **reading: Any) -> None:
     """Bring a gallery up to a folder: describe new and changed files, take labels over, remove deleted files.
 
     Args:
         root: folder of meshes, with or without classes; bodies of other folders stay.
-        gallery: the gallery.
-        n_workers: processes that compute; all cores if not given.
-        strict: stop at the first mesh that cannot be used instead of skipping it
     """
     opened = Gallery(gallery)
     reading = as_described(opened, reading)
     dataset = chosen_dataset(Folder(root), opened.descriptor.requirements, **reading)
-    n_new, n_gone, failures = sync(opened, dataset, root, n_workers=n_workers, strict=strict, progress=True)
+    n_new, n_gone, failures = sync_folder(opened, dataset, root, n_workers=n_workers, strict=strict, progress=True)
     print(f"{n_new} bodies described, {n_gone} removed")
     _print_state(opened, failures)
 
 
-def gallery_merge(others: list[Path], out: Path) -> None:
+def merge(others: list[Path], out: Path) -> None:
     """Make one gallery of several, which stay as they are.
 
     Args:
@@ -93,11 +77,10 @@ def gallery_merge(others: list[Path], out: Path) -> None:
     _print_state(Gallery.merge(out, others, progress=True), [])
 
 
-def gallery_remove(gallery: Path, where: str) -> None:
+def remove(gallery: Path, where: str) -> None:
     """Remove bodies from a gallery; their files stay.
 
     Args:
-        gallery: the gallery.
         where: a condition on its columns, such as "class = 'femur' AND volume > 2e5".
     """
     opened = Gallery(gallery)
@@ -105,11 +88,10 @@ def gallery_remove(gallery: Path, where: str) -> None:
     _print_state(opened, [])
 
 
-def gallery_update(gallery: Path, where: str, to: list[str]) -> None:
+def update(gallery: Path, where: str, to: list[str]) -> None:
     """Set columns of bodies in a gallery.
 
     Args:
-        gallery: the gallery.
         where: a condition on its columns, such as "name LIKE 'left/%'".
         to: values by column, such as class=femur age=41; nothing after the sign empties it.
     """
@@ -119,11 +101,10 @@ def gallery_update(gallery: Path, where: str, to: list[str]) -> None:
     print(f"{Gallery(gallery).update(where, values)} bodies updated")
 
 
-def gallery_info(gallery: Path, version: int | None = None) -> dict[str, Any]:
+def info(gallery: Path, version: int | None = None) -> dict[str, Any]:
     """Tell what a gallery holds, and how it was described.
 
     Args:
-        gallery: the gallery.
         version: an earlier one of its versions.
     """
     opened = Gallery(gallery, version=version)
@@ -132,23 +113,18 @@ def gallery_info(gallery: Path, version: int | None = None) -> dict[str, Any]:
     return {**told, **opened.about}
 
 
-def gallery_versions(gallery: Path) -> list[dict[str, Any]]:
-    """List the versions of a gallery: each change makes one.
-
-    Args:
-        gallery: the gallery.
-    """
+def versions(gallery: Path) -> list[dict[str, Any]]:
+    """List the versions of a gallery: each change makes one."""
     versions = Gallery(gallery).versions()
     for one in versions:
         print(f"{one['version']:>6}  {one['time']}  {one['bodies']} bodies")
     return versions
 
 
-def gallery_restore(gallery: Path, version: int) -> None:
+def restore(gallery: Path, version: int) -> None:
     """Return to an earlier version of a gallery; those between stay.
 
     Args:
-        gallery: the gallery.
         version: its number, see igps gallery versions.
     """
     opened = Gallery(gallery)
@@ -157,11 +133,7 @@ def gallery_restore(gallery: Path, version: int) -> None:
 
 
 def as_described(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of how meshes are read, as they were when the gallery was built.
-
-    Raises:
-        ValueError: others are asked for.
-    """
+    """How meshes are read, as it was when the gallery was built; a ValueError where something else is asked for."""
     given, check = dict(reading), partial(check_alike, gallery.path, gallery.about)
     size, mirror, name = given.pop("size", "auto"), given.pop("mirror", "same"), gallery.about["descriptor"]
     if size != "auto":
@@ -173,13 +145,9 @@ def as_described(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]
     asked = LoadOptions(**{one.name: given.pop(one.name, one.default) for one in fields(LoadOptions)})
     if config != SignatureConfig():
         wanted = gallery.descriptor.requirements.apply_to(config).resolved()
-        check_alike(
-            gallery.path, gallery.about, {"signature": about_of(wanted, asked, gallery.descriptor)["signature"]}
-        )
+        check({"signature": about_of(wanted, asked, gallery.descriptor)["signature"]})
     if asked != LoadOptions():
-        check_alike(
-            gallery.path, gallery.about, {"reading": about_of(gallery.config, asked, gallery.descriptor)["reading"]}
-        )
+        check({"reading": asked.as_dict()})
     return {**given, "signature": gallery.config, **asdict(gallery.reading)}
 
 

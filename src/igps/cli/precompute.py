@@ -1,4 +1,4 @@
-"""`igps precompute`."""
+"""`igps precompute` and `igps cache`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from operator import or_
 from pathlib import Path
 from typing import Any
 
-from igps._parallel import Limits, MachineError
-from igps.cli.reading import Folder, chosen_dataset, write_rows
+from igps._parallel import MachineError
+from igps.cli.reading import Folder, chosen_dataset, limits_of, print_failures, signatures, write_rows
 from igps.data.pipeline import version
 from igps.data.requirements import Requirements
 from igps.descriptors import descriptor as descriptor_of
@@ -39,16 +39,11 @@ def precompute(
     What is there already is not computed again, so that a run that was stopped is finished by another.
 
     Args:
-        root: folder of meshes, with or without classes.
         descriptors: whose needs the signatures shall satisfy; pretrained if not given.
         cluster: address of a Dask scheduler, such as tcp://scheduler:8786, whose workers see folder and cache by the
             same paths as this machine.
         shard: such as 3/64, the third of 64 parts of the meshes, for as many jobs of a batch system.
         failures: a CSV file for the meshes that cannot be used.
-        strict: stop at the first mesh that cannot be used instead of skipping it
-        n_workers: processes that compute; all cores if not given.
-        time_limit: seconds that the signature of one mesh may take; no limit if not given.
-        memory_limit: gigabytes of memory that the signature of one mesh may take; no limit if not given.
     """
     needs = reduce(or_, (descriptor_of(name).requirements for name in descriptors or ["pretrained"]), Requirements())
     dataset = chosen_dataset(Folder(root), needs, **reading)
@@ -56,7 +51,7 @@ def precompute(
     if not len(dataset):
         print(f"{root}: no mesh in shard {shard}")
         return
-    limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
+    limits = limits_of(time_limit, memory_limit)
     if cluster is None:
         failed = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits)
     else:
@@ -68,12 +63,25 @@ def precompute(
     print(f"{len(dataset) - len(failed)} of {len(dataset)} signatures{part} are in the cache; {len(failed)} failed")
 
 
-def of_shard(n_bodies: int, shard: str | None) -> range:
-    """Which bodies a shard has: every n-th, so that the shards 1/n to n/n have all, each once; all of them if None.
+def cache_export(root: Path, out: Path, descriptors: list[str] | None = None, **reading: Any) -> None:
+    """Write the signatures of a folder to one file, which every command takes in place of the folder.
 
-    Raises:
-        ValueError: not two numbers, or the first not one of the second.
+    The file is read by memory map, runs no code, and holds no path: meshes that cannot be used are left out.
+
+    Args:
+        out: the file, such as signatures.igps.
+        descriptors: whose needs the signatures shall satisfy; pretrained if not given.
     """
+    chosen = [descriptor_of(name) for name in descriptors or ["pretrained"]]
+    dataset, failures = signatures(Folder(root), chosen, **reading)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    dataset.to_file(out)
+    print(f"{len(dataset)} signatures written to {out}")
+    print_failures(failures, len(dataset))
+
+
+def of_shard(n_bodies: int, shard: str | None) -> range:
+    """Which bodies a shard has, all if None: every n-th, so that the shards 1/n to n/n have all, each once."""
     if shard is None:
         return range(n_bodies)
     found = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
@@ -84,11 +92,7 @@ def of_shard(n_bodies: int, shard: str | None) -> range:
 
 @contextlib.contextmanager
 def dask_executor(address: str) -> Iterator[Executor]:
-    """The workers of a Dask scheduler, which must have the version of the library that is here.
-
-    Raises:
-        MachineError: no scheduler answers, or a worker has another version.
-    """
+    """The workers of a Dask scheduler; a MachineError where none answers, or one has another version of the library."""
     try:
         from distributed import Client
     except ImportError as error:
@@ -104,18 +108,11 @@ def dask_executor(address: str) -> Iterator[Executor]:
             "worker` with its address."
         ) from error
     with client:
-        for worker, theirs in client.run(_version_there, on_error="return").items():
+        for worker, theirs in client.run(version, on_error="return").items():
             if theirs != version():
+                told = theirs if isinstance(theirs, str) else f"of another version ({type(theirs).__name__})"
                 raise MachineError(
-                    f"cluster: the worker at {worker} has igps {_words(theirs)}, where {version()} is asked for. "
-                    "Install one version everywhere and run again."
+                    f"cluster: the worker at {worker} has igps {told}, where {version()} is asked for. Install one "
+                    "version everywhere and run again."
                 )
         yield client.get_executor()
-
-
-def _version_there() -> str:
-    return version()
-
-
-def _words(theirs: object) -> str:
-    return theirs if isinstance(theirs, str) else f"of another version ({type(theirs).__name__})"

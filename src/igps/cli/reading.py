@@ -11,15 +11,19 @@ from operator import or_
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from igps._parallel import Limits
 from igps.data.attribute_sources import attribute_sources
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
-from igps.data.sources import Bodies, ClassRule, find_bodies, labelled_bodies
+from igps.data.sources import Bodies, ClassRule, find_bodies
 from igps.descriptors import descriptor as descriptor_of
+from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
-from igps.mesh.mending import Cavities, Mending, mended_by
-from igps.mesh.options import MAX_UNPACKED, BodyKind, Component, LoadOptions
+from igps.mesh.mending import mended_by
+from igps.mesh.options import LoadOptions
+from igps.nn.description import describe, fit_centres
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig
 
@@ -37,18 +41,27 @@ LISTS = {
 }
 """Options of several words, of the same commands."""
 
+MEANINGS = {
+    **FLAGS,
+    "root": "folder of meshes, with or without classes",
+    "descriptor": "a name (a wrong one lists all), or package.module:NAME of one of your own",
+    "gallery": "the gallery",
+    "size": "keep lets differences in size count, ignore does not; auto keeps it where all files have a unit of length",
+    "mirror": "distinct tells a body from its mirror image",
+    "n_workers": "processes that compute; all cores if not given",
+    "time_limit": "seconds that one body may take; no limit if not given",
+    "memory_limit": "gigabytes of memory that one body may take; no limit if not given",
+    "cache_dir": "folder where computed signatures are kept; the user's cache directory if not given",
+}
+"""What options mean where the docstring of a command does not say it."""
+
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder whose bodies are found as the options say, or a file that `igps cache export` wrote of one.
-
-    Args:
-        root: the folder or file.
-        labelled: whether it must tell classes.
-    """
+    """A folder whose bodies are found as the options say, or a file that `igps cache export` wrote of one."""
 
     root: Path
-    labelled: bool = False
+    labelled: bool = False  # whether it must tell classes
 
 
 @dataclass(frozen=True)
@@ -57,6 +70,17 @@ class Verdict:
 
     told: Any
     is_good: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """Bodies and their descriptions."""
+
+    dataset: SignatureDataset  # the N bodies that could be used
+    descriptions: Tensor  # (N, ...)
+    failures: list[Failure]  # the other bodies
+    descriptor: Descriptor  # that described them
+    name: str | None  # by which it is found again; None where its centres are the collection's, which no name tells
 
 
 def signatures(
@@ -70,29 +94,70 @@ def signatures(
 ) -> tuple[SignatureDataset, list[Failure]]:
     """The bodies whose signatures are in the cache, after computing what was missing; and those that failed.
 
-    The parameters, and those of `chosen_dataset`, are options of every command that reads bodies.
+    The parameters, and those of `chosen_dataset`, are options of every command that reads bodies, see `MEANINGS`.
 
     Args:
         source: a folder, files, or bodies.
         descriptors: whose requirements the signatures satisfy.
-        n_workers: processes that compute; all cores if not given.
-        time_limit: seconds that the signature of one body may take; no limit if not given.
-        memory_limit: gigabytes of memory that the signature of one body may take; no limit if not given.
-        strict: see `FLAGS`.
 
     Raises:
         ValueError: no body could be used, or `paper` beside other parameters of the signatures.
     """
     needs = reduce(or_, (one.requirements for one in descriptors), Requirements()) if descriptors else None
     dataset = chosen_dataset(source, needs, **reading)
-    limits = Limits(time_limit, None if memory_limit is None else int(memory_limit * 1e9))
-    failures = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits)
+    failures = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits_of(time_limit, memory_limit))
     if len(failures) == len(dataset):
         raise ValueError(f"none of {len(dataset)} meshes could be used; the first: {failures[0].error}")
     usable = dataset.usable(failures)
     if summary := mending_summary(usable, len(dataset)):
         print(summary)
     return usable, failures
+
+
+def described(
+    source: Folder | Sequence[Path] | Bodies,
+    descriptor: str | Descriptor,
+    strict: bool = False,
+    n_workers: int | None = None,
+    size: Size = "auto",
+    mirror: Mirror = "same",
+    **reading: Any,
+) -> Described:
+    """The bodies whose signatures are in the cache, and their descriptions; see `signatures`.
+
+    Args:
+        source: a folder, files, or bodies.
+        descriptor: a name, to which size and mirror are added; or a descriptor as it is.
+    """
+    if isinstance(descriptor, str):
+        descriptor = with_side(descriptor, mirror)
+    dataset, failures = signatures(source, [descriptor_of(descriptor)], strict, n_workers, **reading)
+    if isinstance(descriptor, str):
+        descriptor = sized(descriptor, size, dataset)
+    module = descriptor_of(descriptor)
+    name = None if fit_centres(module, dataset) else name_of(descriptor)
+    undescribed: list[Failure] | None = None if strict else []
+    found = describe(
+        dataset, module, failures=undescribed, cache_tag=cache_tag(module), n_workers=n_workers, progress=True
+    )
+    return Described(dataset.usable(undescribed or ()), found, [*failures, *(undescribed or ())], module, name)
+
+
+def files_or_folder(meshes: Sequence[Path]) -> Folder | Sequence[Path]:
+    """What a list of words names: files, or one folder."""
+    return Folder(meshes[0]) if len(meshes) == 1 and meshes[0].is_dir() else meshes
+
+
+def limits_of(seconds: float | None, gigabytes: float | None) -> Limits:
+    """Of one body."""
+    return Limits(seconds, None if gigabytes is None else int(gigabytes * 1e9))
+
+
+def print_failures(failures: Sequence[Failure], n_used: int) -> None:
+    """How many bodies could not be used, if there are any."""
+    if failures:
+        n_given = n_used + len(failures)
+        print(f"{len(failures)} of {n_given} meshes could not be used. The first: {failures[0].error}")
 
 
 def with_side(descriptor: str, mirror: Mirror) -> str:
@@ -121,44 +186,24 @@ def chosen_dataset(
     cache_dir: Path | None = None,
     signature: SignatureConfig = SignatureConfig(),  # noqa: B008 (frozen)
     paper: bool = False,
-    mend: Mending = "auto",
-    component: Component | None = None,
-    allow_open: bool = False,
-    bodies: BodyKind | None = None,
     classes: ClassRule | None = None,
-    names: str | None = None,
-    threshold: float = 0.5,
-    cavities: Cavities = "fill",
-    max_unpacked: int = MAX_UNPACKED,
     attribute: list[str] | None = None,
+    **options: Any,
 ) -> SignatureDataset:
     """The dataset that the options tell; nothing is computed.
 
     Args:
         source: a folder, files, or bodies.
         needs: what the signatures satisfy, if that is known.
-        cache_dir: folder where computed signatures are kept; the user's cache directory if not given.
         signature: parameters of the signatures.
-        mend: auto does the least that makes a body of each mesh, never refuses what is no body, always makes
-            watertight all that does not bound one body without crossing itself, for collections of mixed quality.
-        component: largest keeps only the largest connected component of each body.
-        bodies: what of a file is a body: whole, labels, objects, pieces, chains, models or assembly; the labels of a
-            volume, the chains of a molecule and the whole of anything else if not given.
         classes: what the class of a body is: folder (or labels.csv), body (its name in its file), or file.
-        names: a table of the names of labels; those of the volume, or beside it, if not given.
-        threshold: a voxel of at least this probability belongs to the body, in volumes of probabilities.
-        cavities: fill takes a hollow body for the full one, keep lets the surfaces of its hollows bound it, too.
-        max_unpacked: bytes that a compressed file may unpack to.
-        attribute: see `LISTS`.
-        paper, allow_open: see `FLAGS`.
 
     Raises:
         ValueError: `paper` beside other parameters of the signatures, or no classes where they are needed.
     """
     if paper and signature != SignatureConfig():
         raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
-    config = SignatureConfig.paper() if paper else signature
-    reading = LoadOptions(mend, component, allow_open, bodies, max_unpacked, names, threshold, cavities)
+    config, reading = SignatureConfig.paper() if paper else signature, LoadOptions(**options)
     if isinstance(source, Folder) and source.root.is_file():
         if config != SignatureConfig() or reading != LoadOptions() or classes is not None:
             raise ValueError(f"{source.root}: expected no options of reading beside a file of signatures.")
@@ -166,12 +211,10 @@ def chosen_dataset(
         if source.labelled and dataset.bodies.labels is None:
             raise ValueError(f"{source.root}: expected signatures with classes. Export those of a labelled folder.")
         return dataset
-    root = source.root if isinstance(source, Folder) else None
-    attributes = attribute_sources(attribute or (), root)
+    attributes = attribute_sources(attribute or (), source.root if isinstance(source, Folder) else None)
     if isinstance(source, Folder):
-        find = labelled_bodies if source.labelled else find_bodies
-        found = find(source.root, reading, classes=classes or "folder", attributes=attributes.values())
-        source, classes = found, None
+        how: dict[str, Any] = {"classes": classes or "folder", "attributes": attributes.values()}
+        source = find_bodies(source.root, reading, labelled=source.labelled, **how)
     return SignatureDataset(
         source, config, cache_dir, descriptor=needs, classes=classes, reading=reading, attributes=attributes
     )
@@ -195,12 +238,11 @@ def write_notes(path: Path, dataset: SignatureDataset) -> None:
     write_rows(path, ("file", "note"), [(name, note) for name, told in notes for note in told])
 
 
-def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Write a table, or remove the one of an earlier run where there are no rows."""
     rows = list(rows)
     path.unlink(missing_ok=True)
     if rows:
-        with path.open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(header)
-            writer.writerows(rows)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([header, *rows])

@@ -11,8 +11,6 @@ from igps.report.results import read_results
 from igps.report.sources import read_sources
 from igps.report.surfaces import keep_surfaces, read_surfaces
 
-PAGE, SURFACES, EXPLANATIONS = "report.html", "surfaces.npz", "explanations.npz"
-
 
 def report(
     results: Path,
@@ -33,23 +31,19 @@ def report(
         explain: paint where each body differs from its nearest, kept in explanations.npz; takes seconds for each
         n_workers: processes that make the pictures; all cores if not given.
     """
-    dataset = read_sources(results, meshes)
-    found = read_results(results)
-    if dataset is None:
-        surfaces = read_surfaces(results / SURFACES)
+    dataset, found = read_sources(results, meshes), read_results(results)
+    kept = results / "surfaces.npz"
+    surfaces = read_surfaces(kept) if dataset is None else keep_surfaces(kept, dataset, n_workers=n_workers)
+    kept = results / "explanations.npz"
+    if not explain:
+        explanations = read_explanations(kept, surfaces)
+    elif dataset is None or len(found.systems) != 1:
+        raise ValueError("explain: expected results of `igps retrieve`, which tell a descriptor and its meshes.")
     else:
-        surfaces = keep_surfaces(results / SURFACES, dataset, n_workers=n_workers)
-    page = out or results / PAGE
-    if explain:
-        if dataset is None or len(found.systems) != 1:
-            raise ValueError("explain: expected results of `igps retrieve`, which tell a descriptor and its meshes.")
-        own = results / "descriptor.safetensors"
-        module = descriptor_of(str(own) if own.is_file() else found.systems[0].name)
-        explanations = keep_explanations(
-            results / EXPLANATIONS, found.systems[0], dataset, module, surfaces, n_workers=n_workers
-        )
-    else:
-        explanations = read_explanations(results / EXPLANATIONS, surfaces)
+        (system,), own = found.systems, results / "descriptor.safetensors"
+        module = descriptor_of(str(own) if own.is_file() else system.name)
+        explanations = keep_explanations(kept, system, dataset, module, surfaces, n_workers=n_workers)
+    page = out or results / "report.html"
     write_page(page, found, surfaces, explanations)
     print(f"page of results: {page}")
 

@@ -23,15 +23,10 @@ def stamp_of(path: Path) -> tuple[int, int, int]:
 
 @dataclass(frozen=True)
 class BodyFile:
-    """What a key needs to know of a file.
+    """What a key needs to know of a file."""
 
-    Args:
-        stamp: see `stamp_of`.
-        digest: of its content.
-    """
-
-    stamp: tuple[int, int, int]
-    digest: bytes
+    stamp: tuple[int, int, int]  # see `stamp_of`
+    digest: bytes  # of its content
 
     @staticmethod
     def of(path: Path) -> BodyFile:

@@ -8,13 +8,12 @@ what is not finite, and what is so large that it stands for nothing (10¹⁵).
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
+from igps.data._keys import content_digest, stamp_of
 from igps.data.attributes import AttributeSource
 from igps.mesh.formats import images, vertex_values
 from igps.mesh.formats.molecules import Molecule, MoleculeBodies, is_structure, molecules_by_part
@@ -59,11 +59,7 @@ class ResidueAttribute:
         return f"residues 1 {self.name}"
 
     def __call__(self, body: BodyRef, points: Values) -> Values:
-        """(P,) or (P, C) at points (P, 3), Å.
-
-        Raises:
-            MeshError: the body is no molecule, or its residues have no such value.
-        """
+        """(P,) or (P, C) at points (P, 3), Å; a MeshError of what is no molecule, or has no such value."""
         if not is_structure(body.path):
             raise MeshError(
                 f"{body}: has no atoms, which {self.name!r} is known of. Give a PDB, mmCIF or PQR file, or choose "
@@ -103,21 +99,12 @@ class FileAttribute(ABC):
     root: Path | None = None
 
     def cache_tag(self, body: BodyRef) -> str:
-        """The kind of source, the array's name, and the content of the file.
-
-        Raises:
-            MeshError: there is no such file.
-        """
+        """The kind of source, the array's name, and the content of the file; a MeshError where there is none."""
         file, name = self.file(body)
-        about = file.stat()
-        return f"{type(self).__name__} 1 {name} {_checksum(file, about.st_mtime_ns, about.st_size)}"
+        return f"{type(self).__name__} 1 {name} {_checksum(file, stamp_of(file))}"
 
     def __call__(self, body: BodyRef, points: Values) -> Values:
-        """(P,) or (P, C) at points (P, 3).
-
-        Raises:
-            MeshError: the file cannot be used, or knows too few of the points.
-        """
+        """(P,) or (P, C) at points (P, 3); a MeshError where the file is of no use, or knows too few of them."""
         file, name = self.file(body)
         try:
             values = self.values(body, file, name, points)
@@ -146,11 +133,7 @@ class FileAttribute(ABC):
         return found
 
     def file(self, body: BodyRef) -> tuple[Path, str]:
-        """The file of a body, and the name of the array in it, which may be "".
-
-        Raises:
-            MeshError: there is none, or the pattern leads out of the folder.
-        """
+        """The file of a body, and the name of the array in it, which may be ""; a MeshError where there is none."""
         pattern, _, name = self.path.partition("#")
         root = body.path.parent if self.root is None else self.root
         try:
@@ -171,10 +154,9 @@ class FileAttribute(ABC):
 
 
 @lru_cache(maxsize=1000)
-def _checksum(file: Path, changed: int, n_bytes: int) -> str:
+def _checksum(file: Path, stamp: tuple[int, int, int]) -> str:
     """Of the content; the many bodies of a volume may have one image."""
-    with file.open("rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()
+    return content_digest(file).hex()
 
 
 @dataclass(frozen=True)
@@ -185,22 +167,21 @@ class ImageAttribute(FileAttribute):
     """
 
     def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
-        """See `FileAttribute.values`."""
         grid, affine = images.read(file, os.stat(file).st_mtime_ns)
         at = (points - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
         size = np.array(grid.shape)
         inside = ((at > -0.5) & (at < size - 0.5)).all(axis=1)
         found = np.full(len(points), np.nan)
-        if inside.any():
-            # No more of a large image is changed than what is needed.
-            low = np.clip(np.floor(at[inside].min(axis=0)).astype(int), 0, size - 1)
-            high = np.clip(np.ceil(at[inside].max(axis=0)).astype(int), 0, size - 1)
-            block = grid[tuple(map(slice, low, high + 1))].astype(np.float64)
-            known = _is_known(block)
-            where = np.ascontiguousarray((at[inside] - low).T)
-            weight = map_coordinates(known.astype(np.float64), where, order=1, mode="nearest")
-            sums = map_coordinates(np.where(known, block, 0.0), where, order=1, mode="nearest")
-            found[inside] = np.where(weight > 0.5, sums / np.maximum(weight, 0.5), np.nan)
+        if not inside.any():
+            return found
+        # No more of a large image is changed than what is needed.
+        low = np.clip(np.floor(at[inside].min(axis=0)).astype(int), 0, size - 1)
+        high = np.clip(np.ceil(at[inside].max(axis=0)).astype(int), 0, size - 1)
+        block = grid[tuple(map(slice, low, high + 1))].astype(np.float64)
+        known = _is_known(block)
+        linear = partial(map_coordinates, coordinates=(at[inside] - low).T, order=1, mode="nearest")
+        weight, sums = linear(known.astype(np.float64)), linear(np.where(known, block, 0.0))
+        found[inside] = np.where(weight > 0.5, sums / np.maximum(weight, 0.5), np.nan)
         return found
 
 
@@ -214,16 +195,13 @@ class VertexAttribute(FileAttribute):
     """
 
     def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
-        """See `FileAttribute.values`."""
         import igl
 
         raw = read_surface(body.path, LoadOptions(), part=body.part)
         given = vertex_values.chosen(vertex_values.read(file), name, file)
         if len(given) != len(raw.vertices):
-            raise MeshError(
-                f"{body}: {file} has {len(given)} values, its surface {len(raw.vertices)} vertices. Give the values of "
-                "this surface."
-            )
+            counts = f"{len(given)} values, its surface {len(raw.vertices)} vertices"
+            raise MeshError(f"{body}: {file} has {counts}. Give the values of this surface.")
         columns = completed(given.reshape(len(given), -1), raw.vertices, str(file))
         mesh = load_mesh(body.path, part=body.part)
         vertices = mesh.vertices
@@ -241,7 +219,6 @@ class TetAttribute(FileAttribute):
     """Values at the points of a mesh of tetrahedra (.vtu), linear in each."""
 
     def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
-        """See `FileAttribute.values`."""
         vertices, tetrahedra, arrays = vertex_values.read_tetrahedra(file)
         given = vertex_values.chosen(arrays, name, file)
         corners = vertices[tetrahedra]
@@ -266,12 +243,7 @@ class TetAttribute(FileAttribute):
 
 
 def attribute_source(path: str, root: Path | None = None) -> AttributeSource:
-    """The source that a pattern of paths asks for, by its suffix; see `FileAttribute`.
-
-    Args:
-        path: such as ``images/{stem}.nii.gz``; or the name of an attribute of residues, such as ``charge``.
-        root: from where a relative path leads.
-    """
+    """The source that a pattern of paths asks for, by its suffix, see `FileAttribute`; or an attribute of residues."""
     name = path.partition("#")[0].lower()
     if path in RESIDUE_ATTRIBUTES:
         return ResidueAttribute(path)
@@ -281,11 +253,7 @@ def attribute_source(path: str, root: Path | None = None) -> AttributeSource:
 
 
 def attribute_sources(given: Sequence[str], root: Path | None) -> dict[str, AttributeSource]:
-    """Sources by name, of words such as ``ct=images/{stem}.nii.gz``.
-
-    Raises:
-        ValueError: a word without a name or a path.
-    """
+    """Sources by name, of words such as ``ct=images/{stem}.nii.gz``; a ValueError of one without a name or a path."""
     found = {}
     for word in given:
         name, _, path = word.partition("=")
@@ -296,12 +264,9 @@ def attribute_sources(given: Sequence[str], root: Path | None) -> dict[str, Attr
 
 
 def completed(values: Values, points: Values, what: str) -> Values:
-    """The values with those that are not known taken from the nearest point that has one, which is logged.
+    """Values (P,) or (P, C), those that are not known (NaN) taken from the nearest of points (P, 3) that has one.
 
-    Args:
-        values: (P,) or (P, C), NaN where they are not known.
-        points: (P, 3).
-        what: for messages.
+    It is logged of `what` that is.
 
     Raises:
         MeshError: more than a tenth is not known.

@@ -17,6 +17,8 @@ from igps.signature.signature import Signature
 
 ROOMS = ("interior", "surface")
 
+PointFunction = Callable[..., NDArray[np.floating[Any]]]
+
 
 @runtime_checkable
 class AttributeSource(Protocol):
@@ -67,7 +69,7 @@ class FunctionAttribute:
         return self.function(body, points)
 
 
-def takes_body(function: Callable[..., Any]) -> bool:
+def _takes_body(function: Callable[..., Any]) -> bool:
     """Whether a function has to be given two things, a body and points."""
     try:
         given = inspect.signature(function).parameters.values()
@@ -79,12 +81,24 @@ def takes_body(function: Callable[..., Any]) -> bool:
     )
 
 
-def with_attribute(signature: Signature, name: str, values: Mapping[str, ArrayLike]) -> Signature:
-    """The Signature with an attribute of its samples, by room.
+def sorted_out(
+    given: Mapping[str, AttributeSource | PointFunction],
+) -> tuple[dict[str, AttributeSource], dict[str, PointFunction]]:
+    """Attributes that are kept in the cache, and functions of points, which are called at each reading."""
+    sources: dict[str, AttributeSource] = {}
+    functions: dict[str, PointFunction] = {}
+    for name, one in given.items():
+        if isinstance(one, AttributeSource):
+            sources[name] = one
+        elif _takes_body(one):
+            sources[name] = FunctionAttribute(one)
+        else:
+            functions[name] = one
+    return sources, functions
 
-    Raises:
-        ValueError: not one finite row for each sample.
-    """
+
+def with_attribute(signature: Signature, name: str, values: Mapping[str, ArrayLike]) -> Signature:
+    """The Signature with an attribute of its samples, by room; a ValueError without one finite row for each."""
     try:
         interior, surface = (getattr(signature, room).with_attributes({name: values[room]}) for room in ROOMS)
     except ValueError as error:

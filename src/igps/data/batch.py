@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -14,6 +14,9 @@ from torch import Tensor
 
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature
+
+Several = slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
+"""Some of a batch or dataset: a slice, numbers, a mask, and of a dataset names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +56,9 @@ class SampleBatch:
     def subset(self, n_samples: int, seed: int | None = None) -> SampleBatch:
         """At most `n_samples` samples of each shape.
 
-        Args:
-            n_samples: how many; a shape with fewer keeps all of them.
-            seed: takes samples at equal steps along the order they come in, from a start that it draws. In a Signature
-                that order is by what the body looks like, and so is the choice: it depends neither on its batch nor on
-                how grid and mesh are numbered. If None, torch's global generator draws the samples at random.
+        A seed takes them at equal steps along the order they come in, from a start that it draws. In a Signature that
+        order is by what the body looks like, and so is the choice: it depends neither on its batch nor on how grid and
+        mesh are numbered. Without one, torch's global generator draws them at random.
         """
         n_kept = min(n_samples, self.mask.shape[1])
         index = torch.zeros(len(self.mask), n_kept, dtype=torch.long)
@@ -71,7 +72,7 @@ class SampleBatch:
 
         n_shapes, longest = self.mask.shape
         rows = (index + longest * torch.arange(n_shapes, device=index.device)[:, None]).flatten()
-        missing = ~kept if not bool(kept.all()) else None
+        missing = None if bool(kept.all()) else ~kept
 
         def take(values: Tensor) -> Tensor:
             taken = values.flatten(0, 1).index_select(0, rows).unflatten(0, (n_shapes, n_kept))
@@ -93,33 +94,19 @@ def _chosen(n_present: int, n_samples: int, seed: int | None) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One shape of a batch, without padding, as arrays.
+    """One shape of a batch, without padding, as arrays."""
 
-    Args:
-        eigenvalues: (K,) float64 ascending, 1/length².
-        interior: interior samples, their points measured from their centre.
-        surface: surface samples, likewise.
-        area: of the surface, length².
-        volume: of the body, length³.
-        id: its name.
-        surface_mesh: its surface; None where the batch has no meshes.
-    """
-
-    eigenvalues: NDArray[np.float64]
-    interior: Samples
-    surface: Samples
-    area: float
-    volume: float
-    id: str
-    surface_mesh: Mesh | None
+    eigenvalues: NDArray[np.float64]  # (K,) ascending, 1/length²
+    interior: Samples  # their points measured from their centre
+    surface: Samples  # likewise
+    area: float  # of the surface, length²
+    volume: float  # of the body, length³
+    id: str  # its name
+    surface_mesh: Mesh | None  # its surface; None where the batch has no meshes
 
     @property
     def mesh(self) -> Mesh:
-        """The surface, for a descriptor that says it needs it.
-
-        Raises:
-            ValueError: the batch has no meshes.
-        """
+        """The surface, for a descriptor that says it needs it; a ValueError where the batch has no meshes."""
         if self.surface_mesh is None:
             raise ValueError(f"{self.id}: expected a batch with meshes, got one without. See SignatureDataset.batch.")
         return self.surface_mesh
@@ -170,20 +157,13 @@ class SignatureBatch:
     @overload
     def __getitem__(self, index: int) -> Body: ...
     @overload
-    def __getitem__(self, index: slice | Sequence[int] | Sequence[bool] | Tensor) -> SignatureBatch: ...
-    def __getitem__(self, index: int | slice | Sequence[int] | Sequence[bool] | Tensor) -> Body | SignatureBatch:
+    def __getitem__(self, index: Several) -> SignatureBatch: ...
+    def __getitem__(self, index: int | Several) -> Body | SignatureBatch:
         """One shape as a `Body` by its number; some as a batch by a slice, numbers, or a mask."""
         if isinstance(index, int | np.integer):
             return self._body(range(len(self))[index])
-        rows: slice | Tensor
-        if isinstance(index, slice):
-            chosen, rows = list(range(len(self))[index]), index
-        else:
-            given = torch.as_tensor(index)
-            if given.dtype == torch.bool and given.shape != (len(self),):
-                raise IndexError(f"mask: expected {len(self)} entries, got a tensor of shape {tuple(given.shape)}.")
-            chosen = torch.arange(len(self))[given.cpu() if given.numel() else given.long()].tolist()
-            rows = torch.tensor(chosen, dtype=torch.int64, device=self.labels.device)
+        chosen = chosen_of(index, len(self))
+        rows = index if isinstance(index, slice) else torch.tensor(chosen, dtype=torch.int64, device=self.labels.device)
         return replace(
             self.map(lambda values: values[rows]),
             ids=tuple(self.ids[i] for i in chosen),
@@ -204,12 +184,7 @@ class SignatureBatch:
         )
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> SignatureBatch:
-        """The same batch on another device; meshes stay where they are.
-
-        Args:
-            device: to move to.
-            non_blocking: return before all is there, for a batch in pinned memory; see `torch.Tensor.to`.
-        """
+        """The same batch on another device, see `torch.Tensor.to`; meshes stay where they are."""
         return self.map(lambda values: values.to(device, non_blocking=non_blocking))
 
     def pin_memory(self) -> SignatureBatch:
@@ -220,8 +195,7 @@ class SignatureBatch:
     def concatenate(batches: Sequence[SignatureBatch]) -> SignatureBatch:
         """The shapes of several batches in one, padded to the longest.
 
-        Args:
-            batches: at least one, on one device, whose samples carry the same attributes; all with meshes, or none.
+        They are on one device, their samples carry the same attributes, and all have meshes, or none.
         """
         if not batches:
             raise ValueError("batches: expected at least one, got none.")
@@ -245,17 +219,21 @@ class SignatureBatch:
         return map(self._body, range(len(self)))
 
     def _body(self, i: int) -> Body:
-        eigenvalues = self.eigenvalues[i]
-        real = torch.isfinite(eigenvalues)
-        return Body(
-            eigenvalues=eigenvalues[real].cpu().numpy(),
-            interior=_samples_of(self.interior, i, int(real.sum())),
-            surface=_samples_of(self.surface, i, int(real.sum())),
-            area=float(self.area[i]),
-            volume=float(self.volume[i]),
-            id=self.ids[i],
-            surface_mesh=None if self.meshes is None else self.meshes[i],
-        )
+        eigenvalues = self.eigenvalues[i][torch.isfinite(self.eigenvalues[i])].cpu().numpy()
+        interior, surface = (_samples_of(one, i, len(eigenvalues)) for one in (self.interior, self.surface))
+        mesh = None if self.meshes is None else self.meshes[i]
+        return Body(eigenvalues, interior, surface, float(self.area[i]), float(self.volume[i]), self.ids[i], mesh)
+
+
+def chosen_of(index: Several, n: int) -> list[int]:
+    """The numbers that a slice, numbers, or a mask choose among n; an IndexError where they do not fit."""
+    if isinstance(index, slice):
+        return list(range(n))[index]
+    given = index.cpu() if isinstance(index, Tensor) else torch.as_tensor(np.asarray(index))
+    if given.dtype == torch.bool and given.shape != (n,):
+        raise IndexError(f"mask: expected {n} entries, got an array of shape {tuple(given.shape)}.")
+    found: list[int] = torch.arange(n)[given if given.numel() else given.long()].tolist()
+    return found
 
 
 def _joined(parts: Sequence[Tensor], padding: float = 0) -> Tensor:
@@ -276,12 +254,11 @@ def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:
             raise ValueError(
                 f"batches: all must carry the same sample attributes, got {names} and {sorted(part.attributes)}."
             )
-    return SampleBatch(
-        points=_joined([part.points for part in parts]),
-        eigenfunctions=_joined([part.eigenfunctions for part in parts]),
-        mask=_joined([part.mask for part in parts]),
-        attributes={name: _joined([part.attributes[name] for part in parts]) for name in names},
+    points, eigenfunctions, mask = (
+        _joined([getattr(part, name) for part in parts]) for name in ("points", "eigenfunctions", "mask")
     )
+    attributes = {name: _joined([part.attributes[name] for part in parts]) for name in names}
+    return SampleBatch(points, eigenfunctions, mask, attributes)
 
 
 def _samples_of(batch: SampleBatch, i: int, n_eigenpairs: int) -> Samples:

@@ -23,6 +23,8 @@ from igps.signature.signature import Samples, Signature, SignatureConfig
 logger = logging.getLogger(__name__)
 
 _ROOMS = ("interior", "surface")
+# What a Signature has beside arrays and configuration
+_OTHERS = ("area", "volume", "name", "notes", "residual", "unit")
 _PARTIAL = ".partial"
 # A file still being written after so many seconds was left by a process that was killed: a write takes well below one.
 _ABANDONED = 24 * 3600
@@ -43,21 +45,15 @@ class FileCache(ABC, Generic[T]):
     killed run leaves of one is removed a day later, see `remove_abandoned`. Two processes that compute the same value
     write the same bytes. Who may read folders and files is for the umask to say.
 
-    Args:
-        directory: made if it is missing.
-
-    Attributes:
-        what: the values are, in a word.
-        file_format: name and version of the files' format.
-        folder: of the values in the directory, "" where they lie in it themselves.
+    The directory is made if it is missing.
     """
 
-    what: ClassVar[str]
-    file_format: ClassVar[str]
-    folder: ClassVar[str] = ""
+    what: ClassVar[str]  # the values are, in a word
+    folder: ClassVar[str] = ""  # of the values in the directory, "" where they lie in it themselves
 
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(directory) / self.folder
+        self._format = f"igps-{self.what}-2"
 
     @staticmethod
     @abstractmethod
@@ -86,8 +82,7 @@ class FileCache(ABC, Generic[T]):
 
     def _checked(self, file: Any, metadata: Mapping[str, str]) -> T:
         tensors = {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118 (no Mapping)
-        if metadata.get("checksum") != checksum(tensors, metadata):
-            raise ValueError("its content is damaged: it does not have the checksum that it was written with")
+        check_checksum(tensors, metadata)
         return self._decode(tensors, metadata)
 
     def _read(self, key: str, read: Callable[[Any, Mapping[str, str]], Read]) -> Read | None:
@@ -95,8 +90,8 @@ class FileCache(ABC, Generic[T]):
         try:
             with safe_open(path, framework="pt") as file:  # in NumPy's words it would copy every array
                 metadata = file.metadata() or {}
-                if metadata.get("format") != self.file_format or metadata.get("key") != key:
-                    raise ValueError(f"not a {self.file_format} file of this key")
+                if metadata.get("format") != self._format or metadata.get("key") != key:
+                    raise ValueError(f"not a {self._format} file of this key")
                 return read(file, metadata)
         except FileNotFoundError:
             return None
@@ -115,7 +110,7 @@ class FileCache(ABC, Generic[T]):
         temporary = path.with_name(f"{key}.{os.getpid()}-{secrets.token_hex(8)}{_PARTIAL}")
         try:
             with open(temporary, "xb") as file:
-                file.write(_ordered(save(tensors, metadata={"format": self.file_format, "key": key, **metadata})))
+                file.write(_ordered(save(tensors, metadata={"format": self._format, "key": key, **metadata})))
             self._move(temporary, key)
         except BaseException as error:
             temporary.unlink(missing_ok=True)
@@ -149,24 +144,12 @@ def encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]
         tensors[f"{room}.eigenfunctions"] = np.ascontiguousarray(samples.eigenfunctions, np.float32)
         for name, values in samples.attributes.items():
             tensors[f"{room}.attributes.{name}"] = np.ascontiguousarray(values, np.float32)
-    scalars = {
-        "area": signature.area,
-        "volume": signature.volume,
-        "config": signature.config.as_dict(),
-        "name": signature.name,
-        "notes": signature.notes,
-        "residual": signature.residual,
-        "unit": signature.unit,
-    }
-    return tensors, {name: json.dumps(value) for name, value in scalars.items()}
+    others = {**{name: getattr(signature, name) for name in _OTHERS}, "config": signature.config.as_dict()}
+    return tensors, {name: json.dumps(value) for name, value in others.items()}
 
 
 def decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Signature:
-    """The Signature that `encode` was given.
-
-    Raises:
-        ValueError, KeyError, TypeError: they make none of the algorithm's version.
-    """
+    """The Signature that `encode` was given; a ValueError, KeyError or TypeError where there is none."""
     config: dict[str, Any] = json.loads(metadata["config"])
     if config.pop("algorithm_version") != SignatureConfig.ALGORITHM_VERSION:
         raise ValueError("made by another version of the algorithm")
@@ -182,18 +165,9 @@ def decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Si
         for name, values in attributes.items():
             _check_array(f"{room}.attributes.{name}", values, np.float32, (len(points), *values.shape[1:]))
         rooms[room] = Samples(points, eigenfunctions, attributes)
-    return Signature(
-        eigenvalues=eigenvalues,
-        interior=rooms["interior"],
-        surface=rooms["surface"],
-        area=json.loads(metadata["area"]),
-        volume=json.loads(metadata["volume"]),
-        config=SignatureConfig(**config),
-        name=json.loads(metadata["name"]),
-        notes=tuple(json.loads(metadata["notes"])),
-        residual=json.loads(metadata["residual"]),
-        unit=json.loads(metadata.get("unit", "null")),
-    )
+    others: dict[str, Any] = {name: json.loads(metadata[name]) for name in _OTHERS}
+    others["notes"] = tuple(others["notes"])
+    return Signature(eigenvalues, rooms["interior"], rooms["surface"], config=SignatureConfig(**config), **others)
 
 
 def _check_array(name: str, values: np.ndarray, kind: type[np.floating[Any]], shape: tuple[int, ...]) -> None:
@@ -205,7 +179,7 @@ class SignatureCache(FileCache[Signature]):
     """Signatures by key, see `FileCache`."""
 
     what = "signature"
-    file_format = "igps-signature-2"
+    _encode, _decode = staticmethod(encode), staticmethod(decode)
 
     def notes(self, key: str) -> tuple[str, ...]:
         """What was done to the mesh of the Signature under `key`, in words; nothing if there is none."""
@@ -213,42 +187,29 @@ class SignatureCache(FileCache[Signature]):
 
     def unit(self, key: str) -> str | None:
         """The unit of length of the Signature under `key`; None where it has none, or there is none."""
-        return self._read(key, lambda file, metadata: json.loads(metadata.get("unit", "null")))
-
-    _encode = staticmethod(encode)
-    _decode = staticmethod(decode)
+        return self._read(key, lambda file, metadata: json.loads(metadata["unit"]))
 
 
 class AttributeCache(FileCache[dict[str, NDArray[np.float32]]]):
     """Attributes of the samples of one Signature by room, beside the Signatures."""
 
-    what = "attribute"
-    file_format = "igps-attribute-2"
-    folder = "attributes"
+    what, folder = "attribute", "attributes"
+    _decode = staticmethod(lambda tensors, metadata: {room: tensors[room] for room in _ROOMS})
 
     @staticmethod
     def _encode(value: dict[str, NDArray[np.float32]]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        return {name: np.ascontiguousarray(values) for name, values in value.items()}, {}
-
-    @staticmethod
-    def _decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> dict[str, NDArray[np.float32]]:
-        return {room: tensors[room] for room in _ROOMS}
+        return {name: np.ascontiguousarray(one) for name, one in value.items()}, {}
 
 
 class DescriptionCache(FileCache[NDArray[np.float32]]):
     """Descriptions by key, beside the Signatures, see `FileCache`."""
 
-    what = "description"
-    file_format = "igps-description-2"
-    folder = "descriptions"
+    what, folder = "description", "descriptions"
+    _decode = staticmethod(lambda tensors, metadata: tensors["values"])
 
     @staticmethod
     def _encode(value: NDArray[np.float32]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         return {"values": np.ascontiguousarray(value)}, {}
-
-    @staticmethod
-    def _decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> NDArray[np.float32]:
-        return tensors["values"]
 
 
 def _remove_abandoned(partials: Iterable[Path]) -> None:
@@ -286,3 +247,9 @@ def checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> 
         found = zlib.crc32(raw[:end].view(np.uint64).reshape(-1, _ROW // 8).sum(axis=0).data, found)
         found = zlib.crc32(raw[end:].data, found)
     return f"{found:08x}"
+
+
+def check_checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
+    """Raise a ValueError where what was read is not what was written."""
+    if metadata.get("checksum") != checksum(tensors, metadata):
+        raise ValueError("its content is damaged: it does not have the checksum that it was written with")

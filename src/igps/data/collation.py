@@ -47,31 +47,16 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
         raise ValueError("items: expected at least one signature, got none.")
     if meshes is not None and len(meshes) != len(items):
         raise ValueError(f"meshes: expected one for each of {len(items)} signatures, got {len(meshes)}.")
-    labelled = [
-        item if isinstance(item, LabelledSignature) else LabelledSignature(item, -1, item.name) for item in items
-    ]
+    labelled = [one if isinstance(one, LabelledSignature) else LabelledSignature(one, -1, one.name) for one in items]
     signatures = [item.signature for item in labelled]
-    eigenvalues, area, volume, labels = _padded(
-        [
-            [np.asarray(s.eigenvalues, dtype=np.float64) for s in signatures],
-            [np.float64(s.area) for s in signatures],
-            [np.float64(s.volume) for s in signatures],
-            [np.int64(item.label) for item in labelled],
-        ],
-        padding=math.inf,
-    )
+    wanted: list[list[Any]] = [[np.asarray(s.eigenvalues, dtype=np.float64) for s in signatures]]
+    wanted += [[np.float64(getattr(s, name)) for s in signatures] for name in ("area", "volume")]
+    wanted.append([np.int64(item.label) for item in labelled])
+    eigenvalues, area, volume, labels = _padded(wanted, padding=math.inf)
     interior, surface = _pad_samples([[s.interior for s in signatures], [s.surface for s in signatures]])
-    return SignatureBatch(
-        eigenvalues=eigenvalues,
-        interior=interior,
-        surface=surface,
-        area=area,
-        volume=volume,
-        labels=labels,
-        ids=tuple(item.id for item in labelled),
-        meshes=None if meshes is None else tuple(meshes),
-        units=tuple(s.unit for s in signatures),
-    )
+    ids, units = tuple(item.id for item in labelled), tuple(s.unit for s in signatures)
+    given = None if meshes is None else tuple(meshes)
+    return SignatureBatch(eigenvalues, interior, surface, area, volume, labels, ids, given, units)
 
 
 def _pad_samples(rooms: Sequence[Sequence[Samples]]) -> list[SampleBatch]:
@@ -91,12 +76,9 @@ def _pad_samples(rooms: Sequence[Sequence[Samples]]) -> list[SampleBatch]:
     padded = iter(_padded(wanted))
     return [
         SampleBatch(
-            points=next(padded),
-            eigenfunctions=next(padded),
-            mask=next(padded),
-            attributes={name: next(padded) for name in sorted(samples[0].attributes)},
+            next(padded), next(padded), next(padded), {name: next(padded) for name in sorted(one[0].attributes)}
         )
-        for samples in rooms
+        for one in rooms
     ]
 
 

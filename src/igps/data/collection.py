@@ -6,15 +6,17 @@ import json
 import os
 import secrets
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from igps.data.cache import checksum, decode, encode
-from igps.signature.signature import Signature
+from igps.data.cache import check_checksum, checksum, decode, encode
+from igps.data.sources import Bodies, file_of
+from igps.mesh.options import LoadOptions
+from igps.signature.signature import Signature, SignatureConfig
 
 _FORMAT = "igps-collection-1"
 # A longer header of names is refused by safetensors.
@@ -24,27 +26,43 @@ _KINDS = {"float64": "F64", "float32": "F32"}
 
 @dataclass(frozen=True)
 class About:
-    """What a collection tells of itself.
+    """What a collection tells of itself."""
 
-    Args:
-        names: of the bodies.
-        parts: of their files; None for a file that is one body.
-        labels: their classes, or None.
-        classes: all names of classes, in the order of their numbers.
-        keys: of the Signatures in the cache that they come from.
-        reading: how the meshes were read, by the names of `LoadOptions`.
-        config: of the Signatures, by the names of `SignatureConfig`.
-        columns: what else is known of the bodies, see `Bodies`.
-    """
+    bodies: Bodies  # without folders
+    classes: tuple[str, ...]  # all names of classes, in the order of their numbers
+    keys: tuple[str, ...]  # of the Signatures in the cache that they come from
+    reading: LoadOptions  # how the meshes were read
+    config: SignatureConfig  # of the Signatures
 
-    names: tuple[str, ...]
-    parts: tuple[str | None, ...]
-    labels: tuple[str, ...] | None
-    classes: tuple[str, ...]
-    keys: tuple[str, ...]
-    reading: dict[str, Any]
-    config: dict[str, Any]
-    columns: dict[str, tuple[str | None, ...]] = field(default_factory=dict)
+    def written(self) -> str:
+        """All of it as JSON; of the paths, what their names tell."""
+        bodies = {name: value for name, value in vars(self.bodies).items() if name != "paths"}
+        parameters = {"reading": asdict(self.reading), "config": asdict(self.config)}
+        return json.dumps({**bodies, "classes": self.classes, "keys": self.keys, **parameters})
+
+    @staticmethod
+    def read(text: str) -> About:
+        """What was written; a ValueError, KeyError or TypeError where it does not fit together."""
+        told: dict[str, Any] = json.loads(text)
+        names, parts, columns = _words(told["names"]), tuple(told["parts"]), dict(told.get("columns", {}))
+        labels = None if told["labels"] is None else _words(told["labels"])
+        columns = {name: tuple(values) for name, values in columns.items()}
+        paths = tuple(Path(file_of(name, part)) for name, part in zip(names, parts, strict=True))
+        bodies, classes, keys = (
+            Bodies(paths, names, labels, parts, columns),
+            _words(told["classes"]),
+            _words(told["keys"]),
+        )
+        if len(keys) != len(names) or len(parts) != len(names) or len(set(names)) < len(names):
+            raise ValueError("its names, parts, labels and keys do not fit each other")
+        words = [*parts, *(value for values in columns.values() for value in values)]
+        if not set(labels or ()) <= set(classes) or not all(one is None or isinstance(one, str) for one in words):
+            raise ValueError("its labels are none of its classes, or its parts or columns no words")
+        try:
+            config = SignatureConfig(**{**told["config"], "attributes": tuple(told["config"]["attributes"])})
+            return About(bodies, classes, keys, LoadOptions(**told["reading"]), config)
+        except (TypeError, KeyError, ValueError) as error:
+            raise ValueError(f"parameters of another version: {error}") from error
 
 
 def write_collection(path: Path, about: About, signature: Callable[[int], Signature]) -> None:
@@ -54,11 +72,8 @@ def write_collection(path: Path, about: About, signature: Callable[[int], Signat
         path: the file; one that is there is replaced.
         about: N bodies.
         signature: of each, by its number; asked for several times, and not kept.
-
-    Raises:
-        ValueError: so many that no reader would take the file.
     """
-    n = len(about.names)
+    n = len(about.bodies)
     arrays: list[dict[str, tuple[str, tuple[int, ...], int]]] = []
     told = []
     for i in range(n):
@@ -73,7 +88,7 @@ def write_collection(path: Path, about: About, signature: Callable[[int], Signat
         kind, shape, n_bytes = arrays[i][name]
         header[f"{i}.{name}"] = {"dtype": _KINDS[kind], "shape": shape, "data_offsets": (end, end + n_bytes)}
         end += n_bytes
-    words = {"format": _FORMAT, "about": json.dumps(vars(about)), "signatures": json.dumps(told)}
+    words = {"format": _FORMAT, "about": about.written(), "signatures": json.dumps(told)}
     text = json.dumps({"__metadata__": words, **header}, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     if len(text) > _MOST_HEADER:
@@ -97,9 +112,6 @@ class CollectionFile:
 
     Reading runs no code. A worker process that is given one opens the file for itself.
 
-    Args:
-        path: the file.
-
     Raises:
         FileNotFoundError: no such file.
         ValueError: not a collection, or a damaged one.
@@ -114,10 +126,10 @@ class CollectionFile:
             metadata = self._file.metadata() or {}
             if metadata.get("format") != _FORMAT:
                 raise ValueError(f"its format is {metadata.get('format')!r}")
-            self.about = _about(json.loads(metadata["about"]))
+            self.about = About.read(metadata["about"])
             self._told: list[dict[str, str]] = json.loads(metadata["signatures"])
-            if len(self._told) != len(self.about.names):
-                raise ValueError(f"{len(self.about.names)} names for {len(self._told)} signatures")
+            if len(self._told) != len(self.about.bodies):
+                raise ValueError(f"{len(self.about.bodies)} names for {len(self._told)} signatures")
             names = set(self._file.keys())
         except (SafetensorError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(
@@ -133,40 +145,19 @@ class CollectionFile:
         return CollectionFile, (self.path,)
 
     def __getitem__(self, index: int) -> Signature:
-        """A Signature by its number; its arrays are views of the file.
-
-        Raises:
-            ValueError: it is damaged, or of another version of the algorithm.
-        """
+        """A Signature by its number, its arrays views of the file; a ValueError where it is damaged, or out of date."""
         metadata = self._told[index]
         try:
             tensors = {name: self._file.get_tensor(f"{index}.{name}").numpy() for name in self._arrays[index]}
-            if metadata.get("checksum") != checksum(tensors, metadata):
-                raise ValueError("its content is damaged: it does not have the checksum that it was written with")
+            check_checksum(tensors, metadata)
             return decode(tensors, metadata)
         except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
-            name = self.about.names[index]
+            name = self.about.bodies.names[index]
             raise ValueError(f"{self.path}: {name} is not usable ({error}). Export the collection again.") from error
 
     def notes(self, index: int) -> tuple[str, ...]:
         """What was done to the mesh of a Signature, in words."""
         return tuple(json.loads(self._told[index]["notes"]))
-
-
-def _about(told: dict[str, Any]) -> About:
-    names, parts = _words(told["names"]), tuple(told["parts"])
-    labels = None if told["labels"] is None else _words(told["labels"])
-    keys, columns = _words(told["keys"]), {name: tuple(values) for name, values in told.get("columns", {}).items()}
-    about = About(names, parts, labels, _words(told["classes"]), keys, told["reading"], told["config"], columns)
-    lengths = {len(names), len(parts), len(keys), len(names if labels is None else labels), *map(len, columns.values())}
-    if len(lengths) > 1 or len(set(names)) < len(names):
-        raise ValueError("its names, parts, labels and keys do not fit each other")
-    words = [*parts, *(value for values in columns.values() for value in values)]
-    if not set(labels or ()) <= set(about.classes) or not all(one is None or isinstance(one, str) for one in words):
-        raise ValueError("its labels are none of its classes, or its parts or columns no words")
-    if not isinstance(about.reading, dict) or not isinstance(about.config, dict):
-        raise ValueError("its reading or configuration is none")
-    return about
 
 
 def _words(values: Sequence[object]) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, Sampler
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import labelled_bodies
+from igps.data.sources import find_bodies
 from igps.data.splits import SplitProtocol, split_seen, split_unseen
 from igps.data.transforms import FewerSamples
 from igps.mesh.options import LoadOptions
@@ -93,14 +93,11 @@ class SignatureDataModule(LightningDataModule):
             raise ValueError(f"evaluation_batch_size: expected at least 1, got {evaluation_batch_size}.")
         if has_configuration():
             self.save_hyperparameters()
-        self.dataset = SignatureDataset(labelled_bodies(root), config, cache_dir, reading=reading)
-        self.classes_per_batch = classes_per_batch
-        self.shapes_per_class = shapes_per_class
-        self.n_samples_in_memory = n_samples_in_memory
+        self.dataset = SignatureDataset(find_bodies(root, labelled=True), config, cache_dir, reading=reading)
+        self.classes_per_batch, self.shapes_per_class = classes_per_batch, shapes_per_class
+        self.n_samples_in_memory, self.evaluation_batch_size = n_samples_in_memory, evaluation_batch_size
+        self.n_workers, self.n_loading_workers = n_workers, n_loading_workers
         self._in_memory: SignatureDataset | None = None
-        self.n_workers = n_workers
-        self.n_loading_workers = n_loading_workers
-        self.evaluation_batch_size = evaluation_batch_size
         labels = self.dataset.labels
         if protocol == "seen":
             self.split = split_seen(labels, n_train, n_validation=n_validation, seed=split_seed)

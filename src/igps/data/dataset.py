@@ -2,53 +2,31 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
-import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self, overload
+from typing import Self, overload
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
-from tqdm import tqdm
 
 from igps._parallel import Failed, Limits
-from igps.data.attributes import ROOMS, AttributeSource, FunctionAttribute, takes_body, with_attribute
-from igps.data.batch import LabelledSignature, SignatureBatch
+from igps.data.attributes import ROOMS, AttributeSource, PointFunction, sorted_out, with_attribute
+from igps.data.batch import LabelledSignature, Several, SignatureBatch, chosen_of
 from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.collation import collate
 from igps.data.collection import About, CollectionFile, write_collection
-from igps.data.file_stat_cache import FileStatCache
-from igps.data.filling import check_visible, filled, hits_in_cache
+from igps.data.filling import Failure, fill, hits_in_cache
 from igps.data.pipeline import CacheHit, PreTransform, SignaturePipeline
-from igps.data.requirements import Requirements, Requiring, requirements_of
-from igps.data.sources import Bodies, ClassRule, find_bodies, given_bodies
-from igps.mesh.loading import BodyRef
+from igps.data.requirements import AnyDescriptor, requirements_of
+from igps.data.sources import Bodies, ClassRule, bodies_of
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature, SignatureConfig
-
-logger = logging.getLogger(__name__)
-
-_REMEMBERED_AT_ONCE = 1000
-
-PointFunction = Callable[..., NDArray[np.floating[Any]]]
-Index = int | str | slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A body that could not be used, and why."""
-
-    id: str
-    path: Path
-    error: str
 
 
 class SignatureDataset(Dataset[LabelledSignature]):
@@ -66,13 +44,10 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     Args:
         root_or_paths: a folder (see `find_bodies`), files, or `Bodies`.
-        config: parameters of the Signatures; `SignatureConfig()` if None, with 250 eigenpairs where no descriptor asks
-            for another number.
-        cache_dir: where Signatures are kept; the user's cache directory if None. The key of a body covers the content
-            of its file, how it is read, every parameter, and the algorithm's version. A Signature with more eigenpairs
-            or attributes serves too.
-        descriptor: what the Signatures are for, by name or itself: they get the eigenpairs and attributes that it
-            requires.
+        config: parameters of the Signatures; 250 eigenpairs where neither it nor a descriptor names a number.
+        cache_dir: where Signatures are kept, by the content of the file, how it is read, every parameter, and the
+            algorithm's version; the user's cache directory if None. One with more eigenpairs or attributes serves too.
+        descriptor: what the Signatures are for, by name or itself: they get what it requires.
         labels: classes of the given paths, by name.
         classes: what the class of a body is, see `ClassRule`; as the folder tells it if None.
         reading: how files are read.
@@ -83,10 +58,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
         transform: a change of a Signature at each reading; see `igps.data.transforms`.
 
     Attributes:
-        bodies: files, names and classes.
-        pipeline: how a body becomes a Signature.
+        bodies: files, names, classes, and further columns of the table of labels.
+        pipeline: how a body becomes a Signature, by `config` and `reading`.
         classes: all names of classes, in the order of their numbers.
-        transform: see above; may be set.
 
     Raises:
         FileNotFoundError: no such folder, or no body in it.
@@ -99,7 +73,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         config: SignatureConfig | None = None,
         cache_dir: str | Path | None = None,
         *,
-        descriptor: str | Requiring | Requirements | None = None,
+        descriptor: AnyDescriptor | None = None,
         labels: Sequence[str] | None = None,
         classes: ClassRule | None = None,
         reading: LoadOptions | None = None,
@@ -112,50 +86,26 @@ class SignatureDataset(Dataset[LabelledSignature]):
         if descriptor is not None:
             requirements = requirements_of(descriptor)
             config, given = requirements.apply_to(config), {**requirements.sources, **given}
-        sources: dict[str, AttributeSource] = {}
-        self._functions: dict[str, PointFunction] = {}
-        for name, one in given.items():
-            if isinstance(one, AttributeSource):
-                sources[name] = one
-            elif takes_body(one):
-                sources[name] = FunctionAttribute(one)
-            else:
-                self._functions[name] = one
-        self.bodies = _bodies(root_or_paths, labels, reading, sources.values()).classed(classes or "folder")
+        sources, self._functions = sorted_out(given)
+        self.bodies = bodies_of(root_or_paths, labels, reading, sources.values()).classed(classes or "folder")
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
         if pre_transform is not None and pre_transform.cache_tag and self._functions:
             raise ValueError("pre_transform: expected attributes with a cache_tag beside it, got a function of points.")
-        self.pipeline = SignaturePipeline(
-            config.resolved(), reading, Path(cache_dir or default_cache_dir()), sources, pre_transform
-        )
+        directory = Path(cache_dir or default_cache_dir())
+        self.config, self.reading = config.resolved(), reading
+        self.pipeline = SignaturePipeline(self.config, reading, directory, sources, pre_transform)
         self.transform = transform
-        # What serves each body, once `precompute` has seen to it. And Signatures that need no cache, with the number of
-        # each body among them.
+        # What serves each body, once `precompute` has seen to it; Signatures that need no cache, and whose each is
         self._hits: tuple[CacheHit | None, ...] = (None,) * len(self.bodies)
         self._at_hand: CollectionFile | list[Signature] | None = None
         self._numbers: tuple[int, ...] = tuple(range(len(self.bodies)))
 
     @property
-    def config(self) -> SignatureConfig:
-        """Parameters of the Signatures."""
-        return self.pipeline.config
-
-    @property
-    def reading(self) -> LoadOptions:
-        """How the files are read."""
-        return self.pipeline.reading
-
-    @property
-    def columns(self) -> Mapping[str, tuple[str | None, ...]]:
-        """Further columns of the table of labels by name, a value for each body, None where it is missing."""
-        return self.bodies.columns
-
-    @property
     def labels(self) -> Tensor:
         """(N,) int64 index of each body's class in `classes`, −1 where unknown."""
         index = {name: i for i, name in enumerate(self.classes)}
-        names: Sequence[str | None] = self.bodies.labels or [None] * len(self.bodies)
-        return torch.tensor([-1 if name is None else index[name] for name in names], dtype=torch.int64)
+        known = None if self.bodies.labels is None else [index[name] for name in self.bodies.labels]
+        return torch.tensor(known or [-1] * len(self), dtype=torch.int64)
 
     @property
     def sizes(self) -> Tensor:
@@ -171,38 +121,22 @@ class SignatureDataset(Dataset[LabelledSignature]):
     @overload
     def __getitem__(self, index: int | str) -> LabelledSignature: ...  # type: ignore[overload-overlap]
     @overload
-    def __getitem__(
-        self, index: slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
-    ) -> Self: ...
-    def __getitem__(self, index: Index) -> LabelledSignature | Self:
+    def __getitem__(self, index: Several) -> Self: ...
+    def __getitem__(self, index: int | str | Several) -> LabelledSignature | Self:
         """An item by number or name; the dataset of some of the bodies by slice, numbers, names, or mask."""
         if isinstance(index, str):
-            return self._item(self._number(index))
+            index = self.bodies.number(index)
         if isinstance(index, int | np.integer):
             return self._item(range(len(self))[index])
-        if isinstance(index, slice):
-            return self.subset(range(len(self))[index])
-        found = list(index)
-        if found and all(isinstance(one, str) for one in found):
-            return self.subset([self._number(str(one)) for one in found])
-        numbers = torch.as_tensor(np.asarray(index))
-        if numbers.dtype == torch.bool and numbers.shape != (len(self),):
-            raise IndexError(f"mask: expected {len(self)} entries, got an array of shape {tuple(numbers.shape)}.")
-        return self.subset(torch.arange(len(self))[numbers if found else numbers.long()].tolist())
-
-    def _number(self, name: str) -> int:
-        try:
-            return self.bodies.names.index(name)
-        except ValueError:
-            raise KeyError(f"no body is called {name!r}; the first is called {self.bodies.names[:1]}") from None
+        if not isinstance(index, slice | Tensor):
+            index = [self.bodies.number(one) if isinstance(one, str) else one for one in index]
+        return self.subset(chosen_of(index, len(self)))
 
     def _item(self, i: int) -> LabelledSignature:
-        name = self.bodies.names[i]
         label = -1 if self.bodies.labels is None else self.classes.index(self.bodies.labels[i])
         signature = self._signature(i)
-        if self.transform is not None:
-            signature = self.transform(signature)
-        return LabelledSignature(signature, label, name)
+        changed = signature if self.transform is None else self.transform(signature)
+        return LabelledSignature(changed, label, self.bodies.names[i])
 
     def _signature(self, i: int) -> Signature:
         """Without the transform."""
@@ -222,32 +156,19 @@ class SignatureDataset(Dataset[LabelledSignature]):
         return map(self._signature, range(len(self)))
 
     def mesh(self, index: int) -> Mesh:
-        """The mesh itself, read and checked as for its Signature.
-
-        Raises:
-            MeshError: it cannot be used.
-        """
+        """The mesh itself, read and checked as for its Signature; a MeshError where it cannot be used."""
         if isinstance(self._at_hand, CollectionFile):
-            raise MeshError(
-                f"{self.bodies.names[index]}: {self._at_hand.path} holds signatures and no meshes. Make the dataset of "
-                "the folder of meshes."
-            )
+            name, file = self.bodies.names[index], self._at_hand.path
+            raise MeshError(f"{name}: {file} holds signatures and no meshes. Make the dataset of the folder of meshes.")
         return self.pipeline.mesh(self.bodies[index])
 
     def key(self, index: int) -> str:
-        """The name of a Signature in the cache, by the content of its file and everything that it depends on.
-
-        Raises:
-            MeshError: the file cannot be read.
-        """
+        """The name of a Signature in the cache, by all that it depends on; a MeshError if its file cannot be read."""
         hit = self._hits[index] if isinstance(self._at_hand, CollectionFile) else None
         return self.pipeline.key(self.bodies[index]) if hit is None else hit.key
 
     def cached_keys(self) -> list[str | None]:
-        """What in the cache serves each body, None where nothing does; of files that are known, without reading them.
-
-        None as well of those that change at each reading, which no key covers.
-        """
+        """What in the cache serves each body, None where nothing does, or a change at each reading."""
         if self._functions or self.transform is not None:
             return [None] * len(self)
         return [None if hit is None else hit.whole_key for hit in self._found()]
@@ -268,7 +189,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         return [None if hit is None else cache.unit(hit.key) for hit in self._found()]
 
     def batch(self, indices: Sequence[int], meshes: bool = False) -> SignatureBatch:
-        """Some of the items as a batch, with or without their meshes."""
+        """Some of the items as a batch."""
         return collate([self[i] for i in indices], [self.mesh(i) for i in indices] if meshes else None)
 
     def subset(self, indices: Sequence[int]) -> Self:
@@ -290,8 +211,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
     def to_memory(self, change: Callable[[Signature], Signature] | None = None) -> Self:
         """The same with all Signatures in memory, as they are before `transform`; those not cached are computed.
 
-        Args:
-            change: what is done to each before it is kept, such as `FewerSamples`, of which more fit.
+        Each is kept as `change` makes it, such as `FewerSamples`, of which more fit.
         """
         chosen = copy.copy(self)
         chosen._at_hand = [copy.deepcopy(one if change is None else change(one)) for one in self.signatures()]
@@ -303,27 +223,13 @@ class SignatureDataset(Dataset[LabelledSignature]):
     def to_file(self, path: str | Path) -> None:
         """Write all Signatures, as they are before `transform`, to one file that `from_file` reads without the meshes.
 
-        Names, classes and parameters go with them; paths do not. Those not cached are computed.
-
-        Args:
-            path: such as ``signatures.igps``; a file that is there is replaced.
-
-        Raises:
-            MeshError: a body that cannot be used; see `usable`.
+        Names, classes and parameters go with them; paths do not. Those not cached are computed; a MeshError of a body
+        that cannot be used, see `usable`.
         """
-        hits = [hit if hit is not None else self.pipeline.hit(self.bodies[i]) for i, hit in enumerate(self._hits)]
-        about = About(
-            names=self.bodies.names,
-            parts=self.bodies.parts,
-            labels=self.bodies.labels,
-            classes=self.classes,
-            keys=tuple(hit.whole_key for hit in hits),
-            reading=asdict(self.reading),
-            config=asdict(self.config),
-            columns=dict(self.bodies.columns),
-        )
         whole = copy.copy(self)
+        hits = [hit or self.pipeline.hit(body) for hit, body in zip(self._hits, self.bodies, strict=True)]
         whole._hits = tuple(hits)
+        about = About(self.bodies, self.classes, tuple(hit.whole_key for hit in hits), self.reading, self.config)
         write_collection(Path(path), about, whole._signature)
 
     @classmethod
@@ -331,27 +237,12 @@ class SignatureDataset(Dataset[LabelledSignature]):
         cls,
         path: str | Path,
         *,
-        descriptor: str | Requiring | Requirements | None = None,
-        cache_dir: str | Path | None = None,
-        transform: Callable[[Signature], Signature] | None = None,
+        descriptor: AnyDescriptor | None = None,
+        cache_dir: Path | None = None,
     ) -> Self:
         """The Signatures of a file that `to_file` wrote; it is read by memory map, and runs no code.
 
-        Example:
-            >>> import tempfile, trimesh
-            >>> ball = trimesh.creation.icosphere(subdivisions=2)
-            >>> with tempfile.TemporaryDirectory() as folder:
-            ...     _ = ball.export(f"{folder}/ball.off")
-            ...     dataset = SignatureDataset(folder, SignatureConfig(n_eigenpairs=20), f"{folder}/cache")
-            ...     dataset.to_file(f"{folder}/signatures.igps")
-            ...     len(SignatureDataset.from_file(f"{folder}/signatures.igps")["ball.off"].signature.eigenvalues)
-            20
-
-        Args:
-            path: the file.
-            descriptor: what the Signatures are for, by name or itself.
-            cache_dir: where descriptions are kept; the user's cache directory if None.
-            transform: a change of a Signature at each reading.
+        Descriptions are kept in `cache_dir`. For `descriptor` see `SignatureDataset`.
 
         Raises:
             FileNotFoundError: no such file.
@@ -359,19 +250,11 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """
         file = CollectionFile(path)
         about = file.about
-        try:
-            config = SignatureConfig(**{**about.config, "attributes": tuple(about.config["attributes"])})
-            reading = LoadOptions(**about.reading)
-        except (TypeError, KeyError, ValueError) as error:
-            raise ValueError(f"{path}: parameters of another version ({error}). Export it again.") from error
         if descriptor is not None:
-            requirements_of(descriptor).check_config(config)
-        paths = tuple(Path(name.removesuffix(f"#{part}")) for name, part in zip(about.names, about.parts, strict=True))
-        bodies = Bodies(paths, about.names, about.labels, about.parts, about.columns)
+            requirements_of(descriptor).check_config(about.config)
         dataset = cls.__new__(cls)
-        SignatureDataset.__init__(dataset, bodies, config, cache_dir, reading=reading, transform=transform)
-        dataset.classes = about.classes
-        dataset._at_hand = file
+        SignatureDataset.__init__(dataset, about.bodies, about.config, cache_dir, reading=about.reading)
+        dataset.classes, dataset._at_hand = about.classes, file
         dataset._hits = tuple(CacheHit(key, 0, file.notes(i), (0, 0, 0)) for i, key in enumerate(about.keys))
         return dataset
 
@@ -391,10 +274,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
         Args:
             executor: any `concurrent.futures.Executor`, such as that of a cluster, whose workers must see the files and
-                the cache by the same paths; processes of ours with one BLAS thread each if None.
-            n_workers: of those processes; all cores if None.
+                the cache by the same paths; `n_workers` processes of ours, or as many as cores, if None.
             strict: raise at the first bad body instead of listing it.
-            progress: show a bar.
             limits: time and memory of one body; one that needs more is bad.
 
         Raises:
@@ -403,37 +284,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """
         if self._at_hand is not None:
             return []
-        SignatureCache(self.pipeline.cache_dir).remove_abandoned()
-        known = FileStatCache(self.pipeline)
-        found = hits_in_cache(self.pipeline, self.bodies, look=executor is None)
-        failures: dict[int, Failure] = {}
-        new: dict[BodyRef, CacheHit] = {}
-        missing = [i for i, hit in enumerate(found) if hit is None]
-        outcomes = filled(
-            self.pipeline, self.bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits()
-        )
-        with (
-            tqdm(total=len(self), initial=len(self) - len(missing), desc="signatures", disable=not progress) as bar,
-            contextlib.closing(outcomes),
-            contextlib.ExitStack() as at_the_end,
-        ):
-            at_the_end.callback(lambda: known.remember(new))
-            for i, outcome in outcomes:
-                bar.update()
-                if not isinstance(outcome, Failed):
-                    if not new:
-                        check_visible(self.pipeline, outcome)
-                    new[self.bodies[i]] = found[i] = outcome
-                    if len(new) >= _REMEMBERED_AT_ONCE:
-                        known.remember(new)
-                        new.clear()
-                    continue
-                failures[i] = self.failure(i, outcome)
-                if strict:
-                    raise MeshError(failures[i].error)
-                logger.warning("skipped: %s", failures[i].error)
-        self._hits = tuple(found)
-        return [failures[i] for i in sorted(failures)]
+        hits, failures = fill(self.pipeline, self.bodies, executor, n_workers, strict, progress, limits)
+        self._hits = tuple(hits)
+        return failures
 
     def _found(self) -> list[CacheHit | None]:
         """What serves each body, as far as something does."""
@@ -444,19 +297,4 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def failure(self, index: int, failed: Failed) -> Failure:
         """What failed of a body, in a sentence that names its file."""
-        path, reason = self.bodies.paths[index], failed.reason
-        named = reason if reason.startswith(str(path)) else f"{self.bodies[index]}: {reason}"
-        return Failure(self.bodies.names[index], path, named)
-
-
-def _bodies(
-    given: str | Path | Sequence[str | Path] | Bodies,
-    labels: Sequence[str] | None,
-    reading: LoadOptions,
-    attributes: Iterable[AttributeSource],
-) -> Bodies:
-    if isinstance(given, Bodies):
-        return given
-    if isinstance(given, str | Path) and Path(given).is_dir():
-        return find_bodies(given, reading, attributes=attributes)
-    return given_bodies([given] if isinstance(given, str | Path) else given, labels, reading)
+        return Failure.of(self.bodies, index, failed)

@@ -1,14 +1,17 @@
-"""The cache is filled: what it has of many bodies, and the rest computed by processes here or elsewhere."""
+"""The cache is filled: what it has of many bodies serves, the rest is computed by processes here or elsewhere."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+
+from tqdm import tqdm
 
 from igps._parallel import Failed, Limits, MachineError, n_cores, run
 from igps.data.cache import SignatureCache
@@ -18,23 +21,72 @@ from igps.data.sources import Bodies
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import MeshError
 
+logger = logging.getLogger(__name__)
+
+_REMEMBERED_AT_ONCE = 1000
 # Seconds until a file that another machine wrote is seen here, by a file system for many.
 _SHARED_WITHIN = 60.0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A body that could not be used, and why."""
+
+    id: str
+    path: Path
+    error: str
+
+    @staticmethod
+    def of(bodies: Bodies, i: int, failed: Failed) -> Failure:
+        """What failed of a body, in a sentence that names its file."""
+        path, reason = bodies.paths[i], failed.reason
+        return Failure(bodies.names[i], path, reason if reason.startswith(str(path)) else f"{bodies[i]}: {reason}")
+
+
+def fill(
+    pipeline: SignaturePipeline, bodies: Bodies, executor: Executor | None, n_workers: int | None, strict: bool,
+    progress: bool, limits: Limits | None,
+) -> tuple[list[CacheHit | None], list[Failure]]:  # fmt: skip
+    """What serves each body, after computing what was missing; and what failed, see `SignatureDataset.precompute`."""
+    SignatureCache(pipeline.cache_dir).remove_abandoned()
+    known = FileStatCache(pipeline)
+    found = hits_in_cache(pipeline, bodies, look=executor is None)
+    failures: dict[int, Failure] = {}
+    new: dict[BodyRef, CacheHit] = {}
+    missing = [i for i, hit in enumerate(found) if hit is None]
+    outcomes = filled(pipeline, bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits())
+    bar = tqdm(total=len(bodies), initial=len(bodies) - len(missing), desc="signatures", disable=not progress)
+    with bar, contextlib.closing(outcomes):
+        try:
+            for i, outcome in outcomes:
+                bar.update()
+                if isinstance(outcome, Failed):
+                    failures[i] = Failure.of(bodies, i, outcome)
+                    if strict:
+                        raise MeshError(failures[i].error)
+                    logger.warning("skipped: %s", failures[i].error)
+                    continue
+                if not new:
+                    check_visible(pipeline, outcome)
+                new[bodies[i]] = found[i] = outcome
+                if len(new) >= _REMEMBERED_AT_ONCE:
+                    known.remember(new)
+                    new.clear()
+        finally:
+            known.remember(new)
+    return found, [failures[i] for i in sorted(failures)]
 
 
 def hits_in_cache(pipeline: SignaturePipeline, bodies: Bodies, look: bool = True) -> list[CacheHit | None]:
     """What in the cache serves each body, None where nothing does.
 
-    Args:
-        pipeline: how a body becomes a Signature.
-        bodies: N bodies.
-        look: read the files that are not known or have changed; otherwise nothing serves these.
+    Files that are not known or have changed are read only if `look`; otherwise nothing serves their bodies.
     """
     known = FileStatCache(pipeline)
     ready = known.ready(bodies)
     found = [ready.get(body) for body in bodies]
     new: dict[BodyRef, CacheHit] = {}
-    for group in _by_file(bodies, (i for i, hit in enumerate(found) if hit is None and look)):
+    for group in by_file(bodies, (i for i, hit in enumerate(found) if hit is None and look)):
         with contextlib.suppress(MeshError):  # computing it will say why
             for i, hit in zip(group, pipeline.served([bodies[i] for i in group]), strict=True):
                 if hit is not None:
@@ -59,22 +111,20 @@ def filled(
     process, each of the chunk is tried again alone. With limits, which are of one body, every body is.
 
     Args:
-        pipeline: how a body becomes a Signature.
-        bodies: N bodies.
-        numbers: of those that are computed.
+        numbers: of the bodies that are computed.
         n_workers, executor, limits: see `igps._parallel.run`.
         at_once: bodies in a chunk; so many that every worker has one if None.
     """
     most = 1 if limits != Limits() else at_once or max(1, -(-len(numbers) // (n_workers or n_cores())))
-    jobs = [group[start : start + most] for group in _by_file(bodies, numbers) for start in range(0, len(group), most)]
-    fill: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
+    jobs = [group[start : start + most] for group in by_file(bodies, numbers) for start in range(0, len(group), most)]
+    work: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
     given = [[bodies[i] for i in job] for job in jobs]
     if executor is not None:  # elsewhere, and from another folder
         there = replace(pipeline, cache_dir=pipeline.cache_dir.absolute())
-        fill = partial(fill_elsewhere, there.fill, version())
+        work = partial(fill_elsewhere, there.fill, version())
         given = [[replace(body, path=body.path.absolute()) for body in job] for job in given]
     lost: list[int] = []
-    results = run(fill, given, n_workers=n_workers, executor=executor, limits=limits)
+    results = run(work, given, n_workers=n_workers, executor=executor, limits=limits)
     with contextlib.closing(results):
         for number, outcome in results:
             job = jobs[number]
@@ -101,8 +151,9 @@ def check_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
         time.sleep(0.1)
 
 
-def _by_file(bodies: Bodies, numbers: Iterable[int]) -> Iterator[list[int]]:
+def by_file(bodies: Bodies, numbers: Iterable[int]) -> list[list[int]]:
+    """The numbers of bodies, those of one file together."""
     groups: dict[Path, list[int]] = {}
     for i in numbers:
         groups.setdefault(bodies.paths[i], []).append(i)
-    yield from groups.values()
+    return list(groups.values())

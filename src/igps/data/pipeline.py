@@ -8,6 +8,7 @@ import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Protocol
 
@@ -37,21 +38,13 @@ class PreTransform(Protocol):
 
 @dataclass(frozen=True)
 class CacheHit:
-    """The Signature in the cache that serves a body.
+    """The Signature in the cache that serves a body."""
 
-    Args:
-        key: its name in the cache; that of a larger one, if that is there.
-        n_bytes: size of its file.
-        notes: what was done to the mesh, in words.
-        stamp: of the body's file when it was read, see `stamp_of`.
-        attributes: the names in the cache of what was added to it, by attribute.
-    """
-
-    key: str
-    n_bytes: int
-    notes: tuple[str, ...]
-    stamp: tuple[int, int, int]
-    attributes: Mapping[str, str] = field(default_factory=dict)
+    key: str  # its name in the cache; that of a larger one, if that is there
+    n_bytes: int  # size of its file
+    notes: tuple[str, ...]  # what was done to the mesh, in words
+    stamp: tuple[int, int, int]  # of the body's file when it was read, see `stamp_of`
+    attributes: Mapping[str, str] = field(default_factory=dict)  # names in the cache of what was added, by attribute
 
     @property
     def whole_key(self) -> str:
@@ -61,79 +54,56 @@ class CacheHit:
 
 @dataclass(frozen=True)
 class SignaturePipeline:
-    """All that the Signature of a body depends on, and where it is kept; small, so that workers get no more than this.
-
-    Args:
-        config: parameters of the Signature.
-        reading: how the file is read.
-        cache_dir: where Signatures are kept.
-        attributes: what is added to the samples, by name.
-        pre_transform: what is done to the Signature with its attributes before it is kept; None for nothing.
-    """
+    """All that the Signature of a body depends on, and where it is kept; small, as workers get it."""
 
     config: SignatureConfig
     reading: LoadOptions
     cache_dir: Path
-    attributes: Mapping[str, AttributeSource] = field(default_factory=dict)
-    pre_transform: PreTransform | None = None
+    attributes: Mapping[str, AttributeSource] = field(default_factory=dict)  # added to the samples, by name
+    pre_transform: PreTransform | None = None  # done to the Signature with its attributes before it is kept
 
     def mesh(self, body: BodyRef) -> Mesh:
-        """The checked mesh of a body.
-
-        Raises:
-            MeshError: it cannot be used.
-        """
+        """The checked mesh of a body; a MeshError where it cannot be used."""
         return load_mesh(body.path, self.reading, part=body.part, least_vertices=self.config.n_vertices_read)
 
     def signature(self, body: BodyRef) -> Signature:
         """The Signature of a body, from the cache where it or a larger one is there, and there afterwards."""
-        return self._made(body, BodyFile.of(body.path))[1]
+        file = BodyFile.of(body.path)
+        hit = self._served(body, file)
+        found = None if hit is None else self.read(hit)
+        return self._made(body, file)[1] if found is None else found
 
     def fill(self, bodies: Sequence[BodyRef]) -> list[CacheHit | Failed]:
         """Put the Signatures of bodies of one file into the cache; they are not returned, to spare the way back.
 
-        Returns:
-            What serves each; of a body that cannot be used, why, if there are several.
-
-        Raises:
-            MeshError: the only one cannot be used.
-            MachineError: the disk is full, or the like.
+        Returned is what serves each, or of one of several that cannot be used, why. A MeshError where the only one
+        cannot be used, a MachineError where the disk is full, or the like.
         """
         if len(bodies) == 1:
             return [self.hit(bodies[0])]
         file = BodyFile.of(bodies[0].path)
-        done: dict[BodyRef, CacheHit | Failed] = {}
-        for body in bodies:
-            if (hit := self._served(body, file)) is not None:
-                done[body] = hit
+        served = {body: self._served(body, file) for body in bodies}
+        done: dict[BodyRef, CacheHit | Failed] = {body: hit for body, hit in served.items() if hit is not None}
         missing = {body.part: body for body in bodies if body not in done}
+        least = self.config.n_vertices_read
         try:
-            least = self.config.n_vertices_read
             for ref, mesh in each_body(bodies[0].path, self.reading, parts=[*missing], least_vertices=least):
+                body = missing[ref.part]
                 if isinstance(mesh, MeshError):
-                    done[missing[ref.part]] = Failed(str(mesh))
+                    done[body] = Failed(str(mesh))
                 else:
-                    done[missing[ref.part]] = attempt(partial(self._hit, missing[ref.part], file, mesh))
+                    done[body] = attempt(partial(self._hit, body, file, mesh))
         except MeshError as error:  # of the file: so of each
-            for body in missing.values():
-                done.setdefault(body, Failed(str(error)))
+            done = {**dict.fromkeys(missing.values(), Failed(str(error))), **done}
         # Those that the file does not have are told so one by one.
         return [done[body] if body in done else attempt(partial(self._hit, body, file)) for body in bodies]
 
     def hit(self, body: BodyRef) -> CacheHit:
-        """What serves a body, which is in the cache then.
-
-        Raises:
-            MeshError: it cannot be used.
-        """
+        """What serves a body, which is in the cache then; a MeshError where it cannot be used."""
         return self._hit(body, BodyFile.of(body.path))
 
     def served(self, bodies: Sequence[BodyRef]) -> list[CacheHit | None]:
-        """What in the cache serves each of the bodies of one file, None where nothing does.
-
-        Raises:
-            MeshError: the file cannot be read.
-        """
+        """What in the cache serves each body of one file, None where nothing does; a MeshError if unreadable."""
         file = BodyFile.of(bodies[0].path)
         return [self._served(body, file) for body in bodies]
 
@@ -161,25 +131,9 @@ class SignaturePipeline:
             signature = with_attribute(signature, name, values)
         return signature
 
-    def is_cached(self, body: BodyRef) -> bool:
-        """Whether the Signature of a body can be read; false for a file that cannot."""
-        try:
-            return self.served([body]) != [None]
-        except MeshError:
-            return False
-
-    def key(self, body: BodyRef, *, mended: bool = False) -> str:
-        """A Signature's name in the cache: content of the file, how it is read, every parameter and version.
-
-        Args:
-            body: the file, and which body of it.
-            mended: whether anything was done to its mesh. Only then does the version of the mending count, so that a
-                new one leaves the Signatures of bodies that are read as they are.
-
-        Raises:
-            MeshError: the file cannot be read.
-        """
-        return self._key(body, BodyFile.of(body.path), self.config, mended)
+    def key(self, body: BodyRef) -> str:
+        """A Signature's name in the cache, by all that it depends on; a MeshError where the file cannot be read."""
+        return self._key(body, BodyFile.of(body.path), self.config, False)
 
     def _hit(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> CacheHit:
         return self._served(body, file) or self._made(body, file, mesh)[0]
@@ -197,12 +151,8 @@ class SignaturePipeline:
         return self.with_attributes(body, hit)
 
     def _made(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> tuple[CacheHit, Signature]:
-        """The Signature of a body with what serves it, which is in the cache then; computed where it is not."""
+        """The Signature of a body, with what serves it from now on."""
         cache = SignatureCache(self.cache_dir)
-        hit = self._served(body, file)
-        found = None if hit is None else self.read(hit)
-        if hit is not None and found is not None:
-            return hit, found
         key, signature = self._plain(body, file, mesh)
         keys = {}
         for name in self.attributes:
@@ -242,11 +192,9 @@ class SignaturePipeline:
     def _cached(self, body: BodyRef, file: BodyFile) -> Iterator[str]:
         """The keys that the cache has of the Signature of a body and of larger ones, which begin with it."""
         cache = SignatureCache(self.cache_dir)
-        for config in _serving(self.config):
-            for mended in (False, True):
-                key = self._key(body, file, config, mended)
-                if key not in cache:
-                    continue
+        for config, mended in product(_serving(self.config), (False, True)):
+            key = self._key(body, file, config, mended)
+            if key in cache:
                 steps = mended_by(cache.notes(key))
                 # A former version of the mending made another body.
                 of_this_version = mended or not steps
@@ -256,6 +204,7 @@ class SignaturePipeline:
                     yield key
 
     def _key(self, body: BodyRef, file: BodyFile, config: SignatureConfig, mended: bool) -> str:
+        # The version of the mending counts where anything was done to the mesh: a new one leaves the others as they are
         # The suffix chooses the reader, so the same bytes under another suffix are another mesh.
         versions = config.ALGORITHM_VERSION, MENDING_VERSION if mended else None
         how = parameters(body.path.suffix.lower(), body.part, self.reading, config, versions)
@@ -285,15 +234,10 @@ def version() -> str:
 def fill_elsewhere(
     fill: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]], expected: str, bodies: Sequence[BodyRef]
 ) -> list[CacheHit | Failed]:
-    """`SignaturePipeline.fill` by a worker of a cluster.
-
-    Raises:
-        MachineError: the worker has another version of the library.
-    """
-    here = version()
-    if here != expected:
+    """`SignaturePipeline.fill` by a worker of a cluster; a MachineError where that has another version."""
+    if version() != expected:
         raise MachineError(
-            f"the worker on {socket.gethostname()} has igps {here}, where {expected} is asked for. Install one version "
-            "everywhere and run again: what is done is kept."
+            f"the worker on {socket.gethostname()} has igps {version()}, where {expected} is asked for. Install one "
+            "version everywhere and run again: what is done is kept."
         )
     return fill(bodies)

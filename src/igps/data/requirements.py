@@ -17,20 +17,13 @@ from igps.signature.signature import SignatureConfig
 
 @dataclass(frozen=True)
 class Requirements:
-    """What a descriptor needs of a body, beside its samples, area and volume.
+    """What a descriptor needs of a body, beside its samples, area and volume."""
 
-    Args:
-        n_eigenpairs: at least so many; with fewer it would be another descriptor.
-        attributes: of the samples, see `SignatureConfig`.
-        mesh: whether the surface itself.
-        whole_spectrum: whether it takes all eigenpairs that there are: with more it would be another descriptor.
-        sources: of further attributes of the samples, by name; those that a Dataset is given itself come first.
-    """
-
-    n_eigenpairs: int = 0
-    attributes: tuple[AttributeName, ...] = ()
-    mesh: bool = False
-    whole_spectrum: bool = False
+    n_eigenpairs: int = 0  # at least so many; with fewer it would be another descriptor
+    attributes: tuple[AttributeName, ...] = ()  # of the samples, see `SignatureConfig`
+    mesh: bool = False  # whether the surface itself
+    whole_spectrum: bool = False  # whether all eigenpairs that there are: with more it would be another descriptor
+    # Of further attributes of the samples, by name; those that a Dataset is given itself come first
     sources: Mapping[str, AttributeSource] = field(default_factory=dict, hash=False)
 
     def __or__(self, other: Requirements) -> Requirements:
@@ -101,6 +94,9 @@ class Requiring(Protocol):
         """What it needs of a body."""
 
 
+AnyDescriptor = str | Requiring | Requirements
+"""A descriptor's name, itself, or its requirements."""
+
 _by_name: list[Callable[[str], Requiring]] = []
 
 
@@ -109,12 +105,8 @@ def register_descriptors(by_name: Callable[[str], Requiring]) -> None:
     _by_name[:] = [by_name]
 
 
-def requirements_of(descriptor: str | Requiring | Requirements) -> Requirements:
-    """What a descriptor needs of a body.
-
-    Args:
-        descriptor: its name, itself, or its requirements.
-    """
+def requirements_of(descriptor: AnyDescriptor) -> Requirements:
+    """What a descriptor needs of a body."""
     if isinstance(descriptor, Requirements):
         return descriptor
     return (_by_name[0](descriptor) if isinstance(descriptor, str) else descriptor).requirements

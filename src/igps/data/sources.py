@@ -24,20 +24,13 @@ ClassRule = Literal["folder", "body", "file"]
 
 @dataclass(frozen=True)
 class Bodies:
-    """Bodies in files, and what is known of them.
+    """Bodies in files, and what is known of them."""
 
-    Args:
-        paths: the file of each.
-        names: a distinct name for each: the path of its file relative to the folder it was found in, and `#part`.
-        labels: the class of each, or None where no classes are known.
-        parts: which body of its file each is; None in a file that is one body. All of them if nothing is given.
-        columns: further columns of the table of labels by name, a value for each body; None where it is missing.
-    """
-
-    paths: tuple[Path, ...]
-    names: tuple[str, ...]
-    labels: tuple[str, ...] | None = None
-    parts: tuple[str | None, ...] = ()
+    paths: tuple[Path, ...]  # the file of each
+    names: tuple[str, ...]  # distinct: the path of the file relative to the folder it was found in, and `#part`
+    labels: tuple[str, ...] | None = None  # the class of each, or None where no classes are known
+    parts: tuple[str | None, ...] = ()  # which body of its file each is; None in a file that is one body
+    # Further columns of the table of labels by name, a value for each body; None where it is missing
     columns: Mapping[str, tuple[str | None, ...]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
@@ -57,6 +50,12 @@ class Bodies:
     def __iter__(self) -> Iterator[BodyRef]:
         return map(BodyRef, self.paths, self.parts)
 
+    def number(self, name: str) -> int:
+        """Of the body of a name; a KeyError where none is called so."""
+        if name not in self.names:
+            raise KeyError(f"no body is called {name!r}; the first is called {self.names[:1]}")
+        return self.names.index(name)
+
     def subset(self, indices: Sequence[int]) -> Bodies:
         """Some of the bodies, in the given order."""
         return Bodies(
@@ -68,11 +67,7 @@ class Bodies:
         )
 
     def column(self, name: str) -> tuple[str, ...]:
-        """The values of a column that every body has, such as of "scanner".
-
-        Raises:
-            ValueError: no such column, or bodies without a value.
-        """
+        """The values of a column that every body has, such as of "scanner"; a ValueError where one has none."""
         if name not in self.columns:
             known = ", ".join(self.columns) or "none"
             raise ValueError(f"{name}: no such column of {LABELS_FILE}; further columns: {known}. Choose one of them.")
@@ -86,11 +81,7 @@ class Bodies:
         return tuple(str(value) for value in values)
 
     def numbers(self, name: str) -> list[float]:
-        """The values of a column of numbers, such as of "age".
-
-        Raises:
-            ValueError: no such column, bodies without a value, or a value that is no finite number.
-        """
+        """The values of a column of numbers, such as of "age"; a ValueError of what is no finite number."""
         values = self.column(name)
         for body, value in zip(self.names, values, strict=True):
             try:
@@ -102,11 +93,7 @@ class Bodies:
         return [float(value) for value in values]
 
     def classed(self, rule: ClassRule) -> Bodies:
-        """The same bodies with the classes that a rule gives them; "folder" leaves them as they are.
-
-        Raises:
-            ValueError: an unknown rule, or bodies without parts to be named by.
-        """
+        """The same bodies with the classes that a rule gives them; "folder" leaves them as they are."""
         if rule not in get_args(ClassRule):
             raise ValueError(f"classes: expected 'folder', 'body' or 'file', got {rule!r}.")
         if rule == "folder":
@@ -118,11 +105,7 @@ class Bodies:
                     f"classes: expected files of several bodies with 'body', but {unnamed[0]} is one body."
                 )
             return replace(self, labels=tuple(str(part) for part in self.parts))
-        files = (
-            name if part is None else name.removesuffix(f"#{part}")
-            for name, part in zip(self.names, self.parts, strict=True)
-        )
-        return replace(self, labels=tuple(files))
+        return replace(self, labels=tuple(map(file_of, self.names, self.parts)))
 
 
 def find_bodies(
@@ -131,6 +114,7 @@ def find_bodies(
     *,
     classes: ClassRule = "folder",
     attributes: Iterable[AttributeSource] = (),
+    labelled: bool = False,
 ) -> Bodies:
     """The bodies below a folder, with their classes if it tells them.
 
@@ -144,51 +128,35 @@ def find_bodies(
         options: how files are read, which says what bodies there are in one.
         classes: what the class of a body is, see `ClassRule`.
         attributes: what bodies bring along; the files of these are no bodies.
+        labelled: whether it must tell classes.
 
     Raises:
         FileNotFoundError: the folder does not exist, or holds no file that may be a body.
-        ValueError: `labels.csv` cannot be understood, or tells no classes where they are asked of it.
+        ValueError: `labels.csv` cannot be understood, or no classes are told where they must be.
     """
     root, options = Path(root), options or LoadOptions()
     if not root.is_dir():
         raise FileNotFoundError(f"{root}: no such folder.")
-    if (root / LABELS_FILE).is_file():
-        return _from_labels_file(root, options).classed(classes)
+    table = (root / LABELS_FILE).is_file()
+    bodies = (_from_labels_file(root, options) if table else _from_folder(root, options, attributes)).classed(classes)
+    if labelled and bodies.labels is None:
+        raise ValueError(f"{root}: no classes found. Expected one folder per class, or a {LABELS_FILE} (file,label).")
+    return bodies
+
+
+def _from_folder(root: Path, options: LoadOptions, attributes: Iterable[AttributeSource]) -> Bodies:
     files = _files_in(root)
     beside = {file for one in attributes if isinstance(one, FromFiles) for file in one.files(files)}
     folders = sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
-    in_classes = [(path, folder.name) for folder in folders for path in _files_in(folder) if path not in beside]
-    rows = in_classes or [(path, "") for path in files if path not in beside]
+    rows: list[tuple[Path, str | None]]
+    rows = [(path, folder.name) for folder in folders for path in _files_in(folder) if path not in beside]
+    rows = rows or [(path, None) for path in files if path not in beside]
     if not rows:
         raise FileNotFoundError(
             f"{root}: no mesh found. Expected a folder per class, or mesh files with a {LABELS_FILE} (file,label), "
             f"in one of the formats {', '.join(searched_suffixes())}."
         )
-    found = [
-        (path, _with_part(path.relative_to(root).as_posix(), part), label, part)
-        for path, label in rows
-        for part in _parts(path, options)
-    ]
-    paths, names, labels, parts = zip(*found, strict=True)
-    return Bodies(paths, names, labels if in_classes else None, parts).classed(classes)
-
-
-def labelled_bodies(
-    root: str | Path,
-    options: LoadOptions | None = None,
-    *,
-    classes: ClassRule = "folder",
-    attributes: Iterable[AttributeSource] = (),
-) -> Bodies:
-    """`find_bodies` of a folder that tells classes.
-
-    Raises:
-        ValueError: it tells none.
-    """
-    bodies = find_bodies(root, options, classes=classes, attributes=attributes)
-    if bodies.labels is None:
-        raise ValueError(f"{root}: no classes found. Expected one folder per class, or a {LABELS_FILE} (file,label).")
-    return bodies
+    return _expanded([(path, path.relative_to(root).as_posix(), label, None) for path, label in rows], options)
 
 
 def given_bodies(
@@ -197,34 +165,40 @@ def given_bodies(
     """The bodies of the given files, in the given order, with the classes given to the files.
 
     ``FILE#PART`` names one body of a file of several.
-
-    Raises:
-        ValueError: no file, or not one label for each.
     """
-    files = tuple(Path(path) for path in paths)
+    files = [file_and_part(Path(path)) for path in paths]
     if not files:
         raise ValueError("paths: expected at least one mesh file, got none.")
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
-    split = [file_and_part(path) for path in files]
-    files = tuple(path for path, _ in split)
-    found = [
-        (i, part)
-        for i, (path, named) in enumerate(split)
-        for part in ([named] if named is not None else _parts(path, options or LoadOptions()))
-    ]
-    return Bodies(
-        tuple(files[i] for i, _ in found),
-        tuple(_with_part(str(files[i]), part) for i, part in found),
-        None if labels is None else tuple(labels[i] for i, _ in found),
-        tuple(part for _, part in found),
-    )
+    classes: Sequence[str | None] = labels or [None] * len(files)
+    rows = [(file, str(file), label, part) for (file, part), label in zip(files, classes, strict=True)]
+    return _expanded(rows, options or LoadOptions())
+
+
+def bodies_of(
+    given: str | Path | Sequence[str | Path] | Bodies,
+    labels: Sequence[str] | None = None,
+    options: LoadOptions | None = None,
+    attributes: Iterable[AttributeSource] = (),
+) -> Bodies:
+    """`find_bodies` of a folder, `given_bodies` of files, and bodies as they are."""
+    if isinstance(given, Bodies):
+        return given
+    if isinstance(given, str | Path) and Path(given).is_dir():
+        return find_bodies(given, options, attributes=attributes)
+    return given_bodies([given] if isinstance(given, str | Path) else given, labels, options)
 
 
 def file_and_part(path: Path) -> tuple[Path, str | None]:
     """The file and the part of ``FILE#PART``; no part where a file has this name, or none has what stands before."""
     file, mark, part = str(path).partition("#")
     return (Path(file), part) if mark and part and not path.exists() and Path(file).is_file() else (path, None)
+
+
+def file_of(name: str, part: str | None) -> str:
+    """The name of the file of a body, by the name of the body."""
+    return name if part is None else name.removesuffix(f"#{part}")
 
 
 def _parts(path: Path, options: LoadOptions) -> Sequence[str | None]:
@@ -246,34 +220,37 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
         if len(set(header)) < len(header):
             raise ValueError(f"{file}: a column is named twice in {header}. Give each column a name of its own.")
         rows = list(reader)
-    has_labels = "label" in header
-    incomplete = [i for i, row in enumerate(rows, start=2) if not row["file"] or (has_labels and not row["label"])]
+    needed = [name for name in ("file", "label") if name in header]
+    incomplete = [i for i, row in enumerate(rows, start=2) if not all(row[name] for name in needed)]
     if not rows or incomplete:
         where = f"line {incomplete[0]} lacks a file or a label" if incomplete else "no rows"
         raise ValueError(f"{file}: {where}. Each line names a mesh file and its class.")
-    found = [
-        (row["file"], part, row)
-        for row in rows
-        for part in ([row["body"]] if row.get("body") else _parts(root / row["file"], options))
-    ]
-    names = tuple(_with_part(name, part) for name, part, _ in found)
-    twice = sorted(name for name, count in Counter(names).items() if count > 1)
+    columns = {name: [(row[name] or "").strip() or None for row in rows] for name in further}
+    found = [(root / row["file"], row["file"], row.get("label"), row.get("body") or None) for row in rows]
+    bodies = _expanded(found, options, columns)
+    twice = sorted(name for name, count in Counter(bodies.names).items() if count > 1)
     if twice:
         raise ValueError(f"{file}: {twice[0]} is listed twice. List each body once.")
-    return Bodies(
-        tuple(root / name for name, _, _ in found),
-        names,
-        tuple(row["label"] for _, _, row in found) if has_labels else None,
-        tuple(part for _, part, _ in found),
-        {name: tuple((row[name] or "").strip() or None for _, _, row in found) for name in further},
-    )
+    return bodies
+
+
+def _expanded(
+    rows: Sequence[tuple[Path, str, str | None, str | None]],
+    options: LoadOptions,
+    columns: Mapping[str, Sequence[str | None]] | None = None,
+) -> Bodies:
+    """The bodies of files, each with its name, class and part; of a file without a part, all that it holds."""
+    found = [
+        (i, path, name if part is None else f"{name}#{part}", label, part)
+        for i, (path, name, label, given) in enumerate(rows)
+        for part in ([given] if given is not None else _parts(path, options))
+    ]
+    numbers, paths, names, labels, parts = zip(*found, strict=True)
+    of_bodies = {name: tuple(values[i] for i in numbers) for name, values in (columns or {}).items()}
+    return Bodies(paths, names, None if None in labels else labels, parts, of_bodies)
 
 
 def _files_in(folder: Path) -> list[Path]:
     return sorted(
         path for path in folder.rglob("*") if is_searched(path) and not path.name.startswith(".") and path.is_file()
     )
-
-
-def _with_part(name: str, part: str | None) -> str:
-    return name if part is None else f"{name}#{part}"

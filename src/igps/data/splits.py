@@ -14,17 +14,11 @@ SplitProtocol = Literal["seen", "unseen"]
 
 @dataclass(frozen=True)
 class Split:
-    """Indices of the shapes of each part; no shape is in two of them.
+    """Indices of the shapes of each part; no shape is in two of them."""
 
-    Args:
-        train: to fit parameters to.
-        validation: taken from the training part, to choose between models; may be empty.
-        test: to be looked at once.
-    """
-
-    train: tuple[int, ...]
-    validation: tuple[int, ...]
-    test: tuple[int, ...]
+    train: tuple[int, ...]  # to fit parameters to
+    validation: tuple[int, ...]  # taken from the training part, to choose between models; may be empty
+    test: tuple[int, ...]  # to be looked at once
 
 
 def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed: int = 0) -> Split:

@@ -10,12 +10,10 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
 
-from igps.data.attributes import ROOMS
 from igps.signature.signature import Samples, Signature
 
 
@@ -31,11 +29,7 @@ class Transform(ABC):
 
     @property
     def cache_tag(self) -> str:
-        """The transform in words.
-
-        Raises:
-            ValueError: without a seed no two Signatures are alike, so none can be kept.
-        """
+        """The transform in words; a ValueError without a seed, as no two Signatures would be alike."""
         if self.seed is None:
             raise ValueError(f"pre_transform: expected a seed, got {self!r}. What is kept must come out alike again.")
         return repr(self)
@@ -50,11 +44,7 @@ class Transform(ABC):
 
 
 class Compose:
-    """Several changes, one after the other.
-
-    Args:
-        transforms: callables from Signature to Signature.
-    """
+    """Several changes, one after the other: callables from Signature to Signature."""
 
     def __init__(self, *transforms: Callable[[Signature], Signature]) -> None:
         self.transforms = transforms
@@ -76,7 +66,6 @@ class FewerSamples(Transform):
     """A random subset of the samples, in their order.
 
     Args:
-        seed: see `Transform`.
         n_interior: interior samples kept at most; None for all.
         n_surface: surface samples kept at most; None for all.
     """
@@ -92,11 +81,8 @@ class FewerSamples(Transform):
             attributes = {name: values[kept] for name, values in samples.attributes.items()}
             return Samples(samples.points[kept], samples.eigenfunctions[kept], attributes)
 
-        return replace(
-            signature,
-            interior=fewer(signature.interior, self.n_interior),
-            surface=fewer(signature.surface, self.n_surface),
-        )
+        interior, surface = fewer(signature.interior, self.n_interior), fewer(signature.surface, self.n_surface)
+        return replace(signature, interior=interior, surface=surface)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +90,6 @@ class FewerEigenpairs(Transform):
     """A random subset of the eigenpairs, ascending. A descriptor that needs more of them refuses the Signature.
 
     Args:
-        seed: see `Transform`.
         n_eigenpairs: kept at most.
     """
 
@@ -112,11 +97,10 @@ class FewerEigenpairs(Transform):
 
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         kept = np.sort(generator.permutation(len(signature.eigenvalues))[: self.n_eigenpairs])
-
-        def fewer(samples: Samples) -> Samples:
-            return replace(samples, eigenfunctions=samples.eigenfunctions[:, kept])
-
-        return replace(signature, eigenvalues=signature.eigenvalues[kept], **_both(signature, fewer))
+        return _changed_samples(
+            replace(signature, eigenvalues=signature.eigenvalues[kept]),
+            lambda samples: replace(samples, eigenfunctions=samples.eigenfunctions[:, kept]),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +108,6 @@ class Noise(Transform):
     """Gaussian noise on positions and on eigenfunctions.
 
     Args:
-        seed: see `Transform`.
         points: its standard deviation over √area.
         eigenfunctions: its standard deviation times √area; an eigenfunction's mean square is 1/area.
     """
@@ -144,7 +127,7 @@ class Noise(Transform):
                 values = values + np.float32(self.eigenfunctions / length) * noise
             return replace(samples, points=points, eigenfunctions=values)
 
-        return replace(signature, **_both(signature, noisy))
+        return _changed_samples(signature, noisy)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +135,6 @@ class Scale(Transform):
     """The Signature of the body scaled by a random factor, whose logarithm is uniform.
 
     Args:
-        seed: see `Transform`.
         smallest, largest: the factors between which it is drawn.
 
     Raises:
@@ -173,13 +155,9 @@ class Scale(Transform):
             values = samples.eigenfunctions / np.float32(factor)
             return replace(samples, points=samples.points * factor, eigenfunctions=values)
 
-        return replace(
-            signature,
-            eigenvalues=signature.eigenvalues / factor**2,
-            **_both(signature, scaled),
-            area=signature.area * factor**2,
-            volume=signature.volume * factor**3,
-        )
+        area, volume = signature.area * factor**2, signature.volume * factor**3
+        whole = replace(signature, eigenvalues=signature.eigenvalues / factor**2, area=area, volume=volume)
+        return _changed_samples(whole, scaled)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,12 +167,10 @@ class FlipSigns(Transform):
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         signs = generator.choice(np.array([-1, 1], np.float32), len(signature.eigenvalues))
 
-        def flipped(samples: Samples) -> Samples:
-            return replace(samples, eigenfunctions=samples.eigenfunctions * signs)
+        return _changed_samples(
+            signature, lambda samples: replace(samples, eigenfunctions=samples.eigenfunctions * signs)
+        )
 
-        return replace(signature, **_both(signature, flipped))
 
-
-def _both(signature: Signature, change: Callable[[Samples], Samples]) -> dict[str, Any]:
-    """Interior and surface samples, changed."""
-    return {room: change(getattr(signature, room)) for room in ROOMS}
+def _changed_samples(signature: Signature, change: Callable[[Samples], Samples]) -> Signature:
+    return replace(signature, interior=change(signature.interior), surface=change(signature.surface))

@@ -19,6 +19,7 @@ from igps.analysis.outliers import Outlier
 from igps.mesh.mesh import Mesh
 from igps.report.drawing import PALETTE, new_figure, paint
 from igps.report.gallery import draw_body, seen_from_the_front
+from igps.retrieval import PrecisionRecallCurve
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,24 +30,16 @@ _FOUND, _OTHER = PALETTE[0], "#777777"
 
 
 def write_answer(out: Path, name: str, rows: Sequence[Mapping[str, Any]], figure: Figure | None = None) -> None:
-    """Write NAME.csv, a line a row, NAME.json with the same, and the picture as NAME.svg and NAME.png.
-
-    Args:
-        out: the folder.
-        name: of the files.
-        rows: of one table.
-        figure: without one, or without rows, there is no picture.
-    """
+    """Write NAME.csv, a line a row, NAME.json with the same, and the picture, if any, as NAME.svg and NAME.png."""
     out.mkdir(parents=True, exist_ok=True)
     (out / f"{name}.json").write_text(json.dumps(list(rows), indent=2) + "\n")
     with (out / f"{name}.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else [])
         writer.writeheader()
         writer.writerows(rows)
-    if figure is None:
-        return
-    for kind in ("svg", "png"):
-        figure.savefig(out / f"{name}.{kind}", dpi=150)
+    if figure is not None:
+        figure.savefig(out / f"{name}.svg")
+        figure.savefig(out / f"{name}.png", dpi=150)
 
 
 def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:
@@ -132,6 +125,28 @@ def clusters_figure(found: Clusters, names: Sequence[str]) -> Figure:
     return figure
 
 
+def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> None:
+    """Draw the precision of systems at equal levels of recall, both in percent, as a PNG file."""
+    figure = new_figure(8.5, 5.2)
+    axes = figure.add_subplot()
+    for i, (name, curve) in enumerate(curves.items()):
+        colour, line = PALETTE[i % len(PALETTE)], _STYLES[i // len(PALETTE) % len(_STYLES)]
+        recall, precision = 100 * curve.recall.numpy(), 100 * curve.precision.numpy()
+        (drawn,) = axes.plot(recall, precision, label=name, color=colour, linestyle=line, linewidth=1.4)
+        drawn.set(marker=_MARKERS[i % len(_MARKERS)], markersize=4)
+    axes.set(xlim=(0, 102), ylim=(0, 102))
+    axes.set_xlabel("recall: share of the query's class that is found (%)")
+    axes.set_ylabel("precision: share of the query's class among the found (%)")
+    fewest, *_, most = sorted(2 * [curve.n_queries for curve in curves.values()])
+    axes.set_title(f"leave-one-out, mean over {most if fewest == most else f'{fewest} to {most}'} queries")
+    axes.grid(color="#DDDDDD", linewidth=0.6)
+    figure.legend(loc="outside right upper", frameon=False, title="system")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, dpi=130)
+
+
+# Of precision and recall, in the second and third round of colours
+_STYLES, _MARKERS = ("-", "--", ":"), ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
 _MARKS = ("o", "s", "^", "x", "+", "D")
 _WHITE, _RED, _BLUE = (np.array(one) for one in ((0.9, 0.9, 0.9), (0.84, 0.25, 0.0), (0.0, 0.35, 0.7)))
 _INTERVAL = ("effect", "effect_low", "effect_high")

@@ -38,6 +38,18 @@ def paint(axis: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int64], c
     axis.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", xticks=[], yticks=[])
 
 
+def axes_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) columns x, y, z of a right-handed frame: y along the longest principal axis, x along the next.
+
+    The slender end is down and the wider side left, so that poses of one body are seen alike.
+    """
+    centred = points - points.mean(axis=0)
+    axes: NDArray[np.float64] = np.linalg.svd(centred, full_matrices=False)[2][:2]
+    slender = np.where(((centred @ axes.T) ** 3).mean(axis=0) < 0, -1, 1)
+    up, right = -slender[0] * axes[0], slender[1] * axes[1]
+    return np.stack([right, up, np.cross(right, up)], axis=1)
+
+
 def new_figure(width: float, height: float) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

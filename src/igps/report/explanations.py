@@ -17,8 +17,9 @@ from igps.analysis.explanation import KINDS, Shares, explain, on_surface
 from igps.data.dataset import SignatureDataset
 from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import Descriptor
+from igps.report.drawing import axes_of
 from igps.report.results import System
-from igps.report.surfaces import STEPS, Surface, axes_of
+from igps.report.surfaces import STEPS, Surface
 from igps.signature.signature import Signature
 
 logger = logging.getLogger(__name__)
@@ -26,17 +27,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Painted:
-    """A body and its nearest.
+    """A body and its nearest."""
 
-    Args:
-        other: the name of the nearest.
-        told: the largest shares of their distance, in words.
-        values: (V,) uint8 of each vertex of both surfaces: 128 where the bodies are alike, more where they are not.
-    """
-
-    other: str
-    told: str
-    values: tuple[NDArray[np.uint8], NDArray[np.uint8]]
+    other: str  # the name of the nearest
+    told: str  # the largest shares of their distance, in words
+    values: tuple[
+        NDArray[np.uint8], NDArray[np.uint8]
+    ]  # (V,) of both surfaces: 128 where the bodies are alike, or more
 
 
 def keep_explanations(
@@ -48,15 +45,13 @@ def keep_explanations(
     *,
     n_workers: int | None = None,
 ) -> dict[str, Painted]:
-    """Explain the distance of each body to its nearest, and write that as a NumPy archive.
+    """Explain the distance of each body to its nearest by a system, and write that as a NumPy archive.
 
     Args:
         path: an .npz file, see `read_explanations`.
-        system: whose distances tell the nearest.
+        system: whose distances tell the nearest; the descriptor is the one of histograms that they are by.
         dataset: the bodies, their signatures cached.
-        descriptor: of histograms, by which the distances are.
         surfaces: by the name of the body; those without are left out.
-        n_workers: processes; all cores if None.
     """
     place = {name: i for i, name in enumerate(dataset.bodies.names)}
     nearest = [system.names[row[0]] for row in system.ranked()] if len(system.names) > 1 else []
@@ -92,7 +87,7 @@ def read_explanations(path: Path, surfaces: Mapping[str, Surface]) -> dict[str, 
         kept = {name: archive[name] for name in archive}
     found = {}
     columns = (kept[name].tolist() for name in ("names", "others", "told", "counts"))
-    for name, other, told, count, values in zip(*columns, np.split(kept["values"], kept["ends"][:-1]), strict=True):
+    for name, other, told, count, values in zip(*columns, np.split(kept["values"], kept["ends"])[:-1], strict=True):
         sizes = [len(surfaces[one].vertices) if one in surfaces else -1 for one in (name, other)]
         if sizes == [count, len(values) - count]:
             found[name] = Painted(other, told, (values[:count], values[count:]))

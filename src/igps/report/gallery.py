@@ -15,7 +15,7 @@ from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 from igps.mesh.simplification import simplify
-from igps.report.drawing import GREY, new_figure, paint
+from igps.report.drawing import GREY, axes_of, new_figure, paint
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,14 +27,11 @@ _THUMBNAIL_VERTICES = 800
 
 
 def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progress: bool = False) -> None:
-    """One row per class: its first mesh as the query, then the meshes ranked nearest to it.
+    """Save a PNG file with a row per class: its first mesh as the query, then the `top` meshes ranked nearest to it.
 
     Args:
         root: folder of the meshes.
         ranking: the ranking.csv that `igps retrieve` wrote.
-        out: the PNG file.
-        top: results in a row.
-        progress: show a bar.
     """
     results: dict[str, list[tuple[str, float, bool]]] = {}
     with ranking.open(newline="") as file:
@@ -49,11 +46,14 @@ def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progre
     axes = figure.subplots(len(queries), top + 1, squeeze=False)
     rows = zip(axes, queries, strict=True)
     for row_axes, query in tqdm(rows, desc="ranked results", total=len(queries), disable=not progress):
-        draw_mesh(row_axes[0], root / query)
-        _frame(row_axes[0], f"query {query}", _QUERY)
-        for axis, (model, distance, relevant) in zip(row_axes[1:], results[query], strict=False):
-            draw_mesh(axis, root / model)
-            _frame(axis, f"{model}\n{distance:#.3g}", _RELEVANT if relevant else _IRRELEVANT)
+        shown = [(query, f"query {query}", _QUERY)]
+        for model, distance, relevant in results[query]:
+            shown.append((model, f"{model}\n{distance:#.3g}", _RELEVANT if relevant else _IRRELEVANT))
+        for axis, (name, title, colour) in zip(row_axes, shown, strict=False):
+            draw_body(axis, load_mesh(root / name, LoadOptions(allow_open=True)))
+            axis.set_title(title, fontsize=5.5, pad=2)
+            for side in axis.spines.values():
+                side.set(color=colour, linewidth=1.6, linestyle="--" if colour == _IRRELEVANT else "-")
     figure.suptitle(
         "Query (left) and its nearest meshes with their chi-square distance; "
         "blue: same class, orange and dashed: another",
@@ -63,29 +63,13 @@ def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progre
     figure.savefig(out, dpi=110)
 
 
-def draw_mesh(axis: Axes, path: Path) -> None:
-    """Draw a mesh, shaded and seen along its thinnest principal axis."""
-    draw_body(axis, load_mesh(path, LoadOptions(allow_open=True)))
-
-
 def draw_body(axis: Axes, mesh: Mesh) -> None:
-    """Draw a mesh that is at hand, see `draw_mesh`."""
+    """Draw a mesh, shaded and seen along its thinnest principal axis."""
     with contextlib.suppress(MeshError):  # drawn in full, it only takes longer
         mesh = simplify(mesh, _THUMBNAIL_VERTICES)
     paint(axis, seen_from_the_front(mesh.vertices), mesh.faces, GREY)
 
 
 def seen_from_the_front(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same, turned so that the thinnest principal axis is z, and the longest y."""
-    centred = vertices - vertices.mean(axis=0)
-    axes = np.linalg.svd(centred, full_matrices=False)[2]
-    # The slender end up, the wider side left, so that poses of one body are drawn alike.
-    axes *= np.where(((centred @ axes.T) ** 3).mean(axis=0) < 0, -1, 1)[:, None]
-    axes[2] = np.cross(axes[1], axes[0])
-    return vertices @ axes[[1, 0, 2]].T
-
-
-def _frame(axis: Axes, title: str, colour: str) -> None:
-    axis.set_title(title, fontsize=5.5, pad=2)
-    for side in axis.spines.values():
-        side.set(color=colour, linewidth=1.6, linestyle="--" if colour == _IRRELEVANT else "-")
+    """The same, turned so that the thinnest principal axis is z, the longest y, and the slender end up."""
+    return vertices @ (axes_of(vertices) * [-1, -1, 1])

@@ -8,17 +8,13 @@ import re
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from igps.report.confusions import N_WORST
 from igps.report.explanations import Painted
-from igps.report.page_data import data_of, letters
+from igps.report.page_data import N_WORST, data_of, letters
 from igps.report.results import Results
 from igps.report.surfaces import Surface
 from igps.report.tables import TITLES
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 _TEMPLATE = files("igps.report") / "template"
 _SCRIPTS = ("three.min.js", "bodies.js", "tables.js", "map.js", "page.js")
@@ -41,15 +37,12 @@ MEANINGS = dict(  # noqa: C408
 
 
 def write_page(
-    path: Path,
-    results: Results,
-    surfaces: Mapping[str, Surface],
-    explanations: Mapping[str, Painted] | None = None,
+    path: Path, results: Results, surfaces: Mapping[str, Surface], explanations: Mapping[str, Painted] | None = None
 ) -> None:
-    """Write the page of results.
+    """Write the page of results as an HTML file.
 
     Args:
-        path: an HTML file.
+        path: of the file.
         results: of a folder, see `read_results`.
         surfaces: pictures by the name of the mesh; those without have none.
         explanations: by name, of those whose difference from their nearest is painted.
@@ -62,9 +55,14 @@ def page_of(
     results: Results, surfaces: Mapping[str, Surface], explanations: Mapping[str, Painted] | None = None
 ) -> str:
     """The page of results as text, for the arguments see `write_page`."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
-    environment = _templates()
+    # Escapes all that it is given
+    environment = Environment(
+        loader=PackageLoader("igps.report", "template"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
     data = data_of(results, surfaces, explanations)
     # A policy that names the page's own scripts and style by content: no other can run, wherever it came from.
     scripts = [(_TEMPLATE / name).read_text(encoding="utf-8").strip() + "\n" for name in _SCRIPTS]
@@ -103,19 +101,6 @@ def page_of(
     )
 
 
-def _templates() -> Environment:
-    """The environment of the templates, which escapes all that it is given."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    return Environment(
-        loader=PackageLoader("igps.report", "template"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-
-
 def _fingerprint(source: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(source.encode()).digest()).decode()}'"
 
@@ -131,17 +116,12 @@ def _title(results: Results, data: Mapping[str, Any]) -> str:
 
 def _drawn(i: int, system: Mapping[str, Any]) -> dict[str, Any]:
     """A curve of precision and recall as points of the drawing."""
+    values = list(zip(*system["curve"], strict=True))
     points = [
-        (round(recall * _PLOT_WIDTH, 1), round((1 - precision) * _PLOT_HEIGHT, 1))
-        for recall, precision in zip(*system["curve"], strict=True)
+        (round(recall * _PLOT_WIDTH, 1), round((1 - precision) * _PLOT_HEIGHT, 1)) for recall, precision in values
     ]
-    return {
-        "style": i,
-        "name": system["name"],
-        "points": points,
-        "path": "M" + " L".join(f"{x} {y}" for x, y in points),
-        "values": list(zip(*system["curve"], strict=True)),
-    }
+    path = "M" + " L".join(f"{x} {y}" for x, y in points)
+    return {"style": i, "name": system["name"], "points": points, "path": path, "values": values}
 
 
 def _flat(config: Mapping[str, Any]) -> Sequence[tuple[str, str]]:

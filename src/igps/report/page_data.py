@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 
 from igps.analysis.clusters import clusters_of
 from igps.analysis.map import body_map
-from igps.report.confusions import worst_confusions
 from igps.report.explanations import Painted
 from igps.report.results import Results, System
 from igps.report.surfaces import Surface
 from igps.retrieval import RetrievalScores
 
+N_WORST = 20
+"""How many of the rankings that are most wrong the page shows at most."""
+_N_WRONG = 3
 _LEAST_RANKED = 48
 _DECIMALS = 5
+_OF_QUERIES = ("nn", "ft", "st", "map")
 # Fewer are no map; more take too long to lay out, and no browser draws them well
 _LEAST_MAPPED, _MOST_MAPPED = 3, 3000
 
@@ -84,11 +87,9 @@ def _shapes(
             place += 1
         if name in explanations:
             painted = explanations[name]
-            shape["explained"] = {
-                "other": results.names.index(painted.other),
-                "told": painted.told,
-                "values": [letters(values.tobytes()) for values in painted.values],
-            }
+            values = [letters(one.tobytes()) for one in painted.values]
+            other = results.names.index(painted.other)
+            shape["explained"] = {"other": other, "told": painted.told, "values": values}
         found.append(shape)
     return found
 
@@ -111,7 +112,7 @@ def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str],
         "distances": letters(distances.astype("<f4").tobytes()),
         "scores": None if scores is None else _rounded(scores.mean()),
         "per_class": None if scores is None else _per_class(scores, classes),
-        "per_query": None if scores is None else _per_query(scores),
+        "per_query": None if scores is None else {one: _numbers(getattr(scores, one).tolist()) for one in _OF_QUERIES},
         "curve": None if curve is None else [_numbers(curve.recall.tolist()), _numbers(curve.precision.tolist())],
         "confusion": None if system.labels is None else _confusion(order, system.labels, classes),
         "worst": None if scores is None else _worst(system, order, scores, places),
@@ -140,10 +141,6 @@ def _per_class(scores: RetrievalScores, classes: Sequence[str]) -> list[dict[str
     return [_rounded(found[name]) if name in found else None for name in classes]
 
 
-def _per_query(scores: RetrievalScores) -> dict[str, list[float | None]]:
-    return {name: _numbers(getattr(scores, name).tolist()) for name in ("nn", "ft", "st", "map")}
-
-
 def _confusion(
     order: NDArray[np.int64], labels: Sequence[str], classes: Sequence[str]
 ) -> dict[str, list[list[int]]] | None:
@@ -162,9 +159,25 @@ def _confusion(
 def _worst(
     system: System, order: NDArray[np.int64], scores: RetrievalScores, places: NDArray[np.int64]
 ) -> list[dict[str, Any]]:
-    """The worst first: `query`, its number among all shapes; `rank` of its first right one; ranks of `wrong` ones."""
-    found = worst_confusions(order, system.labels or (), system.names, scores.ft.numpy())
-    return [{"query": int(places[one.query]), "rank": one.rank, "wrong": list(one.wrong)} for one in found]
+    """The queries whose rankings are most wrong, at most twenty, the worst first; ranks count from 1.
+
+    The later the first shape of the query's class comes, the worse; then the lower the first tier; then by name. So a
+    query whose nearest is right comes after all others, and one whose whole first tier is right is no confusion.
+
+    Of each `query`, its number among all shapes; the `rank` of the first shape of its class; the ranks of the `wrong`
+    ones before that, or where that is the nearest, of those in the first tier: at most three.
+    """
+    _, codes = np.unique(np.asarray(system.labels), return_inverse=True)
+    first_tier = scores.ft.numpy()  # NaN for a shape without another of its class
+    queries = np.flatnonzero(first_tier < 1).tolist()
+    right = codes[order[queries]] == codes[queries][:, None]
+    ranks = (right.argmax(axis=1) + 1).tolist()
+    worst = sorted(range(len(queries)), key=lambda i: (-ranks[i], first_tier[queries[i]], system.names[queries[i]]))
+    found = []
+    for i in worst[:N_WORST]:
+        wrong = np.flatnonzero(~right[i, : ranks[i] - 1 or int(right[i].sum())])[:_N_WRONG] + 1
+        found.append({"query": int(places[queries[i]]), "rank": ranks[i], "wrong": wrong.tolist()})
+    return found
 
 
 def _rounded(values: Mapping[str, float]) -> dict[str, float | None]:

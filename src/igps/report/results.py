@@ -21,33 +21,26 @@ _RETRIEVAL, _COMPARISON, _ROBUSTNESS = "distances.npz", "compare.json", "robustn
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Distances of one descriptor among the N meshes that it describes.
-
-    Args:
-        name: of the descriptor.
-        names: of the meshes.
-        labels: their classes; None where they are not known.
-        distances: (N, N), a row a query.
-        seconds_per_mesh: processor time of a description; None where it was not measured.
-    """
+    """Distances of one descriptor among the N meshes that it describes."""
 
     name: str
     names: tuple[str, ...]
-    labels: tuple[str, ...] | None
-    distances: Tensor
-    seconds_per_mesh: float | None = None
+    labels: tuple[str, ...] | None  # None where they are not known
+    distances: Tensor  # (N, N), a row a query
+    seconds_per_mesh: float | None = None  # of processor time for a description; None where it was not measured
+
+    @property
+    def is_scored(self) -> bool:
+        """Whether two meshes share a class."""
+        return self.labels is not None and len(set(self.labels)) < len(self.labels)
 
     def scores(self) -> RetrievalScores | None:
         """Leave-one-out; None where no two meshes share a class."""
-        if self.labels is None or len(set(self.labels)) == len(self.labels):
-            return None
-        return retrieval_scores(self.distances, self.labels)
+        return retrieval_scores(self.distances, self.labels or ()) if self.is_scored else None
 
     def curve(self) -> PrecisionRecallCurve | None:
         """Precision and recall; None where there are no scores."""
-        if self.labels is None or len(set(self.labels)) == len(self.labels):
-            return None
-        return precision_recall_curve(self.distances, self.labels)
+        return precision_recall_curve(self.distances, self.labels or ()) if self.is_scored else None
 
     def ranked(self) -> NDArray[np.int64]:
         """(N, N − 1) the other meshes, nearest first, ties in the order of the meshes."""
@@ -58,60 +51,34 @@ class System:
 
 @dataclass(frozen=True)
 class Unused:
-    """A mesh that a descriptor, or none at all, could use.
-
-    Args:
-        file: its name.
-        error: why.
-        descriptor: None for all.
-    """
+    """A mesh that one descriptor, or none of them, could use."""
 
     file: str
     error: str
-    descriptor: str | None = None
+    descriptor: str | None = None  # None for all
 
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """All that a page is made from but pictures.
+    """All that a page is made from but pictures."""
 
-    Args:
-        command: that wrote them.
-        names: of all meshes that were used.
-        labels: their classes; None where they are not known.
-        systems: descriptors with distances.
-        rows: the table of `igps compare`, one line a descriptor.
-        robustness: robustness.json.
-        unused: meshes that could not be used.
-        notes: what was done to a mesh, by name.
-        config: the parameters.
-        parts: of bodies that share their file with others, by name.
-        columns: what else is known of the bodies, by column and name of the body.
-        groups: the table of `igps groups`, where it wrote to the same folder, a line a body.
-        outliers: that of `igps outliers`.
-    """
-
-    command: str
-    names: tuple[str, ...]
-    labels: tuple[str, ...] | None
+    command: str  # that wrote them
+    names: tuple[str, ...]  # of all meshes that were used
+    labels: tuple[str, ...] | None  # None where they are not known
     systems: tuple[System, ...] = ()
-    rows: tuple[Mapping[str, Any], ...] = ()
-    robustness: Mapping[str, Any] | None = None
+    rows: tuple[Mapping[str, Any], ...] = ()  # the table of `igps compare`, one line a descriptor
+    robustness: Mapping[str, Any] | None = None  # robustness.json
     unused: tuple[Unused, ...] = ()
-    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)  # what was done to a mesh, by name
     config: Mapping[str, Any] = field(default_factory=dict)
-    parts: Mapping[str, str] = field(default_factory=dict)
-    columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)
-    groups: tuple[Mapping[str, Any], ...] = ()
-    outliers: tuple[Mapping[str, Any], ...] = ()
+    parts: Mapping[str, str] = field(default_factory=dict)  # of bodies that share their file with others, by name
+    columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)  # by column and name of the body
+    groups: tuple[Mapping[str, Any], ...] = ()  # what `igps groups` wrote to the same folder, a line a body
+    outliers: tuple[Mapping[str, Any], ...] = ()  # what `igps outliers` wrote there
 
 
 def read_results(folder: Path) -> Results:
-    """What `igps retrieve`, `compare` or `robustness` wrote to a folder; of several, the last.
-
-    Raises:
-        FileNotFoundError: the folder does not exist, or holds results of none of them.
-    """
+    """What `igps retrieve`, `compare` or `robustness` wrote to a folder; of several, the last."""
     readers = {_RETRIEVAL: _retrieval, _COMPARISON: _comparison, _ROBUSTNESS: _robustness}
     written = {name: (folder / name).stat().st_mtime for name in readers if (folder / name).is_file()}
     if not written:
@@ -119,61 +86,47 @@ def read_results(folder: Path) -> Results:
             f"{folder}: no results found. Expected {', '.join(readers)}, which `igps retrieve`, `igps compare` and "
             "`python -m training.study robustness` write with --out."
         )
+    about, notes, unused = _json(folder / "meshes.json"), dict[str, list[str]](), list[Unused]()
+    for row in _rows(folder / "notes.csv"):
+        notes.setdefault(row["file"], []).append(row["note"])
+    for row in _rows(folder / "failures.csv"):
+        descriptor = row.get("descriptor")
+        unused.append(Unused(row["file"], row["error"], None if descriptor == "all" else descriptor))
     found = readers[max(written, key=lambda name: written[name])](folder)
-    about = _json(folder / "meshes.json") or {}
     bodies = about.get("meshes", [])
     return replace(
         found,
+        unused=(*unused, *found.unused),
+        notes=notes,
+        config=found.config or about.get("signature", {}),
         parts={one["file"]: one["part"] for one in bodies if one.get("part")},
         columns={
             name: {one["file"]: value for one, value in zip(bodies, values, strict=True)}
             for name, values in about.get("columns", {}).items()
         },
-        groups=tuple(_json(folder / "groups.json") or ()),
-        outliers=tuple(_json(folder / "outliers.json") or ()),
+        groups=tuple(_json(folder / "groups.json")),
+        outliers=tuple(_json(folder / "outliers.json")),
     )
 
 
 def _retrieval(folder: Path) -> Results:
-    summary = _json(folder / "scores.json") or {}
-    config = dict(summary.get("config", {}))
+    config = dict(_json(folder / "scores.json").get("config", {}))
     system = _system(folder / _RETRIEVAL, str(config.get("descriptor", "descriptor")))
-    return Results(
-        command="retrieve",
-        names=system.names,
-        labels=system.labels,
-        systems=(system,),
-        unused=tuple(Unused(row["file"], row["error"]) for row in _rows(folder / "failures.csv")),
-        notes=_notes(folder),
-        config=config,
-    )
+    return Results("retrieve", system.names, system.labels, (system,), config=config)
 
 
 def _comparison(folder: Path) -> Results:
-    rows = _json(folder / _COMPARISON)
-    systems = []
+    rows = json.loads((folder / _COMPARISON).read_text())
+    systems, label_of = [], dict[str, str]()
+    names: dict[str, None] = {}
     for row in rows:
         path = folder / "distances" / f"{row['descriptor']}.npz"
         if row["n_models"] and path.is_file():
-            systems.append(_system(path, row["descriptor"], row["seconds_per_mesh"]))
-    label_of = {
-        name: label for system in systems for name, label in zip(system.names, system.labels or (), strict=False)
-    }
-    names = tuple(dict.fromkeys(name for system in systems for name in system.names))
-    unused = [
-        Unused(row["file"], row["error"], None if row["descriptor"] == "all" else row["descriptor"])
-        for row in _rows(folder / "failures.csv")
-    ]
-    return Results(
-        command="compare",
-        names=names,
-        labels=tuple(label_of[name] for name in names) if label_of else None,
-        systems=tuple(systems),
-        rows=tuple(rows),
-        unused=tuple(unused),
-        notes=_notes(folder),
-        config=(_json(folder / "meshes.json") or {}).get("signature", {}),
-    )
+            systems.append(system := _system(path, row["descriptor"], row["seconds_per_mesh"]))
+            names.update(dict.fromkeys(system.names))
+            label_of.update(zip(system.names, system.labels or (), strict=False))
+    labels = tuple(label_of[name] for name in names) if label_of else None
+    return Results("compare", tuple(names), labels, tuple(systems), rows=tuple(rows))
 
 
 def _robustness(folder: Path) -> Results:
@@ -186,16 +139,8 @@ def _robustness(folder: Path) -> Results:
                 names.update(dict.fromkeys([*movement["each"], *movement["notes"]]))
             for file, why in movement["notes"].items():
                 unused.setdefault((file, why), Unused(file, f"{column}: {why}", descriptor))
-    everywhere = [Unused(row["file"], row["error"]) for row in _rows(folder / "failures.csv")]
-    return Results(
-        command="robustness",
-        names=tuple(names),
-        labels=None,
-        robustness=summary,
-        unused=(*everywhere, *unused.values()),
-        notes=_notes(folder),
-        config=summary.get("config", {}),
-    )
+    lost, config = tuple(unused.values()), summary.get("config", {})
+    return Results("robustness", tuple(names), None, robustness=summary, unused=lost, config=config)
 
 
 def _system(path: Path, name: str, seconds: float | None = None) -> System:
@@ -211,19 +156,13 @@ def _system(path: Path, name: str, seconds: float | None = None) -> System:
     return System(name, names, labels or None, distances, seconds)
 
 
-def _notes(folder: Path) -> dict[str, list[str]]:
-    notes: dict[str, list[str]] = {}
-    for row in _rows(folder / "notes.csv"):
-        notes.setdefault(row["file"], []).append(row["note"])
-    return notes
-
-
 def _rows(path: Path) -> list[dict[str, str]]:
     if not path.is_file():
         return []
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
 def _json(path: Path) -> Any:
-    return json.loads(path.read_text()) if path.is_file() else None
+    """What is in a file; an empty dictionary where there is none."""
+    return json.loads(path.read_text()) if path.is_file() else {}

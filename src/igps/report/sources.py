@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import Bodies
+from igps.data.sources import Bodies, file_of
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
@@ -34,15 +34,7 @@ def write_sources(folder: Path, dataset: SignatureDataset) -> None:
 
 
 def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset | None:
-    """The meshes of a folder of results, None where it does not tell them.
-
-    Args:
-        folder: of results.
-        meshes: the folder in which the meshes lie now, if they were moved.
-
-    Raises:
-        ValueError: meshes.json is not what `write_sources` writes.
-    """
+    """The meshes of a folder of results, None where it does not tell them; `meshes` is where they were moved to."""
     path = folder / MESHES_FILE
     if not path.is_file():
         return None
@@ -52,19 +44,13 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
             raise ValueError(f"its format is {summary['format']!r}")
         names = tuple(str(one["file"]) for one in summary["meshes"])
         parts = tuple(one.get("part") for one in summary["meshes"])
-        files = (
-            name if part is None else name.removesuffix(f"#{part}") for name, part in zip(names, parts, strict=True)
-        )
-        paths = tuple(Path(one["path"]) for one in summary["meshes"])
-        if meshes is not None:
-            paths = tuple(meshes / file for file in files)
+        if meshes is None:
+            paths = tuple(Path(one["path"]) for one in summary["meshes"])
+        else:
+            paths = tuple(meshes / file_of(name, part) for name, part in zip(names, parts, strict=True))
         columns = {str(name): tuple(values) for name, values in summary.get("columns", {}).items()}
         signature = {**summary["signature"], "attributes": tuple(summary["signature"]["attributes"])}
-        return SignatureDataset(
-            Bodies(paths, names, None, parts, columns),
-            SignatureConfig(**signature),
-            Path(summary["cache_dir"]),
-            reading=LoadOptions(**summary["reading"]),
-        )
+        bodies, reading = Bodies(paths, names, None, parts, columns), LoadOptions(**summary["reading"])
+        return SignatureDataset(bodies, SignatureConfig(**signature), summary["cache_dir"], reading=reading)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the format {_FORMAT} ({error}). Run the command again.") from error

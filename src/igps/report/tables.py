@@ -50,35 +50,27 @@ def findings_table(findings: Sequence[Finding]) -> str:
     of_voxels = any(finding.voxels for finding in findings)
     header = f"{'voxels':>10}{'pieces':>8}{'thinnest':>10}" if of_voxels else ""
     lines = [f"{'':<{width}}{header}{'vertices':>10}{'after':>9}{'seconds':>9}{'MB':>7}  what is done"]
-    for finding in findings:
-        voxels = finding.voxels
-        counts = ("", "", "") if voxels is None else (voxels.n_voxels, voxels.n_pieces, voxels.thinnest)
-        told = f"{finding.id:<{width}}" + ("{:>10}{:>8}{:>10}".format(*counts) if of_voxels else "")
-        if finding.error is not None:
-            lines.append(f"{told}  cannot be used: {finding.error}")
+    for one in findings:
+        counts = ("", "", "") if one.voxels is None else (one.voxels.n_voxels, one.voxels.n_pieces, one.voxels.thinnest)
+        told = f"{one.id:<{width}}" + ("{:>10}{:>8}{:>10}".format(*counts) if of_voxels else "")
+        if one.error is not None:
+            lines.append(f"{told}  cannot be used: {one.error}")
             continue
-        assert finding.seconds is not None  # of every body that can be used
-        assert finding.memory is not None
-        done = ", ".join(finding.steps) or ("; ".join(finding.notes) if voxels else "") or "nothing"
-        lines.append(
-            f"{told}{finding.n_vertices:>10}{finding.n_vertices_after:>9}{finding.seconds:>9.1f}"
-            f"{finding.memory / 1e6:>7.0f}  {done}"
-        )
-    n_bad = sum(finding.error is not None for finding in findings)
-    n_mended = sum(bool(finding.steps) for finding in findings)
-    total = sum(finding.seconds or 0 for finding in findings)
-    lines.append(
-        f"{len(findings)} bodies: {n_mended} mended, {n_bad} cannot be used; about {total / 60:.1f} core-minutes"
-    )
+        done = ", ".join(one.steps) or ("; ".join(one.notes) if one.voxels else "") or "nothing"
+        cost = f"{one.seconds or 0:>9.1f}{(one.memory or 0) / 1e6:>7.0f}"
+        lines.append(f"{told}{one.n_vertices:>10}{one.n_vertices_after:>9}{cost}  {done}")
+    n_bad, n_mended = sum(one.error is not None for one in findings), sum(bool(one.steps) for one in findings)
+    minutes = sum(one.seconds or 0 for one in findings) / 60
+    lines.append(f"{len(findings)} bodies: {n_mended} mended, {n_bad} cannot be used; about {minutes:.1f} core-minutes")
     return "\n".join(lines)
 
 
 def groups_table(tests: Sequence[GroupTest]) -> str:
     """One line a body: sizes of the groups, probabilities and false discovery rates, effect, area under the curve."""
     width = max(len("body"), *(len(one.body) for one in tests))
-    titles = ("PERMANOVA p", "q", "kernel p", "q", "effect", "95 %", "AUC")
-    widths = (13, 9, 10, 9, 8, 17, 7)
-    lines = [f"{'body':<{width}}" + "".join(f"{t:>{w}}" for t, w in zip(titles, widths, strict=True)) + "  groups"]
+    row = "{:>13}{:>9}{:>10}{:>9}{:>8}{:>17}{:>7}  {}".format
+    titles = ("PERMANOVA p", "q", "kernel p", "q", "effect", "95 %", "AUC", "groups")
+    lines = [f"{'body':<{width}}" + row(*titles)]
     for one in tests:
         sizes = ", ".join(f"{count} {name}" for name, count in one.sizes.items())
         if one.refused is not None:
@@ -86,9 +78,7 @@ def groups_table(tests: Sequence[GroupTest]) -> str:
             continue
         numbers = (one.permanova_p, one.permanova_q, one.kernel_p, one.kernel_q)
         cells = [*(f"{p:.4f}" for p in numbers), f"{one.effect:.3f}"]
-        cells += [f"{one.effect_low:.3f} to {one.effect_high:.3f}", f"{one.auc:.2f}"]
-        lines.append(
-            f"{one.body:<{width}}" + "".join(f"{c:>{w}}" for c, w in zip(cells, widths, strict=True)) + f"  {sizes}"
-        )
+        cells += [f"{one.effect_low:.3f} to {one.effect_high:.3f}", f"{one.auc:.2f}", sizes]
+        lines.append(f"{one.body:<{width}}" + row(*cells))
     lines.append("p: by permutation; q: false discovery rate over the bodies; effect: share of squared distances")
     return "\n".join(lines)

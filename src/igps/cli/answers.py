@@ -1,0 +1,194 @@
+"""`igps groups`, `igps outliers` and `igps explain`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from igps.analysis.explanation import KINDS, Explanation, explain_groups, on_surface
+from igps.analysis.explanation import explain as explain_pair
+from igps.analysis.groups import group_test, squared_distances, vectors_of, with_discovery_rates
+from igps.analysis.outliers import measures_of
+from igps.analysis.outliers import outliers as find_outliers
+from igps.cli.reading import Folder, described, print_failures
+from igps.data.dataset import SignatureDataset
+from igps.descriptors import descriptor as descriptor_of
+from igps.mesh.mesh import Mesh
+from igps.nn.descriptor import EmbeddedDescriptor
+from igps.report.answers import explanation_figure, groups_figure, outliers_figure, write_answer
+from igps.report.tables import groups_table
+
+
+def groups(
+    root: Path,
+    descriptor: str = "pretrained",
+    group: str | None = None,
+    strata: str | None = None,
+    covariate: list[str] | None = None,
+    size: bool = False,
+    out: Path | None = None,
+    n_permutations: int = 10_000,
+    seed: int = 0,
+    **reading: Any,
+) -> list[dict[str, Any]]:
+    """Test whether groups of bodies differ in shape: each named body of the files, such as an organ, by itself.
+
+    Two tests by permutation, PERMANOVA and a kernel two-sample test; how large the difference is, with its interval;
+    the area under the curve of a classifier by cross-validation; and false discovery rates over the bodies.
+
+    Args:
+        root: folder with one subfolder per group, or with files and a labels.csv (columns file,label and more).
+        group: a column of labels.csv that tells the groups; the class if not given.
+        strata: a column within whose values bodies are permuted, such as scanner.
+        covariate: columns of numbers that are regressed out first, such as age.
+        size: test the size, too, the logarithm of the volume, in lines of its own
+        out: folder for groups.csv, groups.json, and the effects as groups.svg and groups.png.
+        n_permutations: random ones.
+        seed: of what is random.
+    """
+    found = described(Folder(root, labelled=group is None), descriptor, size="ignore", **reading)
+    bodies = found.dataset.bodies
+    vectors = {"": vectors_of(found.descriptor, found.descriptions)}
+    if size:
+        vectors[", size"] = np.log([[one.volume] for one in found.dataset.signatures()])
+    labels = np.array(bodies.labels if group is None else bodies.column(group))
+    of_strata = None if strata is None else np.array(bodies.column(strata))
+    of_covariates = np.array([bodies.numbers(name) for name in covariate]).T if covariate else None
+    members: dict[str, list[int]] = {}
+    for i, part in enumerate(bodies.parts):
+        members.setdefault(part or "all", []).append(i)
+    jobs = [(body + what, places, rows[places]) for body, places in members.items() for what, rows in vectors.items()]
+    tests = with_discovery_rates([
+        group_test(
+            rows, labels[places].tolist(), body=body, n_permutations=n_permutations, seed=seed,
+            strata=None if of_strata is None else of_strata[places].tolist(),
+            covariates=None if of_covariates is None else of_covariates[places],
+        )
+        for body, places, rows in tqdm(jobs, desc="tests")
+    ])  # fmt: skip
+    print(groups_table(tests))
+    print_failures(found.failures, len(bodies))
+    if out is not None:
+        rows = [asdict(one) for one in tests]
+        for row in rows:
+            row["sizes"] = " ".join(f"{name}:{count}" for name, count in row["sizes"].items())
+        write_answer(out, "groups", rows, groups_figure(tests))
+        print(f"written to {out}")
+    return [asdict(one) for one in tests]
+
+
+def outliers(
+    root: Path,
+    descriptor: str = "pretrained",
+    top: int = 20,
+    out: Path | None = None,
+    **reading: Any,
+) -> list[dict[str, Any]]:
+    """List the bodies that are most unlike their class, to look at before the collection is trusted.
+
+    Each is compared with the others of its class: shape, volume, how coarse it is, handles, flat sides, repairs. A
+    score is a number of robust standard deviations; above 3.5 it is more than chance. Of a body that lies nearer to
+    another class than to its own, that is said.
+
+    Args:
+        root: folder with one subfolder per class, or with files and a labels.csv (columns file,label).
+        top: how many to list.
+        out: folder for outliers.csv and outliers.json with all, and pictures of the first as outliers.svg and .png.
+    """
+    bodies = described(Folder(root, labelled=True), descriptor, **reading)
+    dataset = bodies.dataset
+    distances = squared_distances(vectors_of(bodies.descriptor, bodies.descriptions)) ** 0.5
+    measures = measures_of(dataset, n_workers=reading.get("n_workers"))
+    found = find_outliers(distances, dataset.bodies.labels or (), measures, dataset.all_notes())
+    rows: list[dict[str, Any]] = [
+        {"body": dataset.bodies.names[one.body], "class": one.label, "score": round(one.score, 3), "reason": one.reason,
+         **{f"score_{name}": round(value, 3) for name, value in one.scores.items()}}
+        for one in found
+    ]  # fmt: skip
+    width = max(len(row["body"]) for row in rows[:top])
+    print(f"{'score':>7}  {'body':<{width}}  class: why")
+    for row in rows[:top]:
+        print(f"{row['score']:>7.1f}  {row['body']:<{width}}  {row['class']}: {row['reason']}")
+    print(f"{sum(one.is_outlier for one in found)} of {len(rows)} bodies have a score above what chance explains")
+    print_failures(bodies.failures, len(dataset))
+    if out is not None:
+        pictured = [(one, dataset.mesh(one.body)) for one in found[: min(top, 12)]]
+        write_answer(out, "outliers", rows, outliers_figure(pictured))
+        print(f"written to {out}")
+    return rows
+
+
+def explain(
+    meshes: list[Path], descriptor: str = "pretrained", level: float = 0.05, out: Path | None = None, **reading: Any
+) -> dict[str, Any]:
+    """Tell where two bodies differ, or two groups of bodies: their distance, shared out and painted on both.
+
+    Args:
+        meshes: two files, or a folder with two classes.
+        descriptor: of histograms, such as interior, rich or pretrained.
+        level: of two groups, only cells of the histograms count whose means differ by more than chance does, any false
+            one with this probability.
+        out: folder for explain.csv, the shares of the histograms; explain_samples.csv, those of the samples; and both
+            bodies painted from two sides as explain.svg and explain.png.
+    """
+    module = descriptor_of(descriptor)
+    if len(meshes) == 1 and meshes[0].is_dir():
+        inner = module.descriptor if isinstance(module, EmbeddedDescriptor) else module
+        bodies = described(Folder(meshes[0], labelled=True), inner, **reading)
+        dataset, descriptions, labels = bodies.dataset, bodies.descriptions, np.array(bodies.dataset.bodies.labels)
+        classes = sorted(set(labels))
+        if len(classes) != 2:
+            raise ValueError(f"meshes: expected a folder of two classes, got {len(classes)}.")
+        members = [np.flatnonzero(labels == name) for name in classes]
+        squares = squared_distances(descriptions.flatten(1).double().sqrt().numpy())
+        chosen = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]  # the medoids
+        batches = [dataset.batch([i]) for i in chosen]
+        found, kept = explain_groups(module, descriptions[members[0]], descriptions[members[1]], batches, level=level)
+        print(f"{int(kept.sum())} of {len(kept)} cells differ by more than chance; painted: the middle of each group")
+    else:
+        dataset, chosen = described(meshes, module, **{**reading, "strict": True}).dataset, [0, 1]
+        if len(dataset) != 2:
+            raise ValueError(f"meshes: expected two bodies, got {len(dataset)}. Name two files, or FILE#PART.")
+        found = explain_pair(module, *(dataset.batch([i]) for i in chosen))
+    names = [dataset.bodies.names[i] for i in chosen]
+    print(f"{' and '.join(names)}: {found.distance:.4g} by {descriptor}: {found.told()}")
+    painted = [_painted(dataset, i, found, place) for place, i in enumerate(chosen)]
+    for name, (_, values) in zip(names, painted, strict=True):
+        print(f"{name}: half of what is its own lies on {_half(values):.0%} of its surface")
+    parts = [{"histogram": name, "share": share} for name, share in found.parts.items()]
+    if out is not None:
+        write_answer(out, "explain_samples", _sample_rows(dataset, chosen, found))
+        write_answer(out, "explain", parts, explanation_figure(painted))
+        print(f"written to {out}")
+    return {"bodies": names, "distance": found.distance, "shares": parts}
+
+
+def _painted(dataset: SignatureDataset, i: int, found: Explanation, place: int) -> tuple[Mesh, Any]:
+    """A body, and what each of its faces has of the difference."""
+    mesh, signature = dataset.mesh(i), dataset[i].signature
+    centres = mesh.vertices[mesh.faces].mean(axis=1)
+    samples = {kind: getattr(signature, kind).points for kind in KINDS}
+    return mesh, on_surface((found.places or found.samples)[place], samples, centres)
+
+
+def _half(values: Any) -> float:
+    """The smallest share of places that holds half of all that is positive."""
+    positive = np.sort(np.maximum(values, 0))[::-1]
+    total = positive.sum()
+    return float((np.searchsorted(np.cumsum(positive), total / 2) + 1) / len(values)) if total else 0.0
+
+
+def _sample_rows(dataset: SignatureDataset, chosen: list[int], found: Explanation) -> list[dict[str, Any]]:
+    return [
+        {"body": dataset.bodies.names[i], "samples": kind, **dict(zip("xyz", point, strict=True)),
+         "share": float(share), "share_by_place": float(placed)}
+        for i, shares, places in zip(chosen, found.samples, found.places or found.samples, strict=True)
+        for kind in KINDS
+        for point, share, placed in zip(
+            getattr(dataset[i].signature, kind).points.tolist(), shares[kind], places[kind], strict=True
+        )
+    ]  # fmt: skip
