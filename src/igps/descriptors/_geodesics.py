@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
+from igps._arrays import Floats, Integers
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import undirected_edges
 from igps.signature.ordering import places_in_space
@@ -32,11 +32,11 @@ class FarthestPoints:
         distances: (S, V) float64 geodesic distances, length.
     """
 
-    vertices: NDArray[np.int64]
-    distances: NDArray[np.float64]
+    vertices: Integers
+    distances: Floats
 
     @property
-    def mutual(self) -> NDArray[np.float64]:
+    def mutual(self) -> Floats:
         """(S, S) distances between the samples, exactly symmetric, length."""
         between = self.distances[:, self.vertices]
         return (between + between.T) / 2  # rounding depends on the direction of the path
@@ -65,10 +65,10 @@ def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> Far
         )
     graph = edge_graph(mesh, points_per_edge)
 
-    def from_vertex(vertex: int) -> NDArray[np.float64]:
+    def from_vertex(vertex: int) -> Floats:
         return dijkstra(graph, indices=vertex)[:n_vertices]
 
-    def farthest(distance: NDArray[np.float64], total: NDArray[np.float64]) -> int:
+    def farthest(distance: Floats, total: Floats) -> int:
         equal = np.flatnonzero(distance >= (1 - _TIE) * distance.max())
         equal = equal[total[equal] <= (1 + _TIE) * total[equal].min()]
         return int(equal[np.argmax(places[equal])])

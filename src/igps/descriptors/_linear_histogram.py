@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
+
+from igps._arrays import Floats
 
 
-def linear_histogram(values: Sequence[NDArray[np.float64]], n_bins: Sequence[int]) -> NDArray[np.float64]:
+def linear_histogram(values: Sequence[Floats], n_bins: Sequence[int]) -> Floats:
     """Joint histogram of variables in [0, 1], larger values in the last bin; sums to 1.
 
     A value at the centre of a bin counts there alone, one between two centres for both, by its distance from each.

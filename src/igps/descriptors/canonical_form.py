@@ -8,9 +8,9 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from igps._arrays import Floats, Integers, Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import farthest_points
@@ -67,7 +67,7 @@ class CanonicalForm(BodyDescriptor):
                 f"n_samples: expected {_DIMENSION + 1} to max_vertices = {self.max_vertices}, got {self.n_samples}."
             )
 
-    def describe_body(self, body: Body) -> NDArray[np.float32]:
+    def describe_body(self, body: Body) -> Singles:
         """(number of moments,) in units of √area, ordered as `exponents(max_order)`.
 
         Raises:
@@ -90,7 +90,7 @@ class CanonicalForm(BodyDescriptor):
         return torch.stack(reflected).amin(dim=0)
 
 
-def classical_scaling(distances: NDArray[np.float64], dimension: int = _DIMENSION) -> NDArray[np.float64]:
+def classical_scaling(distances: Floats, dimension: int = _DIMENSION) -> Floats:
     """Points whose inner products come closest to those that the distances imply (Torgerson 1952).
 
     Args:
@@ -109,7 +109,7 @@ def classical_scaling(distances: NDArray[np.float64], dimension: int = _DIMENSIO
     return vectors * np.sqrt(np.maximum(values, 0))
 
 
-def least_squares_scaling(distances: NDArray[np.float64], start: NDArray[np.float64]) -> NDArray[np.float64]:
+def least_squares_scaling(distances: Floats, start: Floats) -> Floats:
     """Points that locally minimise the stress Σ (‖xᵢ−xⱼ‖ − dᵢⱼ)², by majorisation (SMACOF, de Leeuw 1977).
 
     No step raises the stress.
@@ -135,7 +135,7 @@ def least_squares_scaling(distances: NDArray[np.float64], start: NDArray[np.floa
     return points
 
 
-def exponents(max_order: int) -> NDArray[np.int64]:
+def exponents(max_order: int) -> Integers:
     """(M, 3) exponents of the moments that principal axes leave open: orders 2 to `max_order` without xy, xz and yz."""
     every = np.array(list(product(range(max_order + 1), repeat=_DIMENSION)))
     order = every.sum(axis=1)
@@ -143,7 +143,7 @@ def exponents(max_order: int) -> NDArray[np.int64]:
     return every[(order >= 2) & (order <= max_order) & ~fixed]
 
 
-def moments(points: NDArray[np.float64], max_order: int) -> NDArray[np.float64]:
+def moments(points: Floats, max_order: int) -> Floats:
     """Mean of xᵖ yᵠ zʳ over points laid along their principal axes, over ρ^(p+q+r−1) with their rms radius ρ.
 
     The signs of the axes are arbitrary: a reflection in x changes the sign of the moments with odd p.
@@ -163,7 +163,7 @@ def moments(points: NDArray[np.float64], max_order: int) -> NDArray[np.float64]:
     return radius * powers.prod(axis=2).mean(axis=0)
 
 
-def _lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _lengths(points: Floats) -> Floats:
     inner = points @ points.T
     norm = np.diag(inner)
     return np.sqrt(np.maximum(norm[:, None] + norm - 2 * inner, 0))

@@ -8,9 +8,9 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from igps._arrays import Floats, Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._parameters import check_at_least, check_one_of, check_positive
@@ -59,7 +59,7 @@ class D2(BodyDescriptor):
         check_at_least(1, n_bins=self.n_bins, n_triples=self.n_triples)
         check_positive(reach=self.reach)
 
-    def describe_body(self, body: Body) -> NDArray[np.float32]:
+    def describe_body(self, body: Body) -> Singles:
         """(n_bins,) histogram of the shape function, without unit; sums to 1.
 
         Raises:
@@ -79,7 +79,7 @@ class D2(BodyDescriptor):
         """(Q, G) half the L1 distance of the histograms, in [0, 1]."""
         return torch.cdist(queries, gallery, p=1) / 2
 
-    def _values(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    def _values(self, points: Floats) -> tuple[Floats, float]:
         """The shape function of the samples, and the end of its bins."""
         if self.function == "d2":
             return torch.pdist(torch.from_numpy(points)).numpy(), self.reach
@@ -88,7 +88,7 @@ class D2(BodyDescriptor):
         return _angles(points, self.n_triples, np.random.default_rng(self.seed)), math.pi
 
 
-def _angles(points: NDArray[np.float64], n_triples: int, generator: np.random.Generator) -> NDArray[np.float64]:
+def _angles(points: Floats, n_triples: int, generator: np.random.Generator) -> Floats:
     """Angle at the first of three distinct random samples, (n_triples,) radian."""
     n_points = len(points)
     corner = generator.integers(n_points, size=n_triples)

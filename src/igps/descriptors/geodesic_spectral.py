@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats, Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import farthest_points
@@ -50,7 +50,7 @@ class GeodesicSpectral(BodyDescriptor):
                 f"got {self.n_samples}."
             )
 
-    def describe_body(self, body: Body) -> NDArray[np.float32]:
+    def describe_body(self, body: Body) -> Singles:
         """(n_eigenvalues,) √|λₖ|, without unit.
 
         Raises:
@@ -62,7 +62,7 @@ class GeodesicSpectral(BodyDescriptor):
         return np.sqrt(np.abs(values)).astype(np.float32)
 
 
-def affinity_eigenvalues(distances: NDArray[np.float64], n_eigenvalues: int) -> NDArray[np.float64]:
+def affinity_eigenvalues(distances: Floats, n_eigenvalues: int) -> Floats:
     """The largest eigenvalues of exp(−d²/2σ²) over the number of points, σ the longest distance.
 
     Args:

@@ -12,11 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
+from igps._arrays import Floats, Integers, Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._linear_histogram import linear_histogram
@@ -63,7 +63,7 @@ class InnerDistance(BodyDescriptor):
         check_at_least(1, n_sources=self.n_sources)
         check_positive(max_distance=self.max_distance)
 
-    def describe_body(self, body: Body) -> NDArray[np.float32]:
+    def describe_body(self, body: Body) -> Singles:
         """(n_bins,) histogram that sums to 1.
 
         Raises:
@@ -78,7 +78,7 @@ class InnerDistance(BodyDescriptor):
         return linear_histogram([ratio / self.max_distance], [self.n_bins]).astype(np.float32)
 
 
-def inner_distances(points: NDArray[np.float64], sources: NDArray[np.int64]) -> NDArray[np.float64]:
+def inner_distances(points: Floats, sources: Integers) -> Floats:
     """Lengths of the shortest paths along the links inside a body, from some of its samples to all.
 
     Where the grid is too coarse for a thin part, the cells fall into pieces. Each piece is then joined to its nearest
@@ -99,7 +99,7 @@ def inner_distances(points: NDArray[np.float64], sources: NDArray[np.int64]) -> 
     return np.atleast_2d(dijkstra(graph, directed=True, indices=sources))
 
 
-def _grid_indices(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
+def _grid_indices(points: Floats) -> tuple[Integers, float]:
     """(P, 3) indices of the cells, from 0 on, and the cell's side."""
     if len(points) < 2:
         raise ValueError(f"points: expected at least two interior samples, got {len(points)}. Raise the resolution.")
@@ -117,7 +117,7 @@ def _grid_indices(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], float
     raise ValueError("points: expected cell centres of a cubic grid along the axes; take those of a Signature.")
 
 
-def _visible_links(cells: NDArray[np.int64]) -> sparse.csr_array:
+def _visible_links(cells: Integers) -> sparse.csr_array:
     """(P, P) lengths of the links, in cells, both ways."""
     # Padded by two cells, so that no offset wraps around.
     shape = tuple(cells.max(axis=0) + 5)
@@ -141,13 +141,13 @@ def _visible_links(cells: NDArray[np.int64]) -> sparse.csr_array:
     return sparse.coo_array(entries, shape=(len(cells), len(cells))).tocsr()
 
 
-def _offsets() -> NDArray[np.int64]:
+def _offsets() -> Integers:
     """(98, 3) steps of at most two cells along each axis, without those that are multiples of shorter ones."""
     steps = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     return steps[np.gcd.reduce(steps, axis=1) == 1]
 
 
-def _joined(graph: sparse.csr_array, cells: NDArray[np.int64]) -> sparse.csr_array:
+def _joined(graph: sparse.csr_array, cells: Integers) -> sparse.csr_array:
     """The graph with all its pieces linked, each to its nearest one (Borůvka 1926)."""
     while True:
         n_pieces, piece = connected_components(graph, directed=False)

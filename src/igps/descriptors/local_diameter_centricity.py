@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats, Integers, Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import farthest_points
@@ -69,7 +69,7 @@ class LocalDiameterCentricity(BodyDescriptor):
         if not 0 < self.opening_angle < 180:
             raise ValueError(f"opening_angle: expected between 0 and 180 degrees, got {self.opening_angle}.")
 
-    def describe_body(self, body: Body) -> NDArray[np.float32]:
+    def describe_body(self, body: Body) -> Singles:
         """(n_diameter_bins, n_centricity_bins) histogram that sums to 1.
 
         Raises:
@@ -89,9 +89,7 @@ class LocalDiameterCentricity(BodyDescriptor):
         return linear_histogram(ratios, [self.n_diameter_bins, self.n_centricity_bins]).astype(np.float32)
 
 
-def local_diameters(
-    mesh: Mesh, face: NDArray[np.int64], weights: NDArray[np.float64], n_rays: int, opening_angle: float
-) -> NDArray[np.float64]:
+def local_diameters(mesh: Mesh, face: Integers, weights: Floats, n_rays: int, opening_angle: float) -> Floats:
     """Thickness of the body at points of its surface: the mean length of inward rays that is left without outliers.
 
     The rays fill the cone about the inward normal evenly. A ray counts if it meets the surface from within; of the
@@ -131,7 +129,7 @@ def local_diameters(
     return size * _robust_mean(np.where(within, length, np.nan).reshape(-1, n_rays))
 
 
-def centricity(mesh: Mesh, n_sources: int) -> NDArray[np.float64]:
+def centricity(mesh: Mesh, n_sources: int) -> Floats:
     """Average geodesic distance of each vertex from the whole surface.
 
     The integral over the surface is a sum over evenly spread vertices, each weighted by the area that is nearest to it.
@@ -150,7 +148,7 @@ def centricity(mesh: Mesh, n_sources: int) -> NDArray[np.float64]:
     return weight @ distances / weight.sum()
 
 
-def _cone(n_rays: int, opening_angle: float) -> NDArray[np.float64]:
+def _cone(n_rays: int, opening_angle: float) -> Floats:
     """(R, 3) unit vectors of equal solid angle about the third axis, on a golden spiral (Vogel 1979)."""
     rank = np.arange(n_rays) + 0.5
     cosine = 1 - rank / n_rays * (1 - np.cos(np.radians(opening_angle / 2)))
@@ -159,7 +157,7 @@ def _cone(n_rays: int, opening_angle: float) -> NDArray[np.float64]:
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=1)
 
 
-def _robust_mean(lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+def _robust_mean(lengths: Floats) -> Floats:
     """Mean of each row's numbers within a standard deviation of their median; NaN for a row of NaN alone."""
     result = np.full(len(lengths), np.nan)
     rows = np.isfinite(lengths).any(axis=1)

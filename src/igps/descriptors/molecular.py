@@ -127,8 +127,5 @@ def molecular(*, size: bool = True) -> HistogramDescriptor:
     others = [histogram(Attribute(name, centres, soft=True)) for name, centres in _CENTRES.items()]
     made = SizedHistograms if size else HistogramDescriptor
     return made(
-        [kinds, others],
-        name="molecular",
-        source="Rustamov 2010; Kyte and Doolittle 1982",
-        invariant_to=("motion",),
+        [kinds, others], name="molecular", source="Rustamov 2010; Kyte and Doolittle 1982", invariant_to=("motion",)
     )

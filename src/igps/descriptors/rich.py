@@ -3,15 +3,7 @@
 from __future__ import annotations
 
 from igps.descriptors.multiscale import N_ORIENTED_SAMPLES, N_SAMPLES
-from igps.nn.axes import (
-    Attribute,
-    EuclideanDistance,
-    InteriorDistance,
-    PairAxis,
-    PairCosines,
-    PointAxis,
-    Potential,
-)
+from igps.nn.axes import Attribute, EuclideanDistance, InteriorDistance, PairAxis, PairCosines, PointAxis, Potential
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
+from igps._arrays import Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._parameters import check_at_least, check_one_of
@@ -49,7 +49,7 @@ class ShapeDNA(BodyDescriptor):
         check_one_of(get_args(Normalisation), normalisation=self.normalisation)
         self.requirements = Requirements(n_eigenpairs=self.n_eigenvalues)
 
-    def describe_body(self, body: Body) -> NDArray[np.float32]:
+    def describe_body(self, body: Body) -> Singles:
         """(n_eigenvalues,) normalised eigenvalues, ascending, without unit."""
         eigenvalues = body.eigenvalues[: self.n_eigenvalues]
         if self.normalisation == "area":

@@ -19,9 +19,10 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
+from igps._arrays import Floats, Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._parameters import check_at_least, check_one_of
@@ -76,7 +77,7 @@ class SpectralGromovWasserstein(BodyDescriptor):
         check_at_least(1, n_quantiles=self.n_quantiles, n_eigenpairs=self.n_eigenpairs)
         self.requirements = Requirements(n_eigenpairs=self.n_eigenpairs)
 
-    def describe_body(self, body: Body) -> NDArray[np.float32]:
+    def describe_body(self, body: Body) -> Singles:
         """(times, n_quantiles) quantile functions, with the factor c²(t); (times, 1) for the bound "trace"."""
         rows = []
         for time, kernel in zip(self.times, self._kernels(body), strict=True):
@@ -95,7 +96,7 @@ class SpectralGromovWasserstein(BodyDescriptor):
         at_times = [euclidean(queries[:, i], gallery[:, i]) for i in range(queries.shape[1])]
         return torch.stack(at_times).amax(dim=0) / queries.shape[2] ** 0.5
 
-    def _kernels(self, body: Body) -> list[NDArray[np.float64]]:
+    def _kernels(self, body: Body) -> list[Floats]:
         return heat_kernels(body, self.samples, self.times, self.n_samples, self.n_eigenpairs, self.seed)
 
 
@@ -106,7 +107,7 @@ def heat_kernels(
     n_samples: int,
     n_eigenpairs: int | None = None,
     seed: int = 0,
-) -> list[NDArray[np.float64]]:
+) -> list[Floats]:
     """A k_t(x, y) among some samples: for every time a (P, P) array without unit, P ≤ `n_samples`.
 
     Args:
@@ -138,7 +139,7 @@ def time_weight(time: float) -> float:
     return float(np.exp(-2 * (time + 1 / time)))
 
 
-def quantiles(values: ArrayLike, n_quantiles: int) -> NDArray[np.float64]:
+def quantiles(values: ArrayLike, n_quantiles: int) -> Floats:
     """Means of the quantile function of a sample over equal steps.
 
     For any exponent p ≥ 1, (mean |q − q'|ᵖ)^(1/p) of two samples' means q, q' is at most their Wasserstein distance

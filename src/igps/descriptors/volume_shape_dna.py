@@ -19,12 +19,12 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 from torch import Tensor
 
+from igps._arrays import Booleans, Floats, Integers, Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._parameters import check_at_least, check_one_of
@@ -77,7 +77,7 @@ class VolumeShapeDNA(BodyDescriptor):
         check_one_of(get_args(Boundary), boundary=self.boundary)
         check_at_least(1, n_eigenvalues=self.n_eigenvalues, n_voxels=self.n_voxels)
 
-    def describe_body(self, body: Body) -> NDArray[np.float32]:
+    def describe_body(self, body: Body) -> Singles:
         """(n_eigenvalues,) normalised eigenvalues, ascending, without unit.
 
         Raises:
@@ -90,7 +90,7 @@ class VolumeShapeDNA(BodyDescriptor):
         return euclidean(queries, gallery)
 
 
-def volume_spectrum(mesh: Mesh, n_eigenvalues: int, boundary: Boundary, n_voxels: int) -> NDArray[np.float64]:
+def volume_spectrum(mesh: Mesh, n_eigenvalues: int, boundary: Boundary, n_voxels: int) -> Floats:
     """The smallest eigenvalues of −Δ in the body, times its volume^(2/3), ascending, without Neumann's first zero.
 
     Returns:
@@ -114,7 +114,7 @@ def volume_spectrum(mesh: Mesh, n_eigenvalues: int, boundary: Boundary, n_voxels
     return np.maximum(values[skipped:], 0) * scale
 
 
-def _sampled_cells(mesh: Mesh, n_voxels: int) -> tuple[NDArray[np.bool_], float]:
+def _sampled_cells(mesh: Mesh, n_voxels: int) -> tuple[Booleans, float]:
     """Whether the 3³ points of every cell are inside: (X, 3, Y, 3, Z, 3), with a layer of empty cells all round.
 
     The second result is the side of a cell, length.
@@ -131,7 +131,7 @@ def _sampled_cells(mesh: Mesh, n_voxels: int) -> tuple[NDArray[np.bool_], float]
     return inside.reshape(x, 3, y, 3, z, 3), cell
 
 
-def _neumann(fine: NDArray[np.bool_]) -> tuple[sparse.csr_array, NDArray[np.float64]]:
+def _neumann(fine: Booleans) -> tuple[sparse.csr_array, Floats]:
     """Stiffness and diagonal mass of the cells that are not empty, lengths in cells."""
     filled = fine.mean(axis=(1, 3, 5))
     mass = filled[filled > 0]
@@ -154,14 +154,14 @@ def _neumann(fine: NDArray[np.bool_]) -> tuple[sparse.csr_array, NDArray[np.floa
     return sparse.diags_array(graph.sum(axis=1)) - graph, mass
 
 
-def _without_crumbs(graph: sparse.csr_array, mass: NDArray[np.float64]) -> NDArray[np.int64]:
+def _without_crumbs(graph: sparse.csr_array, mass: Floats) -> Integers:
     """The cells of all pieces but the crumbs."""
     n_pieces, piece = connected_components(graph, directed=False)
     share = np.bincount(piece, weights=mass, minlength=n_pieces) / mass.sum()
     return np.nonzero((share >= _CRUMB)[piece])[0]
 
 
-def _dirichlet(fine: NDArray[np.bool_]) -> tuple[sparse.csr_array, NDArray[np.float64]]:
+def _dirichlet(fine: Booleans) -> tuple[sparse.csr_array, Floats]:
     """Stiffness and unit mass of the cells whose centre is inside, lengths in cells."""
     inside = fine[:, 1, :, 1, :, 1]
     n_cells = int(inside.sum())
@@ -189,14 +189,12 @@ def _dirichlet(fine: NDArray[np.bool_]) -> tuple[sparse.csr_array, NDArray[np.fl
     return sparse.diags_array(diagonal[inside]) - graph, np.ones(n_cells)
 
 
-def _symmetric(
-    rows: NDArray[np.int64], columns: NDArray[np.int64], weights: NDArray[np.float64], size: int
-) -> sparse.csr_array:
+def _symmetric(rows: Integers, columns: Integers, weights: Floats, size: int) -> sparse.csr_array:
     entries = (np.concatenate([weights, weights]), (np.concatenate([rows, columns]), np.concatenate([columns, rows])))
     return sparse.coo_array(entries, shape=(size, size)).tocsr()
 
 
-def _smallest(stiffness: sparse.csr_array, mass: NDArray[np.float64], count: int, shift: float) -> NDArray[np.float64]:
+def _smallest(stiffness: sparse.csr_array, mass: Floats, count: int, shift: float) -> Floats:
     """The smallest eigenvalues of K u = λ M u, ascending, by Lanczos iteration on (K − shift M)⁻¹."""
     scaling = sparse.diags_array(1 / np.sqrt(mass))
     matrix = (scaling @ stiffness @ scaling).tocsc()
@@ -222,6 +220,6 @@ def _smallest(stiffness: sparse.csr_array, mass: NDArray[np.float64], count: int
         values, vectors = values[kept], np.hstack([vectors, more[:, missed]])[:, kept]
 
 
-def _project(vector: NDArray[np.float64], basis: NDArray[np.float64]) -> NDArray[np.float64]:
+def _project(vector: Floats, basis: Floats) -> Floats:
     """The part of a vector orthogonal to an orthonormal basis."""
     return vector - basis @ (basis.T @ vector)

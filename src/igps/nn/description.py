@@ -10,10 +10,10 @@ from collections.abc import Generator, Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from igps._arrays import Singles
 from igps._parallel import Failed, n_cores, on_threads, one_thread, run
 from igps.data.cache import DescriptionCache
 from igps.data.dataset import Failure, SignatureDataset
@@ -24,7 +24,7 @@ from igps.nn.descriptor import BodyDescriptor, Descriptor
 
 logger = logging.getLogger(__name__)
 
-_Described = Generator[tuple[Sequence[int], Sequence[NDArray[np.float32] | Failure]], None, None]
+_Described = Generator[tuple[Sequence[int], Sequence[Singles | Failure]], None, None]
 
 
 def describe(
@@ -120,7 +120,7 @@ def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
         ValueError: the samples have no such attribute.
     """
     axes = [one for one in descriptor.modules() if isinstance(one, Attribute) and not one.is_fitted]
-    values: list[list[NDArray[np.float32]]] = [[] for _ in axes]
+    values: list[list[Singles]] = [[] for _ in axes]
     for signature in dataset.signatures() if axes else ():
         for axis, found in zip(axes, values, strict=True):
             if axis.name not in signature.interior.attributes:
@@ -140,7 +140,7 @@ def _on_threads(
     """Chunks of the meshes with the description of each, on threads; one by one on a device."""
     device = next(descriptor.parameters(), next(descriptor.buffers(), torch.empty(0))).device
 
-    def outcomes(indices: Sequence[int]) -> Sequence[NDArray[np.float32] | Failure]:
+    def outcomes(indices: Sequence[int]) -> Sequence[Singles | Failure]:
         try:
             return list(_described((descriptor, dataset.subset(indices), device)))
         except ValueError as error:
@@ -162,13 +162,13 @@ def _on_processes(
         yield [i], [dataset.failure(i, outcome) if isinstance(outcome, Failed) else outcome[0]]
 
 
-def _described(job: tuple[nn.Module, SignatureDataset, torch.device]) -> NDArray[np.float32]:
+def _described(job: tuple[nn.Module, SignatureDataset, torch.device]) -> Singles:
     """(N, ...) descriptions of all meshes of a dataset at once."""
     descriptor, dataset, device = job
     meshes = isinstance(descriptor, Descriptor) and descriptor.requirements.mesh
     with one_thread(), torch.inference_mode():  # hold for the thread that enters them
         batch = dataset.batch(range(len(dataset)), meshes).to(device)
-        values: NDArray[np.float32] = descriptor(batch).cpu().numpy()
+        values: Singles = descriptor(batch).cpu().numpy()
     if not np.isfinite(values).all():
         raise MeshError(f"{dataset.bodies.paths[0]}: the description has entries that are not finite.")
     return values
@@ -184,11 +184,11 @@ class _Kept:
         self._cache.remove_abandoned()
         self._is_writable = True
 
-    def found(self) -> dict[int, NDArray[np.float32]]:
+    def found(self) -> dict[int, Singles]:
         values = {i: self._cache.get(self._key(one)) for i, one in enumerate(self._keys) if one is not None}
         return {i: one for i, one in values.items() if one is not None}
 
-    def keep(self, i: int, values: NDArray[np.float32]) -> None:
+    def keep(self, i: int, values: Singles) -> None:
         """Keep a description, if the file is the one that it was before it was described."""
         key = self._keys[i]
         if key is None or not self._is_writable or self._dataset.subset([i]).cached_keys() != [key]:

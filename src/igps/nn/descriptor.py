@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from igps._arrays import Singles
 from igps._threads import one_thread
 from igps.data.batch import Body, SignatureBatch
 from igps.data.collation import collate
@@ -157,7 +157,7 @@ class BodyDescriptor(Descriptor):
     """
 
     @abstractmethod
-    def describe_body(self, body: Body) -> NDArray[np.float32]:
+    def describe_body(self, body: Body) -> Singles:
         """The description of one body; raises a ValueError for a body that it cannot describe."""
 
     def describe(self, batch: SignatureBatch) -> Tensor:

@@ -7,15 +7,13 @@ import torch
 from numpy.typing import NDArray
 from scipy import sparse
 
+from igps._arrays import Floats, Integers
 from igps._compiled import compiled
 from igps.retrieval.ranking import SearchResult
 
 # Of conjugate gradients, for walks whose condition is below 40
 _ROUNDS = 40
 _TINY = np.finfo(np.float64).tiny
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 def rerank_graph(

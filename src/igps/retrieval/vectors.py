@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from igps._arrays import Singles
 
 SearchDistance = Literal["cosine", "chi_square"]
 """A distance of descriptions that Euclidean distances of short vectors follow."""
@@ -34,11 +35,11 @@ class VectorMap:
     """
 
     searched_by: SearchDistance
-    mean: NDArray[np.float32] | None = None
-    components: NDArray[np.float32] | None = None
+    mean: Singles | None = None
+    components: Singles | None = None
 
     @classmethod
-    def fit(cls, descriptions: NDArray[np.float32], searched_by: SearchDistance, seed: int = 0) -> VectorMap:
+    def fit(cls, descriptions: Singles, searched_by: SearchDistance, seed: int = 0) -> VectorMap:
         """The map of descriptions (N, F) such as these; a few thousand are enough."""
         if searched_by == "cosine" and descriptions.shape[1] <= MOST_NUMBERS:
             return cls(searched_by)
@@ -55,7 +56,7 @@ class VectorMap:
         """Whether vectors are other numbers than the descriptions."""
         return self.components is not None
 
-    def __call__(self, descriptions: NDArray[np.float32]) -> NDArray[np.float32]:
+    def __call__(self, descriptions: Singles) -> Singles:
         """(N, F) descriptions to (N, D) vectors."""
         if self.components is None or self.mean is None:
             return np.ascontiguousarray(descriptions, dtype=np.float32)
@@ -77,10 +78,10 @@ class VectorMap:
         return cls(str(arrays["searched_by"]), **{name: arrays[name] for name in names})  # type: ignore[arg-type]
 
 
-def _features(descriptions: NDArray[np.float32], searched_by: SearchDistance) -> NDArray[np.float32]:
+def _features(descriptions: Singles, searched_by: SearchDistance) -> Singles:
     if searched_by == "cosine":
         return descriptions
     from sklearn.kernel_approximation import AdditiveChi2Sampler
 
-    features: NDArray[np.float32] = AdditiveChi2Sampler(sample_steps=_SAMPLE_STEPS).fit_transform(descriptions)
+    features: Singles = AdditiveChi2Sampler(sample_steps=_SAMPLE_STEPS).fit_transform(descriptions)
     return features

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from igps._arrays import Integers
 from igps.mesh import surface
 from igps.mesh.mesh import Mesh, MeshError
 from igps.shapes.skeleton import Placed
 from igps.shapes.solids import Array
 
-Faces = NDArray[np.int64]
+Faces = Integers
 
 _MIN_ANGLE = 5.0  # degrees; keeps every cotangent below 11.5
 _VERTEX_TOLERANCE = 0.4

@@ -10,9 +10,10 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from igps._arrays import Floats
+
+Array = Floats
 Vector = tuple[float, float, float]
 
 

@@ -21,13 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from igps._arrays import Floats, Integers
 from igps._threads import ALONE, Team
 from igps.mesh.surface import has_area
 from igps.signature._spatial_order import principal_axes, spatial_order
 from igps.signature._weight_loops import fill_cluster_terms, fill_clusters, fill_hats, replace_near, seen_from
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _LEAF = 32  # hats in the smallest clusters; one costs as much as 19
 N_TERMS = 19

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats, Integers
 from igps._compiled import compiled
 
 _TINY = math.ulp(1.0) ** 2  # keeps a logarithm finite whose factor is 0
@@ -14,15 +14,15 @@ _TINY = math.ulp(1.0) ** 2  # keeps a logarithm finite whose factor is 0
 
 @compiled(error_model="numpy")
 def fill_potentials(
-    points: NDArray[np.float64],
+    points: Floats,
     block: int,
-    patches: NDArray[np.float64],
-    reaches: NDArray[np.float64],
-    first: NDArray[np.int64],
+    patches: Floats,
+    reaches: Floats,
+    first: Integers,
     size: int,
-    limits: NDArray[np.float64],
-    faces: NDArray[np.float64],
-    out: NDArray[np.float64],
+    limits: Floats,
+    faces: Floats,
+    out: Floats,
 ) -> None:
     """Fill the potentials at points, block after block of points that lie close together.
 
@@ -76,13 +76,7 @@ def fill_potentials(
 
 @compiled(error_model="numpy")
 def add_series(
-    patch: NDArray[np.float64],
-    scale: float,
-    share: float,
-    towards: NDArray[np.float64],
-    points: NDArray[np.float64],
-    far: NDArray[np.float64],
-    sums: NDArray[np.float64],
+    patch: Floats, scale: float, share: float, towards: Floats, points: Floats, far: Floats, sums: Floats
 ) -> None:
     """Add A/r + A (3/2 dᵀCd − ½ tr C r²)/r⁵ of a patch (10,) at points (3, n), times `far` (n,).
 
@@ -105,14 +99,7 @@ def add_series(
 
 
 @compiled(error_model="numpy")
-def add_face(
-    patch: NDArray[np.float64],
-    limit: float,
-    face: NDArray[np.float64],
-    points: NDArray[np.float64],
-    far: NDArray[np.float64],
-    sums: NDArray[np.float64],
-) -> None:
+def add_face(patch: Floats, limit: float, face: Floats, points: Floats, far: Floats, sums: Floats) -> None:
     """Add a face that was opened at points (3, n): by the series of its quarters, or near it in closed form."""
     n_far = 0
     for i in range(points.shape[1]):
@@ -131,7 +118,7 @@ def add_face(
 
 
 @compiled(error_model="numpy")
-def near_potential(face: NDArray[np.float64], x: float, y: float, z: float) -> float:
+def near_potential(face: Floats, x: float, y: float, z: float) -> float:
     """The potential of a face (25,) at a point: Σ p ln((r + r' + l)/(r + r' − l)) − |h Ω| over its sides.
 
     For a side of length l, p is the distance of the point's projection from its line, positive inside, and r, r' are

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+
+from igps._arrays import Floats, Integers
 
 
-def spatial_order(points: NDArray[np.float64], size: int) -> NDArray[np.int64]:
+def spatial_order(points: Floats, size: int) -> Integers:
     """An order (n,) of points (n, 3) in which all runs of size·2ᵏ, counted from the start, are compact in space.
 
     The median cut: halves along the longest side of their bounding box, again and again.
@@ -27,7 +28,7 @@ def spatial_order(points: NDArray[np.float64], size: int) -> NDArray[np.int64]:
     return order[order < n_points]
 
 
-def principal_axes(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def principal_axes(points: Floats) -> Floats:
     """The principal axes of points (n, 3), as columns (3, 3), towards the longer tails: cuts turn with the points."""
     centred = points - points.mean(axis=0)
     axes = np.linalg.eigh(centred.T @ centred).eigenvectors

@@ -9,13 +9,10 @@ import math
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
-from numpy.typing import NDArray
 
+from igps._arrays import Booleans, Floats, Integers, Singles
 from igps._compiled import compiled
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
 Arrays = tuple[Integers, Floats, Integers, Integers]
 
 _PAIRS = 128  # pairs of a face and a point at a time: their numbers stay in the first-level cache
@@ -233,7 +230,7 @@ def divide_angles(squares: Floats, cosines: Floats) -> None:
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def fill_cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats, terms: NDArray[np.float32]) -> None:
+def fill_cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats, terms: Singles) -> None:
     """Fill what each hat adds (V, 19) to the sums of its cluster, which is one of `size` consecutive hats.
 
     The moments of n dS about the cluster's centre are F = ∫ λ n, T + F sᵀ with T the symmetric part of ∫ λ n (y − p)ᵀ,

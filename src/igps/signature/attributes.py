@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats, Integers, Singles
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors, unit
 from igps.signature.surface_potential import surface_potential
@@ -15,9 +15,7 @@ from igps.signature.surface_potential import surface_potential
 AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
 
 
-def interior_attributes(
-    mesh: Mesh, points: NDArray[np.float64], names: Sequence[AttributeName]
-) -> Mapping[str, NDArray[np.float32]]:
+def interior_attributes(mesh: Mesh, points: Floats, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
     """Named attributes of points inside, (P,) or (P, 3), dimensionless and the same for a scaled or moved body.
 
     Raises:
@@ -32,9 +30,7 @@ def interior_attributes(
     return {name: functions[name](mesh, points).astype(np.float32) for name in names}
 
 
-def surface_attributes(
-    mesh: Mesh, faces: NDArray[np.int64], names: Sequence[AttributeName]
-) -> Mapping[str, NDArray[np.float32]]:
+def surface_attributes(mesh: Mesh, faces: Integers, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
     """Those of the named attributes that points of the surface have: "surface_direction", the outward normal.
 
     Args:
@@ -56,7 +52,7 @@ def check_attributes(names: Sequence[str]) -> None:
         raise ValueError(f"attributes: expected different ones of {', '.join(known)}, got {', '.join(names)}.")
 
 
-def depth(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def depth(mesh: Mesh, points: Floats) -> Floats:
     """Distance of points to the surface over √area: 0 on the surface, 0.28 in the centre of a ball, its maximum.
 
     Args:
@@ -69,7 +65,7 @@ def depth(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.linalg.norm(_to_surface(mesh, points), axis=1) / np.sqrt(mesh.area)
 
 
-def surface_direction(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def surface_direction(mesh: Mesh, points: Floats) -> Floats:
     """Unit vectors from points to the nearest point of the surface; near it, the outward normal.
 
     Where several points of the surface are nearest, as on the axis of a tube, it is one of their directions.
@@ -84,7 +80,7 @@ def surface_direction(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.flo
     return unit(_to_surface(mesh, points))
 
 
-def _to_surface(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_surface(mesh: Mesh, points: Floats) -> Floats:
     import igl
 
     *_, nearest = igl.point_mesh_squared_distance(
@@ -93,7 +89,7 @@ def _to_surface(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(nearest) - points
 
 
-def electrostatic_potential(mesh: Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def electrostatic_potential(mesh: Mesh, points: Floats) -> Floats:
     """Electrostatic potential of a uniform unit charge on the surface, (1/√area) ∫ dS/|x − s|: √4π in a ball.
 
     It is high where much surface is near: deep in thick parts and among folded ones, low in thin limbs and at their

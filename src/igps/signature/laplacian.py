@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from igps._arrays import Floats, Integers
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import longest_side
 
@@ -19,7 +19,7 @@ _DEGENERATE = 1e-8
 _MOLLIFIER = 1e-6
 
 
-def laplacian(mesh: Mesh, backend: Backend = "cotangent") -> tuple[sparse.csr_matrix, NDArray[np.float64]]:
+def laplacian(mesh: Mesh, backend: Backend = "cotangent") -> tuple[sparse.csr_matrix, Floats]:
     """Stiffness and mass of the generalised eigenproblem `stiffness φ = λ mass φ`.
 
     Args:
@@ -50,7 +50,7 @@ def laplacian(mesh: Mesh, backend: Backend = "cotangent") -> tuple[sparse.csr_ma
     raise ValueError(f"backend: expected 'cotangent' or 'robust', got {backend!r}.")
 
 
-def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, NDArray[np.float64]]:
+def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, Floats]:
     corners = mesh.vertices[mesh.faces]
     # Column i is the edge opposite corner i.
     edges = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
@@ -71,12 +71,12 @@ def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, NDArray[np.float64]]:
     )
 
 
-def _heron(lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+def _heron(lengths: Floats) -> Floats:
     c, b, a = np.sort(lengths, axis=1).T  # Kahan's arrangement, stable for needles
     return np.sqrt((a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))) / 4
 
 
-def _stiffness(faces: NDArray[np.int64], cotangents: NDArray[np.float64], n_vertices: int) -> sparse.csr_matrix:
+def _stiffness(faces: Integers, cotangents: Floats, n_vertices: int) -> sparse.csr_matrix:
     # Half of the cotangent of each corner, at one of the two entries of the edge opposite it.
     shape = n_vertices, n_vertices
     ends = faces[:, [1, 2, 0]].ravel(), faces[:, [2, 0, 1]].ravel()
@@ -85,13 +85,7 @@ def _stiffness(faces: NDArray[np.int64], cotangents: NDArray[np.float64], n_vert
     return sparse.diags(np.asarray(weights.sum(axis=1)).ravel(), format="csr") - weights
 
 
-def _mixed_voronoi_mass(
-    faces: NDArray[np.int64],
-    cotangents: NDArray[np.float64],
-    squared: NDArray[np.float64],
-    area: NDArray[np.float64],
-    n_vertices: int,
-) -> NDArray[np.float64]:
+def _mixed_voronoi_mass(faces: Integers, cotangents: Floats, squared: Floats, area: Floats, n_vertices: int) -> Floats:
     # Meyer et al. 2002, section 3.3. The Voronoi share of corner i takes an eighth of edge² · cot of the angle that
     # faces the edge, over the two edges at i; in an obtuse face the corners take fixed shares instead.
     share = squared * cotangents / 8

@@ -21,13 +21,11 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.distance import cdist
 
+from igps._arrays import Floats, Integers
 from igps._threads import Team
 from igps.mesh.winding import checked_places
 from igps.signature._far_field import Clusters, Surface
 from igps.signature._spatial_order import spatial_order
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from igps._arrays import Floats, Integers
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import face_areas
 
@@ -31,11 +32,8 @@ _ANCHOR_SHARES = 0.1 / np.sqrt([1.0, 2.0, 3.0, 5.0])
 
 
 def places(
-    eigenfunctions: NDArray[np.floating],
-    eigenvalues: NDArray[np.float64],
-    area: float,
-    marks: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
+    eigenfunctions: NDArray[np.floating], eigenvalues: Floats, area: float, marks: Floats | None = None
+) -> Floats:
     """One number for each of some points of a body, by which they can be ordered whatever the order they come in.
 
     The barycentroid potential (Rustamov 2010) in a smooth low-pass embedding, and shares of the distances from four
@@ -59,7 +57,7 @@ def places(
     return _by_anchors(eigenfunctions[:, :n_kept] * weights[:n_kept], marks)
 
 
-def places_in_space(mesh: Mesh) -> NDArray[np.float64]:
+def places_in_space(mesh: Mesh) -> Floats:
     """(V,) the same for the vertices of a mesh, by straight distances from the surface's centroid and from anchors.
 
     This needs no eigenfunctions, but changes with pose.
@@ -83,7 +81,7 @@ def in_order_of_form(mesh: Mesh) -> Mesh:
     return replace(mesh, vertices=mesh.vertices[order], faces=corners[np.lexsort(corners.T[::-1])])
 
 
-def _by_anchors(embedding: NDArray[np.float64], marks: NDArray[np.float64] | None) -> NDArray[np.float64]:
+def _by_anchors(embedding: Floats, marks: Floats | None) -> Floats:
     found = _distances(embedding, np.zeros(embedding.shape[1]))
     if marks is not None:
         found += _MARK_SHARE * marks
@@ -97,26 +95,26 @@ def _by_anchors(embedding: NDArray[np.float64], marks: NDArray[np.float64] | Non
     return found
 
 
-def _distances(points: NDArray[np.float64], from_point: NDArray[np.float64]) -> NDArray[np.float64]:
+def _distances(points: Floats, from_point: Floats) -> Floats:
     """(P,) of points (P, D), by so many at once that the differences stay in the processor's cache."""
     pieces = [slice(start, start + _ROWS_AT_ONCE) for start in range(0, len(points), _ROWS_AT_ONCE)]
     return np.concatenate([np.linalg.norm(points[piece] - from_point, axis=1) for piece in pieces])
 
 
-def crowding(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def crowding(points: Floats) -> Floats:
     """Mean distance of each of some points (P, 3) from its nearest ones, over that of all: marks for `places`."""
     n_nearest = min(_N_NEAREST + 1, len(points))
     distance = cKDTree(points).query(points, n_nearest)[0].reshape(len(points), n_nearest).mean(axis=1)
     return distance / max(distance.mean(), np.finfo(float).tiny)
 
 
-def shares_around(faces: NDArray[np.int64], areas: NDArray[np.float64]) -> NDArray[np.float64]:
+def shares_around(faces: Integers, areas: Floats) -> Floats:
     """Area of the faces (F, 3) around each vertex, over the mean: marks for `places`."""
     around = np.bincount(faces.ravel(), weights=np.repeat(areas, 3))
     return around / around.mean()
 
 
-def one_in_each_share(sizes: NDArray[np.float64], n: int, generator: np.random.Generator) -> NDArray[np.int64]:
+def one_in_each_share(sizes: Floats, n: int, generator: np.random.Generator) -> Integers:
     """Draw n of some things laid end to end, each as often as its size asks: one at random in each n-th of the length.
 
     Args:

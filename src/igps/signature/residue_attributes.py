@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from igps._arrays import Floats
 from igps.mesh.formats.molecules import Molecule
 from igps.mesh.residues import ACCEPTORS, AROMATIC, DONORS, HYDROPATHY, VOLUMES
 from igps.signature.signature import Samples, Signature
@@ -33,7 +33,7 @@ DEBYE_LENGTH = 7.85
 _BLOCK = 2**22
 
 
-def screened_potential(molecule: Molecule, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def screened_potential(molecule: Molecule, points: Floats) -> Floats:
     """(P,) potential at points (P, 3) of all charges in salt water, kT/e (Debye and Hückel 1923).
 
     The sum of l·q/d·exp(−d/D) over the charges q at distances d, with l the Bjerrum length and D the Debye length. In
@@ -49,9 +49,7 @@ def screened_potential(molecule: Molecule, points: NDArray[np.float64]) -> NDArr
     return potential
 
 
-def residue_means(
-    molecule: Molecule, points: NDArray[np.float64], values: NDArray[np.float64], width: float = WIDTH
-) -> NDArray[np.float64]:
+def residue_means(molecule: Molecule, points: Floats, values: Floats, width: float = WIDTH) -> Floats:
     """Means of the residues' values at points, by a Gaussian of the distance.
 
     Args:
@@ -75,7 +73,7 @@ def residue_means(
     return means
 
 
-def residue_attribute(molecule: Molecule, points: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
     """A named attribute of points (P, 3), Å: (P,), of "residue_shares" (P, 25); see `RESIDUE_ATTRIBUTES`.
 
     Raises:
@@ -98,10 +96,10 @@ def with_residue_attributes(signature: Signature, molecule: Molecule, names: Seq
     return replace(signature, interior=added(signature.interior), surface=added(signature.surface))
 
 
-def _by_name(table: Mapping[str, float], default: float = np.nan) -> Callable[[Molecule], NDArray[np.float64]]:
+def _by_name(table: Mapping[str, float], default: float = np.nan) -> Callable[[Molecule], Floats]:
     """Values (R, 1) of the residues by their names; those of amino acids that the table does not name are `default`."""
 
-    def column(molecule: Molecule) -> NDArray[np.float64]:
+    def column(molecule: Molecule) -> Floats:
         return np.array(
             [[table.get(name, default if name in VOLUMES else np.nan)] for name in molecule.residue_names], dtype=float
         ).reshape(-1, 1)
@@ -109,19 +107,19 @@ def _by_name(table: Mapping[str, float], default: float = np.nan) -> Callable[[M
     return column
 
 
-def _charges(molecule: Molecule) -> NDArray[np.float64]:
+def _charges(molecule: Molecule) -> Floats:
     sums = np.bincount(molecule.residue_of, molecule.charges, len(molecule.residue_names))
     return sums[:, None].astype(np.float64)
 
 
-def _kinds(molecule: Molecule) -> NDArray[np.float64]:
+def _kinds(molecule: Molecule) -> Floats:
     """(R, 25), 1 for the kind of each residue."""
     number = {name: i for i, name in enumerate(RESIDUE_KINDS)}
     number |= {f"D{base}": number[base] for base in "ACG"} | {"DT": number["U"], "T": number["U"]}
     return np.eye(len(RESIDUE_KINDS))[[number.get(name, number["other"]) for name in molecule.residue_names]]
 
 
-_COLUMNS: Mapping[str, Callable[[Molecule], NDArray[np.float64]]] = {
+_COLUMNS: Mapping[str, Callable[[Molecule], Floats]] = {
     "charge": _charges,  # elementary charges
     "hydropathy": _by_name(HYDROPATHY),  # Kyte and Doolittle 1982
     "b_factor": lambda molecule: molecule.b_factors[:, None],  # Å², or pLDDT

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats, Integers
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import face_areas
 from igps.signature.ordering import one_in_each_share
@@ -23,20 +23,20 @@ class SurfacePoints:
     """
 
     mesh: Mesh
-    face: NDArray[np.int64]
-    weights: NDArray[np.float64]
+    face: Integers
+    weights: Floats
 
     @property
-    def positions(self) -> NDArray[np.float64]:
+    def positions(self) -> Floats:
         """(P, 3) length."""
         return self.interpolate(self.mesh.vertices)
 
-    def interpolate(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def interpolate(self, values: Floats) -> Floats:
         """(P, D) linear interpolation of values (V, D) at the vertices."""
         return np.einsum("pi,pid->pd", self.weights, values[self.mesh.faces[self.face]])
 
 
-def surface_points(mesh: Mesh, n_points: int, seed: int, places: NDArray[np.float64] | None = None) -> SurfacePoints:
+def surface_points(mesh: Mesh, n_points: int, seed: int, places: Floats | None = None) -> SurfacePoints:
     """Random points evenly distributed over the surface.
 
     Args:
@@ -60,7 +60,7 @@ def surface_points(mesh: Mesh, n_points: int, seed: int, places: NDArray[np.floa
     return SurfacePoints(mesh, face, weights)
 
 
-def _in_triangles(n_points: int, generator: np.random.Generator) -> NDArray[np.float64]:
+def _in_triangles(n_points: int, generator: np.random.Generator) -> Floats:
     """(P, 3) barycentric coordinates, uniform in a triangle (Osada et al. 2002, equation 1)."""
     r = np.sqrt(generator.random(n_points))
     s = generator.random(n_points)

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from igps._arrays import Floats, Singles
 from igps._threads import one_thread
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.simplification import simplify
@@ -46,9 +47,9 @@ class Samples:
         attributes: by name, each (P,) or (P, C) float32; a direction has C = 3.
     """
 
-    points: NDArray[np.float64]
-    eigenfunctions: NDArray[np.float32]
-    attributes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    points: Floats
+    eigenfunctions: Singles
+    attributes: Mapping[str, Singles] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -111,7 +112,7 @@ class Signature:
         unit: of length, such as "mm"; None where it is not known.
     """
 
-    eigenvalues: NDArray[np.float64]
+    eigenvalues: Floats
     interior: Samples
     surface: Samples
     area: float
@@ -123,7 +124,7 @@ class Signature:
     unit: str | None = None
 
     @property
-    def barycentroid(self) -> NDArray[np.float64]:
+    def barycentroid(self) -> Floats:
         """(3,) interior sample of least potential Σ φₖ²/λₖ, a centre that hardly moves with pose (Rustamov 2010)."""
         potential = np.square(self.interior.eigenfunctions, dtype=np.float64) @ (1 / self.eigenvalues)
         return self.interior.points[int(np.argmin(potential))]
@@ -132,7 +133,7 @@ class Signature:
         """The Signature of a configuration of which this one's is one of the larger, see `SignatureConfig.larger`."""
 
         def cut(samples: Samples) -> Samples:
-            kept: dict[str, NDArray[np.float32]] = {
+            kept: dict[str, Singles] = {
                 name: values for name, values in samples.attributes.items() if name in config.attributes
             }
             return replace(
@@ -256,11 +257,7 @@ def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str,
 
 
 def _interior(
-    mesh: Mesh,
-    extension: Extension,
-    eigenvalues: NDArray[np.float64],
-    points: NDArray[np.float64],
-    config: SignatureConfig,
+    mesh: Mesh, extension: Extension, eigenvalues: Floats, points: Floats, config: SignatureConfig
 ) -> Samples:
     """Those at the points, by the extension of eigenfunctions over the roots of their eigenvalues."""
     values = extension(points)
@@ -270,9 +267,7 @@ def _interior(
     return Samples(points, np.asarray(values, dtype=np.float32), interior_attributes(mesh, points, config.attributes))
 
 
-def _surface(
-    mesh: Mesh, functions: NDArray[np.float64], eigenvalues: NDArray[np.float64], config: SignatureConfig
-) -> Samples:
+def _surface(mesh: Mesh, functions: Floats, eigenvalues: Floats, config: SignatureConfig) -> Samples:
     marks = shares_around(mesh.faces, face_areas(mesh.vertices, mesh.faces))
     order = places(functions, eigenvalues, mesh.area, marks)
     points = surface_points(mesh, config.n_surface_samples, config.seed, order)

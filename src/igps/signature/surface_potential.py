@@ -15,8 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats, Integers
 from igps.mesh.surface import longest_side
 from igps.signature._potential_loops import fill_potentials
 from igps.signature._spatial_order import spatial_order
@@ -28,9 +28,7 @@ _FACES = 8  # in the smallest clusters, and so many clusters of one level in one
 _FLAT = 1e-14  # a face's height over its length, below which it has no area and no normal to speak of
 
 
-def surface_potential(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], points: NDArray[np.float64], accuracy: float = 1e-3
-) -> NDArray[np.float64]:
+def surface_potential(vertices: Floats, faces: Integers, points: Floats, accuracy: float = 1e-3) -> Floats:
     """∫ dS/|x − s| over a triangle mesh at points x anywhere, on the surface too.
 
     Args:
@@ -83,13 +81,13 @@ class _Patches:
         radii: (n,) of a ball about the centroid that holds the patch.
     """
 
-    areas: NDArray[np.float64]
-    centres: NDArray[np.float64]
-    spreads: NDArray[np.float64]
-    radii: NDArray[np.float64]
+    areas: Floats
+    centres: Floats
+    spreads: Floats
+    radii: Floats
 
     @staticmethod
-    def of(corners: NDArray[np.float64]) -> _Patches:
+    def of(corners: Floats) -> _Patches:
         """Of triangles (n, 3, 3)."""
         centres = corners.mean(axis=1)
         arms = corners - centres[:, None]
@@ -107,7 +105,7 @@ class _Patches:
         radii = np.maximum.reduceat(np.linalg.norm(arms, axis=1) + self.radii, starts)
         return _Patches(areas, centres, np.add.reduceat(moments, starts) / areas[:, None, None], radii)
 
-    def reaches(self, accuracy: float) -> NDArray[np.float64]:
+    def reaches(self, accuracy: float) -> Floats:
         """(n,) distance from the centroid from which on the series has a relative error below the accuracy."""
         variances = np.trace(self.spreads, axis1=1, axis2=2)
         # (g + R/2)² (g − R/2) ≥ g³ for g ≥ R.
@@ -115,7 +113,7 @@ class _Patches:
         return np.maximum(least, 1.5 * self.radii) + self.radii / 2
 
     @property
-    def table(self) -> NDArray[np.float64]:
+    def table(self) -> Floats:
         """(n, 10): centroid, area, and the form A·(3/2 C − ½ tr C·1) as xx, yy, zz, 2xy, 2xz, 2yz."""
         trace = np.trace(self.spreads, axis1=1, axis2=2)
         form = self.areas[:, None, None] * (1.5 * self.spreads - 0.5 * trace[:, None, None] * np.eye(3))
@@ -123,7 +121,7 @@ class _Patches:
         return np.concatenate([self.centres, self.areas[:, None], entries], axis=1)
 
 
-def _face_table(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def _face_table(corners: Floats) -> Floats:
     """(F, 25) of triangles (F, 3, 3): corners, normal, outward normals of the sides in the plane, lengths, 2 area."""
     sides = np.roll(corners, -1, axis=1) - corners  # from each corner to the next
     normals = np.cross(sides[:, 0], sides[:, 1])

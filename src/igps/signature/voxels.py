@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from igps._arrays import Booleans, Floats, Integers
 from igps.mesh.limits import check_grid
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import box_sides, directed_edges, longest_side
@@ -18,7 +19,7 @@ _MAX_RESOLUTION = 512
 _MAX_CELLS = 2**25
 
 
-def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> NDArray[np.float64]:
+def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> Floats:
     """Centres of the cubic voxels inside the mesh (Rustamov 2010, section 3).
 
     The grid is centred on the bounding box, with cells of 1/`resolution` of its longest side, so that moving the mesh,
@@ -73,7 +74,7 @@ def _finest_resolution(mesh: Mesh) -> int:
     return resolution
 
 
-def grid_axes(mesh: Mesh, resolution: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def grid_axes(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Floats]:
     """Coordinates of the cell centres along x, y and z of the cubic grid centred on the mesh's bounding box."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     cell = (high - low).max() / resolution
@@ -83,9 +84,7 @@ def grid_axes(mesh: Mesh, resolution: int) -> tuple[NDArray[np.float64], NDArray
     return x, y, z
 
 
-def inside_grid(
-    mesh: Mesh, axes: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-) -> NDArray[np.bool_]:
+def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
     """For each point of the grid spanned by `axes`, whether the mesh's winding number there is above one half.
 
     Along each axis the signed crossings of every grid line are summed from both ends. On a closed mesh the six sums
@@ -114,10 +113,8 @@ def inside_grid(
 
 
 def _scan(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    axes: tuple[NDArray[np.float64], ...],
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
+    vertices: Floats, faces: Integers, axes: tuple[Floats, ...]
+) -> tuple[NDArray[np.int32], NDArray[np.int32], Booleans]:
     """Signed crossings of the grid lines along the first axis, after and before each point, and the points touched.
 
     Every comparison belongs to one edge and gives the same answer in both faces of that edge, so that a line through an
@@ -168,13 +165,13 @@ def _scan(
     return after, before, touched[:-1]
 
 
-def _cell(axes: tuple[NDArray[np.float64], ...], vertices: NDArray[np.float64]) -> float:
+def _cell(axes: tuple[Floats, ...], vertices: Floats) -> float:
     """The grid's cell: the first axis tells it, or where that has one point, as across a flat body, the next does."""
     steps = (float(axis[1] - axis[0]) for axis in axes if len(axis) > 1)
     return next(steps, longest_side(vertices))
 
 
-def _ranges(first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _ranges(first: Integers, last: Integers) -> tuple[Integers, Integers]:
     """The pairs (i, k) with first[i] ≤ k < last[i], in order."""
     length = np.maximum(last - first, 0)
     owner = np.repeat(np.arange(len(first)), length)

@@ -114,12 +114,7 @@ def lanczos(
 
 
 def _factorize_inside(
-    tree: Tree,
-    matrix: sparse.csr_array,
-    zero_mode: np.ndarray,
-    n_eigenpairs: int,
-    tolerance: float,
-    team: Team,
+    tree: Tree, matrix: sparse.csr_array, zero_mode: np.ndarray, n_eigenpairs: int, tolerance: float, team: Team
 ) -> tuple[float, Factors]:
     """A shift with about SHIFT_RANK of the wanted eigenvalues below it, at which the factorization is accurate.
 

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from igps._arrays import Floats
 from igps._compiled import SUMS, Lazy, compiled
 
 Real = TypeVar("Real", np.float32, np.float64)
@@ -157,13 +158,7 @@ narrow_tile: Any = Lazy(partial(_tile, 1))
 
 @compiled()
 def product(
-    shape: tuple[int, int, int],
-    factor: float,
-    a: Strided,
-    x: Rows,
-    keep: bool,
-    source: Rows,
-    out: Rows,
+    shape: tuple[int, int, int], factor: float, a: Strided, x: Rows, keep: bool, source: Rows, out: Rows
 ) -> None:
     """out ← factor · Aᵀ X, plus the source if it is to be kept; shape (m, n, k) of out (m, n) and of A and X, k rows.
 
@@ -188,7 +183,7 @@ def product(
 
 
 @compiled()
-def overlaps_by_loops(a: NDArray[np.float64], b: NDArray[np.float64], begin: int, end: int) -> NDArray[np.float64]:
+def overlaps_by_loops(a: Floats, b: Floats, begin: int, end: int) -> Floats:
     """The products (n, m) of rows (n, V) with rows (m, V), over the columns from ``begin`` to ``end``."""
     found = np.zeros((len(a), len(b)))
     for start in range(begin, end, CHUNK):
@@ -204,7 +199,7 @@ def overlaps_by_loops(a: NDArray[np.float64], b: NDArray[np.float64], begin: int
 
 @compiled(fastmath=SUMS)
 def four_by_six(
-    a: NDArray[np.float64], i: int, b: NDArray[np.float64], j: int, begin: int, end: int
+    a: Floats, i: int, b: Floats, j: int, begin: int, end: int
 ) -> tuple[Four, Four, Four, Four, Four, Four]:
     """The products of four rows of one array, from ``i`` on, with each of six of another; the last stands in for more.
 
@@ -230,9 +225,7 @@ def added(sums: Four, x: Four, y: float) -> Four:
 
 
 @compiled()
-def subtract_by_loops(
-    rows: NDArray[np.float64], factors: NDArray[Real], others: NDArray[Real], begin: int, end: int
-) -> None:
+def subtract_by_loops(rows: Floats, factors: NDArray[Real], others: NDArray[Real], begin: int, end: int) -> None:
     """Take (n, m) times (m, V) from rows (n, V), in the columns from ``begin`` to ``end``.
 
     The product is computed in the precision of the others, the difference in that of the rows.

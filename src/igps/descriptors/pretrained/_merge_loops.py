@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Integers
 from igps._compiled import compiled
 
 
 @compiled()
 def merge(
-    order: NDArray[np.int64], neighbours: NDArray[np.int64], counts: NDArray[np.int64], ends: NDArray[np.int64],
-    pieces: NDArray[np.int64],
+    order: Integers, neighbours: Integers, counts: Integers, ends: Integers,
+    pieces: Integers,
 ) -> int:  # fmt: skip
     """Write the branches and the pieces of a function on a graph; how many branches there are.
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from igps._arrays import Singles
 from igps.nn._kernels.ball_loops import bends
 from igps.nn._precision import full_precision
 
@@ -71,6 +71,6 @@ def _radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
     return torch.stack(sides, dim=1)
 
 
-def _array(vectors: Tensor) -> NDArray[np.float32]:
+def _array(vectors: Tensor) -> Singles:
     """(3, P) of vectors (P, 3)."""
     return vectors.detach().T.contiguous().numpy()

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from igps._arrays import Floats
 from igps._threads import ALONE, Team
 from igps.nn._kernels.pair_loops import COSINES, DISTANCES, VALUES, Axes, count_block, gradient_block
 from igps.nn._kernels.pair_values import PairValues, centres_of, cosine_factors, with_tensors
@@ -116,7 +117,7 @@ class _Members:
         self._weights = weights.gather(1, by_order).double().transpose(1, 2).contiguous().numpy()
         self._n_points = layout.mask.sum(dim=1).tolist()
 
-    def of(self, number: int) -> tuple[Tensor, tuple[NDArray[np.int32], NDArray[np.float64]]]:
+    def of(self, number: int) -> tuple[Tensor, tuple[NDArray[np.int32], Floats]]:
         """Of a shape (P,) its points in order, and (M, P) their classes and weights."""
         n = self._n_points[number]
         classes, weights = (np.ascontiguousarray(one[number, :, :n]) for one in (self._classes, self._weights))

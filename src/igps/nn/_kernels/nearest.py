@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from igps._arrays import Integers
 from igps._compiled import compiled
 
 Real = TypeVar("Real", np.float32, np.float64)
@@ -31,7 +32,7 @@ def smallest(values: Tensor, n: int) -> tuple[Tensor, Tensor]:
 
 
 @compiled()
-def keep_smallest(values: NDArray[Real], kept: NDArray[Real], columns: NDArray[np.int64]) -> None:
+def keep_smallest(values: NDArray[Real], kept: NDArray[Real], columns: Integers) -> None:
     """Write the smallest entries of each row of (P, T) in order to (P, n), which holds infinity, and their columns."""
     last = kept.shape[1] - 1
     for i in range(values.shape[0]):

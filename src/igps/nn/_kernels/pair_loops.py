@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from igps._arrays import Booleans, Floats, Integers
 from igps._compiled import compiled
 
 # How the loops get the values of axes: as they are; distances from inner products; three cosines at once from points.
@@ -46,23 +47,17 @@ class Axes(NamedTuple):
         n_centres: (K,).
     """
 
-    kinds: NDArray[np.int64]
+    kinds: Integers
     norms: NDArray[Any]
     oriented: NDArray[Any]
-    n_dimensions: NDArray[np.int64]
+    n_dimensions: Integers
     centres: NDArray[Any]
-    n_centres: NDArray[np.int64]
+    n_centres: Integers
 
 
 @compiled(error_model="numpy")
 def count_block(
-    values: NDArray[Any],
-    axes: Axes,
-    row: int,
-    column: int,
-    classes: NDArray[np.int32],
-    weights: NDArray[np.float64],
-    total: NDArray[np.float64],
+    values: NDArray[Any], axes: Axes, row: int, column: int, classes: NDArray[np.int32], weights: Floats, total: Floats
 ) -> None:
     """Count a block of pairs.
 
@@ -134,11 +129,11 @@ def gradient_block(
     row: int,
     column: int,
     classes: NDArray[np.int32],
-    weights: NDArray[np.float64],
+    weights: Floats,
     upstream: NDArray[Any],
     turns: NDArray[Any],
-    by_weights: NDArray[np.float64],
-    by_centres: NDArray[np.float64],
+    by_weights: Floats,
+    by_centres: Floats,
 ) -> None:
     """The gradient of `count_block`, whose first arguments are the same.
 
@@ -248,7 +243,7 @@ def whole_vectors(first: int, n_columns: int) -> int:
 
 
 @compiled(error_model="numpy")
-def gaps(centres: NDArray[Any], n_centres: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+def gaps(centres: NDArray[Any], n_centres: Integers) -> tuple[NDArray[Any], Booleans]:
     """(K, B − 1) one over the gaps between centres (K, B), and (K,) whether those of an axis are all equal.
 
     Where they are, the first is one over their mean.
@@ -278,7 +273,7 @@ def locate_row(
     i: int,
     axes: Axes,
     inverse: NDArray[Any],
-    equal: NDArray[np.bool_],
+    equal: Booleans,
     point: int,
     column: int,
     start: int,
@@ -430,14 +425,14 @@ def pack_pairs(cell: NDArray[np.int32], home: NDArray[np.int32], share: NDArray[
 
 
 @compiled(error_model="numpy")
-def add_whole_pairs(cell: NDArray[np.int32], parts: NDArray[np.int32], packed: NDArray[np.int64]) -> None:
+def add_whole_pairs(cell: NDArray[np.int32], parts: NDArray[np.int32], packed: Integers) -> None:
     """`add_one_axis` of pairs that weigh 1, into integers (cells·_LANES,): one store for both corners, no rounding."""
     for j in range(len(cell)):
         packed[np.uint32(cell[j])] += _PAIR + np.int64(parts[j])
 
 
 @compiled(error_model="numpy")
-def unpack(packed: NDArray[np.int64], sums: NDArray[np.float64]) -> None:
+def unpack(packed: Integers, sums: Floats) -> None:
     """Move what was packed to the sums (cells, 2)."""
     for c in range(len(packed) // _LANES):
         pairs = packed[_LANES * c : _LANES * (c + 1)]
@@ -452,11 +447,7 @@ def unpack(packed: NDArray[np.int64], sums: NDArray[np.float64]) -> None:
 
 @compiled(**_CONTRACTED)
 def add_one_axis(
-    cell: NDArray[np.int32],
-    home: NDArray[np.int32],
-    share: NDArray[Any],
-    weights: NDArray[np.float64],
-    sums: NDArray[np.float64],
+    cell: NDArray[np.int32], home: NDArray[np.int32], share: NDArray[Any], weights: Floats, sums: Floats
 ) -> None:
     """Add pairs of one row to the sums (cells, 2).
 
@@ -482,8 +473,8 @@ def add_two_axes(
     home: NDArray[np.int32],
     first: NDArray[Any],
     second: NDArray[Any],
-    weights: NDArray[np.float64],
-    sums: NDArray[np.float64],
+    weights: Floats,
+    sums: Floats,
     at: Any,
 ) -> None:
     """`add_one_axis` of the shares along two axes, into four corners from one on."""
@@ -507,12 +498,7 @@ def quarters(weight: float, first: float, second: float) -> tuple[float, float, 
 
 @compiled(**_CONTRACTED)
 def add_four_axes(
-    cell: NDArray[np.int32],
-    home: NDArray[np.int32],
-    shares: NDArray[Any],
-    first: int,
-    weights: NDArray[np.float64],
-    sums: NDArray[np.float64],
+    cell: NDArray[np.int32], home: NDArray[np.int32], shares: NDArray[Any], first: int, weights: Floats, sums: Floats
 ) -> None:
     """`add_axes` along four, a distance and three cosines, which takes half of the time in one pass."""
     one, two, three, four = shares[0, first:], shares[1, first:], shares[2, first:], shares[3, first:]
@@ -528,9 +514,7 @@ def add_four_axes(
 
 
 @compiled(**_CONTRACTED)
-def add_corners(
-    sums: NDArray[np.float64], cell: Any, at: Any, weight: float, parts: tuple[float, float, float, float]
-) -> None:
+def add_corners(sums: Floats, cell: Any, at: Any, weight: float, parts: tuple[float, float, float, float]) -> None:
     """Add a weight to a cell's four corners from one on, in parts."""
     sums[cell, at] += weight * parts[0]
     sums[cell, at + 1] += weight * parts[1]
@@ -540,12 +524,7 @@ def add_corners(
 
 @compiled(error_model="numpy")
 def add_axes(
-    cell: NDArray[np.int32],
-    home: NDArray[np.int32],
-    shares: NDArray[Any],
-    first: int,
-    weights: NDArray[np.float64],
-    sums: NDArray[np.float64],
+    cell: NDArray[np.int32], home: NDArray[np.int32], shares: NDArray[Any], first: int, weights: Floats, sums: Floats
 ) -> None:
     """`add_one_axis` of the shares along any number of axes from two on, (K, n) from the first on."""
     n_outer = len(shares) - 2
@@ -565,13 +544,7 @@ def add_axes(
 
 @compiled(error_model="numpy")
 def flush(
-    sums: NDArray[np.float64],
-    lowest: int,
-    highest: int,
-    classes: NDArray[np.int32],
-    weights: NDArray[np.float64],
-    point: int,
-    total: NDArray[np.float64],
+    sums: Floats, lowest: int, highest: int, classes: NDArray[np.int32], weights: Floats, point: int, total: Floats
 ) -> None:
     """Add the sums (C, cells·corners) of rows like a point, by its weights (M, P) in its classes, and clear them.
 

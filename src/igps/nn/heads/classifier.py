@@ -55,12 +55,7 @@ class ClassifierHead(KernelHead):
 
     @torch.no_grad()
     def fit(
-        self,
-        descriptions: Tensor,
-        labels: Tensor,
-        part_cells: Sequence[int] | None = None,
-        *,
-        calibrate: bool = True,
+        self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None, *, calibrate: bool = True
     ) -> Self:
         """Fit to the training shapes, and calibrate on folds of them.
 
