@@ -26,6 +26,7 @@ CLASSES = body_classes(0)
 # The named classes that bend, and one class of each kind.
 FIRST = {one.name.split("-")[0]: i for i, one in reversed(list(enumerate(CLASSES)))}
 COUNTS, SUM = [(3614, 7224), (2924, 5844), (2770, 5540), (3202, 6404)], 6960.694254095106
+N_VERTICES = (1500, 2500)
 BENDING = ["biped", "octopus", "snake", "hand", "star", "beast", "chain", "serpent", "sheet", "coil"]
 
 
@@ -41,7 +42,7 @@ def poses() -> dict[str, Pose]:
 
 @pytest.fixture(scope="module")
 def shapes() -> GradedShapes:
-    return GradedShapes(3, 2, 3, seed=2)
+    return GradedShapes(3, 2, 3, seed=2, n_vertices=N_VERTICES)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +122,7 @@ def test_shapes_are_read_without_mending(made: list[GradedShape], tmp_path: Path
         mesh = load_mesh(path, LoadOptions(mend="never"))
         assert mesh.notes == ()  # not turned inside out either
         assert mesh.genus == shape.genus
-        assert 0.66 * 2400 <= len(shape.vertices) <= 1.34 * 5000
+        assert 0.66 * N_VERTICES[0] <= len(shape.vertices) <= 1.34 * N_VERTICES[1]
 
 
 def test_poses_have_triangles_of_their_own_and_bodies_are_one(made: list[GradedShape]) -> None:
@@ -143,12 +144,12 @@ def test_same_seed_same_arrays_other_seed_others(made: list[GradedShape]) -> Non
     for index, shape in ((17, made[17]), (4, made[4])):
         body_class, rest = divmod(index, 6)
         body, pose = divmod(rest, 3)
-        more = GradedShapes(5, 4, 7, seed=2)
+        more = GradedShapes(5, 4, 7, seed=2, n_vertices=N_VERTICES)
         again = more[(body_class * 4 + body) * 7 + pose]
         assert again.name == shape.name
         np.testing.assert_array_equal(again.vertices, shape.vertices)
         np.testing.assert_array_equal(again.faces, shape.faces)
-    other = GradedShapes(3, 2, 3, seed=3)[4]
+    other = GradedShapes(3, 2, 3, seed=3, n_vertices=N_VERTICES)[4]
     assert other.vertices.shape != made[4].vertices.shape or not np.allclose(other.vertices, made[4].vertices)
 
 
@@ -185,7 +186,7 @@ def test_the_other_generator_is_as_it_was() -> None:
 
 def test_write_makes_folders_of_classes_and_bodies(tmp_path: Path) -> None:
     shapes = GradedShapes(1, 2, 2, seed=4, n_vertices=(1600, 2000))
-    shapes.write(tmp_path)
+    shapes.write(tmp_path, n_workers=2)
     files = find_bodies(tmp_path)
     assert files.names == tuple(f"{name}.off" for name in shapes.names)
     assert files.labels == tuple(shapes.labels)

@@ -145,11 +145,11 @@ def test_pretrained_gains_on_shapes_it_has_not_seen(tmp_path: Path) -> None:
 
     Of another seed than those that it was fitted to, and without the twelve templates, which all descriptors tell.
     """
-    GradedShapes(12, 3, 1, seed=3, n_vertices=(1500, 2000), look_alikes=False).write(tmp_path, n_workers=None)
+    GradedShapes(8, 3, 1, seed=3, n_vertices=(1500, 2000), look_alikes=False).write(tmp_path)
     module, plain = pretrained(), rich()
     config = (module.requirements | plain.requirements).apply_to(SignatureConfig(n_eigenpairs=64))
     dataset = SignatureDataset(tmp_path, config, tmp_path / "cache")
-    assert not dataset.precompute()
+    assert not dataset.precompute(n_workers=1)
 
     def first_tier(distances: Tensor) -> float:
         return retrieval_scores(distances, dataset.labels).mean()["ft"]
