@@ -397,6 +397,16 @@ def epoch(data: Path | None) -> dict[str, Figure]:
     return figures
 
 
+def learned_step(data: Path | None) -> Figure:
+    """A training step of `rich` with learnable bins, 40 shapes of 400 samples, one thread, over version 0.2.0."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "meshes"
+        igps.ArticulatedShapes(n_classes=4, n_per_class=5, n_vertices=1500).write(root)
+        with two_versions("steps.py", root, VERSION_0_2_0) as seconds_of:
+            ours, before = seconds_of("step")
+    return Figure(ours, "s", before, "version 0.2.0", before / ours, "40 shapes, 400 samples of each")
+
+
 @contextlib.contextmanager
 def two_versions(script: str, path: Path, commit: str) -> Iterator[Callable[[str], tuple[float, float]]]:
     """A script beside this one, run by now's igps and by that of a commit on one thread: gives seconds for a line.
@@ -623,6 +633,7 @@ FIGURES: dict[str, Callable[[Path | None], Figure | dict[str, Figure]]] = {
     "oriented_pairs": oriented_pairs,
     "describe_rich": describe_before,
     "signature_1500": signature_1500,
+    "learned_step": learned_step,
     "epoch": epoch,
     "descriptor_15k": descriptor_15k,
     "mesh_10k": mesh_10k,

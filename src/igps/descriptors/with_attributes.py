@@ -16,14 +16,18 @@ from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import chi_square
 
 _N_SAMPLES = 2000
+# Bins of distance, and how many of them are taken together for the levels of the comparison: fine textures need narrow
+# bins, conformations of a molecule change distances, and of some bodies it is the mixture alone that counts.
+_N_BINS, _LEVELS = 32, (1, 4, 32)
 
 
 class WithAttributes(Descriptor):
     """A descriptor and joint histograms of attributes and interior distances: `NAME+ATTRIBUTE`, or `NAME+ATTRIBUTE=w`.
 
     With d the distance of the descriptor and s its scale between bodies of one class, that of the bodies is
-    d + w·s/t·c: c the χ² distance of the attributes' histograms, and t the scale of `interior`, which is of that kind.
-    So a weight of 1 lets form and attributes count alike. Classes of an attribute are four quantiles of the collection.
+    d + w·s/t·c: c the χ² distance of the attribute's histograms, in the mean over 32, 8 and 1 bins of distance, and t
+    the scale of `interior`, which is of that kind. So a weight of 1 lets form and attributes count alike. Classes of an
+    attribute are eight quantiles of the collection.
 
     Args:
         descriptor: any whose scale is known.
@@ -51,7 +55,9 @@ class WithAttributes(Descriptor):
         self.inside = HistogramDescriptor(
             [
                 PairHistogram(
-                    [Attribute(name, quantiles=4, soft=True), InteriorDistance(16)], embedding, n_samples=_N_SAMPLES
+                    [Attribute(name, quantiles=8, soft=True), InteriorDistance(_N_BINS)],
+                    embedding,
+                    n_samples=_N_SAMPLES,
                 )
                 for name in attributes
             ]
@@ -75,5 +81,7 @@ class WithAttributes(Descriptor):
         shape = self.descriptor.description_shape
         found = self.descriptor.distances(form.unflatten(1, shape), forms.unflatten(1, shape))
         for weight, one, other in zip(self.weights, own, others, strict=True):
-            found = found + weight * chi_square(one, other)
+            for n_together in _LEVELS:
+                levels = (cells.unflatten(1, (-1, n_together)).sum(dim=2) for cells in (one, other))
+                found = found + weight / len(_LEVELS) * chi_square(*levels)
         return found
