@@ -36,14 +36,8 @@ class BodyRef:
 def list_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[BodyRef]:
     """The bodies of a file, without making surfaces of them where the format can tell."""
     path = Path(path)
-    kind = _format(path)
-    how = _bodies(kind, options)
-    if how == "whole":
+    if _bodies(_format(path), options) == "whole":
         return [BodyRef(path)]
-    options = replace(options, bodies=how)
-    if how != "pieces" and kind.parts is not None:
-        with _faults(path, kind):
-            return [BodyRef(path, part) for part in kind.parts(path, options)]
     return [BodyRef(path, body.part) for body in _read(path, options)]
 
 

@@ -57,7 +57,7 @@ class Format:
         name: for messages.
         suffixes: lower case, with the dot. The longest that ends a file's name decides.
         read: the bodies of a file, with distinct names, or the one named; raises anything where the file is faulty.
-        parts: the names of the bodies, told without making them; None: read them.
+            Surfaces that take time are made later, see `RawBody.make`.
         bodies: what a body of the file may be, the usual first. "whole" and "pieces" are made of what `read` gives.
         is_searched: whether files below a folder are taken for bodies by their suffix.
         ignored: suffixes of files of the same format that hold no surface.
@@ -67,7 +67,6 @@ class Format:
     name: str
     suffixes: tuple[str, ...]
     read: Callable[[Path, LoadOptions, str | None], Sequence[RawBody]]
-    parts: Callable[[Path, LoadOptions], Sequence[str]] | None = None
     bodies: tuple[BodyKind, ...] = ("whole",)
     is_searched: bool = True
     ignored: tuple[str, ...] = ()

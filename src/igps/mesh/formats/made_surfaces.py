@@ -17,7 +17,7 @@ from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 
 if TYPE_CHECKING:
-    from igps.mesh.formats.molecules import Molecule, MoleculeBodies
+    from igps.mesh.formats.molecules import MoleculeBodies
 
 
 def read_volume(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
@@ -35,32 +35,15 @@ def read_volume(path: Path, options: LoadOptions, part: str | None) -> list[RawB
     return [_body(partial(made, name), name, volume.unit, partial(volume.measures, name)) for name in names]
 
 
-def volume_parts(path: Path, options: LoadOptions) -> list[str]:
-    """The names of the labels of a volume."""
-    from igps.mesh.formats.volumes import read_label_volume
-
-    return [body.name for body in read_label_volume(path, options).bodies]
-
-
 def read_structure(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The surfaces of the chains, models or the assembly of a structure file, in ångström."""
+    from igps.mesh.formats.molecules import molecules_by_part
     from igps.mesh.molecular_surface import molecular_surface
 
-    found = _molecules(path, options)
+    how: MoleculeBodies = options.bodies if options.bodies in ("chains", "assembly") else "models"
+    found = molecules_by_part(path, path.stat().st_mtime_ns, how)
     names = [name for name in found if part in (None, name)]
     return [_body(partial(molecular_surface, found[name]), name, "Å") for name in names]
-
-
-def structure_parts(path: Path, options: LoadOptions) -> list[str]:
-    """The names of the chains, models or the assembly of a structure file."""
-    return list(_molecules(path, options))
-
-
-def _molecules(path: Path, options: LoadOptions) -> dict[str, Molecule]:
-    from igps.mesh.formats.molecules import molecules_by_part
-
-    how: MoleculeBodies = options.bodies if options.bodies in ("chains", "assembly") else "models"
-    return molecules_by_part(path, path.stat().st_mtime_ns, how)
 
 
 def _body(
@@ -80,7 +63,5 @@ def _body(
 
 _STRUCTURES = tuple(sorted(suffix + packed for suffix in _structures.SUFFIXES for packed in ("", ".gz")))
 _VOLUMES = tuple(_volume_files.READERS)
-VOLUMES = Format("a label volume", _VOLUMES, read_volume, volume_parts, ("labels",), extra="volumes")
-MOLECULES = Format(
-    "a structure", _STRUCTURES, read_structure, structure_parts, ("chains", "models", "assembly"), extra="molecules"
-)
+VOLUMES = Format("a label volume", _VOLUMES, read_volume, ("labels",), extra="volumes")
+MOLECULES = Format("a structure", _STRUCTURES, read_structure, ("chains", "models", "assembly"), extra="molecules")
