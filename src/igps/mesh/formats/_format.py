@@ -13,7 +13,7 @@ import numpy as np
 from igps.mesh._arrays import Floats, Integers
 from igps.mesh._label_measures import VoxelMeasures
 from igps.mesh._tidying import are_specks, places
-from igps.mesh.mesh import MeshError, check_arrays
+from igps.mesh.mesh import Mesh, MeshError, check_arrays
 from igps.mesh.options import BodyKind, LoadOptions
 from igps.mesh.surface import compact, face_parts, stacked
 
@@ -71,6 +71,21 @@ class Format:
     is_searched: bool = True
     ignored: tuple[str, ...] = ()
     extra: str | None = None
+
+
+def made_later(
+    make: Callable[[], Mesh], part: str | None, unit: str | None, voxels: Callable[[], VoxelMeasures] | None = None
+) -> RawBody:
+    """A body whose surface is made when it is asked for; a fault of it leaves the others."""
+
+    def made() -> RawBody:
+        try:
+            mesh = make()
+        except MeshError as fault:
+            return RawBody(part=part, fault=fault, voxels=voxels)
+        return RawBody(mesh.vertices, mesh.faces, part, unit, notes=mesh.notes, voxels=voxels)
+
+    return RawBody(part=part, make=made)
 
 
 def joined(bodies: Sequence[RawBody]) -> RawBody:
