@@ -169,7 +169,7 @@ def _joined(mask: Booleans) -> Booleans:
 
 def _n_vertices(mask: Booleans, sides: Floats) -> float:
     """About how many vertices marching cubes make on a grid as fine as the shortest side."""
-    steps = [np.diff(mask.view(np.int8), axis=axis, prepend=0, append=0) for axis in range(3)]
+    steps = (np.diff(mask.view(np.int8), axis=axis, prepend=0, append=0) for axis in range(3))
     cuts = np.array([np.count_nonzero(step) for step in steps])
     return float((cuts * sides.prod() / sides).sum() / sides.min() ** 2)
 
