@@ -167,18 +167,18 @@ def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
 
 
 @contextmanager
-def faults(path: Path, name: str, extra: str | None) -> Iterator[None]:
+def faults(path: Path, kind: Format) -> Iterator[None]:
     """Turn what a reader raises into a MeshError about the file; running out of memory is no fault of it."""
     try:
         yield
     except (MeshError, MemoryError):
         raise
     except ImportError as error:
-        missing = f"{path}: {name} needs a module that is not installed ({error})."
-        install = f'Install it: pip install "interior-gps[{extra}]"; or convert the file to OFF, OBJ, PLY or STL.'
+        missing = f"{path}: {kind.name} needs a module that is not installed ({error})."
+        install = f'Install it: pip install "interior-gps[{kind.extra}]"; or convert the file to OFF, OBJ, PLY or STL.'
         raise MeshError(f"{missing} {install}") from error
     except Exception as error:  # the loaders of some thirty formats raise whatever they like
-        fault = f"{path}: not readable as {name} ({type(error).__name__}: {' '.join(str(error).split())[:300]})."
+        fault = f"{path}: not readable as {kind.name} ({type(error).__name__}: {' '.join(str(error).split())[:300]})."
         remedy = "Check that the file is complete and in the format that its name tells; or export it again."
         raise MeshError(f"{fault} {remedy}") from error
 

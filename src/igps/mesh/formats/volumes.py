@@ -129,7 +129,7 @@ def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) ->
     path = Path(path)
     if not path.is_file():
         raise MeshError(f"{path}: no such file. Check the path.")
-    with faults(path, "a label volume", "volumes"):
+    with faults(path, FORMAT):
         raw = read_raw(path)
     return _labelled(raw, path, options)
 
