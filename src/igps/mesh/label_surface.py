@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from igps.mesh._arrays import Booleans, Floats, Integers, Surface
+from igps._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh._isosurface import level_surface, simplified, with_volume
 from igps.mesh._label_field import PAD, filled_share, smooth_field
 from igps.mesh._level_set import LEAST, without_bubbles

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from igps.mesh._arrays import Floats, Integers
+from igps._arrays import Floats, Integers
 from igps.mesh._label_measures import VoxelMeasures
 from igps.mesh._tidying import are_specks, places
 from igps.mesh.mesh import Mesh, MeshError, check_arrays

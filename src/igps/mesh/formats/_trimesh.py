@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from igps.mesh._arrays import Floats
+from igps._arrays import Floats
 from igps.mesh.formats._format import RawBody, check_unpacked, distinct
 from igps.mesh.options import LoadOptions
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from igps.mesh._arrays import Floats, Integers
+from igps._arrays import Floats, Integers
 from igps.mesh.formats._format import Format, RawBody, made_later
 from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structure, suffix
 from igps.mesh.mesh import MeshError

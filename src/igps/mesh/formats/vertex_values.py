@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from igps.mesh._arrays import Floats, Integers
+from igps._arrays import Floats, Integers
 from igps.mesh.formats import brains, vtk
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
-from igps.mesh._arrays import Booleans, Floats
+from igps._arrays import Booleans, Floats
 from igps.mesh._label_measures import VoxelMeasures, measured
 from igps.mesh.formats._format import Format, RawBody, faults, made_later
 from igps.mesh.formats._volume_files import READERS, RawVolume, read_raw, suffix_of
