@@ -9,3 +9,4 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
+Surface = tuple[Floats, Integers]  # vertices (V, 3) and faces (F, 3)

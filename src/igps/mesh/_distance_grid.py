@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from igps.mesh._arrays import Floats, Integers, Surface
+from igps._arrays import Floats, Integers, Singles, Surface
 from igps.mesh.surface import face_areas, sums
 
 # How far from the surface exact distances are needed: marching cubes ask for both ends of the edges that cross it.
@@ -64,9 +63,7 @@ def rounded(vertices: Floats, faces: Integers) -> Surface:
     return mean, np.unique(faces[(np.diff(faces, axis=1) > 0).all(axis=1)], axis=0)
 
 
-def distances(
-    vertices: Floats, faces: Integers, shape: tuple[int, int, int]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def distances(vertices: Floats, faces: Integers, shape: tuple[int, int, int]) -> tuple[Singles, Singles]:
     """(X, Y, Z) distances of the grid points in the band around the surface, infinite elsewhere, and the nearest places
     (X, Y, Z, 3). Blocks of eight cells are halved where the surface may be near."""
     import igl

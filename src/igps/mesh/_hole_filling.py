@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
 
-from igps.mesh._arrays import Floats, Integers, Surface
+from igps._arrays import Floats, Integers, Surface
 from igps.mesh.surface import directed_edges, face_parts, undirected_edges
 
 # A hole is small if a circle as long as its rim has at most this share of the area of its part of the surface.

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from igps.mesh._arrays import Floats, Integers, Surface
+from igps._arrays import Floats, Integers, Singles, Surface
 from igps.mesh._level_set import LEAST, without_bubbles
 from igps.mesh.mesh import MeshError
 from igps.mesh.surface import directed_edges, face_areas, largest, longest_side, signed_volume, vertex_normals
@@ -14,7 +13,7 @@ from igps.mesh.surface import directed_edges, face_areas, largest, longest_side,
 _FLAT = 0.95
 
 
-def level_surface(field: NDArray[np.float32], name: str) -> Surface:
+def level_surface(field: Singles, name: str) -> Surface:
     """The closed surface on which the field is zero; grid points are filled where it would touch itself."""
     from skimage.measure import marching_cubes
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from igps.mesh._arrays import Floats, Integers, Surface
+from igps._arrays import Floats, Integers, Surface
 from igps.mesh.surface import face_areas, stacked
 
 # A thread takes no more of a triangle than this share of its sides.

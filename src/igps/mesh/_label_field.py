@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from igps._arrays import Booleans, Floats, Integers
 from igps._compiled import compiled
-from igps.mesh._arrays import Booleans, Floats, Integers
 
 # Least absolute value of a voxel that is wholly inside or outside, in shortest sides; half would be the most that all
 # bodies allow. More keeps edges sharper, less leaves round bodies smoother; this serves descriptors best.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from igps.mesh._arrays import Booleans
+from igps._arrays import Booleans
 
 # Share of the voxels that must lie near balls of a diameter for no part to be thinner; and how near, in radii: corners
 # of a box as thick are no thinner.

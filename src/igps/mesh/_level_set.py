@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 
-from igps.mesh._arrays import Booleans, Floats, Integers
+from igps._arrays import Booleans, Floats, Integers, Singles
 from igps.mesh._distance_grid import BAND
 from igps.mesh._outside import WALL, OrientedSurface
 
@@ -22,9 +22,7 @@ _BAR = 0.9
 SPECK_VOLUME = 2e-3
 
 
-def level_set(
-    distance: NDArray[np.float32], nearest: NDArray[np.float32], outside: Booleans, surface: OrientedSurface
-) -> NDArray[np.float32]:
+def level_set(distance: Singles, nearest: Singles, outside: Booleans, surface: OrientedSurface) -> Singles:
     """The signed distance of solids and, for what has no inside, the distance to a sheet of a cell's thickness."""
     from skimage.segmentation import watershed
 
@@ -71,7 +69,7 @@ def _at(values: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(values[tuple(index.T)])
 
 
-def without_bubbles(field: NDArray[np.float32]) -> NDArray[np.float32]:
+def without_bubbles(field: Singles) -> Singles:
     """The field with everything filled that the outside does not reach."""
     label, count = ndimage.label(field > 0)
     if count > 1:
@@ -79,7 +77,7 @@ def without_bubbles(field: NDArray[np.float32]) -> NDArray[np.float32]:
     return field
 
 
-def joined(field: NDArray[np.float32], notes: list[str]) -> NDArray[np.float32]:
+def joined(field: Singles, notes: list[str]) -> Singles:
     """The field of one piece: small ones dropped, the others joined by bars where the gaps are narrowest."""
     label, count = ndimage.label(field < 0)
     if count < 2:
@@ -119,7 +117,7 @@ def joined(field: NDArray[np.float32], notes: list[str]) -> NDArray[np.float32]:
     return without_bubbles(field)
 
 
-def _add_bar(field: NDArray[np.float32], a: Floats, b: Floats) -> None:
+def _add_bar(field: Singles, a: Floats, b: Floats) -> None:
     low = np.maximum(np.minimum(a, b).astype(int) - 2, 0)
     high = np.minimum(np.maximum(a, b).astype(int) + 3, field.shape)
     box = tuple(map(slice, low, high))

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from igps._arrays import Floats, Integers, Singles
 from igps._compiled import compiled
-from igps.mesh._arrays import Floats, Integers
 
 _TURN = 2 * math.pi
 
@@ -107,7 +107,7 @@ def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: In
 @compiled()
 def depths(
     centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, margin: float
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+) -> tuple[Singles, NDArray[np.int32]]:
     """How deep each grid point lies in the ball in which it lies deepest, at least `-margin` (outside of all, it is
     negative), and in which that is, -1 where there is none within `margin`. The first grid point is the origin."""
     depth = np.full(shape, -margin, np.float32)
@@ -136,9 +136,9 @@ def depths(
 
 @compiled()
 def distances_outside(
-    depth: NDArray[np.float32], owner: NDArray[np.int32], centres: Floats, radii: Floats, first: Integers,
+    depth: Singles, owner: NDArray[np.int32], centres: Floats, radii: Floats, first: Integers,
     neighbours: Integers, exposed: Integers, arcs: Floats, spacing: float, reach: float,
-) -> NDArray[np.float32]:  # fmt: skip
+) -> Singles:  # fmt: skip
     """The distance of each grid point in the balls from what is outside of all of them.
 
     The nearest place outside lies on a sphere, on an arc of two, or at the end of an arc. On a sphere it can only be
@@ -220,7 +220,7 @@ def _span(low: float, high: float, spacing: float, size: int) -> tuple[int, int]
 
 
 @compiled()
-def cubic_values(field: NDArray[np.float32], points: Floats) -> Floats:
+def cubic_values(field: Singles, points: Floats) -> Floats:
     """A function on a grid and its gradient, (P, 4), at points (P, 3) in cells, by cubic convolution (Keys 1981).
 
     The grid has at least four points along each axis.

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from igps.mesh._arrays import Booleans, Floats, Integers
+from igps._arrays import Booleans, Floats, Integers, Singles
 from igps.mesh._distance_grid import MARGIN
 from igps.mesh.surface import area_vectors, face_areas, signed_volume, unit
 
@@ -132,7 +132,7 @@ def _defect(winding: Floats) -> float:
     return float(np.abs(winding - np.maximum(np.round(winding), 0)).mean())
 
 
-def outside_of(distance: NDArray[np.float32], surface: OrientedSurface) -> tuple[Booleans, int]:
+def outside_of(distance: Singles, surface: OrientedSurface) -> tuple[Booleans, int]:
     """Which grid points the flood reaches, walls excepted, and how many openings were closed to it."""
     label, _ = ndimage.label(distance > WALL)
     outside = label == label[0, 0, 0]
@@ -151,9 +151,7 @@ def outside_of(distance: NDArray[np.float32], surface: OrientedSurface) -> tuple
     return watershed(-depth, markers, mask=outside) == 1, count
 
 
-def _outside_by_winding(
-    outside: Booleans, distance: NDArray[np.float32], surface: OrientedSurface
-) -> tuple[Booleans, int]:
+def _outside_by_winding(outside: Booleans, distance: Singles, surface: OrientedSurface) -> tuple[Booleans, int]:
     near = np.argwhere(outside & np.isfinite(distance))
     # A third of the points beside the surface, in all directions, shows whether the flood went in anywhere.
     probe = near[near.sum(axis=1) % 3 == 0]

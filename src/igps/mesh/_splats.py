@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from igps.mesh._arrays import Floats, Integers
+from igps._arrays import Floats, Integers
 from igps.mesh.mesh import MeshError
 from igps.mesh.surface import longest_side
 

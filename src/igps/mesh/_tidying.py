@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from igps.mesh._arrays import Booleans, Floats, Integers, Surface
+from igps._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import compact, diagonal, face_areas, face_parts, signed_volume, undirected_edges
 from igps.mesh.winding import winding_number

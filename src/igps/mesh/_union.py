@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from igps.mesh._arrays import Booleans, Floats, Integers, Surface
+from igps._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh._hole_filling import with_small_holes_filled
 from igps.mesh._tidying import SPECK, oriented, tidied, welded
 from igps.mesh.mesh import Mesh, MeshError

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from igps.mesh._arrays import Floats, Integers
+from igps._arrays import Floats, Integers
 from igps.mesh.surface import area_vectors, longest_side, undirected_edges, unit, vertex_normals
 
 # Calibrated on generated shapes and parts of thin triangles, clean and with noise of 0.1 to 0.4 % of the diagonal.

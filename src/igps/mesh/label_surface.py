@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from igps.mesh._arrays import Booleans, Floats, Integers, Surface
+from igps._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh._isosurface import level_surface, simplified, with_volume
 from igps.mesh._label_field import PAD, filled_share, smooth_field
 from igps.mesh._level_set import LEAST, without_bubbles
@@ -169,7 +169,8 @@ def _joined(mask: Booleans) -> Booleans:
 
 def _n_vertices(mask: Booleans, sides: Floats) -> float:
     """About how many vertices marching cubes make on a grid as fine as the shortest side."""
-    cuts = [np.count_nonzero(np.diff(mask.view(np.int8), axis=axis, prepend=0, append=0)) for axis in range(3)]
+    steps = (np.diff(mask.view(np.int8), axis=axis, prepend=0, append=0) for axis in range(3))
+    cuts = np.array([np.count_nonzero(step) for step in steps])
     return float((cuts * sides.prod() / sides).sum() / sides.min() ** 2)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -36,14 +35,8 @@ class BodyRef:
 def list_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[BodyRef]:
     """The bodies of a file, without making surfaces of them where the format can tell."""
     path = Path(path)
-    kind = _format(path)
-    how = _bodies(kind, options)
-    if how == "whole":
+    if _bodies(_format(path), options) == "whole":
         return [BodyRef(path)]
-    options = replace(options, bodies=how)
-    if how != "pieces" and kind.parts is not None:
-        with _faults(path, kind):
-            return [BodyRef(path, part) for part in kind.parts(path, options)]
     return [BodyRef(path, body.part) for body in _read(path, options)]
 
 
@@ -112,7 +105,7 @@ def each_surface(
     path = Path(path)
     for raw in _read(path, options, parts[0] if parts and len(parts) == 1 else None):
         if parts is None or raw.part in parts:
-            with one_thread(), _faults(path, _format(path)):
+            with one_thread(), faults(path, _format(path)):
                 body = raw.made()
             yield BodyRef(path, raw.part), body
 
@@ -123,7 +116,7 @@ def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part
     bodies = _read(path, options, part)
     found = [body for body in bodies if body.part == part] if part is not None else bodies
     if len(found) == 1:
-        with _faults(path, _format(path)):
+        with faults(path, _format(path)):
             return found[0].made()
     names = [body.part for body in (bodies if part is None else list_bodies(path, options))]
     shown = ", ".join(repr(name) for name in names[:8]) + (", ..." if len(names) > 8 else "")
@@ -163,7 +156,9 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
 def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[RawBody]:
     kind = _format(path)
     how = _bodies(kind, options)
-    with _faults(path, kind):  # of the bodies at least the one that is named
+    if kind.bodies[0] == "whole":
+        check_memory(path)
+    with faults(path, kind):  # of the bodies at least the one that is named
         bodies = list(kind.read(path, replace(options, bodies=how), part if how not in ("whole", "pieces") else None))
         if how == "whole":
             return [joined(bodies)]
@@ -184,11 +179,3 @@ def _format(path: Path) -> Format:
         known = ", ".join(suffix for one in FORMATS for suffix in one.suffixes)
         raise MeshError(f"{path}: not a format that is read. Convert it to one of {known}.")
     return kind
-
-
-@contextmanager
-def _faults(path: Path, kind: Format) -> Iterator[None]:
-    if kind.bodies[0] == "whole":
-        check_memory(path)
-    with faults(path, kind.name, kind.extra):
-        yield

@@ -14,7 +14,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from igps.mesh._arrays import Floats, Integers
+from igps._arrays import Floats, Integers
 from igps.mesh._hole_filling import with_small_holes_filled
 from igps.mesh._tidying import tidied, welded, without_hidden
 from igps.mesh._union import united, without_walls

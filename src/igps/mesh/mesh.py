@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from igps.mesh._arrays import Booleans, Floats, Integers
+from igps._arrays import Booleans, Floats, Integers
 from igps.mesh.surface import (
     components,
     connected,

@@ -11,12 +11,11 @@ import math
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from igps._arrays import Floats, Integers, Singles, Surface
 from igps._threads import one_thread
-from igps.mesh._arrays import Floats, Integers, Surface
 from igps.mesh._isosurface import level_surface, simplified
 from igps.mesh._joining import joined_by_threads
 from igps.mesh._level_set import LEAST, SPECK_VOLUME, without_bubbles
@@ -112,9 +111,7 @@ def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
     return centres[kept], radii[kept]
 
 
-def _field(
-    centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, probe: float
-) -> NDArray[np.float32]:
+def _field(centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, probe: float) -> Singles:
     """How far each grid point is from the surface, in cells, negative inside; with `probe` of 0 that of the balls."""
     margin = _MARGIN * spacing
     depth, owner = depths(centres, radii, shape, spacing, margin)
@@ -155,7 +152,7 @@ def _one_piece(
     return joined_by_threads(parts, _THREADS)
 
 
-def _settled(field: NDArray[np.float32], vertices: Floats, faces: Integers) -> Floats:
+def _settled(field: Singles, vertices: Floats, faces: Integers) -> Floats:
     """The vertices moved to where the field is zero, and evenly apart along it; faces neither cut corners nor bulge.
 
     Triangles with their corners on a curved surface lie on one side of it. How far, at their centres, tells by how much
@@ -175,7 +172,7 @@ def _settled(field: NDArray[np.float32], vertices: Floats, faces: Integers) -> F
     return vertices - 0.75 * _at_vertices(heights, vertices, faces) * vertex_normals(vertices, faces)
 
 
-def _steps(field: NDArray[np.float32], points: Floats) -> tuple[Floats, Floats]:
+def _steps(field: Singles, points: Floats) -> tuple[Floats, Floats]:
     """How far points lie off the surface, as vectors (P, 3) in cells, and their directions; both point outwards."""
     found = cubic_values(field, points)
     # The slope of a distance is 1; where it is not, as in the middle between two surfaces, it leads nowhere.

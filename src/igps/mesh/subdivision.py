@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from igps.mesh._arrays import Floats, Integers, Surface
+from igps._arrays import Floats, Integers, Surface
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import undirected_edges
 

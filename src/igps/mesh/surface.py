@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from igps.mesh._arrays import Booleans, Floats, Integers, Surface
+from igps._arrays import Booleans, Floats, Integers, Surface
 
 _FLAT = 2.0**-26  # height over length of a triangle that counts as flat
 

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from igps.mesh._arrays import Floats, Integers
+from igps._arrays import Floats, Integers
 from igps.mesh._distance_grid import Grid, cell_sizes, distances, rounded
 from igps.mesh._isosurface import level_surface, simplified
 from igps.mesh._level_set import joined, level_set

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.mesh._arrays import Floats, Integers
+from igps._arrays import Floats, Integers
 from igps.mesh.surface import has_area
 
 _TREE_ERROR = 0.01  # of libigl's fast winding numbers; twice the largest found

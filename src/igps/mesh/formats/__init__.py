@@ -11,15 +11,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from igps.mesh.formats import archives, brain_surfaces, clouds, made_surfaces, obj, off, ply, scenes, stl, threemf, vtk
+from igps.mesh.formats import archives, brains, clouds, molecules, obj, off, ply, scenes, stl, threemf, volumes, vtk
 from igps.mesh.formats._format import Format, RawBody
 
 __all__ = ["FORMATS", "Format", "RawBody", "format_of", "is_searched", "searched_suffixes"]
 
 FORMATS: tuple[Format, ...] = (
     off.FORMAT, obj.FORMAT, ply.FORMAT, stl.FORMAT, clouds.FORMAT, threemf.FORMAT, scenes.GLTF, scenes.STEP,
-    scenes.OTHERS, vtk.LEGACY, vtk.XML, brain_surfaces.GIFTI, brain_surfaces.FREESURFER, made_surfaces.VOLUMES,
-    made_surfaces.MOLECULES, archives.ARCHIVE, archives.COMPRESSED,
+    scenes.OTHERS, vtk.LEGACY, vtk.XML, brains.GIFTI, brains.FREESURFER, volumes.FORMAT,
+    molecules.FORMAT, archives.ARCHIVE, archives.COMPRESSED,
 )  # fmt: skip
 
 

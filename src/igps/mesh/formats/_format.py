@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from igps.mesh._arrays import Floats, Integers
+from igps._arrays import Floats, Integers
 from igps.mesh._label_measures import VoxelMeasures
 from igps.mesh._tidying import are_specks, places
-from igps.mesh.mesh import MeshError, check_arrays
+from igps.mesh.mesh import Mesh, MeshError, check_arrays
 from igps.mesh.options import BodyKind, LoadOptions
 from igps.mesh.surface import compact, face_parts, stacked
 
@@ -57,7 +57,7 @@ class Format:
         name: for messages.
         suffixes: lower case, with the dot. The longest that ends a file's name decides.
         read: the bodies of a file, with distinct names, or the one named; raises anything where the file is faulty.
-        parts: the names of the bodies, told without making them; None: read them.
+            Surfaces that take time are made later, see `RawBody.make`.
         bodies: what a body of the file may be, the usual first. "whole" and "pieces" are made of what `read` gives.
         is_searched: whether files below a folder are taken for bodies by their suffix.
         ignored: suffixes of files of the same format that hold no surface.
@@ -67,11 +67,25 @@ class Format:
     name: str
     suffixes: tuple[str, ...]
     read: Callable[[Path, LoadOptions, str | None], Sequence[RawBody]]
-    parts: Callable[[Path, LoadOptions], Sequence[str]] | None = None
     bodies: tuple[BodyKind, ...] = ("whole",)
     is_searched: bool = True
     ignored: tuple[str, ...] = ()
     extra: str | None = None
+
+
+def made_later(
+    make: Callable[[], Mesh], part: str | None, unit: str | None, voxels: Callable[[], VoxelMeasures] | None = None
+) -> RawBody:
+    """A body whose surface is made when it is asked for; a fault of it leaves the others."""
+
+    def made() -> RawBody:
+        try:
+            mesh = make()
+        except MeshError as fault:
+            return RawBody(part=part, fault=fault, voxels=voxels)
+        return RawBody(mesh.vertices, mesh.faces, part, unit, notes=mesh.notes, voxels=voxels)
+
+    return RawBody(part=part, make=made)
 
 
 def joined(bodies: Sequence[RawBody]) -> RawBody:
@@ -153,18 +167,18 @@ def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
 
 
 @contextmanager
-def faults(path: Path, name: str, extra: str | None) -> Iterator[None]:
+def faults(path: Path, kind: Format) -> Iterator[None]:
     """Turn what a reader raises into a MeshError about the file; running out of memory is no fault of it."""
     try:
         yield
     except (MeshError, MemoryError):
         raise
     except ImportError as error:
-        missing = f"{path}: {name} needs a module that is not installed ({error})."
-        install = f'Install it: pip install "interior-gps[{extra}]"; or convert the file to OFF, OBJ, PLY or STL.'
+        missing = f"{path}: {kind.name} needs a module that is not installed ({error})."
+        install = f'Install it: pip install "interior-gps[{kind.extra}]"; or convert the file to OFF, OBJ, PLY or STL.'
         raise MeshError(f"{missing} {install}") from error
     except Exception as error:  # the loaders of some thirty formats raise whatever they like
-        fault = f"{path}: not readable as {name} ({type(error).__name__}: {' '.join(str(error).split())[:300]})."
+        fault = f"{path}: not readable as {kind.name} ({type(error).__name__}: {' '.join(str(error).split())[:300]})."
         remedy = "Check that the file is complete and in the format that its name tells; or export it again."
         raise MeshError(f"{fault} {remedy}") from error
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from igps.mesh._arrays import Floats
-from igps.mesh.formats._format import RawBody, check_unpacked, distinct, joined
+from igps._arrays import Floats
+from igps.mesh.formats._format import RawBody, check_unpacked, distinct
 from igps.mesh.options import LoadOptions
 
 # An error names the file and its fault; tracebacks that trimesh logs where nobody has set up logging say nothing more
@@ -38,11 +38,6 @@ class _Beside(trimesh.resolvers.Resolver):
 
     def write(self, name: str, data: bytes) -> None:
         raise NotImplementedError
-
-
-def surfaces(path: Path, options: LoadOptions, content: bytes | None = None) -> list[RawBody]:
-    """All that a file holds, as one body."""
-    return [joined(objects(path, options, content))]
 
 
 def objects(path: Path, options: LoadOptions, content: bytes | None = None, **loading: Any) -> list[RawBody]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.mesh._arrays import Floats
+from igps._arrays import Floats
 from igps.mesh.formats.label_names import names_in_extensions
 from igps.mesh.limits import check_fits
 from igps.mesh.mesh import MILLIMETRES, MeshError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from igps.mesh._arrays import Integers
+from igps._arrays import Integers
 from igps.mesh.formats._format import triangles
 
 TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, TETRAHEDRON = 5, 6, 7, 8, 9, 10

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.mesh._arrays import Floats
+from igps._arrays import Floats
 from igps.mesh.formats import _volume_files
 from igps.mesh.mesh import MeshError
 

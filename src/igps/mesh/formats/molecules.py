@@ -6,16 +6,18 @@ import logging
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from igps.mesh._arrays import Floats, Integers
+from igps._arrays import Floats, Integers
+from igps.mesh.formats._format import Format, RawBody, made_later
 from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structure, suffix
 from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
 from igps.mesh.residues import BACKBONE, CHARGED_ATOMS, PHOSPHATES, STANDARD, WATER, residue_ball, side_chain_ball
 
 if TYPE_CHECKING:
@@ -277,3 +279,17 @@ def _standard(name: str, kind: gemmi.ResidueInfo) -> str:
         return name
     gemmi = gemmi_module()
     return gemmi.expand_one_letter(kind.one_letter_code.upper(), gemmi.ResidueKind.AA) or name
+
+
+def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    """The surfaces of the chains, models or the assembly of a structure file, in ångström."""
+    from igps.mesh.molecular_surface import molecular_surface
+
+    how: MoleculeBodies = options.bodies if options.bodies in ("chains", "assembly") else "models"
+    found = molecules_by_part(path, path.stat().st_mtime_ns, how)
+    names = [name for name in found if part in (None, name)]
+    return [made_later(partial(molecular_surface, found[name]), name, "Å") for name in names]
+
+
+_SUFFIXES = tuple(sorted(one + packed for one in SUFFIXES for packed in ("", ".gz")))
+FORMAT = Format("a structure", _SUFFIXES, read, ("chains", "models", "assembly"), extra="molecules")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from igps.mesh._arrays import Booleans, Integers
+from igps._arrays import Booleans, Integers
 from igps.mesh.formats._format import Format, RawBody, distinct, triangles
 from igps.mesh.options import LoadOptions
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from igps.mesh._arrays import Surface
+from igps._arrays import Surface
 from igps.mesh.formats._format import Format, RawBody
-from igps.mesh.formats._trimesh import surfaces
+from igps.mesh.formats._trimesh import objects
 from igps.mesh.options import LoadOptions
 
 _WHOLE_NUMBERS = re.compile(r"\s*\d[\d\s]*", re.ASCII)
@@ -18,7 +18,7 @@ _WHOLE_NUMBERS = re.compile(r"\s*\d[\d\s]*", re.ASCII)
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The surface of an OFF file."""
     plain = _plain(path)
-    return surfaces(path, options) if plain is None else [RawBody(*plain)]
+    return objects(path, options) if plain is None else [RawBody(*plain)]
 
 
 def _plain(path: Path) -> Surface | None:

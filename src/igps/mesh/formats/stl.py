@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from igps.mesh._arrays import Floats, Surface
+from igps._arrays import Floats, Surface
 from igps.mesh.formats._format import Format, RawBody
 from igps.mesh.options import LoadOptions
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from igps.mesh._arrays import Floats
+from igps._arrays import Floats
 from igps.mesh.formats import _xml
 from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct, joined
 from igps.mesh.options import LoadOptions

@@ -11,8 +11,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from igps.mesh._arrays import Floats, Integers
-from igps.mesh.formats import brain_surfaces, vtk
+from igps._arrays import Floats, Integers
+from igps.mesh.formats import brains, vtk
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
@@ -29,7 +29,7 @@ def read(path: Path) -> Arrays:
     if name.endswith(_VTK):
         found = vtk.point_values(path, LoadOptions()).values
     elif name.endswith(".gii"):
-        found = brain_surfaces.gifti_values(path, LoadOptions())
+        found = brains.gifti_values(path, LoadOptions())
     elif name.endswith(".ply"):
         found = _ply(path)
     else:

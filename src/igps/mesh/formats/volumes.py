@@ -5,8 +5,8 @@ The world is RAS, x to the patient's right, y to the front and z up, in millimet
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
-from igps.mesh._arrays import Booleans, Floats
+from igps._arrays import Booleans, Floats
 from igps.mesh._label_measures import VoxelMeasures, measured
-from igps.mesh.formats._format import faults
-from igps.mesh.formats._volume_files import RawVolume, read_raw, suffix_of
+from igps.mesh.formats._format import Format, RawBody, faults, made_later
+from igps.mesh.formats._volume_files import READERS, RawVolume, read_raw, suffix_of
 from igps.mesh.formats.label_names import names_beside, read_label_names
 from igps.mesh.label_surface import checked_spacing, voxel_surface
 from igps.mesh.mending import Cavities, Mending, mend
@@ -129,7 +129,7 @@ def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) ->
     path = Path(path)
     if not path.is_file():
         raise MeshError(f"{path}: no such file. Check the path.")
-    with faults(path, "a label volume", "volumes"):
+    with faults(path, FORMAT):
         raw = read_raw(path)
     return _labelled(raw, path, options)
 
@@ -225,3 +225,19 @@ def _counted(labels: ArrayLike, name: str) -> tuple[NDArray[Any], NDArray[Any], 
         many = f"{name}: {len(values)} different values, which look like an image and not like labels."
         raise MeshError(f"{many} Export the labels.")
     return values, counts, compact
+
+
+def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
+    """The surfaces of the labels of a volume; or of all of them together as the whole."""
+    volume = read_label_volume(path, options)
+    if options.bodies in ("whole", "pieces"):
+        labelled = np.any([layer > 0 for layer in volume.layers], axis=0).astype(np.uint8)
+        volume = replace(volume, layers=(labelled,), names=None, segments=None)
+        made = partial(label_surface, volume, 1, cavities=options.cavities)
+        return [made_later(made, None, volume.unit, partial(volume.measures, 1))]
+    made = partial(label_surface, volume, how=options.mend, cavities=options.cavities)
+    names = [body.name for body in volume.bodies] if part is None else [volume.body(part).name]
+    return [made_later(partial(made, name), name, volume.unit, partial(volume.measures, name)) for name in names]
+
+
+FORMAT = Format("a label volume", tuple(READERS), read, ("labels",), extra="volumes")

@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.mesh._arrays import Floats, Integers
+from igps._arrays import Floats, Integers
 from igps.mesh.formats import _vtk_cells, _xml
 from igps.mesh.formats._format import Format, RawBody, check_unpacked, corners_of_rows
 from igps.mesh.options import LoadOptions
