@@ -247,4 +247,5 @@ def exists(path: Path) -> bool:
 def alone(path: Path) -> FileLock:
     """Alone among all processes that write; the system unlocks what a killed process had locked."""
     path.mkdir(parents=True, exist_ok=True)
-    return FileLock(path / "lock", is_singleton=True)
+    # Looked at often: a process that writes change after change is off the lock for a millisecond, and others starve.
+    return FileLock(path / "lock", is_singleton=True, poll_interval=0.001)
