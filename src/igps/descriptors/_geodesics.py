@@ -16,8 +16,9 @@ from scipy.sparse.csgraph import dijkstra
 
 from igps._arrays import Floats, Integers
 from igps.mesh.mesh import Mesh
+from igps.mesh.simplification import simplify
 from igps.mesh.surface import undirected_edges
-from igps.signature.ordering import places_in_space
+from igps.signature.ordering import in_order_of_form, places_in_space
 
 # Distances that differ by less than this share are equal but for rounding.
 _TIE = 1e-9
@@ -25,12 +26,7 @@ _TIE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class FarthestPoints:
-    """Vertices that are spread over a surface, and how far it is from each to every vertex.
-
-    Args:
-        vertices: (S,) int64, in the order in which they were taken.
-        distances: (S, V) float64 geodesic distances, length.
-    """
+    """Vertices (S,) spread over a surface, as they were taken, and the geodesic distances (S, V) from each to all."""
 
     vertices: Integers
     distances: Floats
@@ -42,6 +38,11 @@ class FarthestPoints:
         return (between + between.T) / 2  # rounding depends on the direction of the path
 
 
+def geodesic_samples(mesh: Mesh, n_samples: int, max_vertices: int) -> FarthestPoints:
+    """The `farthest_points` of a mesh, first simplified to at most so many vertices, whatever its numbering."""
+    return farthest_points(simplify(in_order_of_form(mesh), max_vertices), n_samples)
+
+
 def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> FarthestPoints:
     """Vertices each of which is the farthest from all taken before it (Eldar, Lindenbaum, Porat and Zeevi 1997).
 
@@ -49,13 +50,7 @@ def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> Far
     equally far ones the one nearest to all taken before is taken, and of equal ones still that which comes last in
     `places_in_space`: which they are does not depend on how the vertices are numbered.
 
-    Args:
-        mesh: the surface.
-        n_samples: how many.
-        points_per_edge: see `edge_graph`.
-
-    Raises:
-        ValueError: `n_samples` below one or above the number of vertices, or a negative number of points.
+    A ValueError if there are not so many vertices. For the points of an edge see `edge_graph`.
     """
     n_vertices = len(mesh.vertices)
     if not 1 <= n_samples <= n_vertices:

@@ -11,16 +11,9 @@ from igps._arrays import Floats
 
 
 def linear_histogram(values: Sequence[Floats], n_bins: Sequence[int]) -> Floats:
-    """Joint histogram of variables in [0, 1], larger values in the last bin; sums to 1.
+    """Joint histogram, of shape `n_bins` and sum 1, of variables (P,) in [0, 1], larger values in the last bin.
 
     A value at the centre of a bin counts there alone, one between two centres for both, by its distance from each.
-
-    Args:
-        values: of each variable, (P,).
-        n_bins: of each variable, at least 2.
-
-    Returns:
-        of shape `n_bins`.
     """
     positions = [np.clip(one * n - 0.5, 0, n - 1) for one, n in zip(values, n_bins, strict=True)]
     low = [np.minimum(one.astype(int), n - 2) for one, n in zip(positions, n_bins, strict=True)]

@@ -13,12 +13,10 @@ from torch import Tensor
 from igps._arrays import Floats, Integers, Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors._geodesics import farthest_points
+from igps.descriptors._geodesics import geodesic_samples
 from igps.descriptors._parameters import check_at_least, check_one_of
-from igps.mesh.simplification import simplify
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
-from igps.signature.ordering import in_order_of_form
 
 Scaling = Literal["least squares", "classical"]
 
@@ -43,9 +41,6 @@ class CanonicalForm(BodyDescriptor):
         max_order: of the moments.
         n_samples: farthest points of the surface.
         max_vertices: larger meshes are simplified first.
-
-    Raises:
-        ValueError: a parameter out of range.
     """
 
     name = "canonical_form"
@@ -74,7 +69,7 @@ class CanonicalForm(BodyDescriptor):
             ValueError: the mesh has fewer than `n_samples` vertices.
             MeshError: it cannot be simplified.
         """
-        samples = farthest_points(simplify(in_order_of_form(body.mesh), self.max_vertices), self.n_samples)
+        samples = geodesic_samples(body.mesh, self.n_samples, self.max_vertices)
         distances = samples.mutual / np.sqrt(body.mesh.area)
         form = classical_scaling(distances)
         if self.scaling == "least squares":
@@ -86,20 +81,13 @@ class CanonicalForm(BodyDescriptor):
         odd = torch.as_tensor(exponents(self.max_order) % 2, dtype=queries.dtype, device=queries.device)
         reflections = product((0.0, 1.0), repeat=_DIMENSION)
         signs = ((1 - 2 * odd * odd.new_tensor(axes)).prod(dim=1) for axes in reflections)
-        reflected = [euclidean(queries * sign, gallery) for sign in signs]
-        return torch.stack(reflected).amin(dim=0)
+        return torch.stack([euclidean(queries * sign, gallery) for sign in signs]).amin(dim=0)
 
 
 def classical_scaling(distances: Floats, dimension: int = _DIMENSION) -> Floats:
-    """Points whose inner products come closest to those that the distances imply (Torgerson 1952).
+    """Points whose inner products come closest to those that distances (P, P) imply (Torgerson 1952).
 
-    Args:
-        distances: (P, P), symmetric.
-        dimension: of the space.
-
-    Returns:
-        (P, dimension) centred points along their principal axes, longest first. Where the distances span fewer
-        dimensions, the remaining coordinates are zero.
+    They are (P, dimension), centred, along their principal axes, longest first; 0 where the distances span fewer.
     """
     squared = distances**2
     row = squared.mean(axis=0)
@@ -110,16 +98,9 @@ def classical_scaling(distances: Floats, dimension: int = _DIMENSION) -> Floats:
 
 
 def least_squares_scaling(distances: Floats, start: Floats) -> Floats:
-    """Points that locally minimise the stress Σ (‖xᵢ−xⱼ‖ − dᵢⱼ)², by majorisation (SMACOF, de Leeuw 1977).
+    """Points (P, D) that locally minimise the stress Σ (‖xᵢ−xⱼ‖ − dᵢⱼ)², centred (SMACOF, de Leeuw 1977).
 
     No step raises the stress.
-
-    Args:
-        distances: (P, P), symmetric.
-        start: (P, D) points.
-
-    Returns:
-        (P, D) centred points.
     """
     points = start - start.mean(axis=0)
     lengths = _lengths(points)
@@ -146,14 +127,8 @@ def exponents(max_order: int) -> Integers:
 def moments(points: Floats, max_order: int) -> Floats:
     """Mean of xᵖ yᵠ zʳ over points laid along their principal axes, over ρ^(p+q+r−1) with their rms radius ρ.
 
-    The signs of the axes are arbitrary: a reflection in x changes the sign of the moments with odd p.
-
-    Args:
-        points: (P, 3), length.
-        max_order: of the moments.
-
-    Returns:
-        (M,) length, ordered as `exponents(max_order)`.
+    The signs of the axes are arbitrary: a reflection in x changes the sign of the moments with odd p. Of points (P, 3)
+    these are (M,), a length each, ordered as `exponents(max_order)`.
     """
     centred = points - points.mean(axis=0)
     radius = np.sqrt(np.square(centred).sum(axis=1).mean())

@@ -37,9 +37,6 @@ class D2(BodyDescriptor):
         reach: end of the last bin, a distance over √area; what lies beyond counts in the last.
         n_triples: random triples of samples for A3; 1024² in the source.
         seed: of these triples.
-
-    Raises:
-        ValueError: a parameter out of range.
     """
 
     name = "d2"

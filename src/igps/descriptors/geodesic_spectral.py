@@ -9,11 +9,9 @@ import numpy as np
 from igps._arrays import Floats, Singles
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors._geodesics import farthest_points
+from igps.descriptors._geodesics import geodesic_samples
 from igps.descriptors._parameters import check_at_least
-from igps.mesh.simplification import simplify
 from igps.nn.descriptor import BodyDescriptor
-from igps.signature.ordering import in_order_of_form
 
 
 @dataclass(eq=False, repr=False)
@@ -27,9 +25,6 @@ class GeodesicSpectral(BodyDescriptor):
         n_eigenvalues: largest first.
         n_samples: farthest points of the surface.
         max_vertices: larger meshes are simplified first.
-
-    Raises:
-        ValueError: a parameter out of range.
     """
 
     name = "geodesic_spectral"
@@ -57,21 +52,15 @@ class GeodesicSpectral(BodyDescriptor):
             ValueError: the mesh has fewer than `n_samples` vertices.
             MeshError: it cannot be simplified.
         """
-        samples = farthest_points(simplify(in_order_of_form(body.mesh), self.max_vertices), self.n_samples)
+        samples = geodesic_samples(body.mesh, self.n_samples, self.max_vertices)
         values = affinity_eigenvalues(samples.mutual, self.n_eigenvalues)
         return np.sqrt(np.abs(values)).astype(np.float32)
 
 
 def affinity_eigenvalues(distances: Floats, n_eigenvalues: int) -> Floats:
-    """The largest eigenvalues of exp(−d²/2σ²) over the number of points, σ the longest distance.
+    """The largest eigenvalues of exp(−d²/2σ²) over the number of points, descending, σ the longest of distances (P, P).
 
-    Args:
-        distances: (P, P), symmetric, not all zero.
-        n_eigenvalues: at most P.
-
-    Returns:
-        (n_eigenvalues,) descending, without unit. The last ones may be below zero: geodesic distances need not fit
-        into a Euclidean space.
+    The last ones may be below zero: geodesic distances need not fit into a Euclidean space.
     """
     affinity = np.exp(-np.square(distances / distances.max()) / 2)
     return np.linalg.eigvalsh(affinity / len(affinity))[::-1][:n_eigenvalues]

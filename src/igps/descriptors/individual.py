@@ -76,9 +76,8 @@ class IndividualDescriptor(Descriptor):
         self.descriptor, self.scale, self.keeps_size = descriptor, scale, size
         self._unit = _NEAR.get(descriptor.name, _SHARE * scale)
         embedding = SpectralEmbedding(n_eigenpairs=16)
-        self.twists = (
-            PairHistogram([InteriorDistance(6, 3.0), PairTwist()], embedding, n_samples=1000) if side else None
-        )
+        axes = [InteriorDistance(6, 3.0), PairTwist()]
+        self.twists = PairHistogram(axes, embedding, n_samples=1000) if side else None
         self.name, self.source = descriptor.name + SIDE * side + SIZE * size, descriptor.source
         # "motion" holds reflections
         lost = ["scale"] * size + ["motion"] * side
@@ -114,11 +113,7 @@ class IndividualDescriptor(Descriptor):
         return found
 
     def short(self, descriptions: Tensor) -> Tensor:
-        """(N, D) descriptions to (N, ≤ 256 + 55): the short ones of the descriptor, and the numbers of side and size.
-
-        Raises:
-            ValueError: the descriptor has no short ones.
-        """
+        """(N, D) descriptions to (N, ≤ 256 + 55): those of the descriptor, or a ValueError, and of side and size."""
         form, *others = self._parts(descriptions)
         return torch.cat([self.descriptor.short(form), *others], dim=1)
 

@@ -42,9 +42,6 @@ class InnerDistance(BodyDescriptor):
         max_distance: upper end of the last bin, in units of √area; larger distances go into it.
         n_sources: samples from which paths start; all of them if there are fewer.
         seed: of the choice of the sources.
-
-    Raises:
-        ValueError: a parameter out of range.
     """
 
     name = "inner_distance"
@@ -82,14 +79,8 @@ def inner_distances(points: Floats, sources: Integers) -> Floats:
     """Lengths of the shortest paths along the links inside a body, from some of its samples to all.
 
     Where the grid is too coarse for a thin part, the cells fall into pieces. Each piece is then joined to its nearest
-    one by a straight link between their closest samples, until all are one.
-
-    Args:
-        points: (P, 3) cell centres of a cubic grid, length.
-        sources: (S,) indices of points.
-
-    Returns:
-        (S, P) length.
+    one by a straight link between their closest samples, until all are one. From sources (S,) among the cell centres
+    (P, 3) of a cubic grid they are (S, P).
 
     Raises:
         ValueError: fewer than two points, or points that are not on a grid.

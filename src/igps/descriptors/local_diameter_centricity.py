@@ -41,9 +41,6 @@ class LocalDiameterCentricity(BodyDescriptor):
         opening_angle: of the cone about the inward normal, degrees.
         n_sources: points of the surface over which the geodesic distances are averaged.
         seed: of the samples.
-
-    Raises:
-        ValueError: a parameter out of range.
     """
 
     name = "local_diameter_centricity"
@@ -94,16 +91,7 @@ def local_diameters(mesh: Mesh, face: Integers, weights: Floats, n_rays: int, op
 
     The rays fill the cone about the inward normal evenly. A ray counts if it meets the surface from within; of the
     lengths that count, those within a standard deviation of their median are averaged (Shapira et al. 2008, section 3).
-
-    Args:
-        mesh: the body.
-        face: (P,) face of each point.
-        weights: (P, 3) barycentric coordinates in it.
-        n_rays: rays a point.
-        opening_angle: of the cone, degrees.
-
-    Returns:
-        (P,) length, NaN where no ray counts.
+    Points are given by their faces (P,) and barycentric weights (P, 3). It is (P,), and NaN where no ray counts.
     """
     import igl
 
@@ -130,16 +118,9 @@ def local_diameters(mesh: Mesh, face: Integers, weights: Floats, n_rays: int, op
 
 
 def centricity(mesh: Mesh, n_sources: int) -> Floats:
-    """Average geodesic distance of each vertex from the whole surface.
+    """(V,) average geodesic distance of each vertex from the whole surface.
 
-    The integral over the surface is a sum over evenly spread vertices, each weighted by the area that is nearest to it.
-
-    Args:
-        mesh: the surface.
-        n_sources: how many; all vertices if there are fewer.
-
-    Returns:
-        (V,) length.
+    The integral is a sum over evenly spread vertices, `n_sources` or all, each weighted by the area nearest to it.
     """
     n_vertices = len(mesh.vertices)
     distances = farthest_points(mesh, min(n_sources, n_vertices), _POINTS_PER_EDGE).distances

@@ -33,21 +33,14 @@ _SIZE = 0.3
 
 
 class Shares(PointAxis):
-    """Classes of points by an attribute that is their shares in them.
-
-    Args:
-        name: of the attribute, (P, C) with rows of sum 1.
-        n_classes: C.
-    """
+    """Classes of points by a named attribute that is their shares in C classes, (P, C) with rows of sum 1."""
 
     def __init__(self, name: str, n_classes: int) -> None:
         nn.Module.__init__(self)
-        self.name = name
-        self._n_classes = n_classes
+        self.name, self._n_classes = name, n_classes
 
     @property
     def n_classes(self) -> int:
-        """C."""
         return self._n_classes
 
     def requirements(self, embedding: nn.Module) -> Requirements:
@@ -55,11 +48,7 @@ class Shares(PointAxis):
         return attribute_requirements(self.name)
 
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
-        """(N, P, C) of the samples.
-
-        Raises:
-            ValueError: the samples have no such attribute, or one of another number of classes.
-        """
+        """(N, P, C) of the samples; a ValueError if they have no such attribute of so many classes."""
         values = features.attribute(self.name)
         if values.ndim != 3 or values.shape[2] != self.n_classes:
             raise ValueError(
@@ -69,11 +58,7 @@ class Shares(PointAxis):
         return values
 
     def memberships(self, values: Tensor) -> Tensor:
-        """(P, C) shares as they are.
-
-        Raises:
-            ValueError: values that are not finite.
-        """
+        """(P, C) shares as they are; a ValueError if they are not finite."""
         if not torch.isfinite(values).all():
             raise ValueError(f"{self.name}: expected finite shares, got NaN or infinity.")
         return values

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from igps.nn.axes import EmbeddedPairCosines, InteriorDistance, Potential
+from igps.nn.batch_features import SampleKind
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
@@ -24,15 +25,17 @@ def multiscale() -> HistogramDescriptor:
     def scale(n_eigenpairs: int, reach: float) -> PairHistogram:
         return PairHistogram([Potential(8), InteriorDistance(64, reach)], embeddings[n_eigenpairs], n_samples=N_SAMPLES)
 
+    def oriented(n_eigenpairs: int, samples: SampleKind) -> PairHistogram:
+        axes = [InteriorDistance(6, 3.0), EmbeddedPairCosines(5)]
+        return PairHistogram(axes, embeddings[n_eigenpairs], samples, n_samples=N_ORIENTED_SAMPLES)
+
     two_scales = [InteriorDistance(24, 3.0), InteriorDistance(24, 2.5, embedding=embeddings[4])]
-    oriented = [InteriorDistance(6, 3.0), EmbeddedPairCosines(5)]
-    on_surface = [InteriorDistance(6, 3.0), EmbeddedPairCosines(5)]
     return HistogramDescriptor(
         [
             [scale(250, 4.0), scale(50, 4.0), scale(16, 3.0)],
             PairHistogram(two_scales, embeddings[50], n_samples=N_SAMPLES),
-            PairHistogram(oriented, embeddings[16], n_samples=N_ORIENTED_SAMPLES),
-            PairHistogram(on_surface, embeddings[8], "surface", n_samples=N_ORIENTED_SAMPLES),
+            oriented(16, "interior"),
+            oriented(8, "surface"),
         ],
         name="multiscale",
         source="Rustamov 2010, on several scales",

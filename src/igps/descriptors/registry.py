@@ -133,11 +133,8 @@ def descriptor(
         return plain
     scale = plain.scale
     if isinstance(plain, IndividualDescriptor):  # of a file
-        with_size, with_side, plain = (
-            with_size or plain.keeps_size,
-            with_side or plain.twists is not None,
-            plain.descriptor,
-        )
+        with_size, with_side = with_size or plain.keeps_size, with_side or plain.twists is not None
+        plain = plain.descriptor
     return IndividualDescriptor(plain, size=with_size, side=with_side, scale=scale).eval()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from igps.descriptors.multiscale import N_ORIENTED_SAMPLES, N_SAMPLES
 from igps.nn.axes import Attribute, EuclideanDistance, InteriorDistance, PairAxis, PairCosines, PointAxis, Potential
 from igps.nn.descriptor import HistogramDescriptor
@@ -31,36 +33,22 @@ def rich(
     # Fixed embeddings are the same for all, and computed once; learned filters go their own way.
     fixed = {n: SpectralEmbedding(n_eigenpairs=n) for n in (50, 16)}
 
+    def embedding(n_eigenpairs: int) -> SpectralEmbedding:
+        return SpectralEmbedding(n_eigenpairs=n_eigenpairs, n_knots=_N_KNOTS) if learnable else fixed[n_eigenpairs]
+
     def histogram(n_eigenpairs: int, *axes: PointAxis | PairAxis) -> PairHistogram:
-        embedding = SpectralEmbedding(n_eigenpairs=n_eigenpairs, n_knots=_N_KNOTS) if learnable else fixed[n_eigenpairs]
-        return PairHistogram(axes, embedding, n_samples=n_samples or N_SAMPLES, n_training_samples=n_training_samples)
+        n = n_samples or N_SAMPLES
+        return PairHistogram(axes, embedding(n_eigenpairs), n_samples=n, n_training_samples=n_training_samples)
 
-    def potential(n_classes: int) -> Potential:
-        return Potential(n_classes, learnable=learnable)
-
-    def distance(n_bins: int, reach: float = 4.0) -> InteriorDistance:
-        return InteriorDistance(n_bins, reach, learnable=learnable)
-
-    def euclidean(n_bins: int) -> EuclideanDistance:
-        return EuclideanDistance(n_bins, learnable=learnable)
-
-    def depth() -> Attribute:
-        return Attribute("depth", _DEPTH, learnable=learnable)
-
+    potential = partial(Potential, learnable=learnable)
+    distance = partial(InteriorDistance, learnable=learnable)
+    euclidean = partial(EuclideanDistance, learnable=learnable)
+    cosines = partial(PairCosines, 5, learnable=learnable)
+    depth = partial(Attribute, "depth", _DEPTH, learnable=learnable)
     charge = Attribute("electrostatic_potential", _ELECTROSTATIC_POTENTIAL, learnable=learnable)
-    oriented = PairHistogram(
-        [distance(6, 3.0), PairCosines(5, learnable=learnable)],
-        SpectralEmbedding(n_eigenpairs=50, n_knots=_N_KNOTS) if learnable else fixed[50],
-        n_samples=n_samples or N_ORIENTED_SAMPLES,
-        n_training_samples=n_training_samples,
-    )
-    on_surface = PairHistogram(
-        [EuclideanDistance(6, 1.0, learnable=learnable), PairCosines(5, learnable=learnable)],
-        fixed[50],
-        samples="surface",
-        n_samples=n_samples or N_ORIENTED_SAMPLES,
-        n_training_samples=n_training_samples,
-    )
+    n, m = n_samples or N_ORIENTED_SAMPLES, n_training_samples
+    oriented = PairHistogram([distance(6, 3.0), cosines()], embedding(50), n_samples=n, n_training_samples=m)
+    on_surface = PairHistogram([euclidean(6, 1.0), cosines()], fixed[50], "surface", n_samples=n, n_training_samples=m)
     return HistogramDescriptor(
         [
             [

@@ -31,9 +31,6 @@ class ShapeDNA(BodyDescriptor):
     Args:
         n_eigenvalues: eigenvalues compared.
         normalisation: "area" or "slope".
-
-    Raises:
-        ValueError: a parameter out of range.
     """
 
     name = "shape_dna"

@@ -143,14 +143,7 @@ def quantiles(values: ArrayLike, n_quantiles: int) -> Floats:
     """Means of the quantile function of a sample over equal steps.
 
     For any exponent p ≥ 1, (mean |q − q'|ᵖ)^(1/p) of two samples' means q, q' is at most their Wasserstein distance
-    (Jensen), and tends to it with the number of steps.
-
-    Args:
-        values: (P, ...) the sample.
-        n_quantiles: number of steps.
-
-    Returns:
-        (n_quantiles,) ascending, in the unit of the values.
+    (Jensen), and tends to it with the number of steps. They ascend, (n_quantiles,).
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64), axis=None)
     integral = np.concatenate([[0.0], np.cumsum(ordered)]) / len(ordered)
@@ -171,15 +164,7 @@ def gromov_wasserstein(
 
     The largest over the times of local minima over the couplings, by conditional gradients from the uniform coupling
     and from the one of the bound "signature". No lower bound of `SpectralGromovWasserstein` for the same
-    samples and times exceeds it.
-
-    Args:
-        a: a shape.
-        b: another.
-        samples: "surface" or "interior".
-        times: in units of A/8π.
-        n_samples: at most so many of each shape's samples, at equal steps of their order.
-        seed: of the first step.
+    samples and times exceeds it. For the parameters see `heat_kernels`.
 
     Raises:
         ImportError: POT is not installed.

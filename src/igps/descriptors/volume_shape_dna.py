@@ -58,9 +58,6 @@ class VolumeShapeDNA(BodyDescriptor):
         boundary: "dirichlet" (zero on the surface) or "neumann" (no flux through it).
         n_eigenvalues: eigenvalues kept, without the first zero of Neumann's.
         n_voxels: the cells have 1/`n_voxels` of the volume each, but at least 1/128 of the longest side.
-
-    Raises:
-        ValueError: a parameter out of range.
     """
 
     name = "volume_shape_dna"
@@ -92,9 +89,6 @@ class VolumeShapeDNA(BodyDescriptor):
 
 def volume_spectrum(mesh: Mesh, n_eigenvalues: int, boundary: Boundary, n_voxels: int) -> Floats:
     """The smallest eigenvalues of −Δ in the body, times its volume^(2/3), ascending, without Neumann's first zero.
-
-    Returns:
-        (n_eigenvalues,) without unit.
 
     Raises:
         MeshError: the body is too thin for the grid, or has too few cells for the eigenvalues.

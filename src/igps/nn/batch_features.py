@@ -79,12 +79,13 @@ class SampleFeatures:
         """(N, P) how much each sample counts, None where all count alike; derivatives by them tell shares."""
         return self.samples.attributes.get(WEIGHT)
 
-    def ball_radii(self) -> Tensor:
-        """(N, P, 2) `ball_radii` of surface samples, over √area; 1 where padded.
+    def weights_or_ones(self, values: Tensor) -> Tensor:
+        """(N, P) how much each sample counts, in the type of some values (N, P) where all count alike."""
+        weights = self.weights()
+        return torch.ones_like(values) if weights is None else weights
 
-        Raises:
-            ValueError: they have no directions.
-        """
+    def ball_radii(self) -> Tensor:
+        """(N, P, 2) `ball_radii` of surface samples that have directions, over √area; 1 where padded."""
         if self._ball_radii is None:
             self._ball_radii = ball_radii(self.positions(), self.attribute("surface_direction"), self.samples.mask)
         return self._ball_radii

@@ -137,6 +137,8 @@ class Descriptor(Specified, ABC):
 class BodyDescriptor(Descriptor):
     """A descriptor that looks at one body at a time, in NumPy; it has no gradient.
 
+    Those of the library are made with parameters; one out of range is a ValueError.
+
     Example:
         >>> import trimesh
         >>> from igps.data.collation import collate

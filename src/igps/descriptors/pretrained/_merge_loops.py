@@ -13,15 +13,10 @@ def merge(
     order: Integers, neighbours: Integers, counts: Integers, ends: Integers,
     pieces: Integers,
 ) -> int:  # fmt: skip
-    """Write the branches and the pieces of a function on a graph; how many branches there are.
+    """Write the branches and the pieces of a function on a graph, see `merge_tree`; how many branches there are.
 
-    Args:
-        order: (P,) points, the highest first.
-        neighbours: (P, k) of each point; a pair is joined if either names the other.
-        counts: (L,) ascending: pieces are told when so many points have been reached.
-        ends: (P, 2), filled with the highest point of each branch and the point where it joins a higher one, or the
-            lowest point of all.
-        pieces: (L, P) of −1, filled with the highest point of the piece that each point reached belongs to.
+    The points (P,) come in order, the highest first. Written are the peak and the saddle of each branch to (P, 2), and
+    the peak of the piece of each point to (L, P), which holds −1.
     """
     n_points, n_neighbours = neighbours.shape
     place = np.empty(n_points, np.int64)

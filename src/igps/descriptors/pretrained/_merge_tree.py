@@ -34,12 +34,9 @@ def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = ()) -
     2010. Of equal values, that of the smaller number is the higher.
 
     Args:
-        values: (P,) finite.
+        values: (P,) finite, or a ValueError.
         neighbours: (P, k) numbers of points; two are neighbours if either names the other.
         counts: (L,) the superlevel sets to be told, by how many points they have, 1 to P, ascending.
-
-    Raises:
-        ValueError: values that are not finite.
     """
     if not torch.isfinite(values).all():
         raise ValueError("values: expected finite numbers, got NaN or infinity.")

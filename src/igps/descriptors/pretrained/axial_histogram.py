@@ -56,11 +56,9 @@ class AxialHistogram(SampleHistogram):
             raise ValueError(f"n_bins: expected four numbers, each at least 2, got {n_bins}.")
         self.embedding: nn.Module = embedding or SpectralEmbedding()
         self.n_bins = n_bins
-        along, beside, cosine, outward = n_bins
-        self.register_buffer("along", torch.linspace(-_REACH, _REACH, along))
-        self.register_buffer("beside", torch.linspace(0, _REACH, beside))
-        self.register_buffer("cosine", torch.linspace(-1, 1, cosine))
-        self.register_buffer("outward", torch.linspace(-1, 1, outward))
+        ends = {"along": (-_REACH, _REACH), "beside": (0, _REACH), "cosine": (-1, 1), "outward": (-1, 1)}
+        for n, (name, (first, last)) in zip(n_bins, ends.items(), strict=True):
+            self.register_buffer(name, torch.linspace(first, last, n))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -76,14 +74,11 @@ class AxialHistogram(SampleHistogram):
         """(N, 3, ...) histograms of some samples of N shapes."""
         potential = barycentroid_potential(features.embedded(self.embedding))
         positions, directions = features.positions(), features.attribute("surface_direction")
-        weights = features.weights()
-        weights = torch.ones_like(potential) if weights is None else weights
-        return torch.stack(
-            [
-                self._of_shape(positions[i, real], directions[i, real], potential[i, real], weights[i, real])
-                for i, real in enumerate(present(features))
-            ]
-        )
+        weights = features.weights_or_ones(potential)
+        found = []
+        for i, real in enumerate(present(features)):
+            found.append(self._of_shape(positions[i, real], directions[i, real], potential[i, real], weights[i, real]))
+        return torch.stack(found)
 
     def _of_shape(self, points: Tensor, directions: Tensor, potential: Tensor, own: Tensor) -> Tensor:
         if not (torch.isfinite(points).all() and torch.isfinite(directions).all() and torch.isfinite(potential).all()):
@@ -104,20 +99,15 @@ class AxialHistogram(SampleHistogram):
             # towards the nearer end of the axis: so a body and its mirror image agree
             away = torch.where(along < 0, -of_direction, of_direction)
             direction = [soft_memberships(away, self.cosine), soft_memberships(outward, self.outward)]
-            found.append(
-                counted(joint(place) * own[:, None], joint(direction), torch.tensor(len(points))).view(self.n_bins)
-            )
+            counts = counted(joint(place) * own[:, None], joint(direction), torch.tensor(len(points)))
+            found.append(counts.view(self.n_bins))
         return torch.stack(found) / 3
 
 
 def principal_axes(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """The centre (3,) of weighted points and their principal axes (3, 3), in columns, the longest first.
+    """The centre (3,) of points (P, 3) of weights (P,) and their principal axes (3, 3), in columns, the longest first.
 
     Each axis points to where the third moment of all points about the centre, each counted once, is positive.
-
-    Args:
-        points: (P, 3).
-        weights: (P,) positive.
     """
     weights = weights / weights.sum()
     points = points.to(weights.dtype)

@@ -62,12 +62,10 @@ class BranchHistogram(SampleHistogram):
         """(N, B) histograms of some samples of N shapes."""
         heights, neighbours = features.log_potential(self.embedding), features.neighbours(self.embedding)
         weights = features.weights()
-        return torch.stack(
-            [
-                self._of_shape(heights[i, real], neighbours[i], None if weights is None else weights[i, real])
-                for i, real in enumerate(present(features))
-            ]
-        )
+        found = []
+        for i, real in enumerate(present(features)):
+            found.append(self._of_shape(heights[i, real], neighbours[i], None if weights is None else weights[i, real]))
+        return torch.stack(found)
 
     def _of_shape(self, heights: Tensor, neighbours: Tensor, weights: Tensor | None) -> Tensor:
         tree = merge_tree(heights, neighbours)

@@ -71,13 +71,9 @@ def pretrained_head(*, individuals: bool = True) -> TwoLevelHead:
         WCCNHead([balls], n_directions=20, shrinkage=0.3, lengths=True),
         WCCNHead([spectrum], n_directions=60, shrinkage=1.0, lengths=True),
     ]
-    individual_head = WCCNHead(INDIVIDUAL_PARTS, n_directions=60, shrinkage=0.3, lengths=True)
-    return TwoLevelHead(
-        WCCNHead(CLASS_PARTS, n_directions=150, shrinkage=0.1),
-        body_heads,
-        scales=_SCALES,
-        individual_head=individual_head if individuals else None,
-    )
+    individual_head = WCCNHead(INDIVIDUAL_PARTS, n_directions=60, shrinkage=0.3, lengths=True) if individuals else None
+    class_head = WCCNHead(CLASS_PARTS, n_directions=150, shrinkage=0.1)
+    return TwoLevelHead(class_head, body_heads, scales=_SCALES, individual_head=individual_head)
 
 
 def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:

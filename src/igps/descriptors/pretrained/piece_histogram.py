@@ -81,14 +81,11 @@ class PieceHistogram(SampleHistogram):
         """(N, L, ...) histograms of some samples of N shapes."""
         heights, positions = features.log_potential(self.embedding), features.positions()
         neighbours = features.neighbours(self.embedding)
-        weights = features.weights()
-        weights = torch.ones_like(heights) if weights is None else weights
-        return torch.stack(
-            [
-                self._of_shape(heights[i, real], positions[i, real], neighbours[i], weights[i, real])
-                for i, real in enumerate(present(features))
-            ]
-        )
+        weights = features.weights_or_ones(heights)
+        found = []
+        for i, real in enumerate(present(features)):
+            found.append(self._of_shape(heights[i, real], positions[i, real], neighbours[i], weights[i, real]))
+        return torch.stack(found)
 
     def _of_shape(self, heights: Tensor, points: Tensor, neighbours: Tensor, weights: Tensor) -> Tensor:
         if not torch.isfinite(points).all():

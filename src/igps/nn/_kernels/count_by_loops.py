@@ -4,31 +4,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.utils.rnn import pad_sequence
 
-from igps._arrays import Floats
+from igps._arrays import Booleans, Floats
 from igps._threads import ALONE, Team
-from igps.nn._kernels.pair_loops import COSINES, DISTANCES, VALUES, Axes, count_block, gradient_block
+from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES, Axes, Numbers, Places
+from igps.nn._kernels.pair_loops import count_block, gradient_block
 from igps.nn._kernels.pair_values import PairValues, centres_of, cosine_factors, with_tensors
 from igps.nn._precision import full_precision
 
 Result = TypeVar("Result")
 
-# Pairs of a block, whose values stay in a core's second-level cache
+# Pairs of a block, whose values stay in a core's second-level cache; more could overflow the integers of `pair_sums`
 _BLOCK, _MOST_COLUMNS = 2**18, 2048
 # Of the blocks, which threads count side by side; one where counts of its own for each share would take gigabytes
 _SHARES, _MOST_COUNTS = 4, 2**24
 
 
-@dataclass(frozen=True, eq=False)
-class Layout:
+Blocks = Sequence[tuple[int, int]]
+
+
+class Layout(NamedTuple):
     """What a count has no gradient by, see `count_pairs`."""
 
     classes: Tensor
@@ -77,9 +79,6 @@ class CompiledCount(torch.autograd.Function):
         return None, *gradients
 
 
-Blocks = Sequence[tuple[int, int]]
-
-
 def _of_shapes(task: Callable[[int, Team], Result], n_shapes: int) -> list[Result]:
     """What a task finds of each shape: of as many side by side as there are threads, or else with a team for each."""
     with full_precision(), Team() as team:
@@ -99,12 +98,7 @@ def _summed(shape: _Shape, task: Callable[[Blocks], list[Tensor]], team: Team) -
 
 
 class _Members:
-    """The points of all shapes in the order in which loops want them, real ones of the same classes side by side.
-
-    Args:
-        layout: see `count_pairs`.
-        weights: (N, P, M).
-    """
+    """The points of all shapes in the order in which loops want them, real ones of the same classes side by side."""
 
     def __init__(self, layout: Layout, weights: Tensor) -> None:
         key = torch.zeros_like(layout.classes[..., 0])
@@ -117,7 +111,7 @@ class _Members:
         self._weights = weights.gather(1, by_order).double().transpose(1, 2).contiguous().numpy()
         self._n_points = layout.mask.sum(dim=1).tolist()
 
-    def of(self, number: int) -> tuple[Tensor, tuple[NDArray[np.int32], Floats]]:
+    def of(self, number: int) -> tuple[Tensor, tuple[Places, Floats]]:
         """Of a shape (P,) its points in order, and (M, P) their classes and weights."""
         n = self._n_points[number]
         classes, weights = (np.ascontiguousarray(one[number, :, :n]) for one in (self._classes, self._weights))
@@ -125,15 +119,7 @@ class _Members:
 
 
 class _Shape:
-    """The real points of one shape as the loops want them.
-
-    Args:
-        layout: see `count_pairs`.
-        number: of the shape.
-        members: of all shapes.
-        tensors: inputs and centres of the axes.
-        upstream: (C(C+1)/2, B, ...) derivatives by the counts; None where no gradient is asked for.
-    """
+    """The real points of one shape as the loops want them, and what is upstream of its counts for a gradient."""
 
     def __init__(
         self, layout: Layout, number: int, members: _Members, tensors: Sequence[Tensor], upstream: Tensor | None = None
@@ -155,25 +141,21 @@ class _Shape:
         n_shares = min(_SHARES, len(blocks)) if math.prod(self.n_counts) <= _MOST_COUNTS else 1
         self.shares = [blocks[k::n_shares] for k in range(n_shares)]
         self.upstream = _unfolded(torch.empty(0, 0) if upstream is None else upstream.to(self.dtype)).numpy()
-        norms = torch.zeros(self.n_values, n_points, dtype=self.dtype)
-        into = iter(norms)
+        norms, row = torch.zeros(self.n_values, n_points, dtype=self.dtype), 0
         for one, centred in zip(self.pairs, self.centred, strict=True):
-            for norm in [next(into) for kind in one.kinds if kind != COSINES]:
-                if centred is not None:
-                    torch.sum(centred.square(), dim=1, out=norm)
-        oriented = [one.inputs for one in self.pairs if COSINES in one.kinds]
-        n_dimensions = [points.shape[1] for points, _ in oriented]
-        turned = torch.zeros(len(oriented), 2, max(n_dimensions, default=0), n_points, dtype=self.dtype)
-        for vectors, inputs in zip(turned, oriented, strict=True):
-            for k, values in enumerate(inputs):
-                vectors[k, : values.shape[1]] = values.T
-        padded = torch.zeros(len(centres), max(self.bins), dtype=self.dtype)
-        for place, one_axis in zip(padded, centres, strict=True):
-            place[: len(one_axis)] = one_axis
-        self.axes = Axes(
-            np.array(kinds), norms.numpy(), turned.numpy(), np.array(n_dimensions, np.int64), padded.numpy(),
-            np.array(self.bins),
-        )  # fmt: skip
+            if centred is not None:
+                norms[row] = centred.square().sum(dim=1)
+            row += sum(kind != COSINES for kind in one.kinds)
+        vectors = [torch.stack([x.T for x in one.inputs], dim=1) for one in self.pairs if COSINES in one.kinds]
+        oriented = norms.new_zeros(0, 2, 0, n_points)
+        if vectors:
+            oriented = pad_sequence(vectors, batch_first=True).transpose(1, 2).contiguous()
+        padded = pad_sequence(centres, batch_first=True).numpy()
+        gaps = _gaps(padded, self.bins)
+        self.axes = Axes(np.array(kinds), norms.numpy(), oriented.numpy(), padded, np.array(self.bins), *gaps)
+        classes, weights = self.members
+        self.packs = kinds in ([VALUES], [DISTANCES]) and self.dtype == torch.float32
+        self.packs = self.packs and len(classes) == 1 and bool((weights == 1).all())
 
     def counts(self, blocks: Blocks) -> list[Tensor]:
         """(C(C+1)/2, cells·2^K) float64 counts of some blocks, by the cell below and the corner of it."""
@@ -181,7 +163,7 @@ class _Shape:
         for row, column in blocks:
             values = self._part(room, row, column)
             self._fill(values, row, column)
-            count_block(values.numpy(), self.axes, row, column, *self.members, total.numpy())
+            count_block(values.numpy(), self.axes, row, column, *self.members, self.packs, total.numpy())
         return [total]
 
     def gradients(self, blocks: Blocks) -> list[Tensor]:
@@ -238,6 +220,20 @@ class _Shape:
                 between = one.between([x[None, rows] for x in one.inputs], [x[None, columns] for x in one.inputs])
                 for value in between[0]:
                     next(into).copy_(value)
+
+
+def _gaps(centres: Numbers, bins: Sequence[int]) -> tuple[Numbers, Booleans]:
+    """(K, B − 1) one over the gaps between centres (K, B), and (K,) whether those of an axis are equal, see `Axes`."""
+    inverse, equal = np.zeros((len(bins), centres.shape[1] - 1), centres.dtype), np.zeros(len(bins), bool)
+    for k, n in enumerate(bins):
+        gaps = np.diff(centres[k, :n])
+        inverse[k, : n - 1] = 1 / gaps
+        mean = float(centres[k, n - 1] - centres[k, 0]) / (n - 1)
+        rounding = 8 * np.finfo(centres.dtype).eps * float(np.abs(centres[k, [0, n - 1]]).max())
+        equal[k] = bool((np.abs(gaps - mean) <= rounding).all())
+        if equal[k]:
+            inverse[k, 0] = 1 / mean
+    return inverse, equal
 
 
 def _centred(points: Tensor) -> Tensor:

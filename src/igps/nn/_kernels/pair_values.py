@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from igps.nn._kernels.pair_loops import COSINES, DISTANCES, VALUES
+from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES
 
 Inputs = Sequence[Tensor]
 

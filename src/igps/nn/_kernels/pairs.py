@@ -16,7 +16,7 @@ from torch import Tensor
 
 from igps.nn._kernels.count_by_loops import CompiledCount, Layout
 from igps.nn._kernels.count_by_torch import count_by_torch
-from igps.nn._kernels.pair_loops import VALUES
+from igps.nn._kernels.pair_cells import VALUES
 from igps.nn._kernels.pair_values import PairValues
 
 
