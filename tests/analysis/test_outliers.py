@@ -97,6 +97,7 @@ def test_measures_are_those_of_the_meshes(tmp_path: object) -> None:
     assert measures["handles"][0] == 1
     assert measures["volume"][0] == pytest.approx(np.log(torus.volume))
     assert measures["spacing"][0] == pytest.approx(np.log(torus.area / len(torus.faces)) / 2)
+    assert not measures.pop("overlap").any()
     assert all(np.isnan(values[1]) for values in measures.values())
 
 
