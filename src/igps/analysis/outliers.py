@@ -151,7 +151,7 @@ def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> d
         for i, outcome in all_:
             if not isinstance(outcome, Failed):
                 found[i], places[i] = outcome
-    return {**dict(zip(names, found.T, strict=True)), "overlap": overlaps(places)}
+    return {**dict(zip(names, found.T, strict=True)), "overlap": overlaps(places, dataset.bodies.labels)}
 
 
 def flat_share(mesh: Mesh) -> float:

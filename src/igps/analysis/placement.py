@@ -48,8 +48,8 @@ class Place:
         return whole[tuple(map(slice, low - self.low, high - self.low))]
 
 
-def overlaps(places: Sequence[Place | None]) -> Values:
-    """(N, N) shares of the voxels of each that lie in each other one."""
+def overlaps(places: Sequence[Place | None], labels: Sequence[str] | None = None) -> Values:
+    """(N, N) shares of the voxels of each that lie in each other one; 0 of one class, which may be many subjects."""
     found = np.zeros((len(places), len(places)))
     grids = defaultdict[tuple[object, ...], list[tuple[int, Place]]](list)
     for i, place in enumerate(places):
@@ -58,7 +58,7 @@ def overlaps(places: Sequence[Place | None]) -> Values:
     for own in grids.values():
         for (i, one), (j, other) in combinations(own, 2):
             low, high = np.maximum(one.low, other.low), np.minimum(one.low + one.shape, other.low + other.shape)
-            if (low < high).all():
+            if (low < high).all() and (labels is None or labels[i] != labels[j]):
                 shared = np.count_nonzero(one.mask(low, high) & other.mask(low, high))
                 found[i, j], found[j, i] = shared / one.n_voxels, shared / other.n_voxels
     return found
