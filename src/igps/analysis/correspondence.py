@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from igps.data.batch import SampleBatch, SignatureBatch
@@ -107,11 +106,12 @@ def _forms(body: SignatureBatch) -> tuple[Values, Values]:
     )
     sums = np.bincount(pairs.row, weights * heights, len(points))
     curvature = sums / (np.bincount(pairs.row, weights, len(points)) + 1e-12) / reach
-    below = (outward * points).sum(axis=1)[:, None] - outward @ points.T
-    squares = np.square(cdist(points, points))
-    is_below = (below > 0.02 * size) | (below > 0.3 * np.sqrt(squares))
-    radii = np.where(is_below, squares / np.maximum(2 * below, 1e-300), np.inf) / size
-    ball = np.log(np.minimum(np.partition(radii, 2, axis=1)[:, 2] + 1e-6, 0.5))
+    where, normals = (torch.from_numpy(values / scale).float() for values, scale in ((points, size), (outward, 1)))
+    below = (normals * where).sum(dim=1)[:, None] - normals @ where.T
+    away = torch.cdist(where, where)
+    radii = torch.where(below > torch.minimum(torch.tensor(0.02), 0.3 * away), away.square() / (2 * below), torch.inf)
+    third = radii.topk(min(3, len(points)), largest=False).values[:, -1]
+    ball = np.log(third.clamp(1e-6, 0.5).double().numpy())
     return curvature, np.median(ball[tree.query(points, min(8, len(points)))[1]], axis=1)
 
 
