@@ -17,7 +17,7 @@ from igps._parallel import Failed, run
 from igps.analysis.placement import Place, end_of, overlaps
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
-from igps.mesh.formats.volumes import VolumeOptions, read_label_volume
+from igps.mesh.formats.volumes import read_label_volume
 from igps.mesh.loading import BodyRef, each_surface, surface_body
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors
@@ -180,7 +180,7 @@ def _measures(pipeline: SignaturePipeline, body: BodyRef) -> tuple[Values, Place
     if raw.voxels is None:
         found[3] = flat_share(mesh)
         return found, None
-    volume = read_label_volume(body.path, VolumeOptions(reading.threshold, reading.names))
+    volume = read_label_volume(body.path, reading)
     if body.part is None:
         layer = np.any([one > 0 for one in volume.layers], axis=0)
         box = ndimage.find_objects(layer.view(np.uint8))[0]
