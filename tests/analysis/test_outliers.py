@@ -54,6 +54,9 @@ def test_a_wrong_label_is_told() -> None:
         ("spacing", np.log(2), "it is 1.99 times as coarse"),
         ("handles", 3.0, "it has 3 handles, where 0 are usual"),
         ("flat", 0.3, "30% of its surface lie in one plane"),
+        ("pieces", np.log(7), "it has 7 pieces, where 1 are usual"),
+        ("cut", 9.0, "its last slice is as large as those before it"),
+        ("thick", np.log(2), "it is 2.00 times as thick as usual somewhere"),
     ],
 )
 def test_each_measure_is_a_reason(name: str, value: float, told: str) -> None:
@@ -62,6 +65,32 @@ def test_each_measure_is_a_reason(name: str, value: float, told: str) -> None:
     first = found_of(usual(), measures={name: values})[0]
     assert first.body == 5
     assert told in first.reason
+
+
+def test_a_leak_lies_in_another_class_and_not_in_its_own() -> None:
+    overlap = np.zeros((24, 24))
+    overlap[2, 20], overlap[3, 4] = 0.08, 0.9
+    first, second = found_of(usual(), measures={"overlap": overlap})[:2]
+    assert (first.body, first.reason) == (2, "8% of it lie in a body of another class")
+    assert second.scores["overlap"] == 0
+
+
+def test_of_a_pair_the_odd_one_is_found() -> None:
+    labels = ["left and right"] * 2 + [f"pair {i // 2}" for i in range(22)]
+    handles = np.zeros(24)
+    handles[1] = 2
+    found = outliers(squared_distances(usual()) ** 0.5, labels, {"handles": handles})
+    scores = {one.body: one.scores["handles"] for one in found}
+    assert (max(scores, key=lambda body: scores[body]), scores[0] < 0) == (1, True)
+    assert scores[1] > LIMIT
+
+
+def test_what_one_class_has_is_not_usual_of_others() -> None:
+    """A third of all bodies is finer; a class of one that is coarse is odd all the same."""
+    labels = ["fine"] * 8 + [f"single {i}" for i in range(16)]
+    spacing = np.log(np.repeat([1.0, 3.0], [8, 16]))
+    spacing[20] = np.log(6)
+    assert outliers(squared_distances(usual()) ** 0.5, labels, {"spacing": spacing})[0].body == 20
 
 
 def test_a_repair_that_few_needed_is_a_reason() -> None:
@@ -97,6 +126,7 @@ def test_measures_are_those_of_the_meshes(tmp_path: object) -> None:
     assert measures["handles"][0] == 1
     assert measures["volume"][0] == pytest.approx(np.log(torus.volume))
     assert measures["spacing"][0] == pytest.approx(np.log(torus.area / len(torus.faces)) / 2)
+    assert not measures.pop("overlap").any()
     assert all(np.isnan(values[1]) for values in measures.values())
 
 
@@ -110,3 +140,24 @@ def test_the_spacing_of_a_label_is_the_side_of_its_voxels(tmp_path: Path) -> Non
     dataset = SignatureDataset([tmp_path / "fine.nii.gz", tmp_path / "coarse.nii.gz"], cache_dir=tmp_path)
     spacing = measures_of(dataset, n_workers=1)["spacing"]
     assert np.exp(spacing) == pytest.approx([1, 2], rel=0.01)
+
+
+def test_labels_are_measured_in_their_grid(tmp_path: Path) -> None:
+    """Two balls that share a cap, one cut by a plane, one by the border of the volume, one with an island."""
+    nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
+    x, y, z = np.indices((60, 40, 40))
+
+    def ball(at: int, radius: int = 10, height: int = 20) -> np.ndarray:
+        return (x - at) ** 2 + (y - 20) ** 2 + (z - height) ** 2 <= radius**2
+
+    island = ball(40) | ball(56, 2)
+    masks = {"a": ball(20), "b": ball(36), "cut": ball(20) & (z < 24), "border": ball(20, 10, 35), "island": island}
+    for name, mask in masks.items():
+        nibabel.save(nibabel.Nifti1Image(mask.astype(np.uint8), np.eye(4)), tmp_path / f"{name}.nii.gz")
+    dataset = SignatureDataset([tmp_path / f"{name}.nii.gz" for name in masks], cache_dir=tmp_path)
+    found = measures_of(dataset, n_workers=1)
+    assert found["overlap"][0, 1] == pytest.approx((masks["a"] & masks["b"]).sum() / masks["a"].sum())
+    assert found["overlap"][0, 3] == pytest.approx((masks["a"] & masks["border"]).sum() / masks["a"].sum())
+    assert np.exp(found["pieces"]) == pytest.approx([1, 1, 1, 1, 2])
+    assert found["cut"][2] > 3 * max(found["cut"][[0, 1, 3]])
+    assert np.exp(found["thick"][0]) == pytest.approx(3, rel=0.1)  # a ball's radius over its volume by its area

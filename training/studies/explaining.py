@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ Points = NDArray[np.float64]
 def explaining(
     out: Path = Path("build/explaining"),
     descriptors: Sequence[str] = ("interior", "rich", "pretrained"),
-    n_pairs: int = 40,
+    n_bodies: int = 50,
     seed: int = 0,
     same_pose: bool = False,
 ) -> None:
@@ -38,7 +39,7 @@ def explaining(
     Args:
         out: folder for explaining.csv and explaining.json.
         descriptors: names.
-        n_pairs: of bodies.
+        n_bodies: each is altered in each way.
         seed: of the bodies; other seeds give other bodies.
         same_pose: alter the very same mesh in place of one in another pose.
     """
@@ -48,10 +49,10 @@ def explaining(
     needs = Requirements()
     for one in chosen.values():
         needs = needs | one.requirements
-    shapes, rows = GradedShapes(24, 2, 2, seed=seed), list[dict[str, Any]]()
+    shapes, rows = GradedShapes(24, -(-n_bodies // 24), 2, seed=seed), list[dict[str, Any]]()
     random = np.random.default_rng(seed)
-    for number, place in enumerate(random.permutation(len(shapes) // 2)[:n_pairs].tolist()):
-        how = ALTERATIONS[number % len(ALTERATIONS)]
+    places = random.permutation(len(shapes) // 2)[:n_bodies].tolist()
+    for place, how in product(places, ALTERATIONS):
         size = float(np.exp(random.uniform(*np.log(_SIZES))))
         try:
             drawn = [shapes[2 * place + pose] for pose in (int(same_pose), 1)]

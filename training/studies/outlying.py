@@ -22,24 +22,38 @@ DAMAGES = ("slices", "hole", "leak", "island", "label", "half")
 _LEAST_VOXELS = 50
 
 Mask = NDArray[np.bool_]
+Values = NDArray[np.float64]
 
 
-def outlying(volumes: Path | None = None, out: Path = Path("build/outlying"), cache_dir: Path | None = None) -> None:
+def outlying(
+    volumes: Path | None = None,
+    out: Path = Path("build/outlying"),
+    cache_dir: Path | None = None,
+    seed: int = 0,
+    anywhere: bool = False,
+) -> None:
     """Score masks as they are, and each with one damage in its place; the area under the curve tells them apart.
 
     Args:
         volumes: folder with organs/*.nii.gz and prostate/*.nii.gz; generated bodies if not given.
         out: folder for the masks, outlying.csv and outlying.json.
         cache_dir: of the signatures.
+        seed: of the damages, and of the generated bodies.
+        anywhere: bodies leak at any place, in place of where another one is near, if any is.
     """
-    masks = _generated() if volumes is None else _given(volumes)
+    masks = generated(seed) if volumes is None else _given(volumes)
     names = sorted(masks)
     labels = [name.split("/")[0] for name in names]
-    random = np.random.default_rng(0)
+    random = np.random.default_rng(seed)
     damages = [DAMAGES[i % len(DAMAGES)] for i in random.permutation(len(names))]
-    paths = [_write(out / "given" / f"{i}.nii.gz", *masks[name]) for i, name in enumerate(names)]
+    paths = [_write(out / f"{i}_given.nii.gz", *masks[name]) for i, name in enumerate(names)]
     for i, (name, damage) in enumerate(zip(names, damages, strict=True)):
-        paths.append(_write(out / "damaged" / f"{i}.nii.gz", *damaged(*masks[name], damage, random)))
+        mask, spacing = masks[name]
+        others = np.zeros_like(mask)
+        for other, (near, _) in masks.items():
+            if other != name and near.shape == mask.shape and not anywhere:
+                others |= near
+        paths.append(_write(out / f"{i}_damaged.nii.gz", *damaged(mask, spacing, damage, random, others)))
     chosen = descriptor_of("pretrained")
     whole = SignatureDataset(paths, descriptor=chosen, cache_dir=cache_dir)
     failures = whole.precompute()
@@ -54,7 +68,7 @@ def outlying(volumes: Path | None = None, out: Path = Path("build/outlying"), ca
 
     def scored(chosen_paths: Sequence[Path], classes: Sequence[str]) -> list[Outlier]:
         rows = [place[path] for path in chosen_paths]
-        own = {name: values[rows] for name, values in measures.items()}
+        own = {name: values[np.ix_(*values.ndim * [rows])] for name, values in measures.items()}
         found = outliers(distances[np.ix_(rows, rows)], classes, own, [notes[row] for row in rows])
         return sorted(found, key=lambda one: one.body)
 
@@ -89,38 +103,44 @@ def areas(rows: Sequence[dict[str, object]]) -> dict[str, float]:
     return found
 
 
-def damaged(
-    mask: Mask, spacing: NDArray[np.float64], how: str, random: np.random.Generator
-) -> tuple[Mask, NDArray[np.float64]]:
-    """A mask and its spacing after one of the `DAMAGES`; "label" leaves both."""
+def damaged(whole: Mask, spacing: Values, how: str, random: np.random.Generator, others: Mask) -> tuple[Mask, Values]:
+    """A mask and its spacing after one of the `DAMAGES`; "label" leaves both. Others are what it may leak into."""
+    from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
+
+    if how in ("label", "half"):
+        return (whole, spacing) if how == "label" else (whole[::2, ::2, ::2], spacing * 2)
+    found = np.argwhere(whole)
+    low, high = np.maximum(found.min(axis=0) - 8, 0), found.max(axis=0) + 9
+    box = tuple(map(slice, low, high))
+    mask = whole[box]
     places = np.argwhere(mask) * spacing
     radius = np.cbrt(3 / (4 * np.pi) * mask.sum() * spacing.prod())
     grid = np.stack(np.meshgrid(*map(np.arange, mask.shape), indexing="ij"), axis=-1) * spacing
 
-    def ball(centre: NDArray[np.float64], size: float) -> Mask:
+    def ball(centre: Values, size: float) -> Mask:
         return ((grid - centre) ** 2).sum(axis=-1) <= max(size * radius, 1.01 * spacing.max()) ** 2
 
-    from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
-
-    skin = np.argwhere(mask & ~binary_erosion(mask)) * spacing
     if how == "slices":
         lowest, highest = places[:, 2].min(), places[:, 2].max()
-        return mask & (grid[..., 2] <= highest - 0.25 * (highest - lowest)), spacing
+        mask = mask & (grid[..., 2] <= highest - 0.25 * (highest - lowest))
     if how == "hole":
         deepest = np.argwhere((depth := distance_transform_edt(mask, spacing)) == depth.max())[0] * spacing
         across = ((grid - deepest)[..., :2] ** 2).sum(axis=-1) <= max(0.25 * radius, 1.01 * spacing.max()) ** 2
-        return mask & ~across, spacing
+        mask = mask & ~across
     if how == "leak":
-        return mask | ball(skin[random.integers(len(skin))], 0.6), spacing
+        skin = mask & ~binary_erosion(mask)
+        near = skin & (distance_transform_edt(~others[box], spacing) <= 0.3 * radius) if others[box].any() else skin
+        skin = np.argwhere(near if near.any() else skin) * spacing
+        mask = mask | ball(skin[random.integers(len(skin))], 0.6)
     if how == "island":
         outside = np.argwhere(~binary_dilation(mask, iterations=4)) * spacing
-        return mask | ball(outside[random.integers(len(outside))], 0.25), spacing
-    if how == "half":
-        return mask[::2, ::2, ::2], spacing * 2
-    return mask, spacing
+        mask = mask | ball(outside[random.integers(len(outside))], 0.25)
+    changed = whole.copy()
+    changed[box] = mask
+    return changed, spacing
 
 
-def _write(path: Path, mask: Mask, spacing: NDArray[np.float64]) -> Path:
+def _write(path: Path, mask: Mask, spacing: Values) -> Path:
     import nibabel
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -128,14 +148,7 @@ def _write(path: Path, mask: Mask, spacing: NDArray[np.float64]) -> Path:
     return path
 
 
-def _cropped(mask: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, NDArray[np.float64]]:
-    """With room of eight voxels around it, for what is added."""
-    places = np.argwhere(mask)
-    low, high = places.min(axis=0), places.max(axis=0) + 1
-    return np.pad(mask[tuple(map(slice, low, high))], 8), spacing
-
-
-def _given(volumes: Path) -> dict[str, tuple[Mask, NDArray[np.float64]]]:
+def _given(volumes: Path) -> dict[str, tuple[Mask, Values]]:
     """The masks of at least fifty voxels, by class and name; the classes are the names without side and number."""
     import nibabel
 
@@ -147,27 +160,94 @@ def _given(volumes: Path) -> dict[str, tuple[Mask, NDArray[np.float64]]]:
             continue
         name = path.name.removesuffix(".nii.gz")
         kind = re.sub(r"_(left|right)|_?[CTL]?\d+$", "", name)
-        found[f"{kind}/{name}"] = _cropped(mask.squeeze(), np.array(image.header.get_zooms()[:3], dtype=float))
+        found[f"{kind}/{name}"] = (mask.squeeze(), np.array(image.header.get_zooms()[:3], dtype=float))
     return found
 
 
-def _generated() -> dict[str, tuple[Mask, NDArray[np.float64]]]:
-    """Twelve each of five kinds of bodies that vary as organs do: eggs, beans, discs, bent rods, balls on a stalk."""
-    random = np.random.default_rng(1)
-    x, y, z = np.stack(np.meshgrid(*3 * [np.linspace(-1.6, 1.6, 56)], indexing="ij"))
-    found = {}
-    for number in range(12):
-        a, b, c, bend = random.normal(1, 0.1, 4)
-        forms = {
-            "egg": (x / (0.6 * a)) ** 2 + (y / (0.6 * b)) ** 2 + (z / (1.0 * c + 0.2 * x)) ** 2,
-            "bean": (x / (0.45 * a)) ** 2 + ((y - 0.5 * bend * z**2) / (0.35 * b)) ** 2 + (z / (1.0 * c)) ** 2,
-            "disc": (x / (1.1 * a)) ** 2 + (y / (1.0 * b)) ** 2 + (z / (0.3 * c)) ** 2,
-            "rod": (x / (0.2 * a)) ** 4 + ((y - 0.35 * bend * z**2) / (0.2 * b)) ** 4 + (z / (1.3 * c)) ** 8,
-            "stalk": np.minimum(
-                ((x / (0.5 * a)) ** 2 + (y / (0.5 * b)) ** 2 + ((z + 0.6) / (0.5 * c)) ** 2),
-                (x / (0.2 * a)) ** 4 + (y / (0.2 * b)) ** 4 + ((z - 0.3) / (0.9 * bend)) ** 4,
-            ),
-        }
-        for name, form in forms.items():
-            found[f"{name}/{name}{number}"] = _cropped(form <= 1, np.full(3, 2.0))
+def generated(seed: int = 0) -> dict[str, tuple[Mask, Values]]:
+    """One subject in a grid, and a body of many subjects, each in a grid of its own with thick slices.
+
+    Bodies touch, none overlaps, and the border of the grid cuts some: single ones, pairs of sides, a series of thin
+    arcs, and a series of blocks with a ring and a spine.
+    """
+    random = np.random.default_rng(seed + 100)
+    spacing, room = np.full(3, 3.0), np.array([110, 90, 110]) * 3.0
+    found = dict[str, tuple[Mask, Values]]()
+    taken = np.zeros((110, 90, 110), dtype=bool)
+    drawn: list[tuple[str, Values, Values]] = []
+    for level in range(6):
+        angle, wide, long = np.linspace(0.2, 2.6 + 0.1 * level, 60), 60 + 8 * level, 50 + 4 * level
+        arc = [wide * np.sin(angle), long * np.cos(angle) + 120, 290 - 22 * level - 14 * angle]
+        for sign in (-1, 1):
+            own = _jittered(np.stack(arc, axis=1) * [sign, 1, 1] + [165, 0, 0], random)
+            drawn.append((f"arc/arc{level}{sign}", own, np.full(60, 5.0)))
+    for level in range(7):
+        ring, size = np.linspace(0, 2 * np.pi, 40), 1 + 0.05 * level
+        points = [np.linspace([0, 0, -4], [0, 0, 4], 8) * size]
+        points += [np.stack([14 * np.cos(ring), 22 + 13 * np.sin(ring), 0 * ring], axis=1) * size]
+        points += [np.linspace([0, 36, 0], [0, 55, -14], 14) * size]
+        radii = np.repeat([13.0, 4.5, 4.5], [8, 40, 14]) * size
+        own = _jittered(np.vstack(points), random) + np.array([165, 110, 270 - 36 * level])
+        drawn.append((f"block/block{level}", own, radii))
+    for number in range(25):
+        curve, radii = _curve(random)
+        if number < 12:
+            middle = random.uniform([20, 40, 20], [130, 230, 310])
+            for name, sign in (("left", 1), ("right", -1)):
+                own = _jittered(curve * random.normal(1, 0.03, 3), random) + middle
+                own = own if sign == 1 else own * [-1, 1, 1] + [room[0], 0, 0]
+                drawn.append((f"pair{number}/{name}", own, radii * random.normal(1, 0.05)))
+        else:
+            drawn.append((f"single{number}/single", curve + random.uniform(0.15, 0.85, 3) * room, radii))
+    for name, curve, radii in drawn:
+        mask = _tube(curve, radii, spacing, random, ~taken)
+        taken |= mask
+        if mask.sum() >= _LEAST_VOXELS:
+            found[name] = (mask, spacing)
+    curve, radii = _curve(random)
+    curve, radii = curve * 0.3, np.full(len(radii), 16.0)
+    for number in range(16):
+        own = _jittered(curve * random.normal(1, 0.2, 3), random) + 36
+        flat = np.array([1.2, 1.2, 4.0])
+        free = np.ones((60, 60, 18), dtype=bool)
+        found[f"many/many{number}"] = (_tube(own, radii * random.normal(1, 0.12), flat, random, free), flat)
     return found
+
+
+def _curve(random: np.random.Generator) -> tuple[Values, Values]:
+    """A smooth curve of random length about the origin, and the radii of balls along it."""
+    t, size = np.linspace(0, 1, 60), np.exp(random.uniform(np.log(25), np.log(170)))
+    waves = sum(random.normal(0, 0.5 / k**2, (3, 1)) * np.cos(np.pi * k * t + random.uniform(0, 6)) for k in (1, 2, 3))
+    radius = size * np.exp(random.uniform(np.log(0.08), np.log(0.4))) * (1 + 0.3 * np.sin(6 * t + random.uniform(0, 6)))
+    return size * np.asarray(waves).T, np.maximum(radius * (1 - np.abs(2 * t - 1) ** 6) ** 0.5, 4.0)
+
+
+def _jittered(points: Values, random: np.random.Generator) -> Values:
+    """Moved by smooth noise along each axis."""
+    moved: Values = points + 1.5 * np.sin(points[:, ::-1] / 25 + random.uniform(0, 6, 3))
+    return moved
+
+
+def _tube(curve: Values, radii: Values, spacing: Values, random: np.random.Generator, free: Mask) -> Mask:
+    """Free voxels in balls along a curve, with a border as rough as that of segmentations; the largest piece."""
+    from scipy.ndimage import gaussian_filter, label
+
+    reach = radii.max() + 2 * spacing.max()
+    low = np.maximum(((curve.min(axis=0) - reach) / spacing).astype(int), 0)
+    high = np.minimum(((curve.max(axis=0) + reach) / spacing).astype(int) + 1, free.shape)
+    mask = np.zeros_like(free)
+    if (high <= low).any():
+        return mask
+    away = np.full(high - low, np.inf)
+    for centre, radius in zip(curve, radii, strict=True):
+        first, last = (np.clip((centre + sign * (radius + 6)) / spacing, low, high).astype(int) for sign in (-1, 1))
+        near = tuple(map(slice, first - low, last - low + 1))
+        grid = np.meshgrid(*map(np.arange, first, np.minimum(last + 1, high)), indexing="ij")
+        ball = np.linalg.norm(np.stack(grid, axis=-1) * spacing - centre, axis=-1) - radius
+        away[near] = np.minimum(away[near], ball)
+    noise = gaussian_filter(random.normal(size=away.shape), 1.2)
+    box = tuple(map(slice, low, high))
+    pieces, n = label(free[box] & (away + 0.35 * spacing.min() * noise / noise.std() <= 0))
+    if n:
+        mask[box] = pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])
+    return mask

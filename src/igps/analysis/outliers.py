@@ -11,10 +11,13 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from igps._parallel import Failed, run
+from igps.analysis.placement import Place, end_of, overlaps
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
+from igps.mesh.formats.volumes import read_label_volume
 from igps.mesh.loading import BodyRef, each_surface, surface_body
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors
@@ -25,10 +28,17 @@ Values = NDArray[np.float64]
 _NEAREST, _ENOUGH = 3, 4
 # So many bodies of a class weigh as much as all classes together in what scatter is usual
 _PRIOR = 5
-# Of a normal distribution, over the median absolute deviation
+# Of a normal distribution, the standard deviation over the median absolute deviation
 _NORMAL = 1.4826
-# Scatter below which no measure is taken to differ; of logarithms, counts and shares of the area
-_LEAST = {"shape": 0.1, "volume": 0.05, "spacing": 0.05, "handles": 0.35, "repairs": 0.35, "flat": 0.02}
+# Fewer values have no tail
+_FEW = 10
+# Less is as odd as more
+_TWO_SIDED = ("volume", "spacing")
+# Scatter below which no measure is taken to differ; of logarithms, counts and shares
+_LEAST = {
+    "shape": 0.1, "volume": 0.05, "spacing": 0.05, "handles": 0.35, "pieces": 0.2, "repairs": 0.35, "flat": 0.02,
+    "cut": 0.5, "thick": 0.05, "overlap": 0.01,
+}  # fmt: skip
 # A score above this is said to be an outlier: of a normal distribution one body in 2,000 is
 LIMIT = 3.5
 _SAYS = {
@@ -38,6 +48,10 @@ _SAYS = {
     "handles": "it has {value:.0f} handles, where {usual:.0f} are usual",
     "repairs": "it was repaired as few are: {notes}",
     "flat": "{value:.0%} of its surface lie in one plane, as if it were cut",
+    "pieces": "it has {count:.0f} pieces, where {common:.0f} are usual",
+    "cut": "its last slice is as large as those before it, as if it were cut",
+    "thick": "it is {ratio:.2f} times as thick as usual somewhere, as if it had leaked",
+    "overlap": "{value:.0%} of it lie in a body of another class",
 }
 
 
@@ -48,7 +62,7 @@ class Outlier:
     Args:
         body: its number.
         label: its class.
-        score: the largest of the `scores`.
+        score: the root of the sum of squares of those `scores` that are positive.
         scores: of each measure, how many robust standard deviations it is from the rest of its class.
         lies_among: the class whose members are nearer than its own; None where its own are.
         reason: in words.
@@ -87,50 +101,57 @@ def outliers(
     """
     names, codes = np.unique(np.asarray(labels), return_inverse=True)
     own, other, nearest = _nearness(np.asarray(distances, dtype=float), codes)
-    scores = {"shape": np.maximum(_deviations(own, codes, "shape"), _deviations(own - other, codes, "shape", False))}
+    scores = {"shape": np.fmax(*(_deviations(one, codes, "shape")[0] for one in (own, own - other)))}
     values = dict(measures or {})
+    if "overlap" in values:  # bodies of one class lie in one place, in others' files
+        values["overlap"] = np.where(codes[:, None] == codes, 0, values["overlap"]).max(axis=1)
     if notes is not None:
         values["repairs"], rare = _repairs(notes)
     usual: dict[str, Values] = {}
     for name, one in values.items():
-        usual[name] = _centres(one, codes, name == "volume")
-        away = _deviations(one, codes, name, name == "volume")
-        scores[name] = np.abs(away) if name in ("volume", "spacing") else away
+        scores[name], usual[name] = _deviations(one, codes, name)
     found = []
     for i, label in enumerate(labels):
         of_body = {name: float(np.nan_to_num(one[i], nan=0.0)) for name, one in scores.items()}
-        worst = max(of_body, key=lambda name: of_body[name])
+        score = float(np.linalg.norm(np.maximum(list(of_body.values()), 0)))
         among = str(names[nearest[i]]) if own[i] > other[i] else None
-        told = _SAYS[worst]
-        if worst != "shape":
-            value, centre = float(values[worst][i]), float(usual[worst][i])
-            text = "; ".join(rare[i]) if worst == "repairs" else ""
-            told = told.format(value=value, usual=centre, ratio=np.exp(min(value - centre, 50)), notes=text)
-        reason = told if of_body[worst] > LIMIT else "nothing unusual"
+        worst = sorted(of_body, key=lambda name: -of_body[name])
+        told = []
+        for name in [one for k, one in enumerate(worst) if k == 0 or of_body[one] > LIMIT]:
+            value, centre = (float(one[name][i]) if name in one else 0.0 for one in (values, usual))
+            count, common, ratio = np.exp(np.minimum([value, centre, value - centre], 50))
+            text = "; ".join(rare[i]) if name == "repairs" else ""
+            told.append(
+                _SAYS[name].format(value=value, usual=centre, count=count, common=common, ratio=ratio, notes=text)
+            )
+        reason = "; ".join(told) if score > LIMIT else "nothing unusual"
         if among is not None:
             reason += f"; labelled {label}, lies among {among}"
-        found.append(Outlier(i, label, of_body[worst], of_body, among, reason))
+        found.append(Outlier(i, label, score, of_body, among, reason))
     return sorted(found, key=lambda one: -one.score)
 
 
 def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Values]:
     """What segmentations go wrong in, of each body: NaN where its mesh cannot be read again.
 
-    "volume" and "spacing", the side of a voxel or else the root of the area of a face, as logarithms; "handles" of the
-    surface; "flat", the largest share of the surface that lies in one plane.
+    Of all: "volume" and "spacing", the side of a voxel or else the root of the area of a face, as logarithms; "handles"
+    of the surface. Of meshes: "flat", the largest share of the surface that lies in one plane. Of labels: "pieces" and
+    "thick", the radius of the largest ball within over volume by area, as logarithms; "cut", see `end_of`; and
+    "overlap", (N, N), the share of each that lies in each other body of the same grid and folder.
 
     Args:
         dataset: N bodies.
         n_workers: processes; all cores if None.
     """
-    found = np.full((len(dataset), 4), np.nan)
+    names = ("volume", "spacing", "handles", "flat", "pieces", "thick", "cut")
+    found, places = np.full((len(dataset), len(names)), np.nan), list[Place | None]([None] * len(dataset))
     with contextlib.closing(
         run(partial(_measures, dataset.pipeline), list(dataset.bodies), n_workers=n_workers)
     ) as all_:
         for i, outcome in all_:
             if not isinstance(outcome, Failed):
-                found[i] = outcome
-    return dict(zip(("volume", "spacing", "handles", "flat"), found.T, strict=True))
+                found[i], places[i] = outcome
+    return {**dict(zip(names, found.T, strict=True)), "overlap": overlaps(places, dataset.bodies.labels)}
 
 
 def flat_share(mesh: Mesh) -> float:
@@ -151,13 +172,30 @@ def flat_share(mesh: Mesh) -> float:
     return best / float(areas.sum())
 
 
-def _measures(pipeline: SignaturePipeline, body: BodyRef) -> tuple[float, float, float, float]:
-    ((_, raw),) = each_surface(body.path, pipeline.reading, parts=[body.part])
-    mesh = surface_body(raw, body, pipeline.reading, least_vertices=pipeline.config.n_vertices_read)
-    spacing = np.log(mesh.area / len(mesh.faces)) / 2
-    if raw.voxels is not None:  # the surface of a label has as many faces as its form needs, on any grid
-        spacing = np.log(mesh.volume / raw.voxels().n_voxels) / 3
-    return float(np.log(mesh.volume)), float(spacing), float(mesh.genus), flat_share(mesh)
+def _measures(pipeline: SignaturePipeline, body: BodyRef) -> tuple[Values, Place | None]:
+    reading = pipeline.reading
+    ((_, raw),) = each_surface(body.path, reading, parts=[body.part])
+    mesh = surface_body(raw, body, reading, least_vertices=pipeline.config.n_vertices_read)
+    found = np.array([np.log(mesh.volume), np.log(mesh.area / len(mesh.faces)) / 2, mesh.genus, *4 * [np.nan]])
+    if raw.voxels is None:
+        found[3] = flat_share(mesh)
+        return found, None
+    volume = read_label_volume(body.path, reading)
+    if body.part is None:
+        layer = np.any([one > 0 for one in volume.layers], axis=0)
+        box = ndimage.find_objects(layer.view(np.uint8))[0]
+        mask = layer[box]
+    else:
+        box, mask = volume.body(body.part).box, volume.mask(body.part)
+    low, shape = np.array([one.start for one in box]), volume.layers[0].shape
+    sides = np.linalg.norm(volume.affine[:3, :3], axis=0)
+    depth = ndimage.distance_transform_edt(np.pad(mask, 1), sides).max()
+    found[1] = np.log(sides.prod()) / 3  # the surface has as many faces as its form needs, on any grid
+    found[4] = np.log(ndimage.label(mask, np.ones((3, 3, 3)))[1])
+    found[5] = np.log(depth * mesh.area / mesh.volume)
+    found[6] = end_of(mask, np.stack([low == 0, low + mask.shape == shape], axis=1))
+    grid = (body.path.parent, shape, volume.affine.tobytes())
+    return found, Place(grid, low, mask.shape, int(mask.sum()), np.packbits(mask))
 
 
 def _nearness(distances: Values, codes: NDArray[np.int64]) -> tuple[Values, Values, NDArray[np.int64]]:
@@ -180,33 +218,43 @@ def _nearness(distances: Values, codes: NDArray[np.int64]) -> tuple[Values, Valu
     return own, other, nearest
 
 
-def _others(values: Values, codes: NDArray[np.int64], within: bool, i: int) -> Values:
-    """The values that body i is compared with: of its class where that says enough, or must; else of all."""
-    mine = codes == codes[i]
-    mine[i] = False
-    if not within and np.isfinite(values[mine]).sum() < _ENOUGH - 1:
-        mine = np.arange(len(values)) != i
-    found: Values = values[mine & np.isfinite(values)]
-    return found
+def _deviations(values: Values, codes: NDArray[np.int64], name: str) -> tuple[Values, Values]:
+    """How many robust standard deviations values are above what is usual, and what that is.
+
+    Usual is what the others of the class have; of a class of one, other classes. Where less is as odd as more, a body
+    of a class of two or three is as far away as from both, whatever is less: other classes tell which of the two is
+    odd. All is over what a twentieth of the bodies exceed, where that is more than by chance.
+    """
+    n, least, known = len(values), _LEAST[name], np.isfinite(values)
+    members = [np.setdiff1d(np.flatnonzero(known & (codes == codes[i])), i) for i in range(n)]
+    usual = np.array([np.median(values[own]) if len(own) else np.nan for own in members])
+    away = values - usual
+    pooled = _scatter(away[np.isfinite(away)], least)
+    classes = {one: np.median(values[known & (codes == one)]) for one in np.unique(codes[known])}
+    found = np.full(n, np.nan)
+    for i in np.flatnonzero(known).tolist():
+        opinions, own = [], values[members[i]]
+        if len(own):
+            variance = (len(own) * _scatter(own, 0, False) ** 2 + _PRIOR * pooled**2) / (len(own) + _PRIOR)
+            opinions.append(away[i] / max(least, np.sqrt(variance)))
+        if name != "volume" and len(own) < (_ENOUGH - 1 if name == "spacing" else 1):
+            others = np.array([centre for one, centre in classes.items() if one != codes[i]])
+            if len(others) >= _ENOUGH:
+                opinions.append((values[i] - np.median(others)) / _scatter(others, least))
+                usual[i] = usual[i] if len(own) else np.median(others)
+        if opinions:
+            found[i] = min(np.abs(opinions) if name in _TWO_SIDED else opinions)
+    scale = np.nanquantile(found, 0.95) / 1.645 if n > _FEW and np.isfinite(found).any() else 1.0
+    return found / max(1.0, scale), usual
 
 
-def _centres(values: Values, codes: NDArray[np.int64], within: bool) -> Values:
-    compared = (_others(values, codes, within, i) for i in range(len(values)))
-    return np.array([np.median(one) if len(one) else np.nan for one in compared])
-
-
-def _deviations(values: Values, codes: NDArray[np.int64], name: str, within: bool = True) -> Values:
-    """How many robust standard deviations values are above the median of those that they are compared with."""
-    away = values - _centres(values, codes, within)
-    usual = np.abs(away[np.isfinite(away)])
-    pooled = max(_LEAST[name], _NORMAL * float(np.median(usual)) if len(usual) else 0)
-    found = np.full(len(values), np.nan)
-    for i in np.flatnonzero(np.isfinite(away)).tolist():
-        others = _others(values, codes, within, i)
-        scatter = _NORMAL * np.median(np.abs(others - np.median(others)))
-        variance = (len(others) * scatter**2 + _PRIOR * pooled**2) / (len(others) + _PRIOR)
-        found[i] = away[i] / max(_LEAST[name], np.sqrt(variance))
-    return found
+def _scatter(values: Values, least: float, tail: bool = True) -> float:
+    """The robust standard deviation: of the median, or of the largest tenth, whatever is more."""
+    if not len(values):
+        return least
+    away = np.abs(values - np.median(values))
+    largest = np.quantile(away, 0.9) / 1.645 if tail and len(values) > _FEW else 0.0
+    return max(least, _NORMAL * float(np.median(away)), float(largest))
 
 
 def _repairs(notes: Sequence[Sequence[str]]) -> tuple[Values, list[list[str]]]:
