@@ -100,3 +100,12 @@ def test_a_folder_without_meshes_is_an_error(
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, "doctor", tmp_path, *FEW)
     assert f"igps: {tmp_path}: no mesh found" in capsys.readouterr().err
+
+
+def test_files_that_bodies_bring_along_are_not_examined(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_clean(tmp_path / "a" / "clean.off")
+    write_clean(tmp_path / "a" / "clean_fields.off")
+    igps(monkeypatch, "doctor", tmp_path, "--attribute", "f=a/{stem}_fields.off", *FEW)
+    assert capsys.readouterr().out.splitlines()[-1].startswith("1 bodies: 0 mended, 0 cannot be used")

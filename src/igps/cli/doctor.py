@@ -8,6 +8,7 @@ from typing import Any
 
 from igps.analysis.doctor import Finding, examine
 from igps.cli.reading import Verdict, limits_of, write_rows
+from igps.data.attribute_sources import attribute_sources
 from igps.data.sources import find_bodies
 from igps.mesh.options import LoadOptions
 from igps.report.tables import findings_table
@@ -27,6 +28,7 @@ def doctor(
     n_workers: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
+    attribute: list[str] | None = None,
     **options: Any,
 ) -> Verdict:
     """Tell what is wrong with each body of a folder, what will be done about it, and what that will cost.
@@ -37,9 +39,11 @@ def doctor(
     Args:
         out: a CSV file for the findings, with all notes.
         signature: parameters of the signatures to come.
+        attribute: what bodies bring along, such as ct=images/{stem}.nii.gz; these files are no bodies.
     """
     reading, limits = LoadOptions(allow_open=allow_open, **options), limits_of(time_limit, memory_limit)
-    found = examine(find_bodies(root, reading), reading, signature, n_workers=n_workers, limits=limits)
+    bodies = find_bodies(root, reading, attributes=attribute_sources(attribute or (), root).values())
+    found = examine(bodies, reading, signature, n_workers=n_workers, limits=limits)
     print(findings_table(found))
     if out is not None:
         write_rows(out, _HEADER, [_row(finding) for finding in found])
