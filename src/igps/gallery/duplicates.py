@@ -8,7 +8,6 @@ gallery, whose descriptions are near. And no file joins two that are not the sam
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -27,20 +26,16 @@ from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import Size, keeps_size
 from igps.gallery._alignment import surface_distance
+from igps.gallery._near_pairs import NearPairs, near_in_gallery, near_pairs, of_one_size
 from igps.gallery.calibration import Calibration
 from igps.gallery.gallery import Gallery
 from igps.gallery.surfaces import Grade, Surfaces
-from igps.mesh.mesh import MILLIMETRES
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
-from igps.retrieval.distances import Distance, euclidean
+from igps.retrieval.distances import euclidean
 
-# Rows of distances, and pairs whose surfaces are compared, in memory at once.
-_ROWS, _PAIRS = 256, 256
-# Pairs as near as copies are asked for among so many of a gallery, then among ever more.
-_FIRST_TOP = 32
-# Of the logarithm of √area; a level of detail of a body takes up to half of it
-_ONE_SIZE = 0.05
+# Pairs whose surfaces are compared at once.
+_PAIRS = 256
 # What sampling adds to the difference of the profiles of one surface: between copies, it is up to 0.01.
 _PROFILE_NOISE = 0.02
 
@@ -132,31 +127,29 @@ def duplicates(
     if isinstance(source, Gallery):
         calibration.check(source.about["descriptor"], source.descriptor, source.config)
         chosen, dataset = source.descriptor, _files_of(source, cache_dir)
-        near = _near_in_gallery(source, calibration.pose.distance if poses else calibration.near, progress)
+        near = near_in_gallery(source, calibration.pose.distance if poses else calibration.near, progress)
     else:
         chosen = descriptor_of(descriptor)
         calibration.check(descriptor, chosen, source.config)
         if poses:
             descriptions = describe(source, chosen, failures=failures, n_workers=n_workers, progress=progress)
-            near = _near(descriptions, chosen.distances, calibration.pose.distance, progress)
+            near = near_pairs(descriptions, chosen.distances, calibration.pose.distance, progress)
         else:
             profiles, failures = Surfaces(source).profiles(n_workers, progress)
             most = max(calibration.same.distance, tolerance)
-            near = _near(profiles, _profile_distances, 2 * most + _PROFILE_NOISE, progress)
+            near = near_pairs(profiles, _profile_distances, 2 * most + _PROFILE_NOISE, progress)
         dataset = source.usable(failures)
     if keeps_size(size, dataset.units())[0]:
-        near = _of_one_size(near, dataset)
+        near = of_one_size(near, dataset)
     surfaces = None if poses else Surfaces(dataset, tolerance)
     joined = _joined(near, surfaces, calibration, n_workers, progress)
     if surfaces is not None:
         joined = _around_the_finest(joined, surfaces, calibration, n_workers, progress)
         failures = [*failures, *surfaces.failures.values()]
     names, groups = dataset.bodies.names, _groups(joined)
-    grades, largest, nearly = (
-        dict[_Names, Grade](),
-        dict[_Names, tuple[float, float, str | None]](),
-        dict[_Names, float](),
-    )
+    grades: dict[_Names, Grade] = {}
+    largest: dict[_Names, tuple[float, float, str | None]] = {}
+    nearly: dict[_Names, float] = {}
     if surfaces is not None:
         found = on_threads(lambda pair: surfaces.grade(*pair), list(joined), n_workers)
         for (i, j), (grade, apart) in zip(joined, found, strict=True):
@@ -179,7 +172,7 @@ def duplicates(
 
 
 def _joined(
-    near: Iterator[tuple[int, int, float]],
+    near: NearPairs,
     surfaces: Surfaces | None,
     calibration: Calibration,
     n_workers: int | None,
@@ -203,19 +196,6 @@ def _joined(
             if distance < math.inf and group.merge(i, j):
                 joined[i, j] = distance
     return joined
-
-
-def _of_one_size(near: Iterator[tuple[int, int, float]], dataset: SignatureDataset) -> Iterator[tuple[int, int, float]]:
-    """Those of the pairs that are of one size."""
-    known: dict[int, float] = {}
-
-    def log_length(i: int) -> float:
-        if i not in known:
-            signature = dataset[i].signature
-            known[i] = math.log(signature.area) / 2 + math.log(MILLIMETRES.get(signature.unit or "mm", 1.0))
-        return known[i]
-
-    return (pair for pair in near if abs(log_length(pair[0]) - log_length(pair[1])) < _ONE_SIZE)
 
 
 def _laid(surfaces: Surfaces, calibration: Calibration, pair: tuple[int, int, float]) -> float:
@@ -297,40 +277,6 @@ def body_distance(
 
 def _profile_distances(one: Tensor, other: Tensor) -> Tensor:
     return euclidean(one, other) / one.shape[1] ** 0.5
-
-
-def _near(descriptions: Tensor, distance: Distance, limit: float, progress: bool) -> Iterator[tuple[int, int, float]]:
-    """Pairs i < j of descriptions that are no farther apart, and how far."""
-    with _bar(len(descriptions), progress) as bar:
-        for start in range(0, len(descriptions), _ROWS):
-            rows = descriptions[start : start + _ROWS]
-            with torch.inference_mode():
-                distances = distance(rows, descriptions[start:])
-            for i, j in torch.nonzero(distances <= limit).tolist():
-                if i < j:
-                    yield start + i, start + j, float(distances[i, j])
-            bar.update(len(rows))
-
-
-def _near_in_gallery(gallery: Gallery, limit: float, progress: bool) -> Iterator[tuple[int, int, float]]:
-    """The same of the bodies of a gallery, numbered as in `_files_of`."""
-    numbers = {name: i for i, name in enumerate(sorted(row["id"] for row in gallery.rows("id")))}
-    with _bar(len(gallery), progress) as bar:
-        for some in gallery.table.batches():
-            for description, row in zip(*gallery.table.decoded(some), strict=True):
-                top = min(_FIRST_TOP, len(gallery))
-                found, distances, _ = gallery.search(description[None], top=top)
-                while float(distances[-1]) <= limit and top < len(gallery):
-                    top = min(4 * top, len(gallery))
-                    found, distances, _ = gallery.search(description[None], top=top)
-                for other, distance in zip(found, distances.tolist(), strict=True):
-                    if numbers[row["id"]] < numbers[other["id"]] and distance <= limit:
-                        yield numbers[row["id"]], numbers[other["id"]], distance
-                bar.update()
-
-
-def _bar(n_files: int, progress: bool) -> tqdm:
-    return tqdm(desc="compared", total=n_files, disable=not progress)
 
 
 def _files_of(gallery: Gallery, cache_dir: str | Path | None) -> SignatureDataset:

@@ -1,0 +1,71 @@
+"""Pairs of bodies that are near by their descriptions, among all or in a gallery, and how far they are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from igps.data.dataset import SignatureDataset
+from igps.gallery.gallery import Gallery
+from igps.mesh.mesh import MILLIMETRES
+from igps.retrieval.distances import Distance
+
+# Rows of distances in memory at once.
+_ROWS = 256
+# Pairs as near as copies are asked for among so many of a gallery, then among ever more.
+_FIRST_TOP = 32
+# Of the logarithm of √area; a level of detail of a body takes up to half of it
+_ONE_SIZE = 0.05
+
+NearPairs = Iterator[tuple[int, int, float]]
+
+
+def near_pairs(descriptions: Tensor, distance: Distance, limit: float, progress: bool) -> NearPairs:
+    """Pairs i < j of descriptions that are no farther apart, and how far."""
+    with _bar(len(descriptions), progress) as bar:
+        for start in range(0, len(descriptions), _ROWS):
+            rows = descriptions[start : start + _ROWS]
+            with torch.inference_mode():
+                distances = distance(rows, descriptions[start:])
+            for i, j in torch.nonzero(distances <= limit).tolist():
+                if i < j:
+                    yield start + i, start + j, float(distances[i, j])
+            bar.update(len(rows))
+
+
+def near_in_gallery(gallery: Gallery, limit: float, progress: bool) -> NearPairs:
+    """The same of the bodies of a gallery, numbered in order of their ids."""
+    numbers = {name: i for i, name in enumerate(sorted(row["id"] for row in gallery.rows("id")))}
+    with _bar(len(gallery), progress) as bar:
+        for some in gallery.table.batches():
+            for description, row in zip(*gallery.table.decoded(some), strict=True):
+                top = min(_FIRST_TOP, len(gallery))
+                found, distances, _ = gallery.search(description[None], top=top)
+                while float(distances[-1]) <= limit and top < len(gallery):
+                    top = min(4 * top, len(gallery))
+                    found, distances, _ = gallery.search(description[None], top=top)
+                for other, distance in zip(found, distances.tolist(), strict=True):
+                    if numbers[row["id"]] < numbers[other["id"]] and distance <= limit:
+                        yield numbers[row["id"]], numbers[other["id"]], distance
+                bar.update()
+
+
+def _bar(n_files: int, progress: bool) -> tqdm:
+    return tqdm(desc="compared", total=n_files, disable=not progress)
+
+
+def of_one_size(near: NearPairs, dataset: SignatureDataset) -> NearPairs:
+    """Those of the pairs that are of one size."""
+    known: dict[int, float] = {}
+
+    def log_length(i: int) -> float:
+        if i not in known:
+            signature = dataset[i].signature
+            known[i] = math.log(signature.area) / 2 + math.log(MILLIMETRES.get(signature.unit or "mm", 1.0))
+        return known[i]
+
+    return (pair for pair in near if abs(log_length(pair[0]) - log_length(pair[1])) < _ONE_SIZE)
