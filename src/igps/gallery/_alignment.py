@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,13 +40,10 @@ _MOST_SCALED = math.log(1.1)
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
-    """Points spread evenly over a surface, about their mean and in units of √area.
+    """Points (P, 3) spread evenly over a surface, about their mean and over √area, and unit outward normals (P, 3).
 
-    Args:
-        points: (P, 3) without unit.
-        normals: (P, 3) outward, of length 1.
-        surface: gives the surface itself, about the same origin and in the same unit, where it can be had; it is asked
-            for where surfaces are near.
+    `surface` gives the surface itself, about the same origin and in the same unit; it is asked for where others are
+    near.
     """
 
     points: Array
@@ -103,12 +101,7 @@ class SurfaceSamples:
 
 
 class TriangleSurface:
-    """A surface to find nearest points of.
-
-    Args:
-        vertices: (V, 3) without unit.
-        faces: (F, 3).
-    """
+    """A surface to find nearest points of: vertices (V, 3) over √area, and faces (F, 3)."""
 
     gap = 0.0
 
@@ -270,17 +263,13 @@ def _subset(samples: SurfaceSamples, n: int) -> SurfaceSamples:
 def _principal_starts(one: SurfaceSamples, other: SurfaceSamples) -> Array:
     """(8, 3, 3): principal axes onto principal axes, each with either sign."""
     of_one, of_other = (np.linalg.eigh(np.cov(samples.points.T))[1] for samples in (one, other))
-    return np.stack([of_other @ np.diag(signs) @ of_one.T for signs in _signs()])
+    return np.stack([of_other @ np.diag(signs) @ of_one.T for signs in product((1.0, -1.0), repeat=3)])
 
 
 def _least_step(samples: SurfaceSamples) -> float:
     """The smallest factor from one extent to the next."""
     extents = np.maximum(samples.extents, 1e-9)
     return float((extents[1:] / extents[:-1]).min())
-
-
-def _signs() -> Iterator[tuple[float, float, float]]:
-    return ((a, b, c) for a in (1.0, -1.0) for b in (1.0, -1.0) for c in (1.0, -1.0))
 
 
 @cache

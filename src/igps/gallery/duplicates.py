@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 from operator import itemgetter
 from pathlib import Path
@@ -172,11 +171,7 @@ def duplicates(
 
 
 def _joined(
-    near: NearPairs,
-    surfaces: Surfaces | None,
-    calibration: Calibration,
-    n_workers: int | None,
-    progress: bool,
+    near: NearPairs, surfaces: Surfaces | None, calibration: Calibration, n_workers: int | None, progress: bool
 ) -> _Pairs:
     """Those of near pairs that are the same, none of two that others have joined, by their surfaces if there are."""
     group = DisjointSet()
@@ -189,17 +184,13 @@ def _joined(
         if surfaces is None:
             distances = iter([distance for _, _, distance in open_pairs])
         else:
-            laid = on_threads(partial(_laid, surfaces, calibration), open_pairs, n_workers)
+            laid = on_threads(lambda pair: surfaces.distance(*pair[:2], calibration), open_pairs, n_workers)
             distances = iter(tqdm(laid, desc="laid onto each other", total=len(open_pairs), leave=False,
                                   disable=not progress))  # fmt: skip
         for (i, j, _), distance in zip(open_pairs, distances, strict=True):
             if distance < math.inf and group.merge(i, j):
                 joined[i, j] = distance
     return joined
-
-
-def _laid(surfaces: Surfaces, calibration: Calibration, pair: tuple[int, int, float]) -> float:
-    return surfaces.distance(pair[0], pair[1], calibration)
 
 
 def _around_the_finest(
