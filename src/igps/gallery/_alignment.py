@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import product
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,22 +52,14 @@ class SurfaceSamples:
     surface: Callable[[], TriangleSurface] | None = None
 
     @classmethod
-    def of(
-        cls, points: Array, normals: NDArray[np.floating], area: float, origin: Array | None = None
-    ) -> SurfaceSamples:
-        """Those of points (P, 3), length, and outward normals (P, 3) of a surface of an area, length².
-
-        Args:
-            points, normals, area: of the samples, and of the surface.
-            origin: (3,) where the origin is put; the mean of the points if None.
-        """
+    def of(cls, points: Array, normals: NDArray[np.floating], area: float) -> SurfaceSamples:
+        """Those of points (P, 3), length, and outward normals (P, 3) of a surface of an area, length²."""
         if points.shape != normals.shape or points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
             raise ValueError(
                 f"points, normals: expected both (P, 3) with P ≥ 4, got {tuple(points.shape)} and "
                 f"{tuple(normals.shape)}."
             )
-        origin = points.mean(axis=0) if origin is None else origin
-        return cls((points - origin) / math.sqrt(area), np.asarray(normals, dtype=np.float64))
+        return cls((points - points.mean(axis=0)) / math.sqrt(area), np.asarray(normals, dtype=np.float64))
 
     @cached_property
     def tree(self) -> KDTree:
@@ -131,31 +124,23 @@ def surface_distance(
     averaged over patches of ten neighbours, a twentieth of √area across: relief that a coarser mesh has lost, and the
     roughness of triangles, go in and out and cancel, where another shape or pose moves whole patches.
 
-    Args:
-        one, other: samples of the surfaces.
-        enough: a distance that ends the search: a smaller one is not looked for.
-        hopeless: a distance beyond which it matters no more how far apart they are: where few samples are farther
-            after many steps, no more are taken; nor is the other surface itself asked for, where more samples are
-            farther than two thirds of it.
-        patch: neighbours whose offsets are averaged; with 1 lost relief counts, and the farthest sample instead of the
-            mean.
-
-    Returns:
-        Without unit; symmetric but for where the search ends.
+    The search ends at a distance that is `enough`. Beyond `hopeless` it matters no more how far apart they are: where
+    few samples are farther after many steps, no more are taken; nor is the other surface itself asked for, where more
+    samples are farther than two thirds of it. With a `patch` of 1 instead of ten neighbours lost relief counts, and the
+    farthest sample instead of the mean. The result is symmetric but for where the search ends.
     """
     best = math.inf
     is_ambiguous = min(_least_step(one), _least_step(other)) < _AMBIGUOUS
     for starts in (_principal_starts(one, other), _uniform_starts()):
         order = np.argsort(_scores(_subset(one, _N_SCORED), other, starts), kind="stable")[:_N_TRIED]
-        coarse = sorted(
-            (_fitted(_subset(one, _N_COARSE), other, _Placing(starts[i]), _COARSE_STEPS) for i in order),
-            key=lambda found: found[0],
-        )
+        samples = _subset(one, _N_COARSE)
+        coarse = [_fitted(samples, other, _Placing(starts[i]), _COARSE_STEPS) for i in order]
+        coarse.sort(key=itemgetter(0))
         if coarse[0][0] > hopeless:
             best = min(best, coarse[0][0])
         else:
             fine = [_fitted(_subset(one, _N_FINE), other, placing, _FINE_STEPS) for _, placing in coarse[:2]]
-            far, placing = min(fine, key=lambda found: found[0])
+            far, placing = min(fine, key=itemgetter(0))
             best = min(best, far if far > hopeless / _FINER else _apart(one, other, placing, patch))
         # A body may be nearly its own mirror image: near is not yet the nearest.
         if best <= enough or (best > hopeless and not is_ambiguous):
@@ -224,9 +209,8 @@ class _Placing:
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         log_scale = np.clip(math.log(self.scale) + step[6], -_MOST_SCALED, _MOST_SCALED)
         factor = math.exp(log_scale) / self.scale
-        return _Placing(
-            turn @ self.turn, factor * turn @ np.broadcast_to(self.shift, 3) + step[3:6], math.exp(log_scale)
-        )
+        shift = factor * turn @ np.broadcast_to(self.shift, 3) + step[3:6]
+        return _Placing(turn @ self.turn, shift, math.exp(log_scale))
 
 
 def _fitted(

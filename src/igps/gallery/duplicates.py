@@ -39,7 +39,6 @@ _PAIRS = 256
 _PROFILE_NOISE = 0.02
 
 _Pairs = dict[tuple[int, int], float]
-_Names = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -146,9 +145,9 @@ def duplicates(
         joined = _around_the_finest(joined, surfaces, calibration, n_workers, progress)
         failures = [*failures, *surfaces.failures.values()]
     names, groups = dataset.bodies.names, _groups(joined)
-    grades: dict[_Names, Grade] = {}
-    largest: dict[_Names, tuple[float, float, str | None]] = {}
-    nearly: dict[_Names, float] = {}
+    grades: dict[tuple[str, str], Grade] = {}
+    largest: dict[tuple[str, str], tuple[float, float, str | None]] = {}
+    nearly: dict[tuple[str, str], float] = {}
     if surfaces is not None:
         found = on_threads(lambda pair: surfaces.grade(*pair), list(joined), n_workers)
         for (i, j), (grade, apart) in zip(joined, found, strict=True):
