@@ -12,14 +12,7 @@ from torch import Tensor, nn
 from batches import alone, scaled, two_bodies
 from igps.data.batch import Body, SignatureBatch
 from igps.data.requirements import Requirements
-from igps.nn.axes import (
-    Attribute,
-    EmbeddedPairCosines,
-    EuclideanDistance,
-    InteriorDistance,
-    PairCosines,
-    Potential,
-)
+from igps.nn.axes import Attribute, EmbeddedPairCosines, EuclideanDistance, InteriorDistance, PairCosines, Potential
 from igps.nn.descriptor import BodyDescriptor, Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.heads.closed_form import WhitenedHead

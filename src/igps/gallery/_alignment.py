@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import product
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,13 +41,10 @@ _MOST_SCALED = math.log(1.1)
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
-    """Points spread evenly over a surface, about their mean and in units of √area.
+    """Points (P, 3) spread evenly over a surface, about their mean and over √area, and unit outward normals (P, 3).
 
-    Args:
-        points: (P, 3) without unit.
-        normals: (P, 3) outward, of length 1.
-        surface: gives the surface itself, about the same origin and in the same unit, where it can be had; it is asked
-            for where surfaces are near.
+    `surface` gives the surface itself, about the same origin and in the same unit; it is asked for where others are
+    near.
     """
 
     points: Array
@@ -53,22 +52,14 @@ class SurfaceSamples:
     surface: Callable[[], TriangleSurface] | None = None
 
     @classmethod
-    def of(
-        cls, points: Array, normals: NDArray[np.floating], area: float, origin: Array | None = None
-    ) -> SurfaceSamples:
-        """Those of points (P, 3), length, and outward normals (P, 3) of a surface of an area, length².
-
-        Args:
-            points, normals, area: of the samples, and of the surface.
-            origin: (3,) where the origin is put; the mean of the points if None.
-        """
+    def of(cls, points: Array, normals: NDArray[np.floating], area: float) -> SurfaceSamples:
+        """Those of points (P, 3), length, and outward normals (P, 3) of a surface of an area, length²."""
         if points.shape != normals.shape or points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
             raise ValueError(
                 f"points, normals: expected both (P, 3) with P ≥ 4, got {tuple(points.shape)} and "
                 f"{tuple(normals.shape)}."
             )
-        origin = points.mean(axis=0) if origin is None else origin
-        return cls((points - origin) / math.sqrt(area), np.asarray(normals, dtype=np.float64))
+        return cls((points - points.mean(axis=0)) / math.sqrt(area), np.asarray(normals, dtype=np.float64))
 
     @cached_property
     def tree(self) -> KDTree:
@@ -103,12 +94,7 @@ class SurfaceSamples:
 
 
 class TriangleSurface:
-    """A surface to find nearest points of.
-
-    Args:
-        vertices: (V, 3) without unit.
-        faces: (F, 3).
-    """
+    """A surface to find nearest points of: vertices (V, 3) over √area, and faces (F, 3)."""
 
     gap = 0.0
 
@@ -138,31 +124,23 @@ def surface_distance(
     averaged over patches of ten neighbours, a twentieth of √area across: relief that a coarser mesh has lost, and the
     roughness of triangles, go in and out and cancel, where another shape or pose moves whole patches.
 
-    Args:
-        one, other: samples of the surfaces.
-        enough: a distance that ends the search: a smaller one is not looked for.
-        hopeless: a distance beyond which it matters no more how far apart they are: where few samples are farther
-            after many steps, no more are taken; nor is the other surface itself asked for, where more samples are
-            farther than two thirds of it.
-        patch: neighbours whose offsets are averaged; with 1 lost relief counts, and the farthest sample instead of the
-            mean.
-
-    Returns:
-        Without unit; symmetric but for where the search ends.
+    The search ends at a distance that is `enough`. Beyond `hopeless` it matters no more how far apart they are: where
+    few samples are farther after many steps, no more are taken; nor is the other surface itself asked for, where more
+    samples are farther than two thirds of it. With a `patch` of 1 instead of ten neighbours lost relief counts, and the
+    farthest sample instead of the mean. The result is symmetric but for where the search ends.
     """
     best = math.inf
     is_ambiguous = min(_least_step(one), _least_step(other)) < _AMBIGUOUS
     for starts in (_principal_starts(one, other), _uniform_starts()):
         order = np.argsort(_scores(_subset(one, _N_SCORED), other, starts), kind="stable")[:_N_TRIED]
-        coarse = sorted(
-            (_fitted(_subset(one, _N_COARSE), other, _Placing(starts[i]), _COARSE_STEPS) for i in order),
-            key=lambda found: found[0],
-        )
+        samples = _subset(one, _N_COARSE)
+        coarse = [_fitted(samples, other, _Placing(starts[i]), _COARSE_STEPS) for i in order]
+        coarse.sort(key=itemgetter(0))
         if coarse[0][0] > hopeless:
             best = min(best, coarse[0][0])
         else:
             fine = [_fitted(_subset(one, _N_FINE), other, placing, _FINE_STEPS) for _, placing in coarse[:2]]
-            far, placing = min(fine, key=lambda found: found[0])
+            far, placing = min(fine, key=itemgetter(0))
             best = min(best, far if far > hopeless / _FINER else _apart(one, other, placing, patch))
         # A body may be nearly its own mirror image: near is not yet the nearest.
         if best <= enough or (best > hopeless and not is_ambiguous):
@@ -231,9 +209,8 @@ class _Placing:
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         log_scale = np.clip(math.log(self.scale) + step[6], -_MOST_SCALED, _MOST_SCALED)
         factor = math.exp(log_scale) / self.scale
-        return _Placing(
-            turn @ self.turn, factor * turn @ np.broadcast_to(self.shift, 3) + step[3:6], math.exp(log_scale)
-        )
+        shift = factor * turn @ np.broadcast_to(self.shift, 3) + step[3:6]
+        return _Placing(turn @ self.turn, shift, math.exp(log_scale))
 
 
 def _fitted(
@@ -270,17 +247,13 @@ def _subset(samples: SurfaceSamples, n: int) -> SurfaceSamples:
 def _principal_starts(one: SurfaceSamples, other: SurfaceSamples) -> Array:
     """(8, 3, 3): principal axes onto principal axes, each with either sign."""
     of_one, of_other = (np.linalg.eigh(np.cov(samples.points.T))[1] for samples in (one, other))
-    return np.stack([of_other @ np.diag(signs) @ of_one.T for signs in _signs()])
+    return np.stack([of_other @ np.diag(signs) @ of_one.T for signs in product((1.0, -1.0), repeat=3)])
 
 
 def _least_step(samples: SurfaceSamples) -> float:
     """The smallest factor from one extent to the next."""
     extents = np.maximum(samples.extents, 1e-9)
     return float((extents[1:] / extents[:-1]).min())
-
-
-def _signs() -> Iterator[tuple[float, float, float]]:
-    return ((a, b, c) for a in (1.0, -1.0) for b in (1.0, -1.0) for c in (1.0, -1.0))
 
 
 @cache

@@ -63,7 +63,6 @@ def _batches(values: Any, scales: Any, rows: list[Any], kept: list[int], shape: 
         some, told = kept[start : start + _ROWS_AT_ONCE], []
         for id_, name, label, mark in (rows[i] for i in some):
             file, part = file_and_part(Path(id_))
-            row = {"id": id_, "name": name, "class": label, "file": str(file), "part": part, "checksum": mark}
-            told.append(row)
+            told.append({"id": id_, "name": name, "class": label, "file": str(file), "part": part, "checksum": mark})
         descriptions = torch.from_numpy(values[some].astype(np.float32) * scales[some, None])
         yield descriptions.reshape(-1, *shape), told

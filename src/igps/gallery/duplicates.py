@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 from operator import itemgetter
 from pathlib import Path
@@ -40,7 +39,6 @@ _PAIRS = 256
 _PROFILE_NOISE = 0.02
 
 _Pairs = dict[tuple[int, int], float]
-_Names = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -147,9 +145,9 @@ def duplicates(
         joined = _around_the_finest(joined, surfaces, calibration, n_workers, progress)
         failures = [*failures, *surfaces.failures.values()]
     names, groups = dataset.bodies.names, _groups(joined)
-    grades: dict[_Names, Grade] = {}
-    largest: dict[_Names, tuple[float, float, str | None]] = {}
-    nearly: dict[_Names, float] = {}
+    grades: dict[tuple[str, str], Grade] = {}
+    largest: dict[tuple[str, str], tuple[float, float, str | None]] = {}
+    nearly: dict[tuple[str, str], float] = {}
     if surfaces is not None:
         found = on_threads(lambda pair: surfaces.grade(*pair), list(joined), n_workers)
         for (i, j), (grade, apart) in zip(joined, found, strict=True):
@@ -172,11 +170,7 @@ def duplicates(
 
 
 def _joined(
-    near: NearPairs,
-    surfaces: Surfaces | None,
-    calibration: Calibration,
-    n_workers: int | None,
-    progress: bool,
+    near: NearPairs, surfaces: Surfaces | None, calibration: Calibration, n_workers: int | None, progress: bool
 ) -> _Pairs:
     """Those of near pairs that are the same, none of two that others have joined, by their surfaces if there are."""
     group = DisjointSet()
@@ -189,17 +183,13 @@ def _joined(
         if surfaces is None:
             distances = iter([distance for _, _, distance in open_pairs])
         else:
-            laid = on_threads(partial(_laid, surfaces, calibration), open_pairs, n_workers)
+            laid = on_threads(lambda pair: surfaces.distance(*pair[:2], calibration), open_pairs, n_workers)
             distances = iter(tqdm(laid, desc="laid onto each other", total=len(open_pairs), leave=False,
                                   disable=not progress))  # fmt: skip
         for (i, j, _), distance in zip(open_pairs, distances, strict=True):
             if distance < math.inf and group.merge(i, j):
                 joined[i, j] = distance
     return joined
-
-
-def _laid(surfaces: Surfaces, calibration: Calibration, pair: tuple[int, int, float]) -> float:
-    return surfaces.distance(pair[0], pair[1], calibration)
 
 
 def _around_the_finest(

@@ -65,19 +65,11 @@ def told_of(bodies: Bodies, kinds: Mapping[str, type]) -> list[dict[str, Any]]:
     """What is known of bodies without reading their files."""
     folders = {folder: os.path.realpath(folder) for folder in {os.path.dirname(path) for path in bodies.paths}}
     files = [os.path.join(folders[os.path.dirname(path)], os.path.basename(path)) for path in bodies.paths]
-    told = [
-        {
-            "id": file if part is None else f"{file}#{part}",
-            "name": name,
-            "class": label,
-            "file": file,
-            "part": part,
-            **_stamp(file),
-        }
-        for file, part, name, label in zip(
-            files, bodies.parts, bodies.names, bodies.labels or [None] * len(bodies), strict=True
-        )
-    ]
+    labels = bodies.labels or [None] * len(bodies)
+    told: list[dict[str, Any]] = []
+    for file, part, name, label in zip(files, bodies.parts, bodies.names, labels, strict=True):
+        id_ = file if part is None else f"{file}#{part}"
+        told.append({"id": id_, "name": name, "class": label, "file": file, "part": part, **_stamp(file)})
     for column, values in bodies.columns.items():
         for row, value in zip(told, values, strict=True):
             row[column] = None if value is None else kinds[column](value)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import filecmp
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Literal
@@ -162,9 +163,8 @@ class Surfaces:
         Not at all if one has more handles than the other, or if their vertices are numbered alike and lie elsewhere.
         """
         (coarseness, handles), (of_other, handles_of_other) = self._known(i), self._known(j)
-        if None not in (handles, handles_of_other) and handles != handles_of_other:
-            return 0.0
-        if self._numbered_alike_elsewhere(i, j):
+        differ = None not in (handles, handles_of_other) and handles != handles_of_other
+        if differ or self._numbered_alike_elsewhere(i, j):
             return 0.0
         return calibration.limit(max(coarseness, of_other))
 
@@ -200,7 +200,7 @@ class Surfaces:
     def _numbered_alike_elsewhere(self, i: int, j: int) -> bool:
         """Where faces join the same vertices, no level of detail explains a vertex that has moved."""
         (one, faces), (other, faces_of_other) = self._numbered(i), self._numbered(j)
-        if faces.shape != faces_of_other.shape or not np.array_equal(faces, faces_of_other):
+        if not np.array_equal(faces, faces_of_other):
             return False
         rotation, _ = orthogonal_procrustes(one, other)
         return bool(np.linalg.norm(one @ rotation - other, axis=1).max() > _ROUNDED)
@@ -225,18 +225,12 @@ class Surfaces:
         return signature.surface.points.mean(axis=0), signature.area
 
     def _mesh(self, i: int) -> Mesh:
-        try:
+        with self._kept_failure(i):
             return self._dataset.mesh(i)
-        except MeshError as error:
-            self._keep(i, error)
-            raise
 
     def _signature(self, i: int) -> Signature:
-        try:
+        with self._kept_failure(i):
             signature = self._dataset[i].signature
-        except MeshError as error:
-            self._keep(i, error)
-            raise
         if _NORMALS not in signature.surface.attributes:
             raise ValueError(
                 f"attributes: expected {_NORMALS!r} among those of the surface samples, got "
@@ -244,5 +238,10 @@ class Surfaces:
             )
         return signature
 
-    def _keep(self, i: int, error: MeshError) -> None:
-        self.failures[i] = self._dataset.failure(i, Failed(str(error)))
+    @contextlib.contextmanager
+    def _kept_failure(self, i: int) -> Iterator[None]:
+        try:
+            yield
+        except MeshError as error:
+            self.failures[i] = self._dataset.failure(i, Failed(str(error)))
+            raise

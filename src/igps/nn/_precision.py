@@ -11,51 +11,36 @@ import torch
 from igps._threads import ProcessSetting
 
 
-class _Settings:
-    """What decides whether float32 products may be computed in TF32 or bfloat16, as it was when this was made.
+def _change() -> Callable[[], None]:
+    """Allow no TF32 or bfloat16 in float32 products; what restores the settings as they were.
 
-    PyTorch keeps it twice: as `torch.set_float32_matmul_precision` leaves it, and, from 2.9 on, for each backend. The
-    first cannot be read where the second contradicts it.
+    PyTorch keeps them twice: as `torch.set_float32_matmul_precision` leaves them, and, from 2.9 on, for each backend.
+    The first cannot be read where the second contradicts it.
     """
+    common: str | None
+    try:
+        common = torch.get_float32_matmul_precision()
+    except RuntimeError:
+        common = None
+    backends = (torch.backends.cuda, torch.backends.mkldnn)
+    known = [one for one in backends if hasattr(getattr(one, "matmul", None), "fp32_precision")]
+    before = [(backend, _own_precision(backend)) for backend in known]
+    if common == "highest" and all(_is_full(backend) for backend in known):
+        return lambda: None
+    if common is not None:
+        torch.set_float32_matmul_precision("highest")
+    for backend in known:
+        if not _is_full(backend):
+            backend.matmul.fp32_precision = "ieee"
 
-    def __init__(self) -> None:
-        self.common: str | None
-        try:
-            self.common = torch.get_float32_matmul_precision()
-        except RuntimeError:
-            self.common = None
-        self.by_backend = [(backend, _own_precision(backend)) for backend in _backends()]
-
-    @property
-    def is_full(self) -> bool:
-        return self.common == "highest" and all(_is_full(backend) for backend in _backends())
-
-    def make_full(self) -> None:
-        if self.common is not None:
-            torch.set_float32_matmul_precision("highest")
-        for backend in _backends():
-            if not _is_full(backend):
-                backend.matmul.fp32_precision = "ieee"
-
-    def restore(self) -> None:
-        if self.common is not None:
-            torch.set_float32_matmul_precision(self.common)
-        for backend, precision in self.by_backend:
+    def restore() -> None:
+        if common is not None:
+            torch.set_float32_matmul_precision(common)
+        for backend, precision in before:
             if _own_precision(backend) != precision:
                 backend.matmul.fp32_precision = precision
 
-
-def _backends() -> list[Any]:
-    return [
-        backend
-        for backend in (torch.backends.cuda, torch.backends.mkldnn)
-        if hasattr(getattr(backend, "matmul", None), "fp32_precision")
-    ]
-
-
-def _common_precision() -> str:
-    # Of all backends, where one has none for all that it does.
-    return getattr(torch.backends, "fp32_precision", "none")
+    return restore
 
 
 def _is_full(backend: Any) -> bool:
@@ -63,17 +48,10 @@ def _is_full(backend: Any) -> bool:
 
 
 def _own_precision(backend: Any) -> str:
-    # It reads as that of the backend, or of all, where it has none of its own, and must have none again.
+    # It reads as that of the backend, or of all backends, where it has none of its own, and must have none again.
     precision = backend.matmul.fp32_precision
-    return "none" if precision == getattr(backend, "fp32_precision", _common_precision()) else precision
-
-
-def _change() -> Callable[[], None]:
-    settings = _Settings()
-    if settings.is_full:
-        return lambda: None
-    settings.make_full()
-    return settings.restore
+    of_all = getattr(torch.backends, "fp32_precision", "none")
+    return "none" if precision == getattr(backend, "fp32_precision", of_all) else precision
 
 
 _setting = ProcessSetting(_change)

@@ -58,8 +58,7 @@ class SampleFeatures:
 
     def positions(self) -> Tensor:
         """(N, P, 3) of the samples in units of √area."""
-        points = self.samples.points
-        return points / self.batch.area.sqrt().to(points.dtype)[:, None, None]
+        return self.samples.points / self.batch.area.sqrt().to(self.samples.points.dtype)[:, None, None]
 
     def attribute(self, name: str) -> Tensor:
         """(N, P) or (N, P, 3) of the samples.
@@ -99,9 +98,8 @@ class SampleFeatures:
         """Of each shape, (P, k) the other samples that are nearest to each in the embedding, padding left out."""
         if embedding not in self._neighbours:
             coordinates = self.embedded(embedding)
-            self._neighbours[embedding] = [
-                nearest_neighbours(coordinates[i, real]) for i, real in enumerate(self.samples.mask)
-            ]
+            shapes = zip(coordinates, self.samples.mask, strict=True)
+            self._neighbours[embedding] = [nearest_neighbours(one[real]) for one, real in shapes]
         return self._neighbours[embedding]
 
     def embedded_directions(self, embedding: nn.Module) -> Tensor:
@@ -109,9 +107,8 @@ class SampleFeatures:
         other, outward = (self.batch.surface, 1) if self.kind == "interior" else (self.batch.interior, -1)
         targets = embedding(other.eigenfunctions, self.batch.eigenvalues, self.batch.area)
         coordinates = self.embedded(embedding)
-        return torch.stack(
-            [outward * nearest_directions(coordinates[i], targets[i], real) for i, real in enumerate(other.mask)]
-        )
+        shapes = zip(coordinates, targets, other.mask, strict=True)
+        return torch.stack([outward * nearest_directions(*one) for one in shapes])
 
 
 class BatchFeatures:

@@ -230,11 +230,8 @@ class HistogramDescriptor(Descriptor):
         features = BatchFeatures(batch, self.training)
         if self._sizes is None:
             return self.parts[0][0](features)
-        cells = []
-        for part in self.parts:
-            share = 1 / (len(self.parts) * len(part))
-            cells += [share * histogram(features).flatten(1) for histogram in part]
-        return torch.cat(cells, dim=1)
+        shares = [(1 / (len(self.parts) * len(part)), histogram) for part in self.parts for histogram in part]
+        return torch.cat([share * histogram(features).flatten(1) for share, histogram in shares], dim=1)
 
 
 class EmbeddedDescriptor(Descriptor):

@@ -182,10 +182,7 @@ class RetrievalLearner(LightningModule):
         """Collect the descriptions of a batch."""
         self.scores.update(self(batch), batch.labels, batch.ids)
 
-    @one_thread()
-    def test_step(self, batch: SignatureBatch, batch_index: int) -> None:
-        """Collect the descriptions of a batch."""
-        self.scores.update(self(batch), batch.labels, batch.ids)
+    test_step = validation_step
 
     def on_validation_epoch_end(self) -> None:
         """Scores over the validation part."""

@@ -35,6 +35,9 @@ _CLASS = re.compile(r"igps\.(?:nn|descriptors)(?:\.[a-z0-9_]+)*\.[A-Z][A-Za-z0-9
 # A hostile file asks for no more: modules, a number, and numbers in a module whose size the file does not show
 _MOST_MODULES, _MOST, _MOST_PARAMETERS = 200, 100_000, 1_000_000
 
+# Whatever a damaged file raises
+_UNREADABLE = (SafetensorError, OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, ImportError)
+
 
 class Specified(nn.Module):
     """A module that remembers what it was made with."""
@@ -164,16 +167,7 @@ def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
         if not all(bool(torch.isfinite(one).all()) for one in module.state_dict().values()):
             raise ValueError("a parameter is not finite")
         card = json.loads(words["card"])
-    except (
-        SafetensorError,
-        OSError,
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        RuntimeError,
-        ImportError,
-    ) as error:
+    except _UNREADABLE as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"{path}: expected a descriptor in the format {_FORMAT} ({reason}). Save it again.") from error
     return module.eval(), card

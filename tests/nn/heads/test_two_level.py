@@ -92,9 +92,7 @@ def test_with_lengths_distances_are_those_of_mahalanobis(collection: tuple[Tenso
     assert float(own.median()) == pytest.approx(0.5, rel=1e-6)
 
 
-def test_what_is_far_beyond_all_training_shapes_is_a_unit_vector_too(
-    collection: tuple[Tensor, Tensor, Tensor],
-) -> None:
+def test_what_is_far_beyond_all_training_shapes_is_a_unit_vector_too(collection: tuple[Tensor, Tensor, Tensor]) -> None:
     histograms, _, bodies = collection
     head = WCCNHead(n_directions=10, lengths=True).fit(histograms, bodies)
     alone = torch.zeros(N_CELLS, N_CELLS).fill_diagonal_(1.0)  # all in one cell, where training shapes have all 40

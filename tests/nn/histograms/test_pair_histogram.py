@@ -27,16 +27,7 @@ from igps.nn.axes import (
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms import PairHistogram, pair_histogram
-from loops import (
-    Axis,
-    cosines,
-    distances,
-    equal_bins,
-    hard_classes,
-    pair_histogram_by_loops,
-    product,
-    soft_classes,
-)
+from loops import Axis, cosines, distances, equal_bins, hard_classes, pair_histogram_by_loops, product, soft_classes
 
 DEVICES = [
     "cpu",

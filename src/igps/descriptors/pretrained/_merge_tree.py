@@ -26,17 +26,13 @@ class MergeTree(NamedTuple):
 
 
 def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = ()) -> MergeTree:
-    """The merge tree of values on a graph of points.
+    """The merge tree of finite values (P,) on points; two are neighbours if either names the other in (P, k).
 
     From the highest value down, each point joins the pieces of those of its neighbours that are higher; where it joins
     two pieces, the one with the lower peak ends. A branch is as long as its peak is above its end, which is called its
     persistence. Source: Edelsbrunner, Letscher and Zomorodian 2002; on shapes, Skraba, Ovsjanikov, Chazal and Guibas
-    2010. Of equal values, that of the smaller number is the higher.
-
-    Args:
-        values: (P,) finite, or a ValueError.
-        neighbours: (P, k) numbers of points; two are neighbours if either names the other.
-        counts: (L,) the superlevel sets to be told, by how many points they have, 1 to P, ascending.
+    2010. Of equal values, that of the smaller number is the higher. Superlevel sets are told by counts (L,), how many
+    points each has, 1 to P, ascending. A value that is not finite is a ValueError.
     """
     if not torch.isfinite(values).all():
         raise ValueError("values: expected finite numbers, got NaN or infinity.")

@@ -75,13 +75,12 @@ class AxialHistogram(SampleHistogram):
         potential = barycentroid_potential(features.embedded(self.embedding))
         positions, directions = features.positions(), features.attribute("surface_direction")
         weights = features.weights_or_ones(potential)
-        found = []
-        for i, real in enumerate(present(features)):
-            found.append(self._of_shape(positions[i, real], directions[i, real], potential[i, real], weights[i, real]))
-        return torch.stack(found)
+        values = (positions, directions, potential, weights)
+        shapes = enumerate(present(features))
+        return torch.stack([self._of_shape(*(one[i, real] for one in values)) for i, real in shapes])
 
     def _of_shape(self, points: Tensor, directions: Tensor, potential: Tensor, own: Tensor) -> Tensor:
-        if not (torch.isfinite(points).all() and torch.isfinite(directions).all() and torch.isfinite(potential).all()):
+        if not all(torch.isfinite(one).all() for one in (points, directions, potential)):
             raise ValueError("AxialHistogram: expected finite values, got NaN or infinity.")
         with torch.no_grad():
             weights = potential.double().clamp_min(torch.finfo().tiny).pow(_POWER)
@@ -116,5 +115,4 @@ def principal_axes(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     _, axes = torch.linalg.eigh(places.T @ (places * weights[:, None]))
     axes = axes.flip(1)
     third = (places @ axes).pow(3).sum(dim=0)
-    axes = axes * torch.where(third < 0, -1, 1)
-    return centre, axes
+    return centre, axes * torch.where(third < 0, -1, 1)

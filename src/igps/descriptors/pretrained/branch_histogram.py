@@ -70,7 +70,7 @@ class BranchHistogram(SampleHistogram):
     def _of_shape(self, heights: Tensor, neighbours: Tensor, weights: Tensor | None) -> Tensor:
         tree = merge_tree(heights, neighbours)
         lengths, longest = (heights[tree.peaks] - heights[tree.saddles]).sort(descending=True)
-        lengths = lengths[: self.n_branches]
+        lengths, longest = lengths[: self.n_branches], longest[: self.n_branches]
         found = heights.new_zeros(self.n_branches)
         if not lengths[0] > 0:  # a body that is the same everywhere has one branch, of no length
             found[0] = 1
@@ -78,11 +78,9 @@ class BranchHistogram(SampleHistogram):
         shares = lengths / lengths.sum()
         if weights is not None:  # a limb counts as its samples do: those of the piece that joins no other yet
             places = torch.argsort(torch.argsort(heights, descending=True, stable=True))
-            counts = sorted({max(1, int(places[saddle])) for saddle in tree.saddles[longest[: len(lengths)]]})
+            counts = sorted({max(1, int(places[saddle])) for saddle in tree.saddles[longest]})
             pieces = dict(zip(counts, merge_tree(heights, neighbours, counts).pieces, strict=True))
-            limbs = [
-                pieces[max(1, int(places[tree.saddles[one]]))] == tree.peaks[one] for one in longest[: len(lengths)]
-            ]
+            limbs = [pieces[max(1, int(places[tree.saddles[one]]))] == tree.peaks[one] for one in longest]
             shares = shares * torch.stack([weights[limb].mean() for limb in limbs])
         found[: len(lengths)] = shares
         return found

@@ -99,8 +99,7 @@ class PieceHistogram(SampleHistogram):
         """(S, T) numbers of samples by the size and the length of their pieces."""
         left = pieces >= 0
         _, piece, counts = pieces[left].unique(return_inverse=True, return_counts=True)
-        points = points[left]
-        counts = counts.to(points.dtype)
+        points, counts = points[left], counts.to(points.dtype)
 
         def means(values: Tensor) -> Tensor:
             return values.new_zeros(len(counts), values.shape[1]).index_add(0, piece, values) / counts[:, None]
@@ -108,10 +107,8 @@ class PieceHistogram(SampleHistogram):
         places = points - means(points)[piece]
         covariance = means((places[:, :, None] * places[:, None, :]).flatten(1)).view(-1, 3, 3)
         spread = torch.linalg.eigvalsh(covariance)[:, -1]
-        sizes = counts / len(pieces)
-        spread = torch.where(counts < _FEWEST, 0, spread)
+        sizes, spread = counts / len(pieces), torch.where(counts < _FEWEST, 0, spread)
         lengths = (12 * spread / sizes).clamp_min(torch.finfo(points.dtype).tiny).log2() / 2
-        of_sizes = soft_memberships(sizes.log2(), self.sizes)
-        of_lengths = soft_memberships(lengths, self.lengths)
+        of_sizes, of_lengths = soft_memberships(sizes.log2(), self.sizes), soft_memberships(lengths, self.lengths)
         weighed = torch.zeros_like(counts).index_add(0, piece, weights[left].to(counts.dtype))
         return (of_sizes * weighed[:, None]).T @ of_lengths

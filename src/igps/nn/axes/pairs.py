@@ -64,23 +64,24 @@ class PairAxis(Specified, ABC):
         """The values of the pairs of N shapes, and the centres of their bins."""
 
 
+def _bin_middles(n_bins: int, reach: float) -> Tensor:
+    if n_bins < 2:
+        raise ValueError(f"n_bins: expected at least 2, got {n_bins}.")
+    return middles(n_bins, reach, "bins")
+
+
 class DistanceAxis(PairAxis):
     """Bins of a distance: `n_bins` equal intervals of [0, `reach`] at the start."""
 
     def __init__(self, n_bins: int, reach: float, learnable: bool) -> None:
         super().__init__()
-        if n_bins < 2:
-            raise ValueError(f"n_bins: expected at least 2, got {n_bins}.")
         self.reach = reach
-        self.centres = OrderedCentres(middles(n_bins, reach, "bins"), learnable)
+        self.centres = OrderedCentres(_bin_middles(n_bins, reach), learnable)
 
     @property
     def shape(self) -> tuple[int, ...]:
         """(B,)."""
         return (len(self.centres.start),)
-
-    def _distances(self, points: Tensor) -> PairValues:
-        return euclidean_distances(points, self.centres())
 
 
 class InteriorDistance(DistanceAxis):
@@ -105,7 +106,7 @@ class InteriorDistance(DistanceAxis):
 
     def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Embedded samples."""
-        return self._distances(features.embedded(self.embedding or embedding))
+        return euclidean_distances(features.embedded(self.embedding or embedding), self.centres())
 
 
 class EuclideanDistance(DistanceAxis):
@@ -122,15 +123,13 @@ class EuclideanDistance(DistanceAxis):
 
     def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Samples over √area."""
-        return self._distances(features.positions())
+        return euclidean_distances(features.positions(), self.centres())
 
 
 class _CosineAxes(PairAxis):
     def __init__(self, n_bins: int, learnable: bool) -> None:
         super().__init__()
-        if n_bins < 2:
-            raise ValueError(f"n_bins: expected at least 2, got {n_bins}.")
-        cosines = middles(n_bins, 2.0, "bins") - 1
+        cosines = _bin_middles(n_bins, 2.0) - 1
         self.towards_centres = OrderedCentres(cosines, learnable)
         self.between_centres = OrderedCentres(cosines, learnable)
 
@@ -204,9 +203,7 @@ class PairTwist(PairAxis):
 
     def __init__(self, n_bins: int = 6, reach: float = 0.75, *, learnable: bool = False) -> None:
         super().__init__()
-        if n_bins < 2:
-            raise ValueError(f"n_bins: expected at least 2, got {n_bins}.")
-        self.centres = OrderedCentres(middles(n_bins, 2 * reach, "bins") - reach, learnable)
+        self.centres = OrderedCentres(_bin_middles(n_bins, 2 * reach) - reach, learnable)
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -288,10 +288,7 @@ def _check_share(prior_share: float) -> None:
 
 
 def _discriminant(vectors: Tensor, members: Tensor) -> Tensor:
-    """How well the cosine distance of unit vectors (N, D) tells pairs of one class (N,) from pairs of two; at least 0.
-
-    Fisher's linear discriminant (1936) of one variable.
-    """
+    """How well cosine distances of unit vectors (N, D) tell pairs of one class (N,) from others, ≥ 0 (Fisher 1936)."""
     distances = 1 - vectors @ vectors.T
     alike = members[:, None] == members
     far, near = distances[~alike], distances[alike.fill_diagonal_(False)]

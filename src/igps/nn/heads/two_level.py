@@ -111,8 +111,7 @@ class TwoLevelHead(Head):
         for head in self._bodies():
             head.fit(descriptions, labels if bodies is None else bodies, part_cells)
         embeddings = self._two_levels(descriptions)
-        principal, _ = principal_directions(embeddings.double(), MOST_NUMBERS)
-        self.principal = principal.to(embeddings.dtype)
+        self.principal = principal_directions(embeddings.double(), MOST_NUMBERS)[0].to(embeddings.dtype)
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:
@@ -144,10 +143,8 @@ class TwoLevelHead(Head):
     def short(self, embeddings: Tensor) -> Tensor:
         """(N, D) embeddings to (N, ≤ 256) of length 1, along the principal directions of those of the training shapes.
 
-        Individuals are no part of them.
-
-        For engines that take no more numbers: their cosines are nearly those of the embeddings, farther from them the
-        less a shape is like those of training.
+        For engines that take no more numbers: their cosines are nearly those of the embeddings without the individuals,
+        farther from them the less a shape is like those of training.
 
         Raises:
             RuntimeError: it has not been fitted.
@@ -178,7 +175,7 @@ class TwoLevelHead(Head):
         return (1 - self.weight) * found - self.weight * torch.expm1(-near)
 
     def _two_levels(self, descriptions: Tensor) -> Tensor:
-        """(N, D) of length 1, of classes and bodies alone."""
+        """(N, D) of length 1, of classes and bodies alone, without individuals."""
         classes = (1 - self.share).sqrt() * self.class_head(descriptions)
         return torch.cat([classes, *(self._root_share * head(descriptions) for head in self._bodies())], dim=1)
 

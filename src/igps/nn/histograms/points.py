@@ -79,8 +79,4 @@ class PointHistogram(SampleHistogram):
         rest = joint(others) if others else torch.ones_like(first[..., :1])
         weights = features.weights()
         counts = mask if weights is None else mask * weights
-        return (
-            counted(first * counts.unsqueeze(2), rest, mask.sum(dim=1))
-            .unflatten(2, self.shape[1:] or (1,))
-            .view(len(mask), *self.shape)
-        )
+        return counted(first * counts.unsqueeze(2), rest, mask.sum(dim=1)).view(len(mask), *self.shape)
