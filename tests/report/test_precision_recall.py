@@ -10,23 +10,23 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from igps.report import comparison
+from igps.report import answers
 from igps.retrieval import precision_recall_curve
 
 
 def test_curves_are_drawn_in_percent_and_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Figure] = []
-    make = comparison.new_figure
+    make = answers.new_figure
 
     def remember(width: float, height: float) -> Figure:
         made.append(make(width, height))
         return made[-1]
 
-    monkeypatch.setattr(comparison, "new_figure", remember)
+    monkeypatch.setattr(answers, "new_figure", remember)
     labels = [0, 0, 0, 1, 1, 1]
     draws = np.random.default_rng(0).random((12, 6, 6))
     curves = {f"descriptor {i}": precision_recall_curve(torch.from_numpy(draw), labels) for i, draw in enumerate(draws)}
-    comparison.precision_recall(curves, tmp_path / "deep" / "curves.png")
+    answers.precision_recall(curves, tmp_path / "deep" / "curves.png")
     (axes,) = made[0].axes
     assert len(axes.lines) == 12
     for line, (name, curve) in zip(axes.lines, curves.items(), strict=True):

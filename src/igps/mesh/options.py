@@ -29,7 +29,7 @@ class LoadOptions:
         ('welded 28 coincident vertices',)
 
     Args:
-        mend: "auto" does the least that makes a body of the surface, see `mend`; "never" refuses what is no body;
+        mend: "auto" does the least that makes a body of the surface; "never" refuses what is no body;
             "always" makes every surface watertight that does not bound one body without crossing itself, for
             collections of mixed quality.
         component: "largest" keeps only the connected component of the largest area.
