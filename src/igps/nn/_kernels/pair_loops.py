@@ -109,12 +109,6 @@ def gradient_block(
     n_classes = int(np.sqrt(2.0 * len(upstream)))
     found = new_row(axes, n_columns, values)
     cells, shares, features = found.cells, found.shares, found.features
-    # Numbered as the nodes of a binary tree, whose level k splits along axis k, and whose leaves are the corners: the
-    # share that a node has of the pair, and the mean of what is upstream of its leaves.
-    axis_of = np.empty(n_corners, np.int64)
-    for node in range(1, n_corners):
-        axis_of[node] = 0 if node == 1 else axis_of[node >> 1] + 1
-    share_of, mean_of = np.ones(2 * n_corners), np.empty(2 * n_corners)
     slopes = np.empty(n_axes)
     none = values.dtype.type(0)
     for i in range(n_rows):
@@ -126,11 +120,8 @@ def gradient_block(
         turns[:, :, i, : min(first, n_columns)] = none
         for j in range(first, n_columns):
             other = column + j
-            for node in range(1, n_corners):
-                beyond = share_of[node] * shares[axis_of[node], j]
-                share_of[2 * node], share_of[2 * node + 1] = share_of[node] - beyond, beyond
-            mean_of[n_corners:] = 0
-            begin = cells[j] * n_corners
+            slopes[:] = 0
+            begin = np.uint32(cells[j] * n_corners)
             for m in range(n_members):
                 of_row = weights[m, point]
                 for n in range(n_members):
@@ -139,19 +130,9 @@ def gradient_block(
                         continue
                     a, b = min(classes[m, point], classes[n, other]), max(classes[m, point], classes[n, other])
                     pair = np.uint32(a * n_classes - a * (a - 1) // 2 + b - a)
-                    both, mean = of_row * of_column, 0.0
-                    for corner in range(n_corners):
-                        above = np.float64(upstream[pair, np.uint32(begin + corner)])
-                        mean_of[n_corners + corner] += both * above
-                        mean += share_of[n_corners + corner] * above
+                    mean = interpolate(upstream[pair], begin, shares, j, of_row * of_column, slopes)
                     by_weights[m, point] += of_column * mean
                     by_weights[n, other] += of_row * mean
-            slopes[:] = 0
-            for node in range(n_corners - 1, 0, -1):
-                k = axis_of[node]
-                difference = mean_of[2 * node + 1] - mean_of[2 * node]
-                slopes[k] += share_of[node] * difference
-                mean_of[node] = mean_of[2 * node] + shares[k, j] * difference
             within: Any = cells[j]
             for k in range(n_axes - 1, -1, -1):
                 share, width = np.float64(shares[k, j]), np.uint32(axes.n_centres[k])
@@ -180,6 +161,43 @@ def gradient_block(
                     values[r, i, j] = slopes[k]
                 k += 1
                 r += 1
+
+
+@compiled(error_model="numpy", inline="always")
+def interpolate(upstream: Numbers, begin: Any, shares: Numbers, j: int, weight: float, slopes: Floats) -> float:
+    """What is upstream (cells·2^K,) of a pair, by its shares (K, J) between the corners of a cell, from one on.
+
+    Adds its derivatives by the shares, times a weight, to the slopes (K,).
+    """
+    n_outer = len(shares) - 2
+    if n_outer < 0:
+        low, high = np.float64(upstream[begin]), np.float64(upstream[begin + np.uint32(1)])
+        slopes[0] += weight * (high - low)
+        return low + shares[0, j] * (high - low)
+    mean, one, two = 0.0, np.float64(shares[n_outer, j]), np.float64(shares[n_outer + 1, j])
+    for corner in range(1 << n_outer):
+        at = begin + np.uint32(4 * corner)
+        p, q = np.float64(upstream[at]), np.float64(upstream[at + np.uint32(1)])
+        r, s = np.float64(upstream[at + np.uint32(2)]), np.float64(upstream[at + np.uint32(3)])
+        below, above = p + two * (q - p), r + two * (s - r)
+        here, outside = below + one * (above - below), 1.0
+        for k in range(n_outer):
+            of_others = 1.0
+            for other in range(n_outer):
+                if other != k:
+                    of_others *= side(shares[other, j], corner >> (n_outer - 1 - other) & 1)
+            slopes[k] += weight * of_others * (here if corner >> (n_outer - 1 - k) & 1 else -here)
+            outside *= side(shares[k, j], corner >> (n_outer - 1 - k) & 1)
+        slopes[n_outer] += weight * outside * (above - below)
+        slopes[n_outer + 1] += weight * outside * (q - p + one * (s - r - q + p))
+        mean += outside * here
+    return mean
+
+
+@compiled(error_model="numpy", inline="always")
+def side(share: Any, beyond: int) -> float:
+    """What a corner has along an axis: the share if it lies beyond, or the rest of it."""
+    return np.float64(share) if beyond else 1.0 - np.float64(share)
 
 
 @compiled(error_model="numpy")
