@@ -36,8 +36,9 @@ except ImportError as error:
 _BODIES, _MAP, _ABOUT = "bodies", "map-", b"gallery"
 # Fewer are all compared; the map to short vectors is fitted to the first so many.
 _FEWEST_FOR_VECTORS = 4096
-# Of so many and fewer the short vectors are all compared; of more, those of the nearest so many clusters.
-_MOST_FLAT, _PROBED, _ROWS_AT_ONCE = 20_000, 160, 1024
+# Of so many and fewer the short vectors are all compared; of more, those of the nearest so many clusters, but of all
+# where a condition holds, whose rows may be far away.
+_MOST_FLAT, _PROBED, _ALL, _ROWS_AT_ONCE = 20_000, 64, 10**6, 1024
 # Longer descriptions are kept in half precision; the width of short vectors is a multiple of the other.
 _MOST_IN_FULL, _STEP = 1024, 16
 _ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bytes: pa.binary()}
@@ -100,7 +101,8 @@ class BodyTable:
         if not exact and self.vector_map is not None:
             with self._told(where):
                 short = _short(self.vector_map, query.reshape(1, -1).cpu().float().numpy())[0]
-                asked = self.table.search(short, vector_column_name="short").distance_type("l2").nprobes(_PROBED)
+                asked = self.table.search(short, vector_column_name="short").distance_type("l2")
+                asked = asked.nprobes(_PROBED if where is None else _ALL)
                 asked = asked.limit(max(candidates, top)).select(["_rowid", "_distance"])
                 near = (asked if where is None else asked.where(where, prefilter=True)).to_arrow()
             groups = iter([self._taken(near["_rowid"], "vector")]) if len(near) >= max(candidates, top) else groups
