@@ -144,10 +144,10 @@ def outliers(
 def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Values]:
     """What segmentations go wrong in, of each body: NaN where its mesh cannot be read again.
 
-    Of all: "volume" and "spacing", the side of a voxel or else the root of the area of a face, as logarithms. Of meshes:
-    "handles", and "flat", the largest share of the surface that lies in one plane. Of labels: "stray", "cavity", "hole"
-    and "gap", roots of shares of their voxels, and "cut", see `igps.analysis.segmentation`; and "overlap", (N, N), the
-    share of each that lies in each body of another class in the same grid and folder.
+    Of all: "volume" and "spacing", the side of a voxel or else the root of the area of a face, as logarithms. Of
+    meshes: "handles", and "flat", the largest share of the surface that lies in one plane. Of labels: "stray",
+    "cavity", "hole" and "gap", roots of shares of their voxels, and "cut", see `igps.analysis.segmentation`; and
+    "overlap", (N, N), the share of each that lies in each body of another class in the same grid and folder.
 
     Args:
         dataset: N bodies.
