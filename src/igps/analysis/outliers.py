@@ -38,7 +38,7 @@ _NORMAL = 1.4826
 _FEW = 10
 # Less is as odd as more
 _TWO_SIDED = ("volume", "spacing")
-# Scatter below which no measure is taken to differ; of logarithms, counts and shares
+# Scatter below which no measure is taken to differ; of logarithms, counts, shares and their roots
 _LEAST = {
     "shape": 0.1, "volume": 0.05, "spacing": 0.05, "handles": 0.35, "repairs": 0.35, "flat": 0.02,
     "stray": 0.01, "cavity": 0.01, "hole": 0.01, "gap": 0.01, "cut": 0.5, "overlap": 0.01,
