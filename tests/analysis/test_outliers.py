@@ -12,6 +12,7 @@ from conftest import as_mesh
 from igps.analysis.groups import squared_distances
 from igps.analysis.outliers import LIMIT, flat_share, measures_of, outliers
 from igps.data.dataset import SignatureDataset
+from igps.mesh.formats import volumes
 
 LABELS = ["a"] * 12 + ["b"] * 12
 
@@ -54,9 +55,11 @@ def test_a_wrong_label_is_told() -> None:
         ("spacing", np.log(2), "it is 1.99 times as coarse"),
         ("handles", 3.0, "it has 3 handles, where 0 are usual"),
         ("flat", 0.3, "30% of its surface lie in one plane"),
-        ("pieces", np.log(7), "it has 7 pieces, where 1 are usual"),
+        ("stray", 0.2, "4.0% of it lie apart"),
+        ("cavity", 0.2, "it has cavities of 4.0% of its voxels"),
+        ("hole", 0.1, "it has holes of 1.0% of its voxels in slices, where 0.0% are usual"),
+        ("gap", 0.3, "it has gaps of 9% of its voxels, where 0% are usual"),
         ("cut", 9.0, "its last slice is as large as those before it"),
-        ("thick", np.log(2), "it is 2.00 times as thick as usual somewhere"),
     ],
 )
 def test_each_measure_is_a_reason(name: str, value: float, told: str) -> None:
@@ -67,9 +70,9 @@ def test_each_measure_is_a_reason(name: str, value: float, told: str) -> None:
     assert told in first.reason
 
 
-def test_a_leak_lies_in_another_class_and_not_in_its_own() -> None:
+def test_a_leak_lies_in_another_class() -> None:
     overlap = np.zeros((24, 24))
-    overlap[2, 20], overlap[3, 4] = 0.08, 0.9
+    overlap[2, 20] = 0.08
     first, second = found_of(usual(), measures={"overlap": overlap})[:2]
     assert (first.body, first.reason) == (2, "8% of it lie in a body of another class")
     assert second.scores["overlap"] == 0
@@ -98,6 +101,14 @@ def test_a_repair_that_few_needed_is_a_reason() -> None:
     notes[7] = ["smoothed 4 times", "dropped 1 piece apart of 40 voxels, 0.5% of the label"]
     first = found_of(usual(), notes=notes)[0]
     assert (first.body, "dropped 1 piece apart" in first.reason) == (7, True)
+
+
+def test_what_is_repaired_in_labels_is_measured_in_their_voxels() -> None:
+    notes = [["smoothed 3 times"]] * 24
+    notes[7] = ["dropped 1 small piece apart of 9 voxels, 0.1% of the label"]
+    stray = np.where(np.arange(24) == 7, 0.001**0.5, 0.0)
+    scores = {one.body: one.scores for one in found_of(usual(), measures={"stray": stray}, notes=notes)}
+    assert scores[7]["repairs"] == 0 < scores[7]["stray"]
 
 
 def test_classes_of_one_and_measures_that_are_missing_are_borne() -> None:
@@ -154,10 +165,26 @@ def test_labels_are_measured_in_their_grid(tmp_path: Path) -> None:
     masks = {"a": ball(20), "b": ball(36), "cut": ball(20) & (z < 24), "border": ball(20, 10, 35), "island": island}
     for name, mask in masks.items():
         nibabel.save(nibabel.Nifti1Image(mask.astype(np.uint8), np.eye(4)), tmp_path / f"{name}.nii.gz")
-    dataset = SignatureDataset([tmp_path / f"{name}.nii.gz" for name in masks], cache_dir=tmp_path)
+    files = [tmp_path / f"{name}.nii.gz" for name in masks]
+    dataset = SignatureDataset(files, cache_dir=tmp_path, labels=["a", "b", "a", "c", "d"])
     found = measures_of(dataset, n_workers=1)
     assert found["overlap"][0, 1] == pytest.approx((masks["a"] & masks["b"]).sum() / masks["a"].sum())
     assert found["overlap"][0, 3] == pytest.approx((masks["a"] & masks["border"]).sum() / masks["a"].sum())
-    assert np.exp(found["pieces"]) == pytest.approx([1, 1, 1, 1, 2])
+    assert found["overlap"][0, 2] == 0  # of one class, which may be another subject
+    assert found["stray"] ** 2 == pytest.approx([0, 0, 0, 0, ball(56, 2).sum() / island.sum()])
     assert found["cut"][2] > 3 * max(found["cut"][[0, 1, 3]])
-    assert np.exp(found["thick"][0]) == pytest.approx(3, rel=0.1)  # a ball's radius over its volume by its area
+
+
+def test_a_volume_is_read_once_for_all_its_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
+    labels = np.zeros((40, 20, 20), dtype=np.uint8)
+    for label, at in ((1, 2), (2, 14), (3, 26)):
+        labels[at : at + 10, 4:16, 4:16] = label
+    labels[39, 19, 19] = 4  # too small for a surface
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "all.nii.gz")
+    dataset, reads = SignatureDataset(tmp_path, cache_dir=tmp_path / "cache"), []
+    read = volumes.read_raw
+    monkeypatch.setattr(volumes, "read_raw", lambda path: reads.append(path) or read(path))
+    found = measures_of(dataset, n_workers=1)
+    assert len(reads) == 1
+    assert np.exp(found["volume"]) == pytest.approx([1440, 1440, 1440, np.nan], rel=0.01, nan_ok=True)

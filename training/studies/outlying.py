@@ -17,8 +17,8 @@ from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
 from igps.nn.description import describe
 from igps.report.answers import write_answer
+from training.studies.mask_damages import DAMAGES, VARIED, damaged, varied
 
-DAMAGES = ("slices", "hole", "leak", "island", "label", "half")
 _LEAST_VOXELS = 50
 
 Mask = NDArray[np.bool_]
@@ -31,6 +31,7 @@ def outlying(
     cache_dir: Path | None = None,
     seed: int = 0,
     anywhere: bool = False,
+    vary: bool = False,
 ) -> None:
     """Score masks as they are, and each with one damage in its place; the area under the curve tells them apart.
 
@@ -40,12 +41,14 @@ def outlying(
         cache_dir: of the signatures.
         seed: of the damages, and of the generated bodies.
         anywhere: bodies leak at any place, in place of where another one is near, if any is.
+        vary: damages are of other kinds, and of random sizes, places and directions, see `varied`.
     """
     masks = generated(seed) if volumes is None else _given(volumes)
     names = sorted(masks)
     labels = [name.split("/")[0] for name in names]
     random = np.random.default_rng(seed)
-    damages = [DAMAGES[i % len(DAMAGES)] for i in random.permutation(len(names))]
+    kinds, damage_of = (VARIED, varied) if vary else (DAMAGES, damaged)
+    damages = [kinds[i % len(kinds)] for i in random.permutation(len(names))]
     paths = [_write(out / f"{i}_given.nii.gz", *masks[name]) for i, name in enumerate(names)]
     for i, (name, damage) in enumerate(zip(names, damages, strict=True)):
         mask, spacing = masks[name]
@@ -53,9 +56,9 @@ def outlying(
         for other, (near, _) in masks.items():
             if other != name and near.shape == mask.shape and not anywhere:
                 others |= near
-        paths.append(_write(out / f"{i}_damaged.nii.gz", *damaged(mask, spacing, damage, random, others)))
+        paths.append(_write(out / f"{i}_damaged.nii.gz", *damage_of(mask, spacing, damage, random, others)))
     chosen = descriptor_of("pretrained")
-    whole = SignatureDataset(paths, descriptor=chosen, cache_dir=cache_dir)
+    whole = SignatureDataset(paths, descriptor=chosen, cache_dir=cache_dir, labels=2 * labels)
     failures = whole.precompute()
     gone = {failure.id for failure in failures}
     dataset = whole.usable(failures)
@@ -97,47 +100,10 @@ def areas(rows: Sequence[dict[str, object]]) -> dict[str, float]:
     from sklearn.metrics import roc_auc_score
 
     found = {}
-    for damage in ("all", *DAMAGES):
+    for damage in ("all", *sorted({str(row["damage"]) for row in rows} - {"none"})):
         some = [row for row in rows if damage == "all" or row["damage"] in ("none", damage)]
         found[damage] = float(roc_auc_score([row["damage"] != "none" for row in some], [row["score"] for row in some]))
     return found
-
-
-def damaged(whole: Mask, spacing: Values, how: str, random: np.random.Generator, others: Mask) -> tuple[Mask, Values]:
-    """A mask and its spacing after one of the `DAMAGES`; "label" leaves both. Others are what it may leak into."""
-    from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
-
-    if how in ("label", "half"):
-        return (whole, spacing) if how == "label" else (whole[::2, ::2, ::2], spacing * 2)
-    found = np.argwhere(whole)
-    low, high = np.maximum(found.min(axis=0) - 8, 0), found.max(axis=0) + 9
-    box = tuple(map(slice, low, high))
-    mask = whole[box]
-    places = np.argwhere(mask) * spacing
-    radius = np.cbrt(3 / (4 * np.pi) * mask.sum() * spacing.prod())
-    grid = np.stack(np.meshgrid(*map(np.arange, mask.shape), indexing="ij"), axis=-1) * spacing
-
-    def ball(centre: Values, size: float) -> Mask:
-        return ((grid - centre) ** 2).sum(axis=-1) <= max(size * radius, 1.01 * spacing.max()) ** 2
-
-    if how == "slices":
-        lowest, highest = places[:, 2].min(), places[:, 2].max()
-        mask = mask & (grid[..., 2] <= highest - 0.25 * (highest - lowest))
-    if how == "hole":
-        deepest = np.argwhere((depth := distance_transform_edt(mask, spacing)) == depth.max())[0] * spacing
-        across = ((grid - deepest)[..., :2] ** 2).sum(axis=-1) <= max(0.25 * radius, 1.01 * spacing.max()) ** 2
-        mask = mask & ~across
-    if how == "leak":
-        skin = mask & ~binary_erosion(mask)
-        near = skin & (distance_transform_edt(~others[box], spacing) <= 0.3 * radius) if others[box].any() else skin
-        skin = np.argwhere(near if near.any() else skin) * spacing
-        mask = mask | ball(skin[random.integers(len(skin))], 0.6)
-    if how == "island":
-        outside = np.argwhere(~binary_dilation(mask, iterations=4)) * spacing
-        mask = mask | ball(outside[random.integers(len(outside))], 0.25)
-    changed = whole.copy()
-    changed[box] = mask
-    return changed, spacing
 
 
 def _write(path: Path, mask: Mask, spacing: Values) -> Path:

@@ -13,8 +13,7 @@ from tqdm import tqdm
 from igps._parallel import Failed, Limits, run
 from igps.data.filling import by_file
 from igps.data.sources import Bodies, BodyRef
-from igps.mesh.formats import RawBody
-from igps.mesh.formats.volumes import VoxelMeasures
+from igps.mesh.formats import RawBody, VoxelMeasures
 from igps.mesh.loading import each_surface, surface_body
 from igps.mesh.mending import Step, mended_by
 from igps.mesh.mesh import MeshError
@@ -97,7 +96,8 @@ def _examine(reading: LoadOptions, config: SignatureConfig, bodies: Sequence[Bod
 
 
 def _finding(ref: BodyRef, raw: RawBody, reading: LoadOptions, config: SignatureConfig, start: float) -> Finding:
-    found = Finding(str(ref), n_vertices=len(raw.vertices), voxels=None if raw.voxels is None else raw.voxels())
+    voxels = None if raw.voxels is None else raw.voxels().measures()
+    found = Finding(str(ref), n_vertices=len(raw.vertices), voxels=voxels)
     if raw.fault is not None:
         return replace(found, n_vertices=None, fault=str(raw.fault), error=str(raw.fault))
     try:

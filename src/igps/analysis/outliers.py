@@ -11,18 +11,22 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from igps._parallel import Failed, run
-from igps.analysis.placement import Place, end_of, overlaps
+from igps._threads import n_cores
+from igps.analysis.placement import Place, overlaps
+from igps.analysis.segmentation import cavity_root, cut_end, gap_root, hole_root, stray_root
 from igps.data.dataset import SignatureDataset
+from igps.data.filling import by_file
 from igps.data.pipeline import SignaturePipeline
-from igps.mesh.formats.volumes import read_label_volume
+from igps.mesh.formats import RawBody
 from igps.mesh.loading import BodyRef, each_surface, surface_body
-from igps.mesh.mesh import Mesh
+from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors
 
 Values = NDArray[np.float64]
+
+_MEASURED = ("volume", "spacing", "handles", "flat", "stray", "cavity", "hole", "gap", "cut")
 
 # Members of a class that a body is compared with, and from how many on a class is its own measure of what is usual
 _NEAREST, _ENOUGH = 3, 4
@@ -34,10 +38,10 @@ _NORMAL = 1.4826
 _FEW = 10
 # Less is as odd as more
 _TWO_SIDED = ("volume", "spacing")
-# Scatter below which no measure is taken to differ; of logarithms, counts and shares
+# Scatter below which no measure is taken to differ; of logarithms, counts, shares and their roots
 _LEAST = {
-    "shape": 0.1, "volume": 0.05, "spacing": 0.05, "handles": 0.35, "pieces": 0.2, "repairs": 0.35, "flat": 0.02,
-    "cut": 0.5, "thick": 0.05, "overlap": 0.01,
+    "shape": 0.1, "volume": 0.05, "spacing": 0.05, "handles": 0.35, "repairs": 0.35, "flat": 0.02,
+    "stray": 0.01, "cavity": 0.01, "hole": 0.01, "gap": 0.01, "cut": 0.5, "overlap": 0.01,
 }  # fmt: skip
 # A score above this is said to be an outlier: of a normal distribution one body in 2,000 is
 LIMIT = 3.5
@@ -48,10 +52,12 @@ _SAYS = {
     "handles": "it has {value:.0f} handles, where {usual:.0f} are usual",
     "repairs": "it was repaired as few are: {notes}",
     "flat": "{value:.0%} of its surface lie in one plane, as if it were cut",
-    "pieces": "it has {count:.0f} pieces, where {common:.0f} are usual",
+    "stray": "{square:.1%} of it lie apart",
+    "cavity": "it has cavities of {square:.1%} of its voxels",
+    "hole": "it has holes of {square:.1%} of its voxels in slices, where {common:.1%} are usual",
+    "gap": "it has gaps of {square:.0%} of its voxels, where {common:.0%} are usual",
     "cut": "its last slice is as large as those before it, as if it were cut",
-    "thick": "it is {ratio:.2f} times as thick as usual somewhere, as if it had leaked",
-    "overlap": "{value:.0%} of it lie in a body of another class",
+    "overlap": "{square:.0%} of it lie in a body of another class",
 }
 
 
@@ -103,10 +109,12 @@ def outliers(
     own, other, nearest = _nearness(np.asarray(distances, dtype=float), codes)
     scores = {"shape": np.fmax(*(_deviations(one, codes, "shape")[0] for one in (own, own - other)))}
     values = dict(measures or {})
-    if "overlap" in values:  # bodies of one class lie in one place, in others' files
-        values["overlap"] = np.where(codes[:, None] == codes, 0, values["overlap"]).max(axis=1)
+    if "overlap" in values:
+        values["overlap"] = np.sqrt(values["overlap"].max(axis=1))
     if notes is not None:
         values["repairs"], rare = _repairs(notes)
+        if "stray" in values:  # what is repaired in labels is measured in voxels
+            values["repairs"][np.isfinite(values["stray"])] = 0
     usual: dict[str, Values] = {}
     for name, one in values.items():
         scores[name], usual[name] = _deviations(one, codes, name)
@@ -119,10 +127,12 @@ def outliers(
         told = []
         for name in [one for k, one in enumerate(worst) if k == 0 or of_body[one] > LIMIT]:
             value, centre = (float(one[name][i]) if name in one else 0.0 for one in (values, usual))
-            count, common, ratio = np.exp(np.minimum([value, centre, value - centre], 50))
+            ratio = np.exp(min(value - centre, 50))
             text = "; ".join(rare[i]) if name == "repairs" else ""
             told.append(
-                _SAYS[name].format(value=value, usual=centre, count=count, common=common, ratio=ratio, notes=text)
+                _SAYS[name].format(
+                    value=value, usual=centre, square=value**2, common=centre**2, ratio=ratio, notes=text
+                )
             )
         reason = "; ".join(told) if score > LIMIT else "nothing unusual"
         if among is not None:
@@ -134,24 +144,25 @@ def outliers(
 def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Values]:
     """What segmentations go wrong in, of each body: NaN where its mesh cannot be read again.
 
-    Of all: "volume" and "spacing", the side of a voxel or else the root of the area of a face, as logarithms; "handles"
-    of the surface. Of meshes: "flat", the largest share of the surface that lies in one plane. Of labels: "pieces" and
-    "thick", the radius of the largest ball within over volume by area, as logarithms; "cut", see `end_of`; and
-    "overlap", (N, N), the share of each that lies in each other body of the same grid and folder.
+    Of all: "volume" and "spacing", the side of a voxel or else the root of the area of a face, as logarithms. Of
+    meshes: "handles", and "flat", the largest share of the surface that lies in one plane. Of labels: "stray",
+    "cavity", "hole" and "gap", roots of shares of their voxels, and "cut", see `igps.analysis.segmentation`; and
+    "overlap", (N, N), the share of each that lies in each body of another class in the same grid and folder.
 
     Args:
         dataset: N bodies.
         n_workers: processes; all cores if None.
     """
-    names = ("volume", "spacing", "handles", "flat", "pieces", "thick", "cut")
-    found, places = np.full((len(dataset), len(names)), np.nan), list[Place | None]([None] * len(dataset))
-    with contextlib.closing(
-        run(partial(_measures, dataset.pipeline), list(dataset.bodies), n_workers=n_workers)
-    ) as all_:
-        for i, outcome in all_:
-            if not isinstance(outcome, Failed):
-                found[i], places[i] = outcome
-    return {**dict(zip(names, found.T, strict=True)), "overlap": overlaps(places, dataset.bodies.labels)}
+    found = np.full((len(dataset), len(_MEASURED)), np.nan)
+    places = list[Place | None]([None] * len(dataset))
+    jobs = by_file(dataset.bodies, range(len(dataset)), -(-len(dataset) // (n_workers or n_cores())))
+    given = [[dataset.bodies[i] for i in job] for job in jobs]
+    with contextlib.closing(run(partial(_measures, dataset.pipeline), given, n_workers=n_workers)) as all_:
+        for number, outcome in all_:
+            for i, body in zip(jobs[number], given[number], strict=True):
+                if not isinstance(outcome, Failed) and body in outcome:
+                    found[i], places[i] = outcome[body]
+    return {**dict(zip(_MEASURED, found.T, strict=True)), "overlap": overlaps(places, dataset.bodies.labels)}
 
 
 def flat_share(mesh: Mesh) -> float:
@@ -172,30 +183,36 @@ def flat_share(mesh: Mesh) -> float:
     return best / float(areas.sum())
 
 
-def _measures(pipeline: SignaturePipeline, body: BodyRef) -> tuple[Values, Place | None]:
-    reading = pipeline.reading
-    ((_, raw),) = each_surface(body.path, reading, parts=[body.part])
-    mesh = surface_body(raw, body, reading, least_vertices=pipeline.config.n_vertices_read)
-    found = np.array([np.log(mesh.volume), np.log(mesh.area / len(mesh.faces)) / 2, mesh.genus, *4 * [np.nan]])
+def _measures(
+    pipeline: SignaturePipeline, bodies: Sequence[BodyRef]
+) -> dict[BodyRef, tuple[list[float], Place | None]]:
+    """Of the bodies of one file, which is read once; without those that have no surface."""
+    found = {}
+    for body, raw in each_surface(bodies[0].path, pipeline.reading, parts=[one.part for one in bodies]):
+        with contextlib.suppress(MeshError):
+            found[body] = _of_body(pipeline, body, raw)
+    return found
+
+
+def _of_body(pipeline: SignaturePipeline, body: BodyRef, raw: RawBody) -> tuple[list[float], Place | None]:
+    mesh = surface_body(raw, body, pipeline.reading, least_vertices=pipeline.config.n_vertices_read)
+    found = dict.fromkeys(_MEASURED, np.nan)
+    found["volume"] = np.log(mesh.volume)
     if raw.voxels is None:
-        found[3] = flat_share(mesh)
-        return found, None
-    volume = read_label_volume(body.path, reading)
-    if body.part is None:
-        layer = np.any([one > 0 for one in volume.layers], axis=0)
-        box = ndimage.find_objects(layer.view(np.uint8))[0]
-        mask = layer[box]
-    else:
-        box, mask = volume.body(body.part).box, volume.mask(body.part)
-    low, shape = np.array([one.start for one in box]), volume.layers[0].shape
-    sides = np.linalg.norm(volume.affine[:3, :3], axis=0)
-    depth = ndimage.distance_transform_edt(np.pad(mask, 1), sides).max()
-    found[1] = np.log(sides.prod()) / 3  # the surface has as many faces as its form needs, on any grid
-    found[4] = np.log(ndimage.label(mask, np.ones((3, 3, 3)))[1])
-    found[5] = np.log(depth * mesh.area / mesh.volume)
-    found[6] = end_of(mask, np.stack([low == 0, low + mask.shape == shape], axis=1))
-    grid = (body.path.parent, shape, volume.affine.tobytes())
-    return found, Place(grid, low, mask.shape, int(mask.sum()), np.packbits(mask))
+        found["spacing"] = np.log(mesh.area / len(mesh.faces)) / 2
+        found["handles"], found["flat"] = mesh.genus, flat_share(mesh)
+        return list(found.values()), None
+    voxels = raw.voxels()
+    mask, low, grid = voxels.mask, voxels.low, voxels.grid
+    sides = np.linalg.norm(voxels.affine[:3, :3], axis=0)
+    found["spacing"] = np.log(sides.prod()) / 3  # the surface has as many faces as its form needs, on any grid
+    found["stray"], found["cavity"], found["hole"] = stray_root(mask), cavity_root(mask), hole_root(mask)
+    found["gap"] = gap_root(mask, sides)
+    found["cut"] = cut_end(mask, np.stack([low == 0, low + mask.shape == grid], axis=1))
+    place = Place(
+        (body.path.parent, grid, voxels.affine.tobytes()), low, mask.shape, int(mask.sum()), np.packbits(mask)
+    )
+    return list(found.values()), place
 
 
 def _nearness(distances: Values, codes: NDArray[np.int64]) -> tuple[Values, Values, NDArray[np.int64]]:

@@ -1,4 +1,4 @@
-"""Labels in their grid: whether their ends were cut off, and which share voxels."""
+"""Labels in their grid: which share voxels."""
 
 from __future__ import annotations
 
@@ -11,25 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Values = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-
-def end_of(mask: Mask, at_border: Mask) -> float:
-    """How flat an end of a body is along an axis of the grid, as if slices were cut off; 0 if all are at the border.
-
-    Voxels of its last slice beyond two fifths of those of the two slices before it, as ends that are round have, over
-    the root of their mean number.
-
-    Args:
-        mask: (X, Y, Z), no larger than the body.
-        at_border: (3, 2) which ends the border of the volume cuts.
-    """
-    flattest = 0.0
-    for axis, end in np.argwhere(~at_border):
-        counts = np.moveaxis(mask, axis, 0)[:: -1 if end else 1][:3].sum(axis=(1, 2))
-        if len(counts) == 3:
-            flattest = max(flattest, (counts[0] - 0.4 * counts[1:].mean()) / np.sqrt(counts.mean()))
-    return flattest
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,9 +90,10 @@ def outliers(
 ) -> list[dict[str, Any]]:
     """List the bodies that are most unlike their class, to look at before the collection is trusted.
 
-    Each is compared with the others of its class: shape, volume, how coarse it is, handles, flat sides, repairs;
-    of labels also pieces, cut ends, thickness, and overlap with other labels. A score is a number of robust standard
-    deviations; above 3.5 it is more than chance. A body that lies nearer to another class than to its own is told.
+    Each is compared with the others of its class: shape, volume, how coarse it is; of meshes handles, flat sides and
+    repairs; of labels what lies apart, cavities, holes, gaps, cut ends, and overlap with other labels. A score is a
+    number of robust standard deviations; above 3.5 it is more than chance. A body that lies nearer to another class
+    than to its own is told.
 
     Args:
         root: folder with one subfolder per class, or with files and a labels.csv (columns file,label).

@@ -116,7 +116,7 @@ def filled(
         at_once: bodies in a chunk; so many that every worker has one if None.
     """
     most = 1 if limits != Limits() else at_once or max(1, -(-len(numbers) // (n_workers or n_cores())))
-    jobs = [group[start : start + most] for group in by_file(bodies, numbers) for start in range(0, len(group), most)]
+    jobs = by_file(bodies, numbers, most)
     work: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
     given = [[bodies[i] for i in job] for job in jobs]
     if executor is not None:  # elsewhere, and from another folder
@@ -151,9 +151,10 @@ def check_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
         time.sleep(0.1)
 
 
-def by_file(bodies: Bodies, numbers: Iterable[int]) -> list[list[int]]:
-    """The numbers of bodies, those of one file together."""
+def by_file(bodies: Bodies, numbers: Iterable[int], most: int | None = None) -> list[list[int]]:
+    """The numbers of bodies, those of one file together, so many at most."""
     groups: dict[Path, list[int]] = {}
     for i in numbers:
         groups.setdefault(bodies.paths[i], []).append(i)
-    return list(groups.values())
+    most = most or len(bodies)
+    return [group[start : start + most] for group in groups.values() for start in range(0, len(group), most)]

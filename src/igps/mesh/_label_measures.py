@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from igps._arrays import Booleans
+from igps._arrays import Booleans, Floats, Integers
 
 # Share of the voxels that must lie near balls of a diameter for no part to be thinner; and how near, in radii: corners
 # of a box as thick are no thinner.
@@ -15,6 +15,27 @@ _COVERED, _NEAR = 0.95, 3**0.5
 _MOST = 10
 # Smaller masks are measured in half voxels.
 _SMALL = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class LabelVoxels:
+    """A label in its grid.
+
+    Args:
+        mask: (X, Y, Z) where it is, in the smallest box that holds it.
+        low: (3,) index of the first voxel of the box.
+        grid: voxels of the whole volume along its axes.
+        affine: (4, 4) from indices of the volume to the world.
+    """
+
+    mask: Booleans
+    low: Integers
+    grid: tuple[int, ...]
+    affine: Floats
+
+    def measures(self) -> VoxelMeasures:
+        """Their number, pieces and thickness."""
+        return measured(self.mask)
 
 
 @dataclass(frozen=True)

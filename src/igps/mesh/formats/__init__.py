@@ -11,10 +11,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from igps.mesh._label_measures import LabelVoxels, VoxelMeasures
 from igps.mesh.formats import archives, brains, clouds, molecules, obj, off, ply, scenes, stl, threemf, volumes, vtk
 from igps.mesh.formats._format import Format, RawBody
 
-__all__ = ["FORMATS", "Format", "RawBody", "format_of", "is_searched", "searched_suffixes"]
+__all__ = [
+    "FORMATS", "Format", "LabelVoxels", "RawBody", "VoxelMeasures", "format_of", "is_searched", "searched_suffixes",
+]  # fmt: skip
 
 FORMATS: tuple[Format, ...] = (
     off.FORMAT, obj.FORMAT, ply.FORMAT, stl.FORMAT, clouds.FORMAT, threemf.FORMAT, scenes.GLTF, scenes.STEP,

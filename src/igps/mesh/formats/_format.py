@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from igps._arrays import Floats, Integers
-from igps.mesh._label_measures import VoxelMeasures
+from igps.mesh._label_measures import LabelVoxels
 from igps.mesh._tidying import are_specks, places
 from igps.mesh.mesh import Mesh, MeshError, check_arrays
 from igps.mesh.options import BodyKind, LoadOptions
@@ -31,7 +31,7 @@ class RawBody:
         notes: what was noticed on reading, in words.
         fault: why there is no surface of this body, where there are others.
         make: makes the surface, where that takes time; see `made`.
-        voxels: measures the voxels that the surface was made of.
+        voxels: that the surface was made of, of a label.
     """
 
     vertices: Floats = field(default_factory=lambda: np.zeros((0, 3)))
@@ -42,7 +42,7 @@ class RawBody:
     notes: tuple[str, ...] = ()
     fault: MeshError | None = None
     make: Callable[[], RawBody] | None = None
-    voxels: Callable[[], VoxelMeasures] | None = None
+    voxels: Callable[[], LabelVoxels] | None = None
 
     def made(self) -> RawBody:
         """The same with its surface, or with the fault for which there is none."""
@@ -74,7 +74,7 @@ class Format:
 
 
 def made_later(
-    make: Callable[[], Mesh], part: str | None, unit: str | None, voxels: Callable[[], VoxelMeasures] | None = None
+    make: Callable[[], Mesh], part: str | None, unit: str | None, voxels: Callable[[], LabelVoxels] | None = None
 ) -> RawBody:
     """A body whose surface is made when it is asked for; a fault of it leaves the others."""
 

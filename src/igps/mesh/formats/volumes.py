@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from igps._arrays import Booleans, Floats
-from igps.mesh._label_measures import VoxelMeasures, measured
+from igps.mesh._label_measures import LabelVoxels
 from igps.mesh.formats._format import Format, RawBody, faults, made_later
 from igps.mesh.formats._volume_files import READERS, RawVolume, read_raw, suffix_of
 from igps.mesh.formats.label_names import names_beside, read_label_names
@@ -111,9 +111,10 @@ class LabelVolume:
         body = self.body(part)
         return np.asarray(self.layers[body.layer][body.box] == body.value)
 
-    def measures(self, part: int | str) -> VoxelMeasures:
-        """Measures of the voxels of a label."""
-        return measured(self.mask(part))
+    def voxels(self, part: int | str) -> LabelVoxels:
+        """Where the label is, with its place in the grid."""
+        low = np.array([side.start for side in self.body(part).box])
+        return LabelVoxels(self.mask(part), low, self.layers[0].shape, np.asarray(self.affine, dtype=np.float64))
 
 
 def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) -> LabelVolume:
@@ -234,10 +235,10 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
         labelled = np.any([layer > 0 for layer in volume.layers], axis=0).astype(np.uint8)
         volume = replace(volume, layers=(labelled,), names=None, segments=None)
         made = partial(label_surface, volume, 1, cavities=options.cavities)
-        return [made_later(made, None, volume.unit, partial(volume.measures, 1))]
+        return [made_later(made, None, volume.unit, partial(volume.voxels, 1))]
     made = partial(label_surface, volume, how=options.mend, cavities=options.cavities)
     names = [body.name for body in volume.bodies] if part is None else [volume.body(part).name]
-    return [made_later(partial(made, name), name, volume.unit, partial(volume.measures, name)) for name in names]
+    return [made_later(partial(made, name), name, volume.unit, partial(volume.voxels, name)) for name in names]
 
 
 FORMAT = Format("a label volume", tuple(READERS), read, ("labels",), extra="volumes")

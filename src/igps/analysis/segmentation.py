@@ -1,0 +1,83 @@
+"""What goes wrong in masks of voxels: pieces apart, cavities, holes, gaps, and slices that were cut off.
+
+What is a share of the voxels comes as its square root, whose scatter is about the same for small shares and large ones
+(Bartlett 1936), so that a speck in one body of many weighs little and a piece in a body of one much.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+Values = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Of the depth of a body, the radius of the ball that closes it: what is narrower than the body is thick is a gap
+_CLOSING = 0.8
+# Larger boxes are closed on a grid twice as coarse, which shows gaps of that width all the same
+_MOST_VOXELS = 1 << 20
+
+
+def stray_root(mask: Mask) -> float:
+    """The root of the share of the voxels that are connected to the largest piece by no face, edge or corner."""
+    pieces, _ = ndimage.label(mask, np.ones((3, 3, 3)))
+    return float(np.sqrt(1 - np.bincount(pieces[mask]).max() / np.count_nonzero(mask)))
+
+
+def cavity_root(mask: Mask) -> float:
+    """The root of the voxels that the body surrounds, over its own."""
+    filled = ndimage.binary_fill_holes(np.pad(mask, 1))
+    return float(np.sqrt(np.count_nonzero(filled) / np.count_nonzero(mask) - 1))
+
+
+def hole_root(mask: Mask) -> float:
+    """The root of the voxels that the body surrounds in a slice across any axis of the grid, over its own."""
+    padded, holes = np.pad(mask, 1), np.zeros_like(mask)
+    for axis in range(3):
+        neighbours = ndimage.generate_binary_structure(3, 1)
+        np.moveaxis(neighbours, axis, 0)[[0, 2]] = False
+        pieces, n_pieces = ndimage.label(~padded, neighbours)
+        surrounded = np.arange(n_pieces + 1) > 0
+        surrounded[np.take(pieces, 0, axis=axis - 1)] = False  # the padding, which goes all around a slice
+        holes |= surrounded[pieces][1:-1, 1:-1, 1:-1]
+    return float(np.sqrt(np.count_nonzero(holes) / np.count_nonzero(mask)))
+
+
+def gap_root(mask: Mask, sides: Values) -> float:
+    """The root of the voxels that closing adds, over those of the body: its tunnels, notches and clefts.
+
+    Closing (Matheron 1975) keeps outside what a ball outside of the body reaches. Its radius is four fifths of that of
+    the largest ball inside.
+
+    Args:
+        mask: (X, Y, Z).
+        sides: (3,) of a voxel, length.
+    """
+    while mask.size > _MOST_VOXELS:
+        mask = np.pad(mask, [(0, n % 2) for n in mask.shape])
+        halves = mask.reshape(*(m for n in mask.shape for m in (n // 2, 2))).mean(axis=(1, 3, 5))
+        mask, sides = halves >= 0.5, 2 * sides
+    depth = ndimage.distance_transform_edt(np.pad(mask, 1), sides).max()
+    radius = max(_CLOSING * depth, 1.01 * sides.min())
+    padded = np.pad(mask, [2 * (int(radius / side) + 2,) for side in sides])
+    reached = ndimage.distance_transform_edt(ndimage.distance_transform_edt(~padded, sides) <= radius, sides) <= radius
+    return float(np.sqrt(np.count_nonzero(~reached & ~padded) / np.count_nonzero(mask)))
+
+
+def cut_end(mask: Mask, at_border: Mask) -> float:
+    """How flat an end of a body is along an axis of the grid, as if slices were cut off; 0 if all are at the border.
+
+    The root of the voxels of its last slice beyond that of two fifths of those of the two slices before it, which is
+    what ends that are round have.
+
+    Args:
+        mask: (X, Y, Z), no larger than the body.
+        at_border: (3, 2) which ends the border of the volume cuts.
+    """
+    flattest = 0.0
+    for axis, end in np.argwhere(~at_border):
+        counts = np.moveaxis(mask, axis, 0)[:: -1 if end else 1][:3].sum(axis=(1, 2))
+        if len(counts) == 3:
+            flattest = max(flattest, np.sqrt(counts[0]) - np.sqrt(0.4 * counts[1:].mean()))
+    return flattest
