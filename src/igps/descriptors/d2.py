@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from igps._arrays import Floats, Singles
+from igps._parameters import check_at_least, check_one_of, check_positive
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors._parameters import check_at_least, check_one_of, check_positive
 from igps.nn.descriptor import BodyDescriptor
 
 ShapeFunction = Literal["d2", "a3", "d1"]

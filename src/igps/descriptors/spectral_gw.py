@@ -23,9 +23,9 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from igps._arrays import Floats, Singles
+from igps._parameters import check_at_least, check_one_of
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors._parameters import check_at_least, check_one_of
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
 from igps.signature.signature import Signature
@@ -79,8 +79,9 @@ class SpectralGromovWasserstein(BodyDescriptor):
 
     def describe_body(self, body: Body) -> Singles:
         """(times, n_quantiles) quantile functions, with the factor c²(t); (times, 1) for the bound "trace"."""
+        kernels = heat_kernels(body, self.samples, self.times, self.n_samples, self.n_eigenpairs, self.seed)
         rows = []
-        for time, kernel in zip(self.times, self._kernels(body), strict=True):
+        for time, kernel in zip(self.times, kernels, strict=True):
             if self.bound == "pairs":
                 values = quantiles(kernel, self.n_quantiles)
             else:
@@ -95,9 +96,6 @@ class SpectralGromovWasserstein(BodyDescriptor):
         """(Q, G) the largest over the times of the Wasserstein distances of exponent 2."""
         at_times = [euclidean(queries[:, i], gallery[:, i]) for i in range(queries.shape[1])]
         return torch.stack(at_times).amax(dim=0) / queries.shape[2] ** 0.5
-
-    def _kernels(self, body: Body) -> list[Floats]:
-        return heat_kernels(body, self.samples, self.times, self.n_samples, self.n_eigenpairs, self.seed)
 
 
 def heat_kernels(

@@ -25,9 +25,9 @@ from scipy.sparse.linalg import LinearOperator, eigsh, splu
 from torch import Tensor
 
 from igps._arrays import Booleans, Floats, Integers, Singles
+from igps._parameters import check_at_least, check_one_of
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors._parameters import check_at_least, check_one_of
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import longest_side
 from igps.nn.descriptor import BodyDescriptor
@@ -143,16 +143,11 @@ def _neumann(fine: Booleans) -> tuple[sparse.csr_array, Floats]:
         columns.append(cell[1:][here])
         weights.append(aperture[here])
     graph = _symmetric(np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), len(mass))
-    kept = _without_crumbs(graph, mass)
-    graph, mass = graph[kept][:, kept], mass[kept]
-    return sparse.diags_array(graph.sum(axis=1)) - graph, mass
-
-
-def _without_crumbs(graph: sparse.csr_array, mass: Floats) -> Integers:
-    """The cells of all pieces but the crumbs."""
     n_pieces, piece = connected_components(graph, directed=False)
     share = np.bincount(piece, weights=mass, minlength=n_pieces) / mass.sum()
-    return np.nonzero((share >= _CRUMB)[piece])[0]
+    kept = np.nonzero((share >= _CRUMB)[piece])[0]
+    graph, mass = graph[kept][:, kept], mass[kept]
+    return sparse.diags_array(graph.sum(axis=1)) - graph, mass
 
 
 def _dirichlet(fine: Booleans) -> tuple[sparse.csr_array, Floats]:

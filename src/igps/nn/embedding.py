@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from igps._parameters import check_at_least
 from igps.nn.specification import Specified
 
 EmbeddingKind = Literal["commute_time", "diffusion", "biharmonic"]
@@ -130,8 +131,7 @@ class SpectralEmbedding(Specified):
     ) -> None:
         super().__init__()
         _check_kind(kind, time)
-        if n_eigenpairs is not None and n_eigenpairs < 1:
-            raise ValueError(f"n_eigenpairs: expected None or at least 1, got {n_eigenpairs}.")
+        check_at_least(1, n_eigenpairs=n_eigenpairs)
         if n_knots < 0 or n_knots == 1:
             raise ValueError(f"n_knots: expected 0 for a fixed filter or at least 2, got {n_knots}.")
         self.kind: EmbeddingKind = kind

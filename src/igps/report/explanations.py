@@ -31,9 +31,7 @@ class Painted:
 
     other: str  # the name of the nearest
     told: str  # the largest shares of their distance, in words
-    values: tuple[
-        NDArray[np.uint8], NDArray[np.uint8]
-    ]  # (V,) of both surfaces: 128 where the bodies are alike, or more
+    values: tuple[NDArray[np.uint8], NDArray[np.uint8]]  # (V,) of both surfaces: 128 where they are alike, or more
 
 
 def keep_explanations(

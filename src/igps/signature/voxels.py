@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._arrays import Booleans, Floats, Integers
+from igps._parameters import check_at_least
 from igps.mesh.limits import check_grid
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import box_sides, directed_edges, longest_side
@@ -36,10 +37,8 @@ def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> 
     Raises:
         MeshError: no cell centre is inside, `min_samples` is out of reach, or the grid would fill the memory.
     """
-    if resolution < 1:
-        raise ValueError(f"resolution: expected at least 1, got {resolution}.")
-    if min_samples < 0:
-        raise ValueError(f"min_samples: expected at least 0, got {min_samples}.")
+    check_at_least(1, resolution=resolution)
+    check_at_least(0, min_samples=min_samples)
     finest = _finest_resolution(mesh)
     if resolution > finest:
         raise MeshError(
@@ -157,18 +156,13 @@ def _scan(
     before = -np.cumsum(at, axis=0)[:-1]
 
     touched = np.zeros(size, dtype=bool)
-    cell = _cell(axes, vertices)
+    # The first axis tells the cell, or where that has one point, as across a flat body, the next does.
+    cell = next((float(axis[1] - axis[0]) for axis in axes if len(axis) > 1), longest_side(vertices))
     for neighbour in (position - 1, position):
         clipped = np.clip(neighbour, 0, len(x_axis) - 1)
         close = np.abs(x_axis[clipped] - crossing) < _ON_SURFACE * cell
         touched[clipped[close], column[close], row[segment][close]] = True
     return after, before, touched[:-1]
-
-
-def _cell(axes: tuple[Floats, ...], vertices: Floats) -> float:
-    """The grid's cell: the first axis tells it, or where that has one point, as across a flat body, the next does."""
-    steps = (float(axis[1] - axis[0]) for axis in axes if len(axis) > 1)
-    return next(steps, longest_side(vertices))
 
 
 def _ranges(first: Integers, last: Integers) -> tuple[Integers, Integers]:

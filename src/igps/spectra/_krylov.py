@@ -152,7 +152,7 @@ class Krylov(Basis):
         Entry i of a vector becomes row ``order[i]``.
         """
         coefficients = _coefficients(ritz, index)
-        vectors = _empty(self._basis.shape[1], len(index)).numpy()
+        vectors = torch.empty(self._basis.shape[1], len(index), dtype=torch.float64).numpy()
 
         def combine(piece: slice) -> None:
             vectors[order[piece]] = combinations(self._basis[1 : self._stop], coefficients, piece)
@@ -271,10 +271,6 @@ def _coefficients(ritz: RitzPairs, index: torch.Tensor) -> torch.Tensor:
     """(m + b, K) of the Ritz pairs with these indices, of length 1."""
     coefficients = ritz.coefficients[:, index]
     return coefficients / torch.linalg.norm(coefficients, dim=0)
-
-
-def _empty(n_rows: int, n_columns: int) -> torch.Tensor:
-    return torch.empty(n_rows, n_columns, dtype=torch.float64)
 
 
 def _inverse(factor: torch.Tensor) -> torch.Tensor:

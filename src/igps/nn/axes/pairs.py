@@ -73,7 +73,7 @@ def _bin_middles(n_bins: int, reach: float) -> Tensor:
 class DistanceAxis(PairAxis):
     """Bins of a distance: `n_bins` equal intervals of [0, `reach`] at the start."""
 
-    def __init__(self, n_bins: int, reach: float, learnable: bool) -> None:
+    def __init__(self, n_bins: int = 16, reach: float = 1.0, *, learnable: bool = False) -> None:
         super().__init__()
         self.reach = reach
         self.centres = OrderedCentres(_bin_middles(n_bins, reach), learnable)
@@ -97,7 +97,7 @@ class InteriorDistance(DistanceAxis):
     def __init__(
         self, n_bins: int = 64, reach: float = 4.0, *, embedding: nn.Module | None = None, learnable: bool = False
     ) -> None:
-        super().__init__(n_bins, reach, learnable)
+        super().__init__(n_bins, reach, learnable=learnable)
         self.embedding = embedding
 
     def requirements(self, embedding: nn.Module) -> Requirements:
@@ -118,16 +118,13 @@ class EuclideanDistance(DistanceAxis):
         learnable: whether the centres are parameters.
     """
 
-    def __init__(self, n_bins: int = 16, reach: float = 1.0, *, learnable: bool = False) -> None:
-        super().__init__(n_bins, reach, learnable)
-
     def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Samples over √area."""
         return euclidean_distances(features.positions(), self.centres())
 
 
 class _CosineAxes(PairAxis):
-    def __init__(self, n_bins: int, learnable: bool) -> None:
+    def __init__(self, n_bins: int = 5, *, learnable: bool = False) -> None:
         super().__init__()
         cosines = _bin_middles(n_bins, 2.0) - 1
         self.towards_centres = OrderedCentres(cosines, learnable)
@@ -153,9 +150,6 @@ class PairCosines(_CosineAxes):
         learnable: whether the centres are parameters.
     """
 
-    def __init__(self, n_bins: int = 5, *, learnable: bool = False) -> None:
-        super().__init__(n_bins, learnable)
-
     def requirements(self, embedding: nn.Module) -> Requirements:
         """The directions."""
         return Requirements(attributes=("surface_direction",))
@@ -175,9 +169,6 @@ class EmbeddedPairCosines(_CosineAxes):
         n_bins: A, of each cosine.
         learnable: whether the centres are parameters.
     """
-
-    def __init__(self, n_bins: int = 5, *, learnable: bool = False) -> None:
-        super().__init__(n_bins, learnable)
 
     def requirements(self, embedding: nn.Module) -> Requirements:
         """Those of the embedding."""

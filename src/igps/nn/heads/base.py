@@ -82,14 +82,6 @@ def check_cells(cells: Tensor, n_expected: int) -> None:
         raise ValueError(f"descriptions: expected {n_expected} cells as in training, got {cells.shape[1]}.")
 
 
-def check_directions(n_directions: int, shrinkage: float) -> None:
-    """Raise a ValueError unless there is a direction and the shrinkage is positive."""
-    if n_directions < 1:
-        raise ValueError(f"n_directions: expected at least 1, got {n_directions}.")
-    if shrinkage <= 0:
-        raise ValueError(f"shrinkage: expected a positive number, got {shrinkage}.")
-
-
 def checked_parts(cells: Tensor, part_cells: Sequence[int] | None) -> Tensor:
     """(parts,) how many of (N, cells) values each part has, one part if None; a ValueError if they do not add up."""
     found = list(part_cells or (cells.shape[1],))

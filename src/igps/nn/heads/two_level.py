@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from igps._parameters import check_share
 from igps.nn.heads.base import Head, principal_directions
 from igps.nn.heads.wccn import MEDIAN, WCCNHead
 from igps.retrieval.distances import cosine, euclidean, square_root
@@ -85,8 +86,7 @@ class TwoLevelHead(Head):
             raise ValueError(
                 "body_heads, individual_head: expected heads with lengths. Make them by WCCNHead(..., lengths=True)."
             )
-        if not 0 < weight < 1:
-            raise ValueError(f"weight: expected a number between 0 and 1, got {weight}.")
+        check_share(weight=weight)
         self.register_buffer("scales", torch.tensor(list(scales)))
         self.register_buffer("share", torch.tensor(share))
         self.register_buffer("weight", None if individual_head is None else torch.tensor(weight))

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from igps._parameters import check_at_least, check_positive
 from igps.nn.heads.base import (
     Head,
     check_cells,
-    check_directions,
     checked_parts,
     class_means,
     class_members,
@@ -62,7 +62,8 @@ class WCCNHead(Head):
         lengths: bool = False,
     ) -> None:
         super().__init__()
-        check_directions(n_directions, shrinkage)
+        check_at_least(1, n_directions=n_directions)
+        check_positive(shrinkage=shrinkage)
         self.n_directions, self.shrinkage = n_directions, shrinkage
         self._parts = None if parts is None else tuple(parts)
         self.register_buffer("mean", torch.zeros(0))
