@@ -112,12 +112,7 @@ def on_threads(
     """The result of every job in order, each job on one thread of its own, as PyTorch lets many compute at once.
 
     Splitting each small product over all cores instead makes every one of them wait for the slowest core, which on a
-    machine with other work to do costs many times the product itself.
-
-    Args:
-        function: may run beside itself.
-        jobs: by which it is called.
-        n_threads: as many as `n_threads()` if None.
+    machine with other work to do costs many times the product itself. The threads are as many as `n_threads()` if None.
     """
     n_threads = min(available_threads() if n_threads is None else n_threads, len(jobs))
     alone = one_thread()(function)

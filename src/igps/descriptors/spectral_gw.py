@@ -108,16 +108,7 @@ def heat_kernels(
 ) -> list[Floats]:
     """A k_t(x, y) among some samples: for every time a (P, P) array without unit, P ≤ `n_samples`.
 
-    Args:
-        body: with its eigenpairs.
-        samples: "surface" or "interior".
-        times: in units of A/8π.
-        n_samples: at most so many samples, at equal steps of their order.
-        n_eigenpairs: the first so many; None takes all.
-        seed: of the first step.
-
-    Raises:
-        ValueError: a parameter out of range.
+    For the parameters and errors see `SpectralGromovWasserstein`; without a number of eigenpairs all are taken.
     """
     _check_samples(samples, n_samples)
     _check_times(times)
@@ -162,11 +153,7 @@ def gromov_wasserstein(
 
     The largest over the times of local minima over the couplings, by conditional gradients from the uniform coupling
     and from the one of the bound "signature". No lower bound of `SpectralGromovWasserstein` for the same
-    samples and times exceeds it. For the parameters see `heat_kernels`.
-
-    Raises:
-        ImportError: POT is not installed.
-        ValueError: a parameter out of range.
+    samples and times exceeds it. For the parameters see `SpectralGromovWasserstein`; an ImportError without POT.
     """
     try:
         import ot

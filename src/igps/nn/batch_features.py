@@ -34,13 +34,7 @@ def check_kind(samples: str) -> None:
 
 
 class SampleFeatures:
-    """Some samples of each shape of a batch, and what is computed from them, once for all who ask.
-
-    Args:
-        batch: N shapes.
-        kind: of the samples.
-        samples: all of that kind, or a subset.
-    """
+    """All samples of a kind of each shape, or a subset, and what is computed from them, once for all who ask."""
 
     def __init__(self, batch: SignatureBatch, kind: SampleKind, samples: SampleBatch) -> None:
         self.batch = batch
@@ -138,16 +132,9 @@ class BatchFeatures:
 
 
 def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest: int = _N_NEAREST) -> Tensor:
-    """Unit vectors from points to the mean of the targets nearest to them.
+    """(P, D) unit vectors from points to the mean of the nearest of targets (T, D), those of the mask alone.
 
-    Args:
-        points: (P, D).
-        targets: (T, D).
-        mask: (T,) true where a target is real.
-        n_nearest: how many of the targets; all if there are fewer.
-
-    Returns:
-        (P, D); zero where the mean is the point itself.
+    Zero where the mean is the point itself; of all targets where there are fewer.
     """
     with full_precision():
         distances = torch.cdist(points.detach(), targets.detach().masked_fill(~mask[:, None], _FAR))

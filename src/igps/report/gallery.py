@@ -29,9 +29,7 @@ _THUMBNAIL_VERTICES = 800
 def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progress: bool = False) -> None:
     """Save a PNG file with a row per class: its first mesh as the query, then the `top` meshes ranked nearest to it.
 
-    Args:
-        root: folder of the meshes.
-        ranking: the ranking.csv that `igps retrieve` wrote.
+    `ranking` is the ranking.csv that `igps retrieve` wrote of the meshes below `root`.
     """
     results: dict[str, list[tuple[str, float, bool]]] = {}
     with ranking.open(newline="") as file:

@@ -31,12 +31,7 @@ _LEAST_MAPPED, _MOST_MAPPED = 3, 3000
 def data_of(
     results: Results, surfaces: Mapping[str, Surface], explanations: Mapping[str, Painted] | None = None
 ) -> dict[str, Any]:
-    """All numbers of the page but the surfaces themselves.
-
-    Returns:
-        `classes`: names in alphabetical order; `shapes`: see `_shapes`; `columns`: further values of the shapes by
-        name; `systems`: see `_of_system`; `movements` of a robustness study, by descriptor and disturbance.
-    """
+    """All numbers of the page but the surfaces themselves; for `shapes` see `_shapes`, for `systems` `_of_system`."""
     classes = sorted(set(results.labels or ()))
     index = {name: i for i, name in enumerate(results.names)}
     sizes = Counter(results.labels or ())

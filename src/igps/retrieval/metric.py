@@ -23,9 +23,6 @@ class RetrievalScoresMetric(Metric):
     tensors, fractions. Call `update` and `compute`, not the metric itself: single batches seldom hold two of a class.
     A repeated shape would be a perfect match, and a distributed sampler repeats some to fill its batches: give `ids`,
     and each shape counts once, whatever the number of processes.
-
-    Args:
-        distance: the distance function that compares the descriptors.
     """
 
     is_differentiable = False

@@ -151,21 +151,13 @@ def _entries(forms: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Clusters:
-    """Consecutive hats: 32 each on the first level, four clusters of the level before on the next.
+    """Consecutive hats: 32 each on the first level, four clusters of the level before on the next."""
 
-    Args:
-        centres: (C, 3) of all levels, numbered through.
-        radii: (C,) of balls about them that hold those of the hats.
-        first: (levels + 1,) cluster at which each level begins, and their number.
-        sums: (C, 19, K) of the functions.
-        n_hats: V.
-    """
-
-    centres: Floats
-    radii: Floats
-    first: Integers
-    sums: NDArray[np.floating]
-    n_hats: int
+    centres: Floats  # (C, 3) of all levels, numbered through
+    radii: Floats  # (C,) of balls about them that hold those of the hats
+    first: Integers  # (levels + 1,) cluster at which each level begins, and their number
+    sums: NDArray[np.floating]  # (C, 19, K) of the functions
+    n_hats: int  # V
 
     @staticmethod
     def of(hats: Floats, functions: NDArray[np.floating], team: Team = ALONE) -> Clusters:

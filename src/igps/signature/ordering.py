@@ -41,15 +41,9 @@ def places(
     body with symmetries many points have one potential, and the anchors tell them apart; which of several like points
     becomes an anchor is decided by rounding, but whichever it is, all that follows is like what would follow another.
 
-    Args:
-        eigenfunctions: (P, K) at the points, 1/length.
-        eigenvalues: (K,) positive ascending, 1/length².
-        area: of the surface, length².
-        marks: (P,) of the order of 1: what else tells points apart. A body's symmetries need not be those of the points
-            that stand for it: around the axis of a vase the surface is the same, the grid or the triangles are not.
-
-    Returns:
-        (P,) dimensionless.
+    Of eigenfunctions (P, K) at the points it is (P,), dimensionless. Marks (P,) of the order of 1 are what else tells
+    points apart: a body's symmetries need not be those of the points that stand for it. Around the axis of a vase the
+    surface is the same, the grid or the triangles are not.
     """
     scaled = eigenvalues * area
     weights = np.sqrt(area / scaled) * np.exp(-scaled / _CUTOFF)
@@ -115,15 +109,9 @@ def shares_around(faces: Integers, areas: Floats) -> Floats:
 
 
 def one_in_each_share(sizes: Floats, n: int, generator: np.random.Generator) -> Integers:
-    """Draw n of some things laid end to end, each as often as its size asks: one at random in each n-th of the length.
+    """Draw n of things of sizes (F,) laid end to end: one at random in each n-th of the length; (n,) ascending indices.
 
-    Args:
-        sizes: (F,) non-negative, in their order.
-        n: how many to draw.
-        generator: of the draws.
-
-    Returns:
-        (n,) ascending indices; a large thing is drawn several times.
+    Each is drawn as often as its size asks, a large one several times.
     """
     ends = np.cumsum(sizes)
     position = (np.arange(n) + generator.random(n)) * (ends[-1] / n)

@@ -21,18 +21,12 @@ _MAX_CELLS = 2**25
 
 
 def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> Floats:
-    """Centres of the cubic voxels inside the mesh (Rustamov 2010, section 3).
+    """(P, 3) centres, length, of the cubic voxels inside the mesh (Rustamov 2010, section 3).
 
     The grid is centred on the bounding box, with cells of 1/`resolution` of its longest side, so that moving the mesh,
     or turning it by the symmetries of the grid, moves and turns the samples.
 
-    Args:
-        mesh: the body.
-        resolution: cells along the longest side of the bounding box.
-        min_samples: refine the grid until at least so many cells are inside; 0 keeps `resolution`.
-
-    Returns:
-        (P, 3) points in the mesh's coordinates, length.
+    Until at least `min_samples` cells are inside, the grid is refined; 0 keeps the resolution.
 
     Raises:
         MeshError: no cell centre is inside, `min_samples` is out of reach, or the grid would fill the memory.
@@ -84,14 +78,11 @@ def grid_axes(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Floats]:
 
 
 def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
-    """For each point of the grid spanned by `axes`, whether the mesh's winding number there is above one half.
+    """(X, Y, Z) whether the mesh's winding number is above one half, at each point of the grid spanned by `axes`.
 
     Along each axis the signed crossings of every grid line are summed from both ends. On a closed mesh the six sums
     agree, and are the winding number. Where a hole lets one line through, the other five outvote it; where more
     disagree, the winding number is computed from solid angles (Jacobson et al. 2013). Points on the surface are out.
-
-    Returns:
-        (X, Y, Z) booleans.
     """
     shape = tuple(len(axis) for axis in axes)
     votes = np.zeros(shape, dtype=np.int8)

@@ -120,8 +120,7 @@ def class_means(rows: Tensor, members: Tensor) -> Tensor:
 def principal_directions(rows: Tensor, n: int) -> tuple[Tensor, Tensor]:
     """The n orthonormal directions along which rows (N, D) differ most from the origin, and the sums of their squares.
 
-    Returns:
-        (k, D) and (k,), the largest first; k ≤ n, as directions without extent are left out.
+    They are (k, D) and (k,), the largest first; k ≤ n, as directions without extent are left out.
     """
     n_rows, width = rows.shape
     wide = width > n_rows
@@ -138,14 +137,8 @@ def within_class_whitening(residuals: Tensor, rank: int, shrinkage: float, n: in
     factor, the identity but for a gain along each eigenvector of W. Source: within-class covariance normalisation,
     Hatch, Kajarekar and Stolcke 2006.
 
-    Args:
-        residuals: (N, D) rows of the training shapes, less the mean of their class.
-        rank: number of eigenvalues that the mean is taken over.
-        shrinkage: s.
-        n: directions, at most; those of the largest eigenvalues.
-
-    Returns:
-        directions (k, D), orthonormal, and gains (k,) in (0, 1].
+    Of residuals (N, D), rows of the training shapes less the mean of their class, these are at most n orthonormal
+    directions (k, D), of the largest eigenvalues, and gains (k,) in (0, 1]. The mean is taken over `rank` eigenvalues.
     """
     directions, squares = principal_directions(residuals, min(n, rank))
     relative = squares * rank / residuals.square().sum()
