@@ -68,10 +68,7 @@ class About:
 def write_collection(path: Path, about: About, signature: Callable[[int], Signature]) -> None:
     """Write a collection, whole or not at all: a safetensors file of the arrays of all Signatures.
 
-    Args:
-        path: the file; one that is there is replaced.
-        about: N bodies.
-        signature: of each, by its number; asked for several times, and not kept.
+    A file that is there is replaced. Each Signature is asked for by its number, several times, and not kept.
     """
     n = len(about.bodies)
     arrays: list[dict[str, tuple[str, tuple[int, ...], int]]] = []
@@ -110,11 +107,8 @@ def write_collection(path: Path, about: About, signature: Callable[[int], Signat
 class CollectionFile:
     """The Signatures of a file that `write_collection` wrote, read by memory map and checked at each reading.
 
-    Reading runs no code. A worker process that is given one opens the file for itself.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a collection, or a damaged one.
+    Reading runs no code. A worker process that is given one opens the file for itself. A FileNotFoundError without it,
+    a ValueError of another file, or a damaged one.
     """
 
     def __init__(self, path: str | Path) -> None:

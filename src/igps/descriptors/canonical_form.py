@@ -63,12 +63,7 @@ class CanonicalForm(BodyDescriptor):
             )
 
     def describe_body(self, body: Body) -> Singles:
-        """(number of moments,) in units of √area, ordered as `exponents(max_order)`.
-
-        Raises:
-            ValueError: the mesh has fewer than `n_samples` vertices.
-            MeshError: it cannot be simplified.
-        """
+        """(number of moments,), in √area, ordered as `exponents(max_order)`; errors as of `geodesic_samples`."""
         samples = geodesic_samples(body.mesh, self.n_samples, self.max_vertices)
         distances = samples.mutual / np.sqrt(body.mesh.area)
         form = classical_scaling(distances)

@@ -57,11 +57,7 @@ class D2(BodyDescriptor):
         check_positive(reach=self.reach)
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_bins,) histogram of the shape function, without unit; sums to 1.
-
-        Raises:
-            ValueError: too few surface samples.
-        """
+        """(n_bins,) histogram of the shape function, without unit, of sum 1; a ValueError of too few samples."""
         points = body.surface.points / math.sqrt(body.area)
         if len(points) < _N_POINTS[self.function]:
             raise ValueError(

@@ -46,12 +46,7 @@ class GeodesicSpectral(BodyDescriptor):
             )
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_eigenvalues,) √|λₖ|, without unit.
-
-        Raises:
-            ValueError: the mesh has fewer than `n_samples` vertices.
-            MeshError: it cannot be simplified.
-        """
+        """(n_eigenvalues,) √|λₖ|, without unit; errors as of `geodesic_samples`."""
         samples = geodesic_samples(body.mesh, self.n_samples, self.max_vertices)
         values = affinity_eigenvalues(samples.mutual, self.n_eigenvalues)
         return np.sqrt(np.abs(values)).astype(np.float32)

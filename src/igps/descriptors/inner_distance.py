@@ -61,11 +61,7 @@ class InnerDistance(BodyDescriptor):
         check_positive(max_distance=self.max_distance)
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_bins,) histogram that sums to 1.
-
-        Raises:
-            ValueError: fewer than two interior samples, or samples that are not on a grid.
-        """
+        """(n_bins,) histogram that sums to 1; for errors see `inner_distances`."""
         points = body.interior.points
         n_sources = min(self.n_sources, len(points))
         sources = np.random.default_rng(self.seed).permutation(len(points))[:n_sources]

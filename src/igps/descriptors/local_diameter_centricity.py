@@ -67,11 +67,7 @@ class LocalDiameterCentricity(BodyDescriptor):
             raise ValueError(f"opening_angle: expected between 0 and 180 degrees, got {self.opening_angle}.")
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_diameter_bins, n_centricity_bins) histogram that sums to 1.
-
-        Raises:
-            MeshError: no ray meets the far side of the surface.
-        """
+        """(n_diameter_bins, n_centricity_bins) histogram of sum 1; a MeshError where no ray meets the far side."""
         mesh = in_order_of_form(body.mesh)
         points = surface_points(mesh, self.n_samples, self.seed)
         diameter = local_diameters(mesh, points.face, points.weights, self.n_rays, self.opening_angle)

@@ -75,11 +75,7 @@ class VolumeShapeDNA(BodyDescriptor):
         check_at_least(1, n_eigenvalues=self.n_eigenvalues, n_voxels=self.n_voxels)
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_eigenvalues,) normalised eigenvalues, ascending, without unit.
-
-        Raises:
-            MeshError: the body is too thin for the grid, or has too few cells for the eigenvalues.
-        """
+        """(n_eigenvalues,) normalised eigenvalues, ascending, without unit; for errors see `volume_spectrum`."""
         return volume_spectrum(body.mesh, self.n_eigenvalues, self.boundary, self.n_voxels).astype(np.float32)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:

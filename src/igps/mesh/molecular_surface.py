@@ -57,7 +57,6 @@ def molecular_surface(
         1.0
 
     Args:
-        molecule: its balls.
         kind: "excluded": what no probe enters; "accessible": where no centre of a probe can be; "van_der_waals": the
             balls themselves.
         probe: radius, Å; that of water is 1.4.

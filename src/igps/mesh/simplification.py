@@ -14,10 +14,8 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     """The mesh with at most `max_vertices` vertices, by quadric edge collapse (Garland and Heckbert 1997).
 
     A mesh that is small enough is returned as it is. No collapse changes the topology (libigl's `qslim` checks each),
-    so that a closed manifold stays one; the result is checked again like any mesh.
-
-    Raises:
-        MeshError: `max_vertices` cannot be reached, or the simplified surface is not a body any more.
+    so that a closed manifold stays one; the result is checked again like any mesh. A MeshError where `max_vertices`
+    cannot be reached, or the simplified surface is not a body any more.
     """
     if max_vertices < 4:
         raise ValueError(f"max_vertices: expected at least 4, got {max_vertices}.")

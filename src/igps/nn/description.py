@@ -108,15 +108,10 @@ def describe(
 
 
 def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
-    """Give axes whose centres are quantiles those of a collection's samples; what has its centres keeps them.
+    """Give axes whose centres are quantiles those of a collection's samples; whether there were any.
 
-    Of each body as many samples count, the first 500.
-
-    Returns:
-        Whether there were any.
-
-    Raises:
-        ValueError: the samples have no such attribute.
+    What has its centres keeps them. Of each body as many samples count, the first 500. A ValueError where the samples
+    have no such attribute.
     """
     axes = [one for one in descriptor.modules() if isinstance(one, Attribute) and not one.is_fitted]
     values: list[list[Singles]] = [[] for _ in axes]

@@ -140,9 +140,7 @@ def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) ->
 def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     """The module that `save_module` wrote, in evaluation mode, and what is told of it. No code of the file runs.
 
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: it is none of these files, or a damaged one.
+    A FileNotFoundError without a file, a ValueError if it is none of these, or damaged.
     """
     path = Path(path)
     path = path / IN_FOLDER if path.is_dir() else path

@@ -88,17 +88,11 @@ class RetrievalScores:
 
 @dataclass(frozen=True, eq=False)
 class PrecisionRecallCurve:
-    """Interpolated precision at given recall levels, mean over the scored queries.
+    """Interpolated precision at given recall levels, mean over the scored queries."""
 
-    Attributes:
-        recall: (L,) float64 recall levels, ascending.
-        precision: (L,) float64, never ascending.
-        n_queries: number of queries in the mean.
-    """
-
-    recall: Tensor
-    precision: Tensor
-    n_queries: int
+    recall: Tensor  # (L,) float64 recall levels, ascending
+    precision: Tensor  # (L,) float64, never ascending
+    n_queries: int  # in the mean
 
 
 def retrieval_scores(distances: Tensor, query_labels: Labels, gallery_labels: Labels | None = None) -> RetrievalScores:
@@ -176,9 +170,6 @@ def precision_recall_curve(
     The precision at level r is the highest of all precisions at a recall of r or more. The default is the 20 levels
     0.05, 0.10, …, 1 of the Princeton Shape Benchmark (Shilane et al. 2004); the 11 levels 0, 0.1, …, 1 are the other
     usual choice. Distances and labels, and errors, as for retrieval_scores.
-
-    Raises:
-        ValueError: also if the recall levels are not ascending numbers in [0, 1].
     """
     recall = torch.tensor(list(recall_levels), dtype=torch.float64)
     valid = recall.numel() > 0 and bool(((recall >= 0) & (recall <= 1)).all()) and bool((recall.diff() > 0).all())

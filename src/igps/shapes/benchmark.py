@@ -28,22 +28,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class GeneratedShape:
-    """One generated shape.
+    """One generated shape."""
 
-    vertices: (V,3) float64, in units of about half the height of a figure.
-    faces: (F,3) int64, outward.
-    label: name of the class.
-    name: class and running number, such as ``biped/00``.
-    genus: number of handles of the surface; V − E + F = 2 − 2 genus.
-    rotation: (3,3) what turned the shape out of its upright frame; ``vertices @ rotation`` stands upright again.
-    """
-
-    vertices: Array
-    faces: Faces
-    label: str
-    name: str
-    genus: int
-    rotation: Array
+    vertices: Array  # (V,3) float64, in units of about half the height of a figure
+    faces: Faces  # (F,3) int64, outward
+    label: str  # name of the class
+    name: str  # class and running number, such as ``biped/00``
+    genus: int  # number of handles of the surface; V − E + F = 2 − 2 genus
+    rotation: Array  # (3,3) what turned it out of its upright frame; ``vertices @ rotation`` stands upright again
 
 
 class ArticulatedShapes:
@@ -107,12 +99,7 @@ class ArticulatedShapes:
         return [f"{name}/{number:02d}" for name in self.class_names for number in range(self.n_per_class)]
 
     def __getitem__(self, index: int) -> GeneratedShape:
-        """Generate one shape; costs a fraction of a second, nothing is kept.
-
-        Raises:
-            IndexError: there is no such shape.
-            ValueError: no pose gave a valid mesh; names the class and what went wrong.
-        """
+        """Generate one shape, in a fraction of a second; nothing is kept. A ValueError if no pose gave a valid mesh."""
         position = operator.index(index)
         if not -len(self) <= position < len(self):
             raise IndexError(f"index must lie in [{-len(self)}, {len(self)}), got {index}")

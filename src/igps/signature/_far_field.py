@@ -59,11 +59,7 @@ class Surface:
 
     @staticmethod
     def of(vertices: Floats, faces: Integers) -> tuple[Surface, Integers]:
-        """The surface, and which vertices (V,) its own are.
-
-        Raises:
-            ValueError: no face has an area.
-        """
+        """The surface, and which vertices (V,) its own are; a ValueError if no face has an area."""
         faces = faces[has_area(vertices[faces])]
         if len(faces) == 0:
             raise ValueError("faces: expected at least one face with an area, got flat ones only; check the mesh")

@@ -16,11 +16,7 @@ AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
 
 
 def interior_attributes(mesh: Mesh, points: Floats, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
-    """Named attributes of points inside, (P,) or (P, 3), dimensionless and the same for a scaled or moved body.
-
-    Raises:
-        ValueError: unknown name.
-    """
+    """Named attributes, see `check_attributes`, of points inside, (P,) or (P, 3), free of scale and motion."""
     check_attributes(names)
     functions = {
         "depth": depth,

@@ -150,11 +150,7 @@ class Extension:
         self._vertices, self._faces, self._accuracy = vertices, faces, accuracy
 
     def __call__(self, points: NDArray[np.floating]) -> Floats:
-        """(P, K) of points (P, 3).
-
-        Raises:
-            ValueError: points of another shape, or the weights of one sum to zero.
-        """
+        """(P, K) of points (P, 3); a ValueError of another shape, or where the weights of one sum to zero."""
         x = _scaled(self._vertices, self._faces, points)[2] @ self._surface.axes
         accuracy = self._accuracy
         setting = accuracy

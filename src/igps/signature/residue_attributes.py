@@ -67,11 +67,7 @@ def residue_means(molecule: Molecule, points: Floats, values: Floats, width: flo
 
 
 def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
-    """A named attribute of points (P, 3), Å: (P,), of "residue_shares" (P, 25); see `RESIDUE_ATTRIBUTES`.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """A named attribute of points (P, 3), Å: (P,), of "residue_shares" (P, 25); a ValueError of an unknown name."""
     if name == "screened_potential":
         return screened_potential(molecule, points)
     if name not in _COLUMNS:

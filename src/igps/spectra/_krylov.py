@@ -32,19 +32,12 @@ COLUMNS_AT_ONCE = 8192
 
 @dataclass(frozen=True)
 class RitzPairs:
-    """Eigenpairs of the projected problem, in the order of their eigenvalues.
+    """Eigenpairs of the projected problem, in the order of their eigenvalues."""
 
-    Attributes:
-        eigenvalues: (m,) of A.
-        residuals: (m,) ‖A y − λ y‖ of the Ritz vectors after one more application of the operator.
-        coefficients: (m + b, m) of those Ritz vectors, not normalised, in the basis with its next block.
-        below_shift: (m,) whether θ < 0.
-    """
-
-    eigenvalues: torch.Tensor
-    residuals: torch.Tensor
-    coefficients: torch.Tensor
-    below_shift: torch.Tensor
+    eigenvalues: torch.Tensor  # (m,) of A
+    residuals: torch.Tensor  # (m,) ‖A y − λ y‖ of the Ritz vectors after one more application of the operator
+    coefficients: torch.Tensor  # (m + b, m) of those Ritz vectors, not normalised, in the basis with its next block
+    below_shift: torch.Tensor  # (m,) whether θ < 0
 
     def leading(self, n_below: int, tolerance: float) -> torch.Tensor:
         """Indices of the pairs up to the first that has not converged; none if fewer than n_below lie below σ."""

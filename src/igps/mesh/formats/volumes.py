@@ -121,10 +121,7 @@ def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) ->
 
     Names of labels come from `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, extensions of NIfTI), else
     from a table beside it (see `names_beside`); without one a label is its number, and the only label 1 of a mask has
-    the name of the file.
-
-    Raises:
-        MeshError: the file is missing, cut short, too large, or holds no labels; or its library is missing.
+    the name of the file. A MeshError of a file that is missing, cut short, too large, or holds no labels.
     """
     path = Path(path)
     if not path.is_file():

@@ -71,7 +71,10 @@ def _bin_middles(n_bins: int, reach: float) -> Tensor:
 
 
 class DistanceAxis(PairAxis):
-    """Bins of a distance: `n_bins` equal intervals of [0, `reach`] at the start."""
+    """Bins of a distance: `n_bins` equal intervals of [0, `reach`] at the start, whose centres may be parameters.
+
+    What lies beyond counts in the last.
+    """
 
     def __init__(self, n_bins: int = 16, reach: float = 1.0, *, learnable: bool = False) -> None:
         super().__init__()
@@ -88,10 +91,8 @@ class InteriorDistance(DistanceAxis):
     """Bins of the interior distance, the Euclidean distance of embeddings (Rustamov 2010, equation 5).
 
     Args:
-        n_bins: B.
-        reach: end of the last bin; what lies beyond counts in the last bin.
         embedding: other than the histogram's: for a second scale.
-        learnable: whether the centres are parameters.
+        n_bins, reach, learnable: see `DistanceAxis`.
     """
 
     def __init__(
@@ -110,13 +111,7 @@ class InteriorDistance(DistanceAxis):
 
 
 class EuclideanDistance(DistanceAxis):
-    """Bins of the distance in space, over √area.
-
-    Args:
-        n_bins: B.
-        reach: end of the last bin; what lies beyond counts in the last bin.
-        learnable: whether the centres are parameters.
-    """
+    """Bins of the distance in space, over √area; see `DistanceAxis`."""
 
     def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Samples over √area."""
@@ -143,11 +138,7 @@ class PairCosines(_CosineAxes):
     """Bins of the three cosines of point pair features in space (Wahl et al. 2003; Drost et al. 2010).
 
     The direction of a sample is that to the nearest point of the surface, on the surface the outward normal. They see
-    corners, hollows and symmetry, which distances alone tell little of.
-
-    Args:
-        n_bins: A, of each cosine.
-        learnable: whether the centres are parameters.
+    corners, hollows and symmetry, which distances alone tell little of. Each cosine has A bins.
     """
 
     def requirements(self, embedding: nn.Module) -> Requirements:
@@ -164,10 +155,6 @@ class EmbeddedPairCosines(_CosineAxes):
 
     The direction of an interior sample is to the embedded surface samples nearest to it, that of a surface sample away
     from the interior ones.
-
-    Args:
-        n_bins: A, of each cosine.
-        learnable: whether the centres are parameters.
     """
 
     def requirements(self, embedding: nn.Module) -> Requirements:

@@ -139,11 +139,7 @@ class BallRadius(PointAxis):
         return Requirements(attributes=("surface_direction",))
 
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
-        """(N, P) logarithms of the radii over √area.
-
-        Raises:
-            ValueError: interior samples.
-        """
+        """(N, P) logarithms of the radii over √area; a ValueError of interior samples."""
         if features.kind != "surface":
             raise ValueError("samples: expected surface samples, which balls touch, got interior ones.")
         return features.ball_radii()[..., ("inside", "outside").index(self.side)].log()
@@ -203,11 +199,7 @@ class Attribute(PointAxis):
         return attribute_requirements(self.name)
 
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
-        """(N, P) of the attribute.
-
-        Raises:
-            ValueError: the samples have no such attribute, or it is a direction.
-        """
+        """(N, P) of the attribute; a ValueError if the samples have none of this name, or it is a direction."""
         if not self.is_fitted:
             raise ValueError(
                 f"{self.name}: expected centres, got {self.quantiles} quantiles of no collection. Call "

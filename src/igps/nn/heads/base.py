@@ -20,7 +20,8 @@ class Head(Specified, ABC):
     """Descriptions to embeddings of length 1, and the distance that compares embeddings.
 
     A head of your own defines `fit` and `forward`, and `distances` where the cosine distance is not its own. Its
-    buffers take their sizes from what it is fitted to, also when it is loaded.
+    buffers take their sizes from what it is fitted to, also when it is loaded. One that must be fitted before it is
+    used raises a RuntimeError.
     """
 
     @abstractmethod
@@ -32,6 +33,9 @@ class Head(Specified, ABC):
             labels: (N,) classes, integers.
             part_cells: cells of each part of a description, see `HistogramDescriptor.part_cells`; None takes all as one
                 part.
+
+        Raises:
+            ValueError: shapes that do not match, or too few classes, or shapes of a class.
         """
 
     @abstractmethod
@@ -43,11 +47,7 @@ class Head(Specified, ABC):
         return cosine(queries, gallery)
 
     def short(self, embeddings: Tensor) -> Tensor:
-        """(N, D) embeddings to (N, ≤ 256) of length 1 whose cosines are nearly theirs.
-
-        Raises:
-            ValueError: the head has none.
-        """
+        """(N, D) embeddings to (N, ≤ 256) of length 1 whose cosines are nearly theirs; a ValueError if it has none."""
         raise ValueError(
             f"short: expected a head that shortens its embeddings, as the TwoLevelHead of pretrained does, got "
             f"{type(self).__name__} and embeddings of {embeddings.shape[1]} numbers."
@@ -65,11 +65,7 @@ class Head(Specified, ABC):
 
 
 def square_roots(histograms: Tensor) -> Tensor:
-    """(N, ...) histograms to the (N, cells) square roots of their cells, unit vectors with a finite gradient.
-
-    Raises:
-        ValueError: an entry below zero, as embeddings have.
-    """
+    """(N, cells) roots of the cells of histograms (N, ...), with a finite gradient; a ValueError of one below zero."""
     cells = histograms.flatten(1)
     if bool((cells < 0).any()):
         raise ValueError("descriptions: expected histograms, entries ≥ 0, got a negative one.")
@@ -100,11 +96,7 @@ def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
 
 
 def class_members(descriptions: Tensor, labels: Tensor) -> Tensor:
-    """The classes (N,) of descriptions (N, ...), numbered from 0 without a gap.
-
-    Raises:
-        ValueError: labels that are not aligned, or no class of two shapes.
-    """
+    """The classes (N,) of descriptions (N, ...), numbered from 0; a ValueError if not aligned, or all are single."""
     _, members = checked_labels(descriptions, labels).unique(return_inverse=True)
     if int(members.max()) + 1 == len(members):
         raise ValueError("labels: expected a class of at least two shapes, got as many classes as shapes.")

@@ -85,11 +85,7 @@ class WhitenedHead(Head):
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Take mean and directions from the training shapes, see `Head.fit`.
-
-        Raises:
-            ValueError: shapes that do not match, or no class of two shapes.
-        """
+        """Take mean and directions from the training shapes, see `Head.fit`."""
         roots = square_roots(descriptions)
         members = class_members(roots, labels)
         means = class_means(roots, members)
@@ -211,11 +207,7 @@ class KernelHead(Head):
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Fit whitening and regression to the training shapes, see `Head.fit`.
-
-        Raises:
-            ValueError: shapes that do not match, or fewer than two classes.
-        """
+        """Fit whitening and regression to the training shapes, see `Head.fit`."""
         self.classes, members = checked_labels(descriptions, labels).unique(return_inverse=True)
         if len(self.classes) < 2:
             raise ValueError(f"labels: expected at least two classes, got {len(self.classes)}.")
@@ -240,11 +232,7 @@ class KernelHead(Head):
         return self
 
     def scores(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, n_classes), about 1 for the class that a shape is of and 0 for others.
-
-        Raises:
-            RuntimeError: it has not been fitted.
-        """
+        """(N, ...) histograms to (N, n_classes), about 1 for the class that a shape is of and 0 for others."""
         if not len(self.anchors):
             raise self._not_fitted()
         return self._kernel(self._vectors(descriptions)) @ self.coefficients

@@ -73,11 +73,7 @@ class WCCNHead(Head):
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Take mean and directions from the training shapes, see `Head.fit`.
-
-        Raises:
-            ValueError: shapes that do not match, a part that is not there, or no class of two shapes.
-        """
+        """Take mean and directions from the training shapes, see `Head.fit`."""
         roots = square_roots(descriptions)
         members = class_members(roots, labels)
         self.part_cells = checked_parts(roots, part_cells)
@@ -97,11 +93,7 @@ class WCCNHead(Head):
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, D) of length 1.
-
-        Raises:
-            RuntimeError: it has not been fitted.
-        """
+        """(N, ...) histograms to (N, D) of length 1."""
         roots = square_roots(descriptions)
         if not len(self.mean):
             raise self._not_fitted()

@@ -98,11 +98,7 @@ def joint(memberships: list[Tensor]) -> Tensor:
 
 
 def counted(one: Tensor, other: Tensor, n_points: Tensor) -> Tensor:
-    """(..., C, D) shares of points in combinations of classes, from memberships (..., P, C) and (..., P, D).
-
-    Raises:
-        ValueError: no point.
-    """
+    """(..., C, D) shares of points, at least one, in combinations of classes (..., P, C) and (..., P, D)."""
     if not torch.compiler.is_compiling() and int(n_points.min()) < 1:
         raise ValueError("samples: expected at least one of each body, got none.")
     return one.mT @ other / n_points[..., None, None]
