@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from igps.data._keys import content_digest, stamp_of
 from igps.data.attributes import AttributeSource
+from igps.data.cache import content_digest, stamp_of
 from igps.mesh.formats import images, vertex_values
 from igps.mesh.formats.molecules import Molecule, MoleculeBodies, is_structure, molecules_by_part
 from igps.mesh.loading import BodyRef, load_mesh, read_surface

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import os
@@ -36,6 +37,18 @@ Read = TypeVar("Read")
 def default_cache_dir() -> Path:
     """The user's cache directory for Signatures: `$XDG_CACHE_HOME/igps`, or `~/.cache/igps`."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "igps"
+
+
+def stamp_of(path: Path) -> tuple[int, int, int]:
+    """Bytes of a file, and when its content and its name or rights were last changed, in nanoseconds."""
+    found = os.stat(path)
+    return found.st_size, found.st_mtime_ns, found.st_ctime_ns
+
+
+def content_digest(path: Path) -> bytes:
+    """Of what is in a file."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
 
 
 class FileCache(ABC, Generic[T]):

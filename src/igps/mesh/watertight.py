@@ -20,9 +20,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers
-from igps.mesh._distance_grid import Grid, cell_sizes, distances, rounded
 from igps.mesh._isosurface import level_surface, simplified
-from igps.mesh._level_set import joined, level_set
+from igps.mesh._level_set import Grid, cell_sizes, distances, joined, level_set, rounded
 from igps.mesh._outside import OrientedSurface, outside_of
 from igps.mesh.mesh import Mesh, MeshError, check_places
 from igps.mesh.surface import diagonal, face_areas, largest, longest_side

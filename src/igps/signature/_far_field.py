@@ -24,8 +24,8 @@ from scipy import sparse
 from igps._arrays import Floats, Integers
 from igps._threads import ALONE, Team
 from igps.mesh.surface import has_area
-from igps.signature._spatial_order import principal_axes, spatial_order
 from igps.signature._weight_loops import fill_cluster_terms, fill_clusters, fill_hats, replace_near, seen_from
+from igps.signature.ordering import principal_axes, spatial_order
 
 _LEAF = 32  # hats in the smallest clusters; one costs as much as 19
 N_TERMS = 19

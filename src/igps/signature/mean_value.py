@@ -25,11 +25,9 @@ from igps._arrays import Floats, Integers
 from igps._threads import Team
 from igps.mesh.winding import checked_places
 from igps.signature._far_field import Clusters, Surface
-from igps.signature._spatial_order import spatial_order
+from igps.signature.ordering import spatial_order
 
 logger = logging.getLogger(__name__)
-
-__all__ = ["Extension", "extend", "mean_value_coordinates"]
 
 _BLOCK_BYTES = 256 * 2**20  # of weights at a time
 _GROUP = 192  # points that see the same clusters

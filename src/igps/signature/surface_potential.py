@@ -19,9 +19,7 @@ import numpy as np
 from igps._arrays import Floats, Integers
 from igps.mesh.surface import longest_side
 from igps.signature._potential_loops import fill_potentials
-from igps.signature._spatial_order import spatial_order
-
-__all__ = ["surface_potential"]
+from igps.signature.ordering import spatial_order
 
 _POINTS = 32  # in a block; they see the same clusters
 _FACES = 8  # in the smallest clusters, and so many clusters of one level in one of the next
