@@ -92,15 +92,10 @@ class FewerEigenpairs(Transform):
 
 @dataclass(frozen=True, kw_only=True)
 class Noise(Transform):
-    """Gaussian noise on positions and on eigenfunctions.
+    """Gaussian noise on positions and on eigenfunctions."""
 
-    Args:
-        points: its standard deviation over √area.
-        eigenfunctions: its standard deviation times √area; an eigenfunction's mean square is 1/area.
-    """
-
-    points: float = 0.0
-    eigenfunctions: float = 0.0
+    points: float = 0.0  # its standard deviation over √area
+    eigenfunctions: float = 0.0  # its standard deviation times √area; an eigenfunction's mean square is 1/area
 
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         length = np.sqrt(signature.area)

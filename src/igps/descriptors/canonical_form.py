@@ -34,13 +34,6 @@ class CanonicalForm(BodyDescriptor):
     of one form against another the closest counts. Elad and Kimmel compare raw moments of surfaces of one size; here
     lengths are in units of the square root of the surface area, and a moment of order k is divided by the (k − 1)-th
     power of the root mean square radius, so that moments of all orders are lengths of similar size.
-
-    Args:
-        scaling: "least squares" minimises Σ (‖xᵢ−xⱼ‖ − dᵢⱼ)² from the classical solution on; "classical" is that
-            solution, which is faster and fits less well.
-        max_order: of the moments.
-        n_samples: farthest points of the surface.
-        max_vertices: larger meshes are simplified first.
     """
 
     name = "canonical_form"
@@ -48,10 +41,11 @@ class CanonicalForm(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
     requirements = Requirements(mesh=True)
 
+    # "least squares" minimises Σ (‖xᵢ−xⱼ‖ − dᵢⱼ)² from the classical solution on, which is faster and fits less well
     scaling: Scaling = "least squares"
-    max_order: int = 4
-    n_samples: int = 200
-    max_vertices: int = 1000
+    max_order: int = 4  # of the moments
+    n_samples: int = 200  # farthest points of the surface
+    max_vertices: int = 1000  # larger meshes are simplified first
 
     def __post_init__(self) -> None:
         super().__init__()

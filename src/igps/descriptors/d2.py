@@ -30,13 +30,6 @@ class D2(BodyDescriptor):
 
     Source: Osada, Funkhouser, Chazelle and Dobkin 2002, with 64 values and the L1 norm, as recommended there; the
     scale is that of the area, in place of the mean distance.
-
-    Args:
-        function: "d2", "a3" or "d1".
-        n_bins: equal bins of the histogram.
-        reach: end of the last bin, a distance over √area; what lies beyond counts in the last.
-        n_triples: random triples of samples for A3; 1024² in the source.
-        seed: of these triples.
     """
 
     name = "d2"
@@ -45,10 +38,10 @@ class D2(BodyDescriptor):
     requirements = Requirements()
 
     function: ShapeFunction = "d2"
-    n_bins: int = 64
-    reach: float = 2.0
-    n_triples: int = 1024**2
-    seed: int = 0
+    n_bins: int = 64  # equal bins of the histogram
+    reach: float = 2.0  # end of the last bin, a distance over √area; what lies beyond counts in the last
+    n_triples: int = 1024**2  # random triples of samples for A3; 1024² in the source
+    seed: int = 0  # of these triples
 
     def __post_init__(self) -> None:
         super().__init__()

@@ -20,11 +20,6 @@ class GeodesicSpectral(BodyDescriptor):
 
     The matrix is that of farthest points, as for Nyström's method, and its eigenvalues are taken per point, so that
     their number does not matter but for accuracy. σ takes out the scale.
-
-    Args:
-        n_eigenvalues: largest first.
-        n_samples: farthest points of the surface.
-        max_vertices: larger meshes are simplified first.
     """
 
     name = "geodesic_spectral"
@@ -32,9 +27,9 @@ class GeodesicSpectral(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
     requirements = Requirements(mesh=True)
 
-    n_eigenvalues: int = 20
-    n_samples: int = 200
-    max_vertices: int = 1000
+    n_eigenvalues: int = 20  # largest first
+    n_samples: int = 200  # farthest points of the surface
+    max_vertices: int = 1000  # larger meshes are simplified first
 
     def __post_init__(self) -> None:
         super().__init__()

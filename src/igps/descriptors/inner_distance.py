@@ -36,12 +36,6 @@ class InnerDistance(BodyDescriptor):
 
     Source: Ling and Jacobs 2007 for the distance, Liu, Fang and Ramani 2009 for its histogram as a signature of a
     solid, there over samples of its surface. Pairs go from a random choice of the samples to all of them.
-
-    Args:
-        n_bins: distance bins, with a linear kernel.
-        max_distance: upper end of the last bin, in units of √area; larger distances go into it.
-        n_sources: samples from which paths start; all of them if there are fewer.
-        seed: of the choice of the sources.
     """
 
     name = "inner_distance"
@@ -49,10 +43,10 @@ class InnerDistance(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
     requirements = Requirements()
 
-    n_bins: int = 64
-    max_distance: float = 3.0
-    n_sources: int = 200
-    seed: int = 0
+    n_bins: int = 64  # distance bins, with a linear kernel
+    max_distance: float = 3.0  # upper end of the last bin, in units of √area; larger distances go into it
+    n_sources: int = 200  # samples from which paths start; all of them if there are fewer
+    seed: int = 0  # of the choice of the sources
 
     def __post_init__(self) -> None:
         super().__init__()

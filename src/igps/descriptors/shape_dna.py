@@ -27,10 +27,6 @@ class ShapeDNA(BodyDescriptor):
 
     Source: Reuter, Wolter and Peinecke 2005 and 2006 (normalisations, Euclidean distance); 12 eigenvalues over the
     area as in Reuter's run at SHREC'11 (Lian et al. 2011).
-
-    Args:
-        n_eigenvalues: eigenvalues compared.
-        normalisation: "area" or "slope".
     """
 
     name = "shape_dna"

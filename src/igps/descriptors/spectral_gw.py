@@ -41,19 +41,9 @@ TIMES = (0.25, 0.5, 1.0, 2.0, 4.0)
 class SpectralGromovWasserstein(BodyDescriptor):
     """Lower bounds of the spectral Gromov-Wasserstein distance.
 
-    Args:
-        samples: on the "surface" or in the "interior".
-        bound: "trace" compares the norms ‖K_t‖₂, whose squares are the heat traces; "signature" the distributions
-            over the points x of ‖K_t(x, ·)‖₂, on the surface the square root of the heat kernel signature at 2t;
-            "pairs" the distributions of K_t(x, y) over the pairs of points.
-        times: in units of A/8π.
-        n_samples: at most so many of the body's samples, at equal steps of their order, which is that of its form.
-        n_quantiles: steps of the quantile functions.
-        n_eigenpairs: of the kernels; at the shortest of the default times the hundredth weighs 10⁻⁶ of the first.
-        seed: of the first step.
-
-    Raises:
-        ValueError: a parameter out of range.
+    "trace" compares the norms ‖K_t‖₂, whose squares are the heat traces; "signature" the distributions over the points
+    x of ‖K_t(x, ·)‖₂, on the surface the square root of the heat kernel signature at 2t; "pairs" the distributions of
+    K_t(x, y) over the pairs of points.
     """
 
     name = "spectral_gw"
@@ -62,11 +52,15 @@ class SpectralGromovWasserstein(BodyDescriptor):
 
     samples: Where = "surface"
     bound: Bound = "pairs"
-    times: tuple[float, ...] = TIMES
-    n_samples: int = 500
-    n_quantiles: int = 200
-    n_eigenpairs: int = 100
-    seed: int = 0
+    times: tuple[float, ...] = TIMES  # in units of A/8π
+    n_samples: int = (
+        500  # at most so many of the body's samples, at equal steps of their order, which is that of its form
+    )
+    n_quantiles: int = 200  # steps of the quantile functions
+    n_eigenpairs: int = (
+        100  # of the kernels; at the shortest default time the hundredth weighs 10⁻⁶ of the first
+    )
+    seed: int = 0  # of the first step
 
     def __post_init__(self) -> None:
         super().__init__()

@@ -53,11 +53,6 @@ class VolumeShapeDNA(BodyDescriptor):
     """The first eigenvalues of the Laplacian in the body, times volume^(2/3).
 
     Source: Reuter, Wolter and Peinecke 2005, 2006 (normalisation, Euclidean distance); 12 eigenvalues as in `ShapeDNA`.
-
-    Args:
-        boundary: "dirichlet" (zero on the surface) or "neumann" (no flux through it).
-        n_eigenvalues: eigenvalues kept, without the first zero of Neumann's.
-        n_voxels: the cells have 1/`n_voxels` of the volume each, but at least 1/128 of the longest side.
     """
 
     name = "volume_shape_dna"
@@ -65,9 +60,9 @@ class VolumeShapeDNA(BodyDescriptor):
     invariant_to = ("motion", "scale")
     requirements = Requirements(mesh=True)
 
-    boundary: Boundary = "dirichlet"
-    n_eigenvalues: int = 12
-    n_voxels: int = 4000
+    boundary: Boundary = "dirichlet"  # zero on the surface, or "neumann": no flux through it
+    n_eigenvalues: int = 12  # without the first zero of Neumann's
+    n_voxels: int = 4000  # the cells have 1/`n_voxels` of the volume each, but at least 1/128 of the longest side
 
     def __post_init__(self) -> None:
         super().__init__()

@@ -33,31 +33,21 @@ STANDARD_RECALL_LEVELS = tuple(level / 20 for level in range(1, 21))
 class RetrievalScores:
     """Scores of every query, as fractions: (Q,) float64 on the CPU, NaN for a query without a relevant entry.
 
-    Attributes:
-        nn: nearest neighbour, rel(1).
-        ft: first tier, hits in the first R over R.
-        st: second tier, hits in the first 2R over R.
-        e: E-measure 2/(1/P + 1/R') of precision P and recall R' in the first 32 (or the whole, shorter gallery). A
-            perfect ranking reaches 1 only where R = 32.
-        dcg: discounted cumulative gain [rel(1) + Σ_{k≥2} rel(k)/log₂k] / [1 + Σ_{k=2..R} 1/log₂k].
-        adr: average dynamic recall (1/R) Σ_{i=1..R} (hits in the first i)/i.
-        adr_self: average dynamic recall of a ranking that keeps the query itself, as a hit, at rank 1, with R + 1 in
-            place of R: the form of SHREC'07. None where query and gallery sets are separate.
-        map: average precision, (1/R) Σ_k rel(k) · (hits in the first k)/k.
-        labels: the label of each query.
-        scored: (Q,) bool, False where the query has no relevant entry.
+    The E-measure looks at the first 32 entries, or the whole, shorter gallery: a perfect ranking reaches 1 only where
+    R = 32. `adr_self` is that of a ranking that keeps the query itself, as a hit, at rank 1, with R + 1 in place of R:
+    the form of SHREC'07. It is None where query and gallery sets are separate.
     """
 
-    nn: Tensor
-    ft: Tensor
-    st: Tensor
-    e: Tensor
-    dcg: Tensor
-    adr: Tensor
+    nn: Tensor  # nearest neighbour, rel(1)
+    ft: Tensor  # first tier, hits in the first R over R
+    st: Tensor  # second tier, hits in the first 2R over R
+    e: Tensor  # E-measure 2/(1/P + 1/R') of precision P and recall R'
+    dcg: Tensor  # discounted cumulative gain [rel(1) + Σ_{k≥2} rel(k)/log₂k] / [1 + Σ_{k=2..R} 1/log₂k]
+    adr: Tensor  # average dynamic recall (1/R) Σ_{i=1..R} (hits in the first i)/i
     adr_self: Tensor | None
-    map: Tensor
-    labels: tuple[Hashable, ...]
-    scored: Tensor
+    map: Tensor  # average precision, (1/R) Σ_k rel(k) · (hits in the first k)/k
+    labels: tuple[Hashable, ...]  # of each query
+    scored: Tensor  # (Q,) bool, False where the query has no relevant entry
 
     @property
     def n_queries(self) -> int:

@@ -14,16 +14,11 @@ from igps._compiled import compiled
 
 
 class MergeTree(NamedTuple):
-    """Branches by the elder rule, and the pieces of superlevel sets.
+    """Branches by the elder rule, and the pieces of superlevel sets, by the numbers of points."""
 
-    peaks: (B,) the highest point of each branch, numbers of points.
-    saddles: (B,) the point where it joins the branch of a higher peak; the lowest point of all where it joins none.
-    pieces: (L, P) of each point the peak of the piece of the superlevel set that it belongs to; −1 where it is below.
-    """
-
-    peaks: Tensor
-    saddles: Tensor
-    pieces: Tensor
+    peaks: Tensor  # (B,) the highest point of each branch
+    saddles: Tensor  # (B,) where it joins the branch of a higher peak; the lowest point of all where it joins none
+    pieces: Tensor  # (L, P) of each point the peak of the piece of the superlevel set it belongs to; −1 where below
 
 
 def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = ()) -> MergeTree:
