@@ -53,13 +53,9 @@ class SpectralGromovWasserstein(BodyDescriptor):
     samples: Where = "surface"
     bound: Bound = "pairs"
     times: tuple[float, ...] = TIMES  # in units of A/8π
-    n_samples: int = (
-        500  # at most so many of the body's samples, at equal steps of their order, which is that of its form
-    )
+    n_samples: int = 500  # at most so many of the body's samples, at equal steps of their order of form
     n_quantiles: int = 200  # steps of the quantile functions
-    n_eigenpairs: int = (
-        100  # of the kernels; at the shortest default time the hundredth weighs 10⁻⁶ of the first
-    )
+    n_eigenpairs: int = 100  # of the kernels; at the shortest default time the hundredth weighs 10⁻⁶ of the first
     seed: int = 0  # of the first step
 
     def __post_init__(self) -> None:
