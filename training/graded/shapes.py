@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from igps._parallel import Failed, run
 from igps.mesh.mesh import Mesh, MeshError
-from igps.shapes.files import is_whole_off, off_text, write_whole
+from igps.shapes.benchmark import is_whole_off, off_text, write_whole
 from igps.shapes.meshing import Faces
 from igps.shapes.solids import Array
 from training.graded.bodies import Body, Pose, draw_body, draw_pose

@@ -6,6 +6,7 @@ import json
 import logging
 import operator
 import os
+import uuid
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from igps.shapes.files import is_whole_off, off_text, write_whole
 from igps.shapes.meshing import Faces, defect, mesh, roughen
 from igps.shapes.skeleton import Skeleton, pose
 from igps.shapes.solids import Array
@@ -170,3 +170,32 @@ class ArticulatedShapes:
                 shape = self[index]
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_whole(path, off_text(shape.vertices, shape.faces))
+
+
+def off_text(vertices: Array, faces: Faces) -> str:
+    """A mesh in the Object File Format; 17 digits give the same float64 values back."""
+    lines = [f"OFF\n{len(vertices)} {len(faces)} 0"]
+    lines += [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in vertices.tolist()]
+    lines += [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def is_whole_off(path: Path) -> bool:
+    """Whether an OFF file is there with as many lines as its header promises."""
+    if not path.is_file():
+        return False
+    text = path.read_bytes()
+    header = text[:64].split()
+    if len(header) < 3 or header[0] != b"OFF":
+        return False
+    return text.endswith(b"\n") and text.count(b"\n") == 2 + int(header[1]) + int(header[2])
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file under another name and move it into place, so that nobody sees a part of it."""
+    temporary = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
+    try:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
