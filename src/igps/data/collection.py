@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import secrets
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
@@ -13,7 +11,7 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from igps.data.cache import check_checksum, checksum, decode, encode
+from igps.data.cache import check_checksum, checksum, decode, encode, whole_file
 from igps.data.sources import Bodies, file_of
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature, SignatureConfig
@@ -48,11 +46,8 @@ class About:
         labels = None if told["labels"] is None else _words(told["labels"])
         columns = {name: tuple(values) for name, values in columns.items()}
         paths = tuple(Path(file_of(name, part)) for name, part in zip(names, parts, strict=True))
-        bodies, classes, keys = (
-            Bodies(paths, names, labels, parts, columns),
-            _words(told["classes"]),
-            _words(told["keys"]),
-        )
+        bodies = Bodies(paths, names, labels, parts, columns)
+        classes, keys = _words(told["classes"]), _words(told["keys"])
         if len(keys) != len(names) or len(parts) != len(names) or len(set(names)) < len(names):
             raise ValueError("its names, parts, labels and keys do not fit each other")
         words = [*parts, *(value for values in columns.values() for value in values)]
@@ -90,18 +85,12 @@ def write_collection(path: Path, about: About, signature: Callable[[int], Signat
     text += b" " * (-len(text) % 8)
     if len(text) > _MOST_HEADER:
         raise ValueError(f"{path}: {n} bodies are too many for one file. Export parts of the dataset.")
-    partial = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(8)}.partial")
-    try:
-        with open(partial, "xb") as file:
-            file.write(len(text).to_bytes(8, "little") + text)
-            for (i, _), group in groupby(order, key=lambda one: (one[0], arrays[one[0]][one[1]][0])):
-                tensors, _ = encode(signature(i))
-                for _, name in group:
-                    file.write(tensors[name].data)
-        os.replace(partial, path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+    with whole_file(path) as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for (i, _), group in groupby(order, key=lambda one: (one[0], arrays[one[0]][one[1]][0])):
+            tensors, _ = encode(signature(i))
+            for _, name in group:
+                file.write(tensors[name].data)
 
 
 class CollectionFile:
