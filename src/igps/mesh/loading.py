@@ -130,9 +130,8 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
         raise raw.fault
     name = str(ref)
     vertices, faces, notes = raw.vertices, raw.faces, raw.notes
-    if options.mend == "never" or len(faces):
-        check_arrays(vertices, faces, name)
     if options.component == "largest" and len(faces):
+        check_arrays(vertices, faces, name)
         owner, areas = face_parts(vertices, faces)
         if len(areas) > 1:
             n_before = len(vertices)
