@@ -19,7 +19,7 @@ from igps.mesh._tidying import tidied, welded, with_small_holes_filled, without_
 from igps.mesh._union import united, without_walls
 from igps.mesh.denoising import denoised, is_noisy
 from igps.mesh.mesh import Mesh, MeshError, check_arrays, check_places, check_size
-from igps.mesh.subdivision import subdivided
+from igps.mesh.simplification import subdivided
 from igps.mesh.watertight import crosses_itself, watertight
 
 logger = logging.getLogger(__name__)

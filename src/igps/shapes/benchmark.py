@@ -150,26 +150,27 @@ class ArticulatedShapes:
         Raises:
             ValueError: ``root`` holds shapes of another seed, resolution or version.
         """
-        folder = Path(root)
-        settings = json.dumps(
-            {"generator": "ArticulatedShapes", "version": _VERSION, "seed": self.seed, "n_vertices": self.n_vertices}
+        folder = shapes_folder(
+            root, generator="ArticulatedShapes", version=_VERSION, seed=self.seed, n_vertices=self.n_vertices
         )
-        manifest = folder / "shapes.json"
-        if manifest.exists():
-            found = manifest.read_text(encoding="utf-8")
-            if found != settings:
-                raise ValueError(
-                    f"root={str(root)!r} holds shapes of {found}, not of {settings}; choose another folder"
-                )
-        else:
-            folder.mkdir(parents=True, exist_ok=True)
-            write_whole(manifest, settings)
         for index, name in enumerate(tqdm(self.names, desc="shapes", unit="shape", disable=not progress)):
             path = folder / f"{name}.off"
             if not is_whole_off(path):
                 shape = self[index]
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_whole(path, off_text(shape.vertices, shape.faces))
+
+
+def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
+    """The folder that ``shapes.json`` says to be of these settings, made where absent; a ValueError if of others."""
+    folder, wanted = Path(root), json.dumps(settings)
+    manifest = folder / "shapes.json"
+    if not manifest.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(manifest, wanted)
+    elif (found := manifest.read_text(encoding="utf-8")) != wanted:
+        raise ValueError(f"root={str(root)!r} holds shapes of {found}, not of {wanted}; choose another folder")
+    return folder
 
 
 def off_text(vertices: Array, faces: Faces) -> str:
