@@ -22,11 +22,7 @@ SUMS = {"contract", "reassoc", "nsz"}
 
 
 class Lazy:
-    """Something that compiled functions may call by its name, and that needs Numba only when one of them is compiled.
-
-    Args:
-        make: gives what Numba knows it as.
-    """
+    """Something that compiled functions may call by its name; it needs Numba only when one of them is compiled."""
 
     def __init__(self, make: Callable[[], Callable[..., Any]]) -> None:
         self._make = make
@@ -41,11 +37,8 @@ class Lazy:
 class Compiled(Lazy, Generic[Arguments, Result]):
     """A function of arrays and numbers that is compiled when it is first called.
 
-    Other compiled functions call a form of it that Python cannot call, which takes a tenth less time to compile.
-
-    Args:
-        function: what `numba.njit` can compile; it may call other such functions, and `Lazy` ones, of its module.
-        **options: of `numba.njit`.
+    It may call other such functions, and `Lazy` ones, of its module: in a form that Python cannot call, which takes a
+    tenth less time to compile. The options are those of `numba.njit`.
     """
 
     def __init__(self, function: Callable[Arguments, Result], **options: Any) -> None:

@@ -21,7 +21,6 @@ from concurrent.futures import (
     wait,
 )
 from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 from typing import TypeVar
 
@@ -113,15 +112,10 @@ def on_threads(
     """The result of every job in order, each job on one thread of its own, as PyTorch lets many compute at once.
 
     Splitting each small product over all cores instead makes every one of them wait for the slowest core, which on a
-    machine with other work to do costs many times the product itself.
-
-    Args:
-        function: may run beside itself.
-        jobs: by which it is called.
-        n_threads: as many as `n_threads()` if None.
+    machine with other work to do costs many times the product itself. The threads are as many as `n_threads()` if None.
     """
     n_threads = min(available_threads() if n_threads is None else n_threads, len(jobs))
-    alone = partial(_alone, function)
+    alone = one_thread()(function)
     if n_threads <= 1:
         yield from map(alone, jobs)
         return
@@ -138,11 +132,6 @@ def machines_words(error: OSError) -> str:
     """What to do about it."""
     remedy = "Choose a folder that can be written" if error.errno in _FORBIDDEN else "Make room"
     return f"{error}. {remedy} and run again: what is done is kept."
-
-
-def _alone(function: Callable[[Job], Result], job: Job) -> Result:
-    with one_thread():
-        return function(job)
 
 
 def attempt(result: Callable[[], Result], limits: Limits = Limits()) -> Result | Failed:

@@ -71,10 +71,8 @@ class Team:
     """Threads that stay for a computation of many short steps, each of a few jobs.
 
     To start threads for every step would take longer than the step. The thread that calls `each` takes jobs as well,
-    and waits only for jobs that another thread has begun. So a thread that gets no core delays nothing.
-
-    Args:
-        most: number of threads, the calling one included; `n_threads` if None.
+    and waits only for jobs that another thread has begun. So a thread that gets no core delays nothing. There
+    are at most so many threads, the calling one included; `n_threads` if None.
     """
 
     def __init__(self, most: int | None = None) -> None:
@@ -147,11 +145,8 @@ def _fork_safe_lock() -> threading.Lock:
 class ProcessSetting:
     """A context in which a setting of the whole process is changed, for any number of threads at once.
 
-    The first that enters changes it, the last that leaves restores it. In a forked child only the thread that forked
-    lives on: the others no longer count.
-
-    Args:
-        change: changes the setting, and returns what restores it.
+    The first that enters changes it, the last that leaves restores it, by what `change` returned. In a forked child
+    only the thread that forked lives on: the others no longer count.
     """
 
     def __init__(self, change: Callable[[], Callable[[], None]]) -> None:

@@ -26,7 +26,7 @@ from scipy.optimize import nnls
 from igps.analysis.doctor import expected_cost
 from igps.mesh.loading import load_mesh
 from igps.shapes import ArticulatedShapes
-from igps.shapes.files import off_text
+from igps.shapes.benchmark import off_text
 from igps.signature.signature import SignatureConfig, compute_signature
 
 SIZES = (1_000, 2_500, 6_000, 15_000, 40_000, 100_000)

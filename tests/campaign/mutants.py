@@ -93,9 +93,9 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         # Nothing compares two of them.
         ("src/igps/signature/sampling.py", "@dataclass(frozen=True, eq=True)"),
         # NumPy takes every negative length for the one that is not known.
-        ("src/igps/mesh/subdivision.py", "order = (np.arange(3) + np.reshape(turn, (- 2, 1))) % 3"),
+        ("src/igps/mesh/simplification.py", "order = (np.arange(3) + np.reshape(turn, (- 2, 1))) % 3"),
         # By how much one ring of a patch is turned against the next.
-        ("src/igps/mesh/_hole_filling.py", "disc.append(_circle((np.arange(size) + ring / 3) / size, radius))"),
+        ("src/igps/mesh/_tidying.py", "disc.append(_circle((np.arange(size) + ring / 3) / size, radius))"),
         # Below zero there is only rounding.
         (
             "src/igps/retrieval/reranking.py",

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import trimesh
 
-from igps.shapes.files import off_text
+from igps.shapes.benchmark import off_text
 
 HERE = Path(__file__).parent
 SHAPES_A_CLASS = 4

@@ -83,7 +83,7 @@ def test_evaluation_reads_by_workers_in_batches_of_the_size_asked(root: Path, tm
 
 
 def test_a_single_sample_in_memory_is_refused(root: Path) -> None:
-    with pytest.raises(ValueError, match="n_samples_in_memory: expected None or at least 2, got -3"):
+    with pytest.raises(ValueError, match="n_samples_in_memory: expected at least 2, got -3"):
         SignatureDataModule(root, n_samples_in_memory=-3)
 
 

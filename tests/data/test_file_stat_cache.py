@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from bodies_on_disk import write_body
 
-from igps.data import _keys as keys
+from igps.data.cache import content_digest
 from igps.data.dataset import SignatureDataset
 from igps.signature.signature import SignatureConfig
 
@@ -35,13 +35,12 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the mesh files that are read for their key."""
     names: list[str] = []
-    digest = keys.content_digest
 
     def reading(path: Path) -> bytes:
         names.append(path.name)
-        return digest(path)
+        return content_digest(path)
 
-    monkeypatch.setattr(keys, "content_digest", reading)
+    monkeypatch.setattr("igps.data.pipeline.content_digest", reading)
     return names
 
 

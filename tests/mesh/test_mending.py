@@ -10,11 +10,10 @@ import trimesh
 from scipy.spatial import cKDTree
 from training.studies.damages import DAMAGES, halves, holes
 
-from igps.mesh._hole_filling import with_small_holes_filled
-from igps.mesh._tidying import welded
+from igps.mesh._tidying import welded, with_small_holes_filled
 from igps.mesh.mending import mend, mended_by
 from igps.mesh.mesh import Mesh, MeshError
-from igps.mesh.subdivision import subdivided
+from igps.mesh.simplification import subdivided
 from igps.mesh.surface import area_vectors
 from igps.mesh.watertight import watertight
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from igps.mesh import _splats as module
-from igps.mesh._splats import splats
+from igps.mesh import watertight as module
+from igps.mesh.watertight import splats
 
 
 def sphere(n: int) -> np.ndarray:

@@ -19,9 +19,8 @@ from igps.data.batch import Body, SignatureBatch
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
 from igps.mesh.mesh import MeshError
-from igps.nn._evaluation import evaluation_mode
 from igps.nn.axes import InteriorDistance, Potential
-from igps.nn.description import describe
+from igps.nn.description import describe, evaluation_mode
 from igps.nn.descriptor import BodyDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram

@@ -17,10 +17,10 @@ from igps.mesh import mesh as geometry
 from igps.signature import _far_field as far_field
 from igps.signature import mean_value as coordinates
 from igps.signature._far_field import Clusters, Surface
-from igps.signature._spatial_order import spatial_order
 from igps.signature._weight_loops import fill_hats
 from igps.signature.laplacian import laplacian
 from igps.signature.mean_value import Extension, extend
+from igps.signature.ordering import spatial_order
 from igps.spectra import eigenpairs
 
 pytestmark = pytest.mark.usefixtures("approximate_small_meshes")

@@ -19,7 +19,7 @@ from training.graded.plates import MACHINES, SHEETS, Helix, Plate, machine, shee
 from igps.data.sources import find_bodies
 from igps.mesh.loading import load_mesh
 from igps.mesh.options import LoadOptions
-from igps.shapes.files import off_text
+from igps.shapes.benchmark import off_text
 from igps.shapes.templates import TEMPLATES
 
 CLASSES = body_classes(0)

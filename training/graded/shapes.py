@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import operator
 import os
@@ -16,7 +15,7 @@ from tqdm import tqdm
 
 from igps._parallel import Failed, run
 from igps.mesh.mesh import Mesh, MeshError
-from igps.shapes.files import is_whole_off, off_text, write_whole
+from igps.shapes.benchmark import is_whole_off, off_text, shapes_folder, write_whole
 from igps.shapes.meshing import Faces
 from igps.shapes.solids import Array
 from training.graded.bodies import Body, Pose, draw_body, draw_pose
@@ -204,27 +203,15 @@ class GradedShapes:
         Raises:
             ValueError: ``root`` holds other shapes, or a shape cannot be made; all others are written first.
         """
-        folder = Path(root)
-        settings = json.dumps(
-            {
-                "generator": type(self).__name__,
-                "version": _VERSION,
-                "seed": self.seed,
-                "n_vertices": list(self.n_vertices),
-                "look_alikes": self.look_alikes,
-                **({"individuals": True} if self.n_individuals else {}),
-            }
+        folder = shapes_folder(
+            root,
+            generator=type(self).__name__,
+            version=_VERSION,
+            seed=self.seed,
+            n_vertices=list(self.n_vertices),
+            look_alikes=self.look_alikes,
+            **({"individuals": True} if self.n_individuals else {}),
         )
-        manifest = folder / "shapes.json"
-        if manifest.exists():
-            found = manifest.read_text(encoding="utf-8")
-            if found != settings:
-                raise ValueError(
-                    f"root={str(root)!r} holds shapes of {found}, not of {settings}; choose another folder"
-                )
-        else:
-            folder.mkdir(parents=True, exist_ok=True)
-            write_whole(manifest, settings)
         names = self.names
         _record_bodies(folder / BODIES_FILE, names)
         missing = [i for i, name in enumerate(names) if not is_whole_off(folder / f"{name}.off")]

@@ -12,7 +12,7 @@ from igps.cli.report import report as write_report
 from igps.data.sources import Bodies, find_bodies
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
-from igps.report.sources import write_sources
+from igps.report.results import write_sources
 from training.studies.disturbances import DISTURBANCES
 from training.studies.robustness import robustness as measure
 from training.studies.tables import robustness_table

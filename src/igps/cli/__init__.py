@@ -6,7 +6,6 @@ import contextlib
 import inspect
 import json
 import logging
-import math
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -29,6 +28,7 @@ from igps.cli.precompute import cache_export, precompute
 from igps.cli.reading import FLAGS, LISTS, MEANINGS, Verdict
 from igps.cli.report import report
 from igps.cli.retrieval import extract, query, retrieve
+from igps.report.page_data import finite
 
 Command = Callable[..., Any]
 Commands = Mapping[str, "Command | Commands"]
@@ -101,7 +101,7 @@ def main(commands: Commands | None = None, program: str = "igps") -> None:
         sys.exit(2 if full or isinstance(error, MachineError) else 1)
     verdict = found if isinstance(found, Verdict) else Verdict(found, True)
     if as_json:
-        print(json.dumps(_finite(verdict.told), indent=2))
+        print(json.dumps(finite(verdict.told), indent=2))
     if not verdict.is_good:
         sys.exit(1)
 
@@ -111,15 +111,6 @@ def command_parser(commands: Commands | None = None, program: str = "igps") -> A
     parser = ArgumentParser(prog=program, description="Volumetric shape retrieval by interior Global Point Signatures.")
     _add_commands(parser, COMMANDS if commands is None else commands)
     return parser
-
-
-def _finite(found: Any) -> Any:
-    """The same without numbers that JSON does not know: null where a score is not defined."""
-    if isinstance(found, Mapping):
-        return {name: _finite(value) for name, value in found.items()}
-    if isinstance(found, list | tuple):
-        return [_finite(value) for value in found]
-    return None if isinstance(found, float) and not math.isfinite(found) else found
 
 
 def _chosen(arguments: Namespace, commands: Commands) -> tuple[Command, dict[str, Any]]:

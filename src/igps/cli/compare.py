@@ -20,7 +20,7 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import Mirror, Size
 from igps.nn.description import fit_centres
 from igps.report.answers import precision_recall
-from igps.report.sources import write_sources
+from igps.report.results import write_sources
 from igps.report.tables import comparison_table
 from igps.retrieval import precision_recall_curve
 

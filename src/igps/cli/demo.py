@@ -16,7 +16,7 @@ def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> dict[s
     Args:
         out: folder for the meshes, the results of `igps retrieve`, ranked.png and report.html.
     """
-    from igps.report.gallery import ranked_results
+    from igps.report.drawing import ranked_results
 
     check_report(True, out)
     shapes = ArticulatedShapes(n_classes=8, n_per_class=10)

@@ -7,8 +7,7 @@ from pathlib import Path
 from igps.descriptors import descriptor as descriptor_of
 from igps.report.explanations import keep_explanations, read_explanations
 from igps.report.page import write_page
-from igps.report.results import read_results
-from igps.report.sources import read_sources
+from igps.report.results import read_results, read_sources
 from igps.report.surfaces import keep_surfaces, read_surfaces
 
 

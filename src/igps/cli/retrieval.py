@@ -22,7 +22,7 @@ from igps.descriptors.individual import IndividualDescriptor
 from igps.gallery.about import is_gallery
 from igps.gallery.gallery import Gallery
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
-from igps.report.sources import write_sources
+from igps.report.results import write_sources
 from igps.report.tables import scores_table
 from igps.retrieval import N_RERANKED, RetrievalScores, rank, rerank_found, retrieval_scores, search
 from igps.retrieval import rerank as reranked_distances

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from igps.data._keys import content_digest, stamp_of
 from igps.data.attributes import AttributeSource
+from igps.data.cache import content_digest, stamp_of
 from igps.mesh.formats import images, vertex_values
 from igps.mesh.formats.molecules import Molecule, MoleculeBodies, is_structure, molecules_by_part
 from igps.mesh.loading import BodyRef, load_mesh, read_surface
@@ -266,10 +266,7 @@ def attribute_sources(given: Sequence[str], root: Path | None) -> dict[str, Attr
 def completed(values: Values, points: Values, what: str) -> Values:
     """Values (P,) or (P, C), those that are not known (NaN) taken from the nearest of points (P, 3) that has one.
 
-    It is logged of `what` that is.
-
-    Raises:
-        MeshError: more than a tenth is not known.
+    It is logged of `what` that is; a MeshError where more than a tenth is not known.
     """
     known = np.asarray(_is_known(values.reshape(len(points), -1)).all(axis=1))
     n_missing = int((~known).sum())

@@ -43,8 +43,7 @@ class FromFiles(Protocol):
 class FunctionAttribute:
     """A function `(body, points)` as a source; its name and source code stand for it in the keys of the cache.
 
-    Raises:
-        ValueError: its source code is not known, or does not tell what it does.
+    A ValueError where its source code is not known, or does not tell what it does.
     """
 
     function: Callable[[BodyRef, NDArray[np.float64]], NDArray[np.floating[Any]]]

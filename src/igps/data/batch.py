@@ -30,19 +30,12 @@ class LabelledSignature:
 
 @dataclass(frozen=True, eq=False)
 class SampleBatch:
-    """Samples of N shapes, padded to the longest.
+    """Samples of N shapes, padded to the longest."""
 
-    Args:
-        points: (N, P, 3) float32, length, measured from the centre of each shape's own samples.
-        eigenfunctions: (N, P, K) float32, 1/length; zero where padded.
-        mask: (N, P) true where a sample is real.
-        attributes: by name, each (N, P) or (N, P, C) float32; a direction has C = 3.
-    """
-
-    points: Tensor
-    eigenfunctions: Tensor
-    mask: Tensor
-    attributes: Mapping[str, Tensor]
+    points: Tensor  # (N, P, 3) float32, length, measured from the centre of each shape's own samples
+    eigenfunctions: Tensor  # (N, P, K) float32, 1/length; zero where padded
+    mask: Tensor  # (N, P) true where a sample is real
+    attributes: Mapping[str, Tensor]  # by name, each (N, P) or (N, P, C) float32; a direction has C = 3
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SampleBatch:
         """The batch of what a function makes of each of its tensors."""

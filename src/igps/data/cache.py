@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
 import logging
 import os
@@ -9,9 +11,9 @@ import secrets
 import time
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import IO, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +38,18 @@ Read = TypeVar("Read")
 def default_cache_dir() -> Path:
     """The user's cache directory for Signatures: `$XDG_CACHE_HOME/igps`, or `~/.cache/igps`."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "igps"
+
+
+def stamp_of(path: Path) -> tuple[int, int, int]:
+    """Bytes of a file, and when its content and its name or rights were last changed, in nanoseconds."""
+    found = os.stat(path)
+    return found.st_size, found.st_mtime_ns, found.st_ctime_ns
+
+
+def content_digest(path: Path) -> bytes:
+    """Of what is in a file."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
 
 
 class FileCache(ABC, Generic[T]):
@@ -106,32 +120,37 @@ class FileCache(ABC, Generic[T]):
         tensors, metadata = self._encode(value)
         metadata["checksum"] = checksum(tensors, metadata)
         _remove_abandoned(path.parent.glob(f"*{_PARTIAL}"))
-        # By an ordinary open: files that tempfile or safetensors make are for their owner alone, whatever the umask.
-        temporary = path.with_name(f"{key}.{os.getpid()}-{secrets.token_hex(8)}{_PARTIAL}")
         try:
-            with open(temporary, "xb") as file:
+            with whole_file(path) as file:
                 file.write(_ordered(save(tensors, metadata={"format": self._format, "key": key, **metadata})))
-            self._move(temporary, key)
-        except BaseException as error:
-            temporary.unlink(missing_ok=True)
-            if isinstance(error, OSError) and error.errno is not None and error.filename is None:
-                # That of a full disk does not say which.
-                raise OSError(error.errno, error.strerror, str(path)) from error
-            raise
-
-    def _move(self, temporary: Path, key: str) -> None:
-        try:
-            os.replace(temporary, self.path(key))
         except PermissionError:
             # Some file systems replace no file that another process holds open. Where that process was first with the
             # same value, its file serves as well.
             if key not in self:
                 raise
-            temporary.unlink()
+        except OSError as error:
+            if error.errno is None or error.filename is not None:
+                raise
+            # That of a full disk does not say which.
+            raise OSError(error.errno, error.strerror, str(path)) from error
 
     def remove_abandoned(self) -> None:
         """Remove what killed processes left of files that they were writing, a day after."""
         _remove_abandoned(self.directory.glob(f"*/*{_PARTIAL}"))
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[IO[bytes]]:
+    """A file to write beside its place, which is moved there in one step, whole or not at all."""
+    # By an ordinary open: files that tempfile or safetensors make are for their owner alone, whatever the umask.
+    partial = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(8)}{_PARTIAL}")
+    try:
+        with open(partial, "xb") as file:
+            yield file
+        os.replace(partial, path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 def encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import secrets
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
@@ -13,7 +11,7 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from igps.data.cache import check_checksum, checksum, decode, encode
+from igps.data.cache import check_checksum, checksum, decode, encode, whole_file
 from igps.data.sources import Bodies, file_of
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature, SignatureConfig
@@ -48,11 +46,8 @@ class About:
         labels = None if told["labels"] is None else _words(told["labels"])
         columns = {name: tuple(values) for name, values in columns.items()}
         paths = tuple(Path(file_of(name, part)) for name, part in zip(names, parts, strict=True))
-        bodies, classes, keys = (
-            Bodies(paths, names, labels, parts, columns),
-            _words(told["classes"]),
-            _words(told["keys"]),
-        )
+        bodies = Bodies(paths, names, labels, parts, columns)
+        classes, keys = _words(told["classes"]), _words(told["keys"])
         if len(keys) != len(names) or len(parts) != len(names) or len(set(names)) < len(names):
             raise ValueError("its names, parts, labels and keys do not fit each other")
         words = [*parts, *(value for values in columns.values() for value in values)]
@@ -68,10 +63,7 @@ class About:
 def write_collection(path: Path, about: About, signature: Callable[[int], Signature]) -> None:
     """Write a collection, whole or not at all: a safetensors file of the arrays of all Signatures.
 
-    Args:
-        path: the file; one that is there is replaced.
-        about: N bodies.
-        signature: of each, by its number; asked for several times, and not kept.
+    A file that is there is replaced. Each Signature is asked for by its number, several times, and not kept.
     """
     n = len(about.bodies)
     arrays: list[dict[str, tuple[str, tuple[int, ...], int]]] = []
@@ -93,28 +85,19 @@ def write_collection(path: Path, about: About, signature: Callable[[int], Signat
     text += b" " * (-len(text) % 8)
     if len(text) > _MOST_HEADER:
         raise ValueError(f"{path}: {n} bodies are too many for one file. Export parts of the dataset.")
-    partial = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(8)}.partial")
-    try:
-        with open(partial, "xb") as file:
-            file.write(len(text).to_bytes(8, "little") + text)
-            for (i, _), group in groupby(order, key=lambda one: (one[0], arrays[one[0]][one[1]][0])):
-                tensors, _ = encode(signature(i))
-                for _, name in group:
-                    file.write(tensors[name].data)
-        os.replace(partial, path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+    with whole_file(path) as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for (i, _), group in groupby(order, key=lambda one: (one[0], arrays[one[0]][one[1]][0])):
+            tensors, _ = encode(signature(i))
+            for _, name in group:
+                file.write(tensors[name].data)
 
 
 class CollectionFile:
     """The Signatures of a file that `write_collection` wrote, read by memory map and checked at each reading.
 
-    Reading runs no code. A worker process that is given one opens the file for itself.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a collection, or a damaged one.
+    Reading runs no code. A worker process that is given one opens the file for itself. A FileNotFoundError without it,
+    a ValueError of another file, or a damaged one.
     """
 
     def __init__(self, path: str | Path) -> None:

@@ -10,6 +10,7 @@ from pytorch_lightning import LightningDataModule
 from pytorch_lightning.core.mixins.hparams_mixin import _given_hyperparameters
 from torch.utils.data import DataLoader, Sampler
 
+from igps._parameters import check_at_least
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
@@ -87,10 +88,8 @@ class SignatureDataModule(LightningDataModule):
             raise ValueError(f"protocol: expected 'seen' or 'unseen', got {protocol!r}.")
         if protocol == "seen" and n_test is not None:
             raise ValueError("n_test: expected None with protocol 'seen', which tests all shapes not trained on.")
-        if n_samples_in_memory is not None and n_samples_in_memory < 2:
-            raise ValueError(f"n_samples_in_memory: expected None or at least 2, got {n_samples_in_memory}.")
-        if evaluation_batch_size < 1:
-            raise ValueError(f"evaluation_batch_size: expected at least 1, got {evaluation_batch_size}.")
+        check_at_least(2, n_samples_in_memory=n_samples_in_memory)
+        check_at_least(1, evaluation_batch_size=evaluation_batch_size)
         if has_configuration():
             self.save_hyperparameters()
         self.dataset = SignatureDataset(find_bodies(root, labelled=True), config, cache_dir, reading=reading)

@@ -11,8 +11,7 @@ import sqlite3
 import time
 from collections.abc import Generator, Iterable, Mapping
 
-from igps.data._keys import stamp_of
-from igps.data.cache import SignatureCache
+from igps.data.cache import SignatureCache, stamp_of
 from igps.data.pipeline import CacheHit, SignaturePipeline
 from igps.mesh.loading import BodyRef
 from igps.mesh.mending import MENDING_VERSION

@@ -108,12 +108,8 @@ def filled(
     """Compute Signatures into the cache, and tell of each body by its number what serves it, or why it failed.
 
     The bodies of one file are computed in chunks, for each of which it is read once. Where one of a chunk loses its
-    process, each of the chunk is tried again alone. With limits, which are of one body, every body is.
-
-    Args:
-        numbers: of the bodies that are computed.
-        n_workers, executor, limits: see `igps._parallel.run`.
-        at_once: bodies in a chunk; so many that every worker has one if None.
+    process, each of the chunk is tried again alone. With limits, which are of one body, every body is. A chunk has at
+    most `at_once` bodies; so many that every worker has one if None. See `igps._parallel.run` for the rest.
     """
     most = 1 if limits != Limits() else at_once or max(1, -(-len(numbers) // (n_workers or n_cores())))
     jobs = by_file(bodies, numbers, most)

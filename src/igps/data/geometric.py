@@ -15,11 +15,6 @@ if TYPE_CHECKING:
 def to_pyg(signature: Signature, samples: Literal["interior", "surface"] = "surface", label: int = -1) -> Data:
     """The samples of a body as `torch_geometric.data.Data`: P nodes without edges, which its loaders batch.
 
-    Args:
-        signature: of the body.
-        samples: which of them.
-        label: its class.
-
     Returns:
         `pos` (P, 3); `eigenfunctions` (P, K); `mass` (P,), the share of the surface's area, or of the volume, of each
         sample; the attributes of the samples under their names; `eigenvalues` (1, K), `area` and `volume` (1,), which

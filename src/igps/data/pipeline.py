@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
+import json
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,9 +16,8 @@ from typing import Protocol
 import numpy as np
 
 from igps._parallel import Failed, MachineError, attempt
-from igps.data._keys import BodyFile, digest, parameters
 from igps.data.attributes import ROOMS, AttributeSource, with_attribute
-from igps.data.cache import AttributeCache, SignatureCache
+from igps.data.cache import AttributeCache, SignatureCache, content_digest, stamp_of
 from igps.mesh.loading import BodyRef, each_body, load_mesh
 from igps.mesh.mending import MENDING_VERSION, mended_by
 from igps.mesh.mesh import Mesh, MeshError
@@ -37,6 +37,22 @@ class PreTransform(Protocol):
 
 
 @dataclass(frozen=True)
+class BodyFile:
+    """What a key needs to know of a file."""
+
+    stamp: tuple[int, int, int]  # see `stamp_of`
+    digest: bytes  # of its content
+
+    @staticmethod
+    def of(path: Path) -> BodyFile:
+        """What is known of a file; a MeshError where it cannot be read."""
+        try:
+            return BodyFile(stamp_of(path), content_digest(path))
+        except OSError as error:
+            raise MeshError(f"{path}: cannot be read ({error.strerror}). Check the path.") from error
+
+
+@dataclass(frozen=True)
 class CacheHit:
     """The Signature in the cache that serves a body."""
 
@@ -49,7 +65,7 @@ class CacheHit:
     @property
     def whole_key(self) -> str:
         """A name for the Signature with its attributes."""
-        return digest([self.key, sorted(self.attributes.items())]) if self.attributes else self.key
+        return _digest([self.key, sorted(self.attributes.items())]) if self.attributes else self.key
 
 
 @dataclass(frozen=True)
@@ -207,17 +223,31 @@ class SignaturePipeline:
         # The version of the mending counts where anything was done to the mesh: a new one leaves the others as they are
         # The suffix chooses the reader, so the same bytes under another suffix are another mesh.
         versions = config.ALGORITHM_VERSION, MENDING_VERSION if mended else None
-        how = parameters(body.path.suffix.lower(), body.part, self.reading, config, versions)
+        how = _parameters(body.path.suffix.lower(), body.part, self.reading, config, versions)
         return hashlib.sha256(how + file.digest).hexdigest()
 
     def _attribute_key(self, body: BodyRef, key: str, name: str) -> str:
-        return digest(["attribute", key, name, self.attributes[name].cache_tag(body)])
+        return _digest(["attribute", key, name, self.attributes[name].cache_tag(body)])
 
     def _changed_key(self, body: BodyRef, key: str) -> str:
         """Of the Signature with its attributes, changed: by all that these depend on."""
         assert self.pre_transform is not None
         attributes = [self._attribute_key(body, key, name) for name in sorted(self.attributes)]
-        return digest(["changed", key, self.pre_transform.cache_tag, attributes])
+        return _digest(["changed", key, self.pre_transform.cache_tag, attributes])
+
+
+def _digest(words: Sequence[object]) -> str:
+    return hashlib.sha256(json.dumps(words).encode()).hexdigest()
+
+
+@lru_cache
+def _parameters(
+    suffix: str, part: str | None, reading: LoadOptions, config: SignatureConfig, versions: tuple[int, int | None]
+) -> bytes:
+    """What a key depends on beside the content of the file, the same for thousands of files."""
+    algorithm, mending = versions
+    how = {"suffix": suffix, "part": part, "reading": reading.as_dict(), "mending_version": mending}
+    return json.dumps([how, {**config.as_dict(), "algorithm_version": algorithm}], sort_keys=True).encode()
 
 
 @lru_cache

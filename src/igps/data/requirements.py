@@ -39,10 +39,7 @@ class Requirements:
     def apply_to(self, config: SignatureConfig) -> SignatureConfig:
         """The configuration with the attributes that are needed, and as many eigenpairs if it names no number.
 
-        A descriptor of the whole spectrum gets the usual number, if that is enough.
-
-        Raises:
-            ValueError: too few eigenpairs.
+        A descriptor of the whole spectrum gets the usual number, if that is enough; a ValueError of too few eigenpairs.
         """
         usual = SignatureConfig.DEFAULT_EIGENPAIRS if self.whole_spectrum else 0
         config = config.needing(max(usual, self.n_eigenpairs))

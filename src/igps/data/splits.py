@@ -29,7 +29,6 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
         n_train: shapes of each class in training and validation together; below 1 a share of them,
             three or more, which leaves two.
         n_validation: how many of those validate; below 1 a share, two or more, which leaves one to train on.
-        seed: of the draw.
 
     Raises:
         ValueError: a class has no more than `n_train` shapes, or for a share fewer than five; or `n_validation`
@@ -66,7 +65,6 @@ def split_unseen(
         n_train: classes in training and validation together; below 1 a share of them, which leaves one.
         n_validation: how many of those validate; below 1 a share, which leaves one to train on.
         n_test: classes to test; all others if None.
-        seed: of the draw.
 
     Raises:
         ValueError: not so many classes, or `n_validation` leaves none to train on.

@@ -19,11 +19,7 @@ from igps.signature.signature import Samples, Signature
 
 @dataclass(frozen=True, kw_only=True)
 class Transform(ABC):
-    """A change of a Signature; written down, and so named in a cache, by its class and parameters.
-
-    Args:
-        seed: of the draw; None for another draw at each reading.
-    """
+    """A change of a Signature; written down, and so named in a cache, by its class and parameters."""
 
     seed: int | None = None
 
@@ -63,12 +59,7 @@ class Compose:
 
 @dataclass(frozen=True, kw_only=True)
 class FewerSamples(Transform):
-    """A random subset of the samples, in their order.
-
-    Args:
-        n_interior: interior samples kept at most; None for all.
-        n_surface: surface samples kept at most; None for all.
-    """
+    """A random subset of the samples, in their order, at most so many interior and surface ones; None keeps all."""
 
     n_interior: int | None = None
     n_surface: int | None = None
@@ -87,11 +78,7 @@ class FewerSamples(Transform):
 
 @dataclass(frozen=True, kw_only=True)
 class FewerEigenpairs(Transform):
-    """A random subset of the eigenpairs, ascending. A descriptor that needs more of them refuses the Signature.
-
-    Args:
-        n_eigenpairs: kept at most.
-    """
+    """A random subset of the eigenpairs, ascending. A descriptor that needs more of them refuses the Signature."""
 
     n_eigenpairs: int = 50
 
@@ -105,15 +92,10 @@ class FewerEigenpairs(Transform):
 
 @dataclass(frozen=True, kw_only=True)
 class Noise(Transform):
-    """Gaussian noise on positions and on eigenfunctions.
+    """Gaussian noise on positions and on eigenfunctions."""
 
-    Args:
-        points: its standard deviation over √area.
-        eigenfunctions: its standard deviation times √area; an eigenfunction's mean square is 1/area.
-    """
-
-    points: float = 0.0
-    eigenfunctions: float = 0.0
+    points: float = 0.0  # its standard deviation over √area
+    eigenfunctions: float = 0.0  # its standard deviation times √area; an eigenfunction's mean square is 1/area
 
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         length = np.sqrt(signature.area)
@@ -132,14 +114,7 @@ class Noise(Transform):
 
 @dataclass(frozen=True, kw_only=True)
 class Scale(Transform):
-    """The Signature of the body scaled by a random factor, whose logarithm is uniform.
-
-    Args:
-        smallest, largest: the factors between which it is drawn.
-
-    Raises:
-        ValueError: not 0 < smallest ≤ largest.
-    """
+    """The Signature of the body scaled by a random factor between two, whose logarithm is uniform."""
 
     smallest: float = 0.8
     largest: float = 1.25

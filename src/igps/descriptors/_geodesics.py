@@ -39,7 +39,10 @@ class FarthestPoints:
 
 
 def geodesic_samples(mesh: Mesh, n_samples: int, max_vertices: int) -> FarthestPoints:
-    """The `farthest_points` of a mesh, first simplified to at most so many vertices, whatever its numbering."""
+    """The `farthest_points` of a mesh, first simplified to at most so many vertices, whatever its numbering.
+
+    A ValueError of a mesh that has fewer vertices than samples, a MeshError of one that cannot be simplified.
+    """
     return farthest_points(simplify(in_order_of_form(mesh), max_vertices), n_samples)
 
 

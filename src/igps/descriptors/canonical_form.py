@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from igps._arrays import Floats, Integers, Singles
+from igps._parameters import check_at_least, check_one_of
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import geodesic_samples
-from igps.descriptors._parameters import check_at_least, check_one_of
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
 
@@ -34,13 +34,6 @@ class CanonicalForm(BodyDescriptor):
     of one form against another the closest counts. Elad and Kimmel compare raw moments of surfaces of one size; here
     lengths are in units of the square root of the surface area, and a moment of order k is divided by the (k − 1)-th
     power of the root mean square radius, so that moments of all orders are lengths of similar size.
-
-    Args:
-        scaling: "least squares" minimises Σ (‖xᵢ−xⱼ‖ − dᵢⱼ)² from the classical solution on; "classical" is that
-            solution, which is faster and fits less well.
-        max_order: of the moments.
-        n_samples: farthest points of the surface.
-        max_vertices: larger meshes are simplified first.
     """
 
     name = "canonical_form"
@@ -48,10 +41,11 @@ class CanonicalForm(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
     requirements = Requirements(mesh=True)
 
+    # "least squares" minimises Σ (‖xᵢ−xⱼ‖ − dᵢⱼ)² from the classical solution on, which is faster and fits less well
     scaling: Scaling = "least squares"
-    max_order: int = 4
-    n_samples: int = 200
-    max_vertices: int = 1000
+    max_order: int = 4  # of the moments
+    n_samples: int = 200  # farthest points of the surface
+    max_vertices: int = 1000  # larger meshes are simplified first
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -63,12 +57,7 @@ class CanonicalForm(BodyDescriptor):
             )
 
     def describe_body(self, body: Body) -> Singles:
-        """(number of moments,) in units of √area, ordered as `exponents(max_order)`.
-
-        Raises:
-            ValueError: the mesh has fewer than `n_samples` vertices.
-            MeshError: it cannot be simplified.
-        """
+        """(number of moments,), in √area, ordered as `exponents(max_order)`; errors as of `geodesic_samples`."""
         samples = geodesic_samples(body.mesh, self.n_samples, self.max_vertices)
         distances = samples.mutual / np.sqrt(body.mesh.area)
         form = classical_scaling(distances)

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from igps._arrays import Floats, Singles
+from igps._parameters import check_at_least, check_one_of, check_positive
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors._parameters import check_at_least, check_one_of, check_positive
 from igps.nn.descriptor import BodyDescriptor
 
 ShapeFunction = Literal["d2", "a3", "d1"]
@@ -30,13 +30,6 @@ class D2(BodyDescriptor):
 
     Source: Osada, Funkhouser, Chazelle and Dobkin 2002, with 64 values and the L1 norm, as recommended there; the
     scale is that of the area, in place of the mean distance.
-
-    Args:
-        function: "d2", "a3" or "d1".
-        n_bins: equal bins of the histogram.
-        reach: end of the last bin, a distance over √area; what lies beyond counts in the last.
-        n_triples: random triples of samples for A3; 1024² in the source.
-        seed: of these triples.
     """
 
     name = "d2"
@@ -45,10 +38,10 @@ class D2(BodyDescriptor):
     requirements = Requirements()
 
     function: ShapeFunction = "d2"
-    n_bins: int = 64
-    reach: float = 2.0
-    n_triples: int = 1024**2
-    seed: int = 0
+    n_bins: int = 64  # equal bins of the histogram
+    reach: float = 2.0  # end of the last bin, a distance over √area; what lies beyond counts in the last
+    n_triples: int = 1024**2  # random triples of samples for A3; 1024² in the source
+    seed: int = 0  # of these triples
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -57,11 +50,7 @@ class D2(BodyDescriptor):
         check_positive(reach=self.reach)
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_bins,) histogram of the shape function, without unit; sums to 1.
-
-        Raises:
-            ValueError: too few surface samples.
-        """
+        """(n_bins,) histogram of the shape function, without unit, of sum 1; a ValueError of too few samples."""
         points = body.surface.points / math.sqrt(body.area)
         if len(points) < _N_POINTS[self.function]:
             raise ValueError(

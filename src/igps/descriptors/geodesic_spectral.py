@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from igps._arrays import Floats, Singles
+from igps._parameters import check_at_least
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import geodesic_samples
-from igps.descriptors._parameters import check_at_least
 from igps.nn.descriptor import BodyDescriptor
 
 
@@ -20,11 +20,6 @@ class GeodesicSpectral(BodyDescriptor):
 
     The matrix is that of farthest points, as for Nyström's method, and its eigenvalues are taken per point, so that
     their number does not matter but for accuracy. σ takes out the scale.
-
-    Args:
-        n_eigenvalues: largest first.
-        n_samples: farthest points of the surface.
-        max_vertices: larger meshes are simplified first.
     """
 
     name = "geodesic_spectral"
@@ -32,9 +27,9 @@ class GeodesicSpectral(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
     requirements = Requirements(mesh=True)
 
-    n_eigenvalues: int = 20
-    n_samples: int = 200
-    max_vertices: int = 1000
+    n_eigenvalues: int = 20  # largest first
+    n_samples: int = 200  # farthest points of the surface
+    max_vertices: int = 1000  # larger meshes are simplified first
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -46,12 +41,7 @@ class GeodesicSpectral(BodyDescriptor):
             )
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_eigenvalues,) √|λₖ|, without unit.
-
-        Raises:
-            ValueError: the mesh has fewer than `n_samples` vertices.
-            MeshError: it cannot be simplified.
-        """
+        """(n_eigenvalues,) √|λₖ|, without unit; errors as of `geodesic_samples`."""
         samples = geodesic_samples(body.mesh, self.n_samples, self.max_vertices)
         values = affinity_eigenvalues(samples.mutual, self.n_eigenvalues)
         return np.sqrt(np.abs(values)).astype(np.float32)

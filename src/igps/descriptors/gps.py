@@ -12,9 +12,6 @@ def gps(n_eigenpairs: int = 250) -> HistogramDescriptor:
     """Histograms of the commute-time distances between surface samples, by pairs of potential classes.
 
     Source: Rustamov 2007, with the 4 classes, 64 bins and χ² of the comparison in Rustamov 2010.
-
-    Args:
-        n_eigenpairs: of the embedding.
     """
     embedding = SpectralEmbedding(n_eigenpairs=n_eigenpairs)
     histogram = PairHistogram([Potential(4), InteriorDistance(64)], embedding, samples="surface")

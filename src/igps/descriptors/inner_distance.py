@@ -17,10 +17,10 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
 from igps._arrays import Floats, Integers, Singles
+from igps._parameters import check_at_least, check_positive
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._linear_histogram import linear_histogram
-from igps.descriptors._parameters import check_at_least, check_positive
 from igps.nn.descriptor import BodyDescriptor
 
 METRICATION = 1.0495
@@ -36,12 +36,6 @@ class InnerDistance(BodyDescriptor):
 
     Source: Ling and Jacobs 2007 for the distance, Liu, Fang and Ramani 2009 for its histogram as a signature of a
     solid, there over samples of its surface. Pairs go from a random choice of the samples to all of them.
-
-    Args:
-        n_bins: distance bins, with a linear kernel.
-        max_distance: upper end of the last bin, in units of √area; larger distances go into it.
-        n_sources: samples from which paths start; all of them if there are fewer.
-        seed: of the choice of the sources.
     """
 
     name = "inner_distance"
@@ -49,10 +43,10 @@ class InnerDistance(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
     requirements = Requirements()
 
-    n_bins: int = 64
-    max_distance: float = 3.0
-    n_sources: int = 200
-    seed: int = 0
+    n_bins: int = 64  # distance bins, with a linear kernel
+    max_distance: float = 3.0  # upper end of the last bin, in units of √area; larger distances go into it
+    n_sources: int = 200  # samples from which paths start; all of them if there are fewer
+    seed: int = 0  # of the choice of the sources
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -61,11 +55,7 @@ class InnerDistance(BodyDescriptor):
         check_positive(max_distance=self.max_distance)
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_bins,) histogram that sums to 1.
-
-        Raises:
-            ValueError: fewer than two interior samples, or samples that are not on a grid.
-        """
+        """(n_bins,) histogram that sums to 1; for errors see `inner_distances`."""
         points = body.interior.points
         n_sources = min(self.n_sources, len(points))
         sources = np.random.default_rng(self.seed).permutation(len(points))[:n_sources]

@@ -14,9 +14,6 @@ def interior(n_eigenpairs: int = 250) -> HistogramDescriptor:
     """Histograms of the commute-time distances between interior samples, by pairs of potential classes.
 
     Source: Rustamov 2010, sections 3 and 4: 4 classes, 64 bins, 250 eigenpairs, χ².
-
-    Args:
-        n_eigenpairs: of the embedding.
     """
     histogram = PairHistogram([Potential(4), InteriorDistance(64)], SpectralEmbedding(n_eigenpairs=n_eigenpairs))
     return HistogramDescriptor(histogram, name="interior", source="Rustamov 2010", invariant_to=INVARIANT_TO)

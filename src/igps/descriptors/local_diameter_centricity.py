@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from igps._arrays import Floats, Integers, Singles
+from igps._parameters import check_at_least, check_positive
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import farthest_points
 from igps.descriptors._linear_histogram import linear_histogram
-from igps.descriptors._parameters import check_at_least, check_positive
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors, longest_side, unit, vertex_areas
 from igps.nn.descriptor import BodyDescriptor
@@ -30,17 +30,6 @@ class LocalDiameterCentricity(BodyDescriptor):
 
     Source: Gal, Shamir and Cohen-Or 2007, with the cone and the statistics of its rays as in Shapira, Shamir and
     Cohen-Or 2008, and scale taken from the area. Of the histogram distances that they compare, this is χ².
-
-    Args:
-        n_diameter_bins: bins of the local diameter, with a linear kernel.
-        n_centricity_bins: bins of the centricity, with a linear kernel.
-        max_diameter: upper end of the last diameter bin, in units of √area; larger values go into it.
-        max_centricity: the same of the centricity.
-        n_samples: area-weighted random points of the surface.
-        n_rays: rays of each sample.
-        opening_angle: of the cone about the inward normal, degrees.
-        n_sources: points of the surface over which the geodesic distances are averaged.
-        seed: of the samples.
     """
 
     name = "local_diameter_centricity"
@@ -48,15 +37,15 @@ class LocalDiameterCentricity(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
     requirements = Requirements(mesh=True)
 
-    n_diameter_bins: int = 32
-    n_centricity_bins: int = 32
-    max_diameter: float = 0.45
-    max_centricity: float = 2.0
-    n_samples: int = 2000
-    n_rays: int = 30
-    opening_angle: float = 120.0
-    n_sources: int = 40
-    seed: int = 0
+    n_diameter_bins: int = 32  # with a linear kernel
+    n_centricity_bins: int = 32  # with a linear kernel
+    max_diameter: float = 0.45  # upper end of the last bin, in units of √area; larger values go into it
+    max_centricity: float = 2.0  # the same of the centricity
+    n_samples: int = 2000  # area-weighted random points of the surface
+    n_rays: int = 30  # of each sample
+    opening_angle: float = 120.0  # of the cone about the inward normal, degrees
+    n_sources: int = 40  # points of the surface over which the geodesic distances are averaged
+    seed: int = 0  # of the samples
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -67,11 +56,7 @@ class LocalDiameterCentricity(BodyDescriptor):
             raise ValueError(f"opening_angle: expected between 0 and 180 degrees, got {self.opening_angle}.")
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_diameter_bins, n_centricity_bins) histogram that sums to 1.
-
-        Raises:
-            MeshError: no ray meets the far side of the surface.
-        """
+        """(n_diameter_bins, n_centricity_bins) histogram of sum 1; a MeshError where no ray meets the far side."""
         mesh = in_order_of_form(body.mesh)
         points = surface_points(mesh, self.n_samples, self.seed)
         diameter = local_diameters(mesh, points.face, points.weights, self.n_rays, self.opening_angle)

@@ -9,9 +9,9 @@ import numpy as np
 from torch import Tensor
 
 from igps._arrays import Singles
+from igps._parameters import check_at_least, check_one_of
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors._parameters import check_at_least, check_one_of
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
 
@@ -27,10 +27,6 @@ class ShapeDNA(BodyDescriptor):
 
     Source: Reuter, Wolter and Peinecke 2005 and 2006 (normalisations, Euclidean distance); 12 eigenvalues over the
     area as in Reuter's run at SHREC'11 (Lian et al. 2011).
-
-    Args:
-        n_eigenvalues: eigenvalues compared.
-        normalisation: "area" or "slope".
     """
 
     name = "shape_dna"

@@ -23,9 +23,9 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from igps._arrays import Floats, Singles
+from igps._parameters import check_at_least, check_one_of
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors._parameters import check_at_least, check_one_of
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
 from igps.signature.signature import Signature
@@ -41,19 +41,9 @@ TIMES = (0.25, 0.5, 1.0, 2.0, 4.0)
 class SpectralGromovWasserstein(BodyDescriptor):
     """Lower bounds of the spectral Gromov-Wasserstein distance.
 
-    Args:
-        samples: on the "surface" or in the "interior".
-        bound: "trace" compares the norms ‖K_t‖₂, whose squares are the heat traces; "signature" the distributions
-            over the points x of ‖K_t(x, ·)‖₂, on the surface the square root of the heat kernel signature at 2t;
-            "pairs" the distributions of K_t(x, y) over the pairs of points.
-        times: in units of A/8π.
-        n_samples: at most so many of the body's samples, at equal steps of their order, which is that of its form.
-        n_quantiles: steps of the quantile functions.
-        n_eigenpairs: of the kernels; at the shortest of the default times the hundredth weighs 10⁻⁶ of the first.
-        seed: of the first step.
-
-    Raises:
-        ValueError: a parameter out of range.
+    "trace" compares the norms ‖K_t‖₂, whose squares are the heat traces; "signature" the distributions over the points
+    x of ‖K_t(x, ·)‖₂, on the surface the square root of the heat kernel signature at 2t; "pairs" the distributions of
+    K_t(x, y) over the pairs of points.
     """
 
     name = "spectral_gw"
@@ -62,11 +52,11 @@ class SpectralGromovWasserstein(BodyDescriptor):
 
     samples: Where = "surface"
     bound: Bound = "pairs"
-    times: tuple[float, ...] = TIMES
-    n_samples: int = 500
-    n_quantiles: int = 200
-    n_eigenpairs: int = 100
-    seed: int = 0
+    times: tuple[float, ...] = TIMES  # in units of A/8π
+    n_samples: int = 500  # at most so many of the body's samples, at equal steps of their order of form
+    n_quantiles: int = 200  # steps of the quantile functions
+    n_eigenpairs: int = 100  # of the kernels; at the shortest default time the hundredth weighs 10⁻⁶ of the first
+    seed: int = 0  # of the first step
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -79,8 +69,9 @@ class SpectralGromovWasserstein(BodyDescriptor):
 
     def describe_body(self, body: Body) -> Singles:
         """(times, n_quantiles) quantile functions, with the factor c²(t); (times, 1) for the bound "trace"."""
+        kernels = heat_kernels(body, self.samples, self.times, self.n_samples, self.n_eigenpairs, self.seed)
         rows = []
-        for time, kernel in zip(self.times, self._kernels(body), strict=True):
+        for time, kernel in zip(self.times, kernels, strict=True):
             if self.bound == "pairs":
                 values = quantiles(kernel, self.n_quantiles)
             else:
@@ -96,9 +87,6 @@ class SpectralGromovWasserstein(BodyDescriptor):
         at_times = [euclidean(queries[:, i], gallery[:, i]) for i in range(queries.shape[1])]
         return torch.stack(at_times).amax(dim=0) / queries.shape[2] ** 0.5
 
-    def _kernels(self, body: Body) -> list[Floats]:
-        return heat_kernels(body, self.samples, self.times, self.n_samples, self.n_eigenpairs, self.seed)
-
 
 def heat_kernels(
     body: Body | Signature,
@@ -110,16 +98,7 @@ def heat_kernels(
 ) -> list[Floats]:
     """A k_t(x, y) among some samples: for every time a (P, P) array without unit, P ≤ `n_samples`.
 
-    Args:
-        body: with its eigenpairs.
-        samples: "surface" or "interior".
-        times: in units of A/8π.
-        n_samples: at most so many samples, at equal steps of their order.
-        n_eigenpairs: the first so many; None takes all.
-        seed: of the first step.
-
-    Raises:
-        ValueError: a parameter out of range.
+    For the parameters and errors see `SpectralGromovWasserstein`; without a number of eigenpairs all are taken.
     """
     _check_samples(samples, n_samples)
     _check_times(times)
@@ -164,11 +143,7 @@ def gromov_wasserstein(
 
     The largest over the times of local minima over the couplings, by conditional gradients from the uniform coupling
     and from the one of the bound "signature". No lower bound of `SpectralGromovWasserstein` for the same
-    samples and times exceeds it. For the parameters see `heat_kernels`.
-
-    Raises:
-        ImportError: POT is not installed.
-        ValueError: a parameter out of range.
+    samples and times exceeds it. For the parameters see `SpectralGromovWasserstein`; an ImportError without POT.
     """
     try:
         import ot

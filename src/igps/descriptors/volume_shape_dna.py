@@ -25,9 +25,9 @@ from scipy.sparse.linalg import LinearOperator, eigsh, splu
 from torch import Tensor
 
 from igps._arrays import Booleans, Floats, Integers, Singles
+from igps._parameters import check_at_least, check_one_of
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
-from igps.descriptors._parameters import check_at_least, check_one_of
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import longest_side
 from igps.nn.descriptor import BodyDescriptor
@@ -53,11 +53,6 @@ class VolumeShapeDNA(BodyDescriptor):
     """The first eigenvalues of the Laplacian in the body, times volume^(2/3).
 
     Source: Reuter, Wolter and Peinecke 2005, 2006 (normalisation, Euclidean distance); 12 eigenvalues as in `ShapeDNA`.
-
-    Args:
-        boundary: "dirichlet" (zero on the surface) or "neumann" (no flux through it).
-        n_eigenvalues: eigenvalues kept, without the first zero of Neumann's.
-        n_voxels: the cells have 1/`n_voxels` of the volume each, but at least 1/128 of the longest side.
     """
 
     name = "volume_shape_dna"
@@ -65,9 +60,9 @@ class VolumeShapeDNA(BodyDescriptor):
     invariant_to = ("motion", "scale")
     requirements = Requirements(mesh=True)
 
-    boundary: Boundary = "dirichlet"
-    n_eigenvalues: int = 12
-    n_voxels: int = 4000
+    boundary: Boundary = "dirichlet"  # zero on the surface, or "neumann": no flux through it
+    n_eigenvalues: int = 12  # without the first zero of Neumann's
+    n_voxels: int = 4000  # the cells have 1/`n_voxels` of the volume each, but at least 1/128 of the longest side
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -75,11 +70,7 @@ class VolumeShapeDNA(BodyDescriptor):
         check_at_least(1, n_eigenvalues=self.n_eigenvalues, n_voxels=self.n_voxels)
 
     def describe_body(self, body: Body) -> Singles:
-        """(n_eigenvalues,) normalised eigenvalues, ascending, without unit.
-
-        Raises:
-            MeshError: the body is too thin for the grid, or has too few cells for the eigenvalues.
-        """
+        """(n_eigenvalues,) normalised eigenvalues, ascending, without unit; for errors see `volume_spectrum`."""
         return volume_spectrum(body.mesh, self.n_eigenvalues, self.boundary, self.n_voxels).astype(np.float32)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
@@ -143,16 +134,11 @@ def _neumann(fine: Booleans) -> tuple[sparse.csr_array, Floats]:
         columns.append(cell[1:][here])
         weights.append(aperture[here])
     graph = _symmetric(np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), len(mass))
-    kept = _without_crumbs(graph, mass)
-    graph, mass = graph[kept][:, kept], mass[kept]
-    return sparse.diags_array(graph.sum(axis=1)) - graph, mass
-
-
-def _without_crumbs(graph: sparse.csr_array, mass: Floats) -> Integers:
-    """The cells of all pieces but the crumbs."""
     n_pieces, piece = connected_components(graph, directed=False)
     share = np.bincount(piece, weights=mass, minlength=n_pieces) / mass.sum()
-    return np.nonzero((share >= _CRUMB)[piece])[0]
+    kept = np.nonzero((share >= _CRUMB)[piece])[0]
+    graph, mass = graph[kept][:, kept], mass[kept]
+    return sparse.diags_array(graph.sum(axis=1)) - graph, mass
 
 
 def _dirichlet(fine: Booleans) -> tuple[sparse.csr_array, Floats]:

@@ -35,10 +35,8 @@ PAD = _BAND + 2
 def smooth_field(share: Floats, spacing: Floats, is_mask: bool) -> Floats:
     """The function at the centres of the voxels, in units of length, about the distance to the surface nearby.
 
-    Args:
-        share: (X, Y, Z) the share of each voxel that lies in the body, 0 to 1; with `PAD` empty layers around.
-        spacing: (3,) sides of a voxel, length.
-        is_mask: the shares are 0 or 1, and tell whether the centre is in the body.
+    Shares (X, Y, Z) of each voxel that lies in the body, 0 to 1, have `PAD` empty layers around; those of a mask are 0
+    or 1 and tell whether the centre is in the body. The spacing (3,) are the sides of a voxel, length.
     """
     scale = float(spacing.min())
     sides = spacing / scale

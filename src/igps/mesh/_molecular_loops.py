@@ -17,13 +17,9 @@ _TURN = 2 * math.pi
 def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: Integers) -> tuple[Floats, Integers]:
     """The arcs in which two spheres meet outside all other balls, and (A,) 1 for balls that have one or meet no other.
 
-    Args:
-        centres, radii: (A, 3) and (A,) of the balls, none in another.
-        first, neighbours: those that meet ball i are `neighbours[first[i]:first[i + 1]]`.
-
-    Returns:
-        Arcs (N, 12): centre of the circle, first axis, normal, radius, angle of the start from the first axis, and
-        angle from start to end, up to 2π.
+    No ball (A, 3), (A,) lies in another; those that meet ball i are `neighbours[first[i]:first[i + 1]]`. Of an arc
+    (N, 12) these are the centre of its circle, first axis, normal, radius, angle of the start from the first axis, and
+    angle from start to end, up to 2π.
     """
     room = 256
     found = np.empty((room, 12))

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from igps._arrays import Booleans, Floats, Integers, Singles
-from igps.mesh._distance_grid import MARGIN
 from igps.mesh.surface import area_vectors, face_areas, signed_volume, unit
 
+# Cells around the surface's bounding box.
+MARGIN = 3
 # Grid points so close to a triangle are its wall, through which the flood does not pass: a grid line that crosses a
 # triangle has a point at most half a cell from it on either side.
 WALL = 0.5 + 1e-6

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from igps._arrays import Booleans, Floats, Integers, Surface
-from igps.mesh._hole_filling import with_small_holes_filled
-from igps.mesh._tidying import SPECK, oriented, tidied, welded
+from igps.mesh._tidying import SPECK, oriented, tidied, welded, with_small_holes_filled
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors, compact, diagonal, face_areas, face_parts, face_patches, unit
 

@@ -58,8 +58,7 @@ def load_mesh(
         (8, 6.0)
 
     Args:
-        path: the file.
-        options: what of it is a body, and what may be done to it; what was done is kept in `Mesh.notes`.
+        options: what of the file is a body, and what may be done to it; what was done is kept in `Mesh.notes`.
         part: which of its bodies, see `list_bodies`; needed where there are several.
         least_vertices: a body with fewer is subdivided, unless `options` mends never.
 
@@ -131,9 +130,8 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
         raise raw.fault
     name = str(ref)
     vertices, faces, notes = raw.vertices, raw.faces, raw.notes
-    if options.mend == "never" or len(faces):
-        check_arrays(vertices, faces, name)
     if options.component == "largest" and len(faces):
+        check_arrays(vertices, faces, name)
         owner, areas = face_parts(vertices, faces)
         if len(areas) > 1:
             n_before = len(vertices)

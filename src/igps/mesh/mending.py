@@ -15,12 +15,11 @@ from typing import Literal, get_args
 import numpy as np
 
 from igps._arrays import Floats, Integers
-from igps.mesh._hole_filling import with_small_holes_filled
-from igps.mesh._tidying import tidied, welded, without_hidden
+from igps.mesh._tidying import tidied, welded, with_small_holes_filled, without_hidden
 from igps.mesh._union import united, without_walls
 from igps.mesh.denoising import denoised, is_noisy
 from igps.mesh.mesh import Mesh, MeshError, check_arrays, check_places, check_size
-from igps.mesh.subdivision import subdivided
+from igps.mesh.simplification import subdivided
 from igps.mesh.watertight import crosses_itself, watertight
 
 logger = logging.getLogger(__name__)

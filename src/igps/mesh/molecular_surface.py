@@ -8,6 +8,7 @@ the distance to them is known exactly at every point of a grid. The triangles ar
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -15,14 +16,14 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers, Singles, Surface
+from igps._parameters import check_one_of, check_positive
 from igps._threads import one_thread
 from igps.mesh._isosurface import level_surface, simplified
-from igps.mesh._joining import joined_by_threads
 from igps.mesh._level_set import LEAST, SPECK_VOLUME, without_bubbles
 from igps.mesh._molecular_loops import cubic_values, depths, distances_outside, exposed_arcs
 from igps.mesh.formats.molecules import Molecule
 from igps.mesh.mesh import Mesh, MeshError
-from igps.mesh.surface import connected, face_areas, signed_volume, sums, vertex_normals
+from igps.mesh.surface import connected, face_areas, signed_volume, stacked, sums, vertex_normals
 
 SurfaceKind = Literal["excluded", "accessible", "van_der_waals"]
 Pieces = Literal["joined", "largest"]
@@ -32,8 +33,8 @@ _MARGIN = 2.5
 _MOST_CELLS = 2**28
 # A step of vertices towards the surface is shorter, in cells.
 _STEP = 0.3
-# Share of the area that threads between pieces may add.
-_THREADS = 0.003
+# Share of the area that threads between pieces may add, and of a triangle's sides the most that one takes.
+_THREADS, _MOST_TAKEN = 0.003, 0.5
 # Rounds in which vertices are moved apart along the surface.
 _N_ROUNDS = 2
 
@@ -56,7 +57,6 @@ def molecular_surface(
         1.0
 
     Args:
-        molecule: its balls.
         kind: "excluded": what no probe enters; "accessible": where no centre of a probe can be; "van_der_waals": the
             balls themselves.
         probe: radius, Å; that of water is 1.4.
@@ -68,14 +68,11 @@ def molecular_surface(
         ValueError: a parameter out of range.
         MeshError: the balls lie too far apart for a grid, or give no closed surface.
     """
-    if kind not in get_args(SurfaceKind):
-        raise ValueError(f"kind: expected one of {', '.join(get_args(SurfaceKind))}, got {kind!r}.")
-    if pieces not in get_args(Pieces):
-        raise ValueError(f"pieces: expected 'joined' or 'largest', got {pieces!r}.")
+    check_one_of(get_args(SurfaceKind), kind=kind)
+    check_one_of(get_args(Pieces), pieces=pieces)
+    check_positive(spacing=spacing)
     if not 0 <= probe < math.inf:
         raise ValueError(f"probe: expected a radius of at least 0 Å, got {probe}.")
-    if not 0 < spacing < math.inf:
-        raise ValueError(f"spacing: expected more than 0 Å, got {spacing}.")
     centres, radii = _outermost(molecule.positions, molecule.radii + (0.0 if kind == "van_der_waals" else probe))
     margin = _MARGIN * spacing
     low = (centres - radii[:, None]).min(axis=0) - margin
@@ -149,7 +146,7 @@ def _one_piece(
         parts = [simplified(*part, max(round(max_vertices * len(part[0]) / n_vertices), 12)) for part in parts]
     if len(parts) > 1:
         notes.append(f"joined {len(parts)} pieces by threads")
-    return joined_by_threads(parts, _THREADS)
+    return _joined(parts)
 
 
 def _settled(field: Singles, vertices: Floats, faces: Integers) -> Floats:
@@ -187,3 +184,55 @@ def _at_vertices(values: Floats, vertices: Floats, faces: Integers) -> Floats:
     rows = np.repeat(np.concatenate([areas, areas * values], axis=1), 3, axis=0)
     totals = sums(faces.ravel(), rows, len(vertices))
     return totals[:, 1:] / np.maximum(totals[:, :1], np.finfo(float).tiny)
+
+
+def _joined(parts: Sequence[Surface]) -> Surface:
+    """The parts, closed and outward and none within another, as one closed surface; nearest ones are joined.
+
+    A thread is a tube of triangular section between two triangles, the largest at the nearest vertices.
+    """
+    starts = np.cumsum([0, *(len(points) for points, _ in parts)])
+    vertices, faces = stacked(parts)
+    links = [(starts[i] + a, starts[j] + b) for i, j, a, b in _nearest([points for points, _ in parts])]
+    length = sum(float(np.linalg.norm(vertices[a] - vertices[b])) for a, b in links)
+    girth = _THREADS * float(face_areas(vertices, faces).sum()) / max(length, 1e-300)
+    for a, b in links:
+        vertices, faces = _with_thread(vertices, faces, int(a), int(b), girth)
+    return vertices, faces
+
+
+def _nearest(parts: Sequence[Floats]) -> list[tuple[int, int, int, int]]:
+    """Two parts and a vertex of each, for every link of the shortest tree that joins them all."""
+    trees, links = [cKDTree(points) for points in parts], []
+    best = dict.fromkeys(range(1, len(parts)), (np.inf, 0, 0, 0))
+    new = 0
+    while best:
+        for j in best:
+            away, at = trees[new].query(parts[j])
+            if away.min() < best[j][0]:
+                best[j] = (float(away.min()), new, int(at[away.argmin()]), int(away.argmin()))
+        new = min(best, key=lambda j: best[j][0])
+        _, old, a, b = best.pop(new)
+        links.append((old, new, a, b))
+    return links
+
+
+def _with_thread(vertices: Floats, faces: Integers, a: int, b: int, girth: float) -> Surface:
+    """With a tube of this girth between the largest triangles at two vertices."""
+    areas = face_areas(vertices, faces)
+    ends = [int(at[areas[at].argmax()]) for at in (np.flatnonzero((faces == v).any(axis=1)) for v in (a, b))]
+    rims, new = [], []
+    for number, face in enumerate(ends):
+        corners = vertices[faces[face]]
+        centre, around = corners.mean(axis=0), np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
+        vertices = np.concatenate([vertices, centre + min(girth / around, _MOST_TAKEN) * (corners - centre)])
+        rims.append(len(vertices) - 3 + np.arange(3))
+        for i, k in ((0, 1), (1, 2), (2, 0)):
+            c, d, e, f = faces[face][i], faces[face][k], rims[number][k], rims[number][i]
+            new += [(c, d, e), (c, e, f)]
+    # The rims run in opposite directions, as they face each other.
+    turned = [np.roll(rims[1][::-1], k) for k in range(3)]
+    other = min(turned, key=lambda rim: float(np.linalg.norm(vertices[rims[0]] - vertices[rim], axis=1).sum()))
+    for i, k in ((0, 1), (1, 2), (2, 0)):
+        new += [(rims[0][i], rims[0][k], other[k]), (rims[0][i], other[k], other[i])]
+    return vertices, np.concatenate([np.delete(faces, ends, axis=0), np.array(new, dtype=np.int64)])

@@ -34,13 +34,7 @@ def check_kind(samples: str) -> None:
 
 
 class SampleFeatures:
-    """Some samples of each shape of a batch, and what is computed from them, once for all who ask.
-
-    Args:
-        batch: N shapes.
-        kind: of the samples.
-        samples: all of that kind, or a subset.
-    """
+    """All samples of a kind of each shape, or a subset, and what is computed from them, once for all who ask."""
 
     def __init__(self, batch: SignatureBatch, kind: SampleKind, samples: SampleBatch) -> None:
         self.batch = batch
@@ -61,11 +55,7 @@ class SampleFeatures:
         return self.samples.points / self.batch.area.sqrt().to(self.samples.points.dtype)[:, None, None]
 
     def attribute(self, name: str) -> Tensor:
-        """(N, P) or (N, P, 3) of the samples.
-
-        Raises:
-            ValueError: they have no such attribute.
-        """
+        """(N, P) or (N, P, 3) of the samples; a ValueError if they have no such attribute."""
         if name not in self.samples.attributes:
             raise ValueError(
                 f"attributes: expected {name!r} among those of the {self.kind} samples, got "
@@ -114,9 +104,7 @@ class SampleFeatures:
 class BatchFeatures:
     """A batch with the `SampleFeatures` of each kind and number of samples, shared by the parts of a descriptor.
 
-    Args:
-        batch: N shapes.
-        training: whether subsets of samples are drawn anew; otherwise a subset is always the same.
+    In training, subsets of samples are drawn anew; otherwise a subset is always the same.
     """
 
     def __init__(self, batch: SignatureBatch, training: bool) -> None:
@@ -138,16 +126,9 @@ class BatchFeatures:
 
 
 def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest: int = _N_NEAREST) -> Tensor:
-    """Unit vectors from points to the mean of the targets nearest to them.
+    """(P, D) unit vectors from points to the mean of the nearest of targets (T, D), those of the mask alone.
 
-    Args:
-        points: (P, D).
-        targets: (T, D).
-        mask: (T,) true where a target is real.
-        n_nearest: how many of the targets; all if there are fewer.
-
-    Returns:
-        (P, D); zero where the mean is the point itself.
+    Zero where the mean is the point itself; of all targets where there are fewer.
     """
     with full_precision():
         distances = torch.cdist(points.detach(), targets.detach().masked_fill(~mask[:, None], _FAR))
@@ -158,11 +139,7 @@ def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest:
 
 
 def nearest_neighbours(points: Tensor, n_nearest: int = N_NEIGHBOURS) -> Tensor:
-    """(P, k) the others that are nearest to each of points (P, D), the nearest first; all where there are no more.
-
-    Raises:
-        ValueError: no point.
-    """
+    """(P, k) the others nearest to each of points (P, D), nearest first; a ValueError if there is no point."""
     if not len(points):
         raise ValueError("samples: expected at least one of each body, got none.")
     with full_precision():

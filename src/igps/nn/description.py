@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import json
 import logging
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -18,7 +18,6 @@ from igps._parallel import Failed, n_cores, on_threads, one_thread, run
 from igps.data.cache import DescriptionCache
 from igps.data.dataset import Failure, SignatureDataset
 from igps.mesh.mesh import MeshError
-from igps.nn._evaluation import evaluation_mode
 from igps.nn.axes import Attribute
 from igps.nn.descriptor import BodyDescriptor, Descriptor
 
@@ -109,15 +108,10 @@ def describe(
 
 
 def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
-    """Give axes whose centres are quantiles those of a collection's samples; what has its centres keeps them.
+    """Give axes whose centres are quantiles those of a collection's samples; whether there were any.
 
-    Of each body as many samples count, the first 500.
-
-    Returns:
-        Whether there were any.
-
-    Raises:
-        ValueError: the samples have no such attribute.
+    What has its centres keeps them. Of each body as many samples count, the first 500. A ValueError where the samples
+    have no such attribute.
     """
     axes = [one for one in descriptor.modules() if isinstance(one, Attribute) and not one.is_fitted]
     values: list[list[Singles]] = [[] for _ in axes]
@@ -132,6 +126,18 @@ def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
     for axis, found in zip(axes, values, strict=True):
         axis.fit(torch.from_numpy(np.concatenate(found)))
     return bool(axes)
+
+
+@contextlib.contextmanager
+def evaluation_mode(module: nn.Module) -> Iterator[None]:
+    """The module and all in it in evaluation mode; afterwards each in the mode in which it was."""
+    modes = [(one, one.training) for one in module.modules()]
+    module.eval()
+    try:
+        yield
+    finally:
+        for one, training in modes:
+            one.training = training
 
 
 def _on_threads(

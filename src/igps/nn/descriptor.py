@@ -110,11 +110,7 @@ class Descriptor(Specified, ABC):
         """(N, ...) descriptions of N shapes that have what is needed; finite numbers."""
 
     def forward(self, batch: SignatureBatch) -> Tensor:
-        """(N, ...) descriptions of N shapes.
-
-        Raises:
-            ValueError: the batch lacks what the descriptor needs.
-        """
+        """(N, ...) descriptions of N shapes; a ValueError if the batch lacks what the descriptor needs."""
         self.requirements.check(batch)
         # On other devices nothing is gained, and what is traced runs later.
         alone = batch.area.device.type == "cpu" and not torch.compiler.is_compiling()
@@ -126,11 +122,7 @@ class Descriptor(Specified, ABC):
         return chi_square(queries, gallery)
 
     def short(self, descriptions: Tensor) -> Tensor:
-        """(N, D) descriptions to (N, ≤ 256), for engines that take no more and compare by the cosine.
-
-        Raises:
-            ValueError: the descriptor has none.
-        """
+        """(N, D) descriptions to (N, ≤ 256), for engines that compare so few by the cosine; or a ValueError."""
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {self.name!r}.")
 
 
@@ -277,9 +269,5 @@ class EmbeddedDescriptor(Descriptor):
         return self.head.distances(queries, gallery)
 
     def short(self, embeddings: Tensor) -> Tensor:
-        """(N, D) embeddings to (N, ≤ 256) of length 1, for engines that take no more and compare by the cosine.
-
-        Raises:
-            ValueError: they have more numbers, and the head has no shorter ones, see `Head.short`.
-        """
+        """(N, D) embeddings to (N, ≤ 256) of length 1: themselves, or those of `Head.short`, which may have none."""
         return embeddings if embeddings.shape[1] <= MOST_NUMBERS else self.head.short(embeddings)

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from igps._parameters import check_at_least
 from igps.nn.specification import Specified
 
 EmbeddingKind = Literal["commute_time", "diffusion", "biharmonic"]
@@ -55,47 +56,25 @@ def spectral_embedding(
     time: float | None = None,
     n_eigenpairs: int | None = None,
 ) -> Tensor:
-    """Eigenfunctions times their `spectral_weights`.
+    """Eigenfunctions (..., P, K), 1/length, times their `spectral_weights`; see there for other arguments and errors.
 
     Args:
-        eigenfunctions: (..., P, K), 1/length.
-        eigenvalues: (..., K) positive ascending, 1/length²; infinite where padded.
-        area: (...) of the surface, length².
-        kind, time: see `spectral_weights`.
         n_eigenpairs: keep so many of the first; None, or more than there are, keeps all.
 
     Returns:
         (..., P, min(K, n_eigenpairs)) in the eigenfunctions' type, float32 at least, dimensionless.
-
-    Raises:
-        ValueError: see `spectral_weights`.
     """
     weights = spectral_weights(eigenvalues[..., :n_eigenpairs], area, kind, time)
     return _weigh(eigenfunctions[..., :n_eigenpairs], weights)
 
 
 def interior_distance(p: Tensor, q: Tensor) -> Tensor:
-    """Interior distance between points: Euclidean distance of their embeddings (Rustamov 2010, equation 5).
-
-    Args:
-        p: (..., P, K) embedding.
-        q: (..., Q, K) embedding.
-
-    Returns:
-        (..., P, Q).
-    """
+    """(..., P, Q) interior distances: Euclidean of embeddings (..., P, K) and (..., Q, K) (Rustamov 2010, eq. 5)."""
     return torch.cdist(p, q, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def barycentroid_potential(embedding: Tensor) -> Tensor:
-    """Barycentroid potential U, the norm of the embedding (Rustamov 2010, section 4); least at the barycentroid.
-
-    Args:
-        embedding: (..., P, K).
-
-    Returns:
-        (..., P).
-    """
+    """(..., P) the potential U, the norm of embeddings (..., P, K) (Rustamov 2010); least at the barycentroid."""
     return torch.linalg.vector_norm(embedding, dim=-1)
 
 
@@ -130,8 +109,7 @@ class SpectralEmbedding(Specified):
     ) -> None:
         super().__init__()
         _check_kind(kind, time)
-        if n_eigenpairs is not None and n_eigenpairs < 1:
-            raise ValueError(f"n_eigenpairs: expected None or at least 1, got {n_eigenpairs}.")
+        check_at_least(1, n_eigenpairs=n_eigenpairs)
         if n_knots < 0 or n_knots == 1:
             raise ValueError(f"n_knots: expected 0 for a fixed filter or at least 2, got {n_knots}.")
         self.kind: EmbeddingKind = kind

@@ -10,12 +10,13 @@ import torch
 from pytorch_lightning import LightningModule
 from pytorch_lightning.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
+from torch.nn.parameter import is_lazy
 from torch.utils.data import DataLoader
 
 from igps._threads import one_thread
 from igps.data.batch import SignatureBatch
 from igps.data.datamodule import has_configuration
-from igps.nn._evaluation import evaluation_mode
+from igps.nn.description import evaluation_mode
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.heads.base import Head
 from igps.nn.heads.learned import BlendedDistance
@@ -89,7 +90,7 @@ class RetrievalLearner(LightningModule):
         self.bin_rate = bin_rate
         self.weight_decay = weight_decay
         self.part_cells = descriptor.part_cells if isinstance(descriptor, HistogramDescriptor) else None
-        if distance.head is not None and self.part_cells is not None and _is_lazy(distance.head):
+        if distance.head is not None and self.part_cells is not None and any(map(is_lazy, distance.parameters())):
             # The optimiser needs parameters that have a size.
             with torch.no_grad():
                 distance.head.eval()(torch.ones(1, sum(self.part_cells)))
@@ -236,10 +237,6 @@ class RetrievalLearner(LightningModule):
         parts = [(self(batch.to(self.device)), batch.labels) for batch in in_order]
         descriptions, labels = zip(*parts, strict=True)
         return torch.cat(descriptions), torch.cat(labels)
-
-
-def _is_lazy(module: nn.Module) -> bool:
-    return any(isinstance(parameter, nn.UninitializedParameter) for parameter in module.parameters())
 
 
 def _class_paths(configuration: Any) -> Iterator[str]:

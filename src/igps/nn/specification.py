@@ -83,14 +83,9 @@ def specification(module: nn.Module) -> dict[str, Any]:
 
 
 def made(told: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
-    """The module that a `specification` tells of.
+    """The module that a `specification` tells of; none is made that would need many more bytes of parameters.
 
-    Args:
-        told: the specification.
-        n_bytes: of the parameters that are at hand for it; none is made that would need many more.
-
-    Raises:
-        ValueError: it tells of something else than modules of the library.
+    A ValueError where it tells of something else than modules of the library.
     """
     known: list[nn.Module] = []
 
@@ -129,11 +124,7 @@ def _numbers(values: Any) -> Iterator[int]:
 
 
 def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) -> None:
-    """Write a module of the library, with its parameters and what is told of it, to a safetensors file or a folder.
-
-    Raises:
-        ValueError: see `specification`.
-    """
+    """Write a module of the library, with its parameters and what is told of it, to a safetensors file or a folder."""
     if Path(path).suffix != ".safetensors":
         save_module(module, path := Path(path) / IN_FOLDER, card)
         rows = (f"| {name} | `{json.dumps(value)}` |\n" for name, value in card.items())
@@ -149,9 +140,7 @@ def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) ->
 def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     """The module that `save_module` wrote, in evaluation mode, and what is told of it. No code of the file runs.
 
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: it is none of these files, or a damaged one.
+    A FileNotFoundError without a file, a ValueError if it is none of these, or damaged.
     """
     path = Path(path)
     path = path / IN_FOLDER if path.is_dir() else path

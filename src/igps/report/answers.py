@@ -17,8 +17,7 @@ from igps.analysis.groups import GroupTest
 from igps.analysis.map import BodyMap
 from igps.analysis.outliers import Outlier
 from igps.mesh.mesh import Mesh
-from igps.report.drawing import PALETTE, new_figure, paint
-from igps.report.gallery import draw_body, seen_from_the_front
+from igps.report.drawing import PALETTE, draw_body, new_figure, paint, seen_from_the_front
 from igps.retrieval import PrecisionRecallCurve
 
 if TYPE_CHECKING:

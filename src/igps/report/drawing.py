@@ -1,12 +1,20 @@
-"""What the pictures share: colours, a figure without a window, and a shaded surface."""
+"""Pictures of bodies: colours, a figure without a window, a shaded surface, and ranked results as PNG."""
 
 from __future__ import annotations
 
+import contextlib
+import csv
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
+from igps.mesh.loading import load_mesh
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.options import LoadOptions
+from igps.mesh.simplification import simplify
 from igps.mesh.surface import area_vectors, unit
 
 if TYPE_CHECKING:
@@ -19,6 +27,10 @@ GREY: Colour = (0.86, 0.88, 0.92)
 BLUE: Colour = (0.55, 0.72, 0.95)
 PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """They stay apart for every kind of colour vision (Okabe and Ito 2008)."""
+# Blue for a hit and orange for a miss stay apart for every kind of colour vision (Okabe and Ito 2008).
+_RELEVANT, _IRRELEVANT, _QUERY = "#0072B2", "#D55E00", "#444444"
+# A thumbnail shows no more detail than this, and drawing takes time with every face.
+_THUMBNAIL_VERTICES = 800
 
 
 def paint(axis: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int64], colour: Any) -> None:
@@ -57,3 +69,50 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)  # draws to a file without touching the user's pyplot state
     return figure
+
+
+def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progress: bool = False) -> None:
+    """Save a PNG file with a row per class: its first mesh as the query, then the `top` meshes ranked nearest to it.
+
+    `ranking` is the ranking.csv that `igps retrieve` wrote of the meshes below `root`.
+    """
+    results: dict[str, list[tuple[str, float, bool]]] = {}
+    with ranking.open(newline="") as file:
+        for row in csv.DictReader(file):
+            found = results.setdefault(row["query"], [])
+            if len(found) < top:
+                found.append((row["model"], float(row["distance"]), row["relevant"] == "1"))
+    # A class is a folder in the layouts that this figure is drawn for.
+    first = {name.split("/")[0]: name for name in sorted(results, reverse=True)}
+    queries = [first[label] for label in sorted(first)]
+    figure = new_figure(1.25 * (top + 1), 1.45 * len(queries) + 0.6)
+    axes = figure.subplots(len(queries), top + 1, squeeze=False)
+    rows = zip(axes, queries, strict=True)
+    for row_axes, query in tqdm(rows, desc="ranked results", total=len(queries), disable=not progress):
+        shown = [(query, f"query {query}", _QUERY)]
+        for model, distance, relevant in results[query]:
+            shown.append((model, f"{model}\n{distance:#.3g}", _RELEVANT if relevant else _IRRELEVANT))
+        for axis, (name, title, colour) in zip(row_axes, shown, strict=False):
+            draw_body(axis, load_mesh(root / name, LoadOptions(allow_open=True)))
+            axis.set_title(title, fontsize=5.5, pad=2)
+            for side in axis.spines.values():
+                side.set(color=colour, linewidth=1.6, linestyle="--" if colour == _IRRELEVANT else "-")
+    figure.suptitle(
+        "Query (left) and its nearest meshes with their chi-square distance; "
+        "blue: same class, orange and dashed: another",
+        fontsize=9,
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, dpi=110)
+
+
+def draw_body(axis: Axes, mesh: Mesh) -> None:
+    """Draw a mesh, shaded and seen along its thinnest principal axis."""
+    with contextlib.suppress(MeshError):  # drawn in full, it only takes longer
+        mesh = simplify(mesh, _THUMBNAIL_VERTICES)
+    paint(axis, seen_from_the_front(mesh.vertices), mesh.faces, GREY)
+
+
+def seen_from_the_front(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same, turned so that the thinnest principal axis is z, the longest y, and the slender end up."""
+    return vertices @ (axes_of(vertices) * [-1, -1, 1])

@@ -31,9 +31,7 @@ class Painted:
 
     other: str  # the name of the nearest
     told: str  # the largest shares of their distance, in words
-    values: tuple[
-        NDArray[np.uint8], NDArray[np.uint8]
-    ]  # (V,) of both surfaces: 128 where the bodies are alike, or more
+    values: tuple[NDArray[np.uint8], NDArray[np.uint8]]  # (V,) of both surfaces: 128 where they are alike, or more
 
 
 def keep_explanations(
@@ -47,11 +45,7 @@ def keep_explanations(
 ) -> dict[str, Painted]:
     """Explain the distance of each body to its nearest by a system, and write that as a NumPy archive.
 
-    Args:
-        path: an .npz file, see `read_explanations`.
-        system: whose distances tell the nearest; the descriptor is the one of histograms that they are by.
-        dataset: the bodies, their signatures cached.
-        surfaces: by the name of the body; those without are left out.
+    The descriptor is the one of histograms that the system's distances are by; bodies without a surface are left out.
     """
     place = {name: i for i, name in enumerate(dataset.bodies.names)}
     nearest = [system.names[row[0]] for row in system.ranked()] if len(system.names) > 1 else []

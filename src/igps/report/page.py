@@ -39,14 +39,7 @@ MEANINGS = dict(  # noqa: C408
 def write_page(
     path: Path, results: Results, surfaces: Mapping[str, Surface], explanations: Mapping[str, Painted] | None = None
 ) -> None:
-    """Write the page of results as an HTML file.
-
-    Args:
-        path: of the file.
-        results: of a folder, see `read_results`.
-        surfaces: pictures by the name of the mesh; those without have none.
-        explanations: by name, of those whose difference from their nearest is painted.
-    """
+    """Write the page of results as an HTML file, see `page_of`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page_of(results, surfaces, explanations), encoding="utf-8")
 
@@ -54,7 +47,7 @@ def write_page(
 def page_of(
     results: Results, surfaces: Mapping[str, Surface], explanations: Mapping[str, Painted] | None = None
 ) -> str:
-    """The page of results as text, for the arguments see `write_page`."""
+    """The page of results as text, with surfaces by the name of the mesh, and explanations of those that have one."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 

@@ -31,12 +31,7 @@ _LEAST_MAPPED, _MOST_MAPPED = 3, 3000
 def data_of(
     results: Results, surfaces: Mapping[str, Surface], explanations: Mapping[str, Painted] | None = None
 ) -> dict[str, Any]:
-    """All numbers of the page but the surfaces themselves.
-
-    Returns:
-        `classes`: names in alphabetical order; `shapes`: see `_shapes`; `columns`: further values of the shapes by
-        name; `systems`: see `_of_system`; `movements` of a robustness study, by descriptor and disturbance.
-    """
+    """All numbers of the page but the surfaces themselves; for `shapes` see `_shapes`, for `systems` `_of_system`."""
     classes = sorted(set(results.labels or ()))
     index = {name: i for i, name in enumerate(results.names)}
     sizes = Counter(results.labels or ())
@@ -47,7 +42,7 @@ def data_of(
         "shapes": _shapes(results, surfaces, classes, explanations or {}),
         "columns": {name: [of.get(one) for one in results.names] for name, of in results.columns.items()},
         "systems": [_of_system(system, index, classes, n_ranked) for system in results.systems],
-        "movements": _finite((results.robustness or {}).get("movements", {})),
+        "movements": finite((results.robustness or {}).get("movements", {})),
     }
 
 
@@ -103,6 +98,7 @@ def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str],
     places = np.array([index[name] for name in system.names])
     distances = np.take_along_axis(system.distances.numpy(), near, axis=1)
     scores, curve = system.scores(), system.curve()
+    by_class = None if scores is None else {str(label): _rounded(one) for label, one in scores.per_class().items()}
     return {
         "name": system.name,
         "seconds": system.seconds_per_mesh,
@@ -111,7 +107,7 @@ def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str],
         "ranked": letters(places[near].astype("<u4").tobytes()),
         "distances": letters(distances.astype("<f4").tobytes()),
         "scores": None if scores is None else _rounded(scores.mean()),
-        "per_class": None if scores is None else _per_class(scores, classes),
+        "per_class": None if by_class is None else [by_class.get(name) for name in classes],
         "per_query": None if scores is None else {one: _numbers(getattr(scores, one).tolist()) for one in _OF_QUERIES},
         "curve": None if curve is None else [_numbers(curve.recall.tolist()), _numbers(curve.precision.tolist())],
         "confusion": None if system.labels is None else _confusion(order, system.labels, classes),
@@ -133,12 +129,6 @@ def _map(system: System) -> dict[str, Any] | None:
         "cluster": clusters.numbers.tolist(),
         "stability": _numbers(list(clusters.stability)),
     }
-
-
-def _per_class(scores: RetrievalScores, classes: Sequence[str]) -> list[dict[str, Any] | None]:
-    """In the order of the classes; None for one without a scored query."""
-    found = {str(label): values for label, values in scores.per_class().items()}
-    return [_rounded(found[name]) if name in found else None for name in classes]
 
 
 def _confusion(
@@ -189,10 +179,12 @@ def _numbers(values: Sequence[float]) -> list[float | None]:
     return [round(value, _DECIMALS) if math.isfinite(value) else None for value in values]
 
 
-def _finite(value: Any) -> Any:
-    """The same with None in place of numbers that JSON does not know."""
+def finite(value: Any) -> Any:
+    """The same with None in place of numbers that JSON does not know, such as of a score that is not defined."""
     if isinstance(value, Mapping):
-        return {name: _finite(one) for name, one in value.items()}
+        return {name: finite(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

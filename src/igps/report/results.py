@@ -1,11 +1,11 @@
-"""What a folder of results holds, read again for its page."""
+"""What a folder of results holds, read again for its page; and where its meshes lie and how they were read."""
 
 from __future__ import annotations
 
 import csv
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from igps.data.dataset import SignatureDataset
+from igps.data.sources import Bodies, file_of
+from igps.mesh.options import LoadOptions
 from igps.retrieval import PrecisionRecallCurve, RetrievalScores, precision_recall_curve, rank, retrieval_scores
+from igps.signature.signature import SignatureConfig
 
+MESHES_FILE = "meshes.json"
+_FORMAT = "igps-meshes-1"
 _RETRIEVAL, _COMPARISON, _ROBUSTNESS = "distances.npz", "compare.json", "robustness.json"
 
 
@@ -86,7 +92,7 @@ def read_results(folder: Path) -> Results:
             f"{folder}: no results found. Expected {', '.join(readers)}, which `igps retrieve`, `igps compare` and "
             "`python -m training.study robustness` write with --out."
         )
-    about, notes, unused = _json(folder / "meshes.json"), dict[str, list[str]](), list[Unused]()
+    about, notes, unused = _json(folder / MESHES_FILE), dict[str, list[str]](), list[Unused]()
     for row in _rows(folder / "notes.csv"):
         notes.setdefault(row["file"], []).append(row["note"])
     for row in _rows(folder / "failures.csv"):
@@ -107,6 +113,46 @@ def read_results(folder: Path) -> Results:
         groups=tuple(_json(folder / "groups.json")),
         outliers=tuple(_json(folder / "outliers.json")),
     )
+
+
+def write_sources(folder: Path, dataset: SignatureDataset) -> None:
+    """Write meshes.json: of each body its name in the results, file, part, columns; reading, signature, cache."""
+    pipeline, files = dataset.pipeline, dataset.bodies
+    summary = {
+        "format": _FORMAT,
+        "meshes": [
+            {"file": name, "path": str(body.path.resolve()), "part": body.part}
+            for name, body in zip(files.names, files, strict=True)
+        ],
+        "columns": files.columns,
+        "reading": pipeline.reading.as_dict(),
+        "signature": asdict(pipeline.config),
+        "cache_dir": str(pipeline.cache_dir.resolve()),
+    }
+    (folder / MESHES_FILE).write_text(json.dumps(summary, indent=1) + "\n")
+
+
+def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset | None:
+    """The meshes of a folder of results, None where it does not tell them; `meshes` is where they were moved to."""
+    path = folder / MESHES_FILE
+    if not path.is_file():
+        return None
+    try:
+        summary: dict[str, Any] = json.loads(path.read_text())
+        if summary["format"] != _FORMAT:
+            raise ValueError(f"its format is {summary['format']!r}")
+        names = tuple(str(one["file"]) for one in summary["meshes"])
+        parts = tuple(one.get("part") for one in summary["meshes"])
+        if meshes is None:
+            paths = tuple(Path(one["path"]) for one in summary["meshes"])
+        else:
+            paths = tuple(meshes / file_of(name, part) for name, part in zip(names, parts, strict=True))
+        columns = {str(name): tuple(values) for name, values in summary.get("columns", {}).items()}
+        signature = {**summary["signature"], "attributes": tuple(summary["signature"]["attributes"])}
+        bodies, reading = Bodies(paths, names, None, parts, columns), LoadOptions(**summary["reading"])
+        return SignatureDataset(bodies, SignatureConfig(**signature), summary["cache_dir"], reading=reading)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected the format {_FORMAT} ({error}). Run the command again.") from error
 
 
 def _retrieval(folder: Path) -> Results:

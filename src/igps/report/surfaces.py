@@ -38,9 +38,7 @@ _NEIGHBOURS = 4  # samples that a vertex takes its potential from
 class Surface:
     """What is shown of a body."""
 
-    vertices: NDArray[
-        np.uint16
-    ]  # (V, 3) in a cube around the body, the longest principal axis along y, the next along x
+    vertices: NDArray[np.uint16]  # (V, 3) in a cube around it, the longest principal axis along y, the next along x
     faces: NDArray[np.uint16]  # (F, 3), counter-clockwise seen from outside
     potential: NDArray[np.uint8]  # (V,) barycentroid potential, from its least value on the surface to the largest
     potential_range: tuple[float, float]  # these values, no unit

@@ -1,8 +1,10 @@
 """Distances between every query and every gallery descriptor: tensors (Q, ...) and (G, ...) in, (Q, G) out.
 
 Smaller is closer, identical descriptors are at exactly zero, and a distance matrix of a set with itself is exactly
-symmetric. All functions are differentiable, run on the device of their inputs, and compute half precision in float32.
-Checking the entries for NaN and signs waits for the device once per argument.
+symmetric. All dimensions after the first are cells, or entries of one vector. All functions are differentiable, run on
+the device of their inputs, and compute half precision in float32. All raise a ValueError for shapes, dtypes or devices
+that do not fit, for NaN or infinite entries, and those of histograms for negative ones; to check that waits for the
+device once per argument.
 """
 
 from __future__ import annotations
@@ -48,15 +50,12 @@ def chi_square(queries: Tensor, gallery: Tensor, weights: Tensor | None = None) 
         tensor([[0.0000, 0.5000, 1.0000]])
 
     Args:
-        queries: (Q, ...) histograms, entries ≥ 0; all dimensions after the first are cells.
+        queries: (Q, ...) histograms, entries ≥ 0.
         gallery: (G, ...) histograms of the same cells.
         weights: non-negative weight of every cell, of a shape that broadcasts to the cells; None weighs all by 1.
 
     Returns:
         (Q, G) distances, without unit.
-
-    Raises:
-        ValueError: for shapes, dtypes or devices that do not fit, and for negative, NaN or infinite entries.
     """
     a, b = _as_rows(queries, gallery, non_negative=True)
     w = None if weights is None else _cell_weights(weights, queries.shape[1:], a)
@@ -68,50 +67,20 @@ def hellinger(queries: Tensor, gallery: Tensor) -> Tensor:
 
     It lies in [0, 1] for histograms that sum to 1. Gradients are set to zero where they are infinite: at an empty cell
     and at distance zero. Source: Hellinger 1909; Bhattacharyya 1943 for histograms.
-
-    Args:
-        queries: (Q, ...) histograms, entries ≥ 0; all dimensions after the first are cells.
-        gallery: (G, ...) histograms of the same cells.
-
-    Returns:
-        (Q, G) distances, without unit.
-
-    Raises:
-        ValueError: for shapes, dtypes or devices that do not fit, and for negative, NaN or infinite entries.
     """
     a, b = _as_rows(queries, gallery, non_negative=True)
     return _row_distance(square_root(a), square_root(b)) / math.sqrt(2.0)
 
 
 def euclidean(queries: Tensor, gallery: Tensor) -> Tensor:
-    """Euclidean distance √(Σ (a−b)²) between descriptors; its gradient at distance zero is set to zero.
-
-    Args:
-        queries: (Q, ...) descriptors; all dimensions after the first are summed over.
-        gallery: (G, ...) descriptors of the same form.
-
-    Returns:
-        (Q, G) distances in the unit of the descriptors.
-
-    Raises:
-        ValueError: for shapes, dtypes or devices that do not fit, and for NaN or infinite entries.
-    """
+    """Euclidean distance √(Σ (a−b)²), in the unit of the descriptors; its gradient at distance zero is set to zero."""
     return _row_distance(*_as_rows(queries, gallery, non_negative=False))
 
 
 def cosine(queries: Tensor, gallery: Tensor) -> Tensor:
     """Cosine distance 1 − cos(a, b), in [0, 2], as ½ ‖a/‖a‖ − b/‖b‖‖², which does not cancel for near descriptors.
 
-    Args:
-        queries: (Q, ...) descriptors; all dimensions after the first are one vector.
-        gallery: (G, ...) descriptors of the same form.
-
-    Returns:
-        (Q, G) distances, without unit.
-
-    Raises:
-        ValueError: for shapes, dtypes or devices that do not fit, for NaN or infinite entries, and for a descriptor of
-            length zero, which has no direction.
+    A ValueError also of a descriptor of length zero, which has no direction.
     """
     a, b = _as_rows(queries, gallery, non_negative=False)
     return _row_distance(_unit("queries", a), _unit("gallery", b)).square() / 2.0

@@ -23,9 +23,6 @@ class RetrievalScoresMetric(Metric):
     tensors, fractions. Call `update` and `compute`, not the metric itself: single batches seldom hold two of a class.
     A repeated shape would be a perfect match, and a distributed sampler repeats some to fill its batches: give `ids`,
     and each shape counts once, whatever the number of processes.
-
-    Args:
-        distance: the distance function that compares the descriptors.
     """
 
     is_differentiable = False
@@ -44,11 +41,7 @@ class RetrievalScoresMetric(Metric):
         self.add_state("ids", default=[], dist_reduce_fx="cat")
 
     def update(self, descriptors: Tensor, labels: Tensor, ids: Sequence[str] | None = None) -> None:
-        """Add descriptors (N, ...), integer labels (N,) and names that tell shapes apart.
-
-        Raises:
-            ValueError: they are not aligned, or some updates have names and others none.
-        """
+        """Add descriptors (N, ...), integer labels (N,), names that tell shapes apart; a ValueError if not aligned."""
         if labels.ndim != 1 or labels.is_floating_point() or descriptors.ndim < 2 or len(labels) != len(descriptors):
             raise ValueError(
                 f"labels: expected one integer for each of the descriptors (N, ...), got {tuple(labels.shape)} of "

@@ -12,23 +12,14 @@ from igps.retrieval.distances import Distance, chi_square
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """The closest gallery entries of every query, closest first.
+    """The closest gallery entries of every query, closest first."""
 
-    Attributes:
-        indices: (Q, top) int64, positions in the gallery.
-        distances: (Q, top), ascending along each row.
-    """
-
-    indices: Tensor
-    distances: Tensor
+    indices: Tensor  # (Q, top) int64, positions in the gallery
+    distances: Tensor  # (Q, top), ascending along each row
 
 
 def rank(distances: Tensor) -> Tensor:
-    """Gallery indices of every query, (Q, G) int64, closest first, from distances (Q, G); ties keep gallery order.
-
-    Raises:
-        ValueError: if distances is not a real matrix, or holds NaN or negative entries.
-    """
+    """(Q, G) int64 gallery indices, closest first, ties in gallery order, of checked distances (Q, G)."""
     check_distances(distances)
     return torch.sort(distances, dim=1, stable=True).indices
 

@@ -97,15 +97,8 @@ def rerank_found(
 ) -> SearchResult:
     """The entries that each query found, put in order by `rerank` of the query and them: not of the whole collection.
 
-    Args:
-        queries: (Q, ...).
-        found: the nearest M entries of each, of which more than `top` are of use: `N_RERANKED`.
-        descriptions: those (M, ...) of entries (M,).
-        distance: that of the descriptions.
-        top: how many to return, at most M.
-
-    Returns:
-        re-ranked distances, without unit.
+    Of the nearest M entries of each query (Q, ...), more than `top` are of use: `N_RERANKED`; `descriptions` gives
+    those (M, ...) of entries (M,). The re-ranked distances have no unit.
     """
     results = []
     for query, entries in zip(queries, found.indices, strict=True):

@@ -33,31 +33,21 @@ STANDARD_RECALL_LEVELS = tuple(level / 20 for level in range(1, 21))
 class RetrievalScores:
     """Scores of every query, as fractions: (Q,) float64 on the CPU, NaN for a query without a relevant entry.
 
-    Attributes:
-        nn: nearest neighbour, rel(1).
-        ft: first tier, hits in the first R over R.
-        st: second tier, hits in the first 2R over R.
-        e: E-measure 2/(1/P + 1/R') of precision P and recall R' in the first 32 (or the whole, shorter gallery). A
-            perfect ranking reaches 1 only where R = 32.
-        dcg: discounted cumulative gain [rel(1) + Σ_{k≥2} rel(k)/log₂k] / [1 + Σ_{k=2..R} 1/log₂k].
-        adr: average dynamic recall (1/R) Σ_{i=1..R} (hits in the first i)/i.
-        adr_self: average dynamic recall of a ranking that keeps the query itself, as a hit, at rank 1, with R + 1 in
-            place of R: the form of SHREC'07. None where query and gallery sets are separate.
-        map: average precision, (1/R) Σ_k rel(k) · (hits in the first k)/k.
-        labels: the label of each query.
-        scored: (Q,) bool, False where the query has no relevant entry.
+    The E-measure looks at the first 32 entries, or the whole, shorter gallery: a perfect ranking reaches 1 only where
+    R = 32. `adr_self` is that of a ranking that keeps the query itself, as a hit, at rank 1, with R + 1 in place of R:
+    the form of SHREC'07. It is None where query and gallery sets are separate.
     """
 
-    nn: Tensor
-    ft: Tensor
-    st: Tensor
-    e: Tensor
-    dcg: Tensor
-    adr: Tensor
+    nn: Tensor  # nearest neighbour, rel(1)
+    ft: Tensor  # first tier, hits in the first R over R
+    st: Tensor  # second tier, hits in the first 2R over R
+    e: Tensor  # E-measure 2/(1/P + 1/R') of precision P and recall R'
+    dcg: Tensor  # discounted cumulative gain [rel(1) + Σ_{k≥2} rel(k)/log₂k] / [1 + Σ_{k=2..R} 1/log₂k]
+    adr: Tensor  # average dynamic recall (1/R) Σ_{i=1..R} (hits in the first i)/i
     adr_self: Tensor | None
-    map: Tensor
-    labels: tuple[Hashable, ...]
-    scored: Tensor
+    map: Tensor  # average precision, (1/R) Σ_k rel(k) · (hits in the first k)/k
+    labels: tuple[Hashable, ...]  # of each query
+    scored: Tensor  # (Q,) bool, False where the query has no relevant entry
 
     @property
     def n_queries(self) -> int:
@@ -88,17 +78,11 @@ class RetrievalScores:
 
 @dataclass(frozen=True, eq=False)
 class PrecisionRecallCurve:
-    """Interpolated precision at given recall levels, mean over the scored queries.
+    """Interpolated precision at given recall levels, mean over the scored queries."""
 
-    Attributes:
-        recall: (L,) float64 recall levels, ascending.
-        precision: (L,) float64, never ascending.
-        n_queries: number of queries in the mean.
-    """
-
-    recall: Tensor
-    precision: Tensor
-    n_queries: int
+    recall: Tensor  # (L,) float64 recall levels, ascending
+    precision: Tensor  # (L,) float64, never ascending
+    n_queries: int  # in the mean
 
 
 def retrieval_scores(distances: Tensor, query_labels: Labels, gallery_labels: Labels | None = None) -> RetrievalScores:
@@ -176,9 +160,6 @@ def precision_recall_curve(
     The precision at level r is the highest of all precisions at a recall of r or more. The default is the 20 levels
     0.05, 0.10, …, 1 of the Princeton Shape Benchmark (Shilane et al. 2004); the 11 levels 0, 0.1, …, 1 are the other
     usual choice. Distances and labels, and errors, as for retrieval_scores.
-
-    Raises:
-        ValueError: also if the recall levels are not ascending numbers in [0, 1].
     """
     recall = torch.tensor(list(recall_levels), dtype=torch.float64)
     valid = recall.numel() > 0 and bool(((recall >= 0) & (recall <= 1)).all()) and bool((recall.diff() > 0).all())

@@ -27,16 +27,11 @@ class VectorMap:
     Unit vectors, compared by the cosine, are such vectors if they are short, and else are reduced to their principal
     components. Histograms, compared by χ², become their features first, whose squared Euclidean distance is nearly in
     proportion to χ² (Vedaldi and Zisserman 2012).
-
-    Args:
-        searched_by: the distance of the descriptions.
-        mean: (F,) of the descriptions, or of their features; None where vectors are taken as they are.
-        components: (D, F) orthonormal directions.
     """
 
-    searched_by: SearchDistance
-    mean: Singles | None = None
-    components: Singles | None = None
+    searched_by: SearchDistance  # the distance of the descriptions
+    mean: Singles | None = None  # (F,) of the descriptions, or of their features; None where they are taken as they are
+    components: Singles | None = None  # (D, F) orthonormal directions
 
     @classmethod
     def fit(cls, descriptions: Singles, searched_by: SearchDistance, seed: int = 0) -> VectorMap:

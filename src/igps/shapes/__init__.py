@@ -4,7 +4,7 @@ A class is a skeleton: a tree of solids, each with a signed distance function (n
 a ball joint with limits. The solids are blended by a smooth union and the zero level set is meshed by marching cubes
 (Lewiner, Lopes, Vieira and Tavares 2003), relaxed along the surface and checked.
 
-Each module uses only those before it: solids, skeleton, templates, meshing, files, benchmark.
+Each module uses only those before it: solids, skeleton, templates, meshing, benchmark.
 """
 
 from igps.shapes.benchmark import ArticulatedShapes, GeneratedShape

@@ -6,6 +6,7 @@ import json
 import logging
 import operator
 import os
+import uuid
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from igps.shapes.files import is_whole_off, off_text, write_whole
 from igps.shapes.meshing import Faces, defect, mesh, roughen
 from igps.shapes.skeleton import Skeleton, pose
 from igps.shapes.solids import Array
@@ -28,22 +28,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class GeneratedShape:
-    """One generated shape.
+    """One generated shape."""
 
-    vertices: (V,3) float64, in units of about half the height of a figure.
-    faces: (F,3) int64, outward.
-    label: name of the class.
-    name: class and running number, such as ``biped/00``.
-    genus: number of handles of the surface; V − E + F = 2 − 2 genus.
-    rotation: (3,3) what turned the shape out of its upright frame; ``vertices @ rotation`` stands upright again.
-    """
-
-    vertices: Array
-    faces: Faces
-    label: str
-    name: str
-    genus: int
-    rotation: Array
+    vertices: Array  # (V,3) float64, in units of about half the height of a figure
+    faces: Faces  # (F,3) int64, outward
+    label: str  # name of the class
+    name: str  # class and running number, such as ``biped/00``
+    genus: int  # number of handles of the surface; V − E + F = 2 − 2 genus
+    rotation: Array  # (3,3) what turned it out of its upright frame; ``vertices @ rotation`` stands upright again
 
 
 class ArticulatedShapes:
@@ -107,12 +99,7 @@ class ArticulatedShapes:
         return [f"{name}/{number:02d}" for name in self.class_names for number in range(self.n_per_class)]
 
     def __getitem__(self, index: int) -> GeneratedShape:
-        """Generate one shape; costs a fraction of a second, nothing is kept.
-
-        Raises:
-            IndexError: there is no such shape.
-            ValueError: no pose gave a valid mesh; names the class and what went wrong.
-        """
+        """Generate one shape, in a fraction of a second; nothing is kept. A ValueError if no pose gave a valid mesh."""
         position = operator.index(index)
         if not -len(self) <= position < len(self):
             raise IndexError(f"index must lie in [{-len(self)}, {len(self)}), got {index}")
@@ -163,23 +150,53 @@ class ArticulatedShapes:
         Raises:
             ValueError: ``root`` holds shapes of another seed, resolution or version.
         """
-        folder = Path(root)
-        settings = json.dumps(
-            {"generator": "ArticulatedShapes", "version": _VERSION, "seed": self.seed, "n_vertices": self.n_vertices}
+        folder = shapes_folder(
+            root, generator="ArticulatedShapes", version=_VERSION, seed=self.seed, n_vertices=self.n_vertices
         )
-        manifest = folder / "shapes.json"
-        if manifest.exists():
-            found = manifest.read_text(encoding="utf-8")
-            if found != settings:
-                raise ValueError(
-                    f"root={str(root)!r} holds shapes of {found}, not of {settings}; choose another folder"
-                )
-        else:
-            folder.mkdir(parents=True, exist_ok=True)
-            write_whole(manifest, settings)
         for index, name in enumerate(tqdm(self.names, desc="shapes", unit="shape", disable=not progress)):
             path = folder / f"{name}.off"
             if not is_whole_off(path):
                 shape = self[index]
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_whole(path, off_text(shape.vertices, shape.faces))
+
+
+def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
+    """The folder that ``shapes.json`` says to be of these settings, made where absent; a ValueError if of others."""
+    folder, wanted = Path(root), json.dumps(settings)
+    manifest = folder / "shapes.json"
+    if not manifest.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(manifest, wanted)
+    elif (found := manifest.read_text(encoding="utf-8")) != wanted:
+        raise ValueError(f"root={str(root)!r} holds shapes of {found}, not of {wanted}; choose another folder")
+    return folder
+
+
+def off_text(vertices: Array, faces: Faces) -> str:
+    """A mesh in the Object File Format; 17 digits give the same float64 values back."""
+    lines = [f"OFF\n{len(vertices)} {len(faces)} 0"]
+    lines += [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in vertices.tolist()]
+    lines += [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def is_whole_off(path: Path) -> bool:
+    """Whether an OFF file is there with as many lines as its header promises."""
+    if not path.is_file():
+        return False
+    text = path.read_bytes()
+    header = text[:64].split()
+    if len(header) < 3 or header[0] != b"OFF":
+        return False
+    return text.endswith(b"\n") and text.count(b"\n") == 2 + int(header[1]) + int(header[2])
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file under another name and move it into place, so that nobody sees a part of it."""
+    temporary = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
+    try:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -21,23 +21,15 @@ DOWN: Vector = (0.0, 0.0, -1.0)
 
 @dataclass(frozen=True)
 class Part:
-    """A solid and the joint that holds it.
-
-    group: parts of one group share their proportions.
-    bend: limits of the joint (raise, swing, twist), degrees.
-    at: the joint's place on the parent.
-    turn: the joint's frame at rest, in the parent's.
-    blend: how far from the solid its union with the others is smooth.
-    lift: how far the solid's own origin lies along z from the joint.
-    """
+    """A solid and the joint that holds it."""
 
     solid: Solid
-    group: str = "body"
-    bend: Vector = ORIGIN
-    at: Vector = ORIGIN
-    turn: Array = field(default_factory=lambda: np.eye(3))
-    blend: float = 0.06
-    lift: float = 0.0
+    group: str = "body"  # parts of one group share their proportions
+    bend: Vector = ORIGIN  # limits of the joint (raise, swing, twist), degrees
+    at: Vector = ORIGIN  # the joint's place on the parent
+    turn: Array = field(default_factory=lambda: np.eye(3))  # the joint's frame at rest, in the parent's
+    blend: float = 0.06  # how far from the solid its union with the others is smooth
+    lift: float = 0.0  # how far the solid's own origin lies along z from the joint
     children: tuple[Part, ...] = ()
 
     def joined(self, at: Vector, heading: Vector = UP, roll: float = 0.0) -> Part:

@@ -24,8 +24,8 @@ from scipy import sparse
 from igps._arrays import Floats, Integers
 from igps._threads import ALONE, Team
 from igps.mesh.surface import has_area
-from igps.signature._spatial_order import principal_axes, spatial_order
 from igps.signature._weight_loops import fill_cluster_terms, fill_clusters, fill_hats, replace_near, seen_from
+from igps.signature.ordering import principal_axes, spatial_order
 
 _LEAF = 32  # hats in the smallest clusters; one costs as much as 19
 N_TERMS = 19
@@ -59,11 +59,7 @@ class Surface:
 
     @staticmethod
     def of(vertices: Floats, faces: Integers) -> tuple[Surface, Integers]:
-        """The surface, and which vertices (V,) its own are.
-
-        Raises:
-            ValueError: no face has an area.
-        """
+        """The surface, and which vertices (V,) its own are; a ValueError if no face has an area."""
         faces = faces[has_area(vertices[faces])]
         if len(faces) == 0:
             raise ValueError("faces: expected at least one face with an area, got flat ones only; check the mesh")
@@ -151,21 +147,13 @@ def _entries(forms: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Clusters:
-    """Consecutive hats: 32 each on the first level, four clusters of the level before on the next.
+    """Consecutive hats: 32 each on the first level, four clusters of the level before on the next."""
 
-    Args:
-        centres: (C, 3) of all levels, numbered through.
-        radii: (C,) of balls about them that hold those of the hats.
-        first: (levels + 1,) cluster at which each level begins, and their number.
-        sums: (C, 19, K) of the functions.
-        n_hats: V.
-    """
-
-    centres: Floats
-    radii: Floats
-    first: Integers
-    sums: NDArray[np.floating]
-    n_hats: int
+    centres: Floats  # (C, 3) of all levels, numbered through
+    radii: Floats  # (C,) of balls about them that hold those of the hats
+    first: Integers  # (levels + 1,) cluster at which each level begins, and their number
+    sums: NDArray[np.floating]  # (C, 19, K) of the functions
+    n_hats: int  # V
 
     @staticmethod
     def of(hats: Floats, functions: NDArray[np.floating], team: Team = ALONE) -> Clusters:

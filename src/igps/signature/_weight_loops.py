@@ -263,17 +263,9 @@ def fill_cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats, 
         g1 += e01 * f0 + 2 * e11 * f1 + e12 * f2
         g2 += e02 * f0 + e12 * f1 + 2 * e22 * f2
         # 12 (F·e) eᵀEe + 24 (s·e) eᵀTe − 2 (g·e) |e|²
-        f0, f1, f2, s0, s1, s2, g0, g1, g2 = (
-            12 * f0,
-            12 * f1,
-            12 * f2,
-            24 * s0,
-            24 * s1,
-            24 * s2,
-            2 * g0,
-            2 * g1,
-            2 * g2,
-        )
+        f0, f1, f2 = 12 * f0, 12 * f1, 12 * f2
+        s0, s1, s2 = 24 * s0, 24 * s1, 24 * s2
+        g0, g1, g2 = 2 * g0, 2 * g1, 2 * g2
         out[9] = f0 * e00 + s0 * t00 - g0
         out[10] = f0 * e01 + f1 * e00 + s0 * t01 + s1 * t00 - g1
         out[11] = f0 * e02 + f2 * e00 + s0 * t02 + s2 * t00 - g2

@@ -16,11 +16,7 @@ AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
 
 
 def interior_attributes(mesh: Mesh, points: Floats, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
-    """Named attributes of points inside, (P,) or (P, 3), dimensionless and the same for a scaled or moved body.
-
-    Raises:
-        ValueError: unknown name.
-    """
+    """Named attributes, see `check_attributes`, of points inside, (P,) or (P, 3), free of scale and motion."""
     check_attributes(names)
     functions = {
         "depth": depth,
@@ -31,13 +27,7 @@ def interior_attributes(mesh: Mesh, points: Floats, names: Sequence[AttributeNam
 
 
 def surface_attributes(mesh: Mesh, faces: Integers, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
-    """Those of the named attributes that points of the surface have: "surface_direction", the outward normal.
-
-    Args:
-        mesh: F faces, oriented outwards.
-        faces: (P,) the face of each point.
-        names: see `interior_attributes`.
-    """
+    """Those of the named attributes that points on these faces (P,) have: "surface_direction", the outward normal."""
     check_attributes(names)
     if "surface_direction" not in names:
         return {}
@@ -53,29 +43,14 @@ def check_attributes(names: Sequence[str]) -> None:
 
 
 def depth(mesh: Mesh, points: Floats) -> Floats:
-    """Distance of points to the surface over √area: 0 on the surface, 0.28 in the centre of a ball, its maximum.
-
-    Args:
-        mesh: V vertices, F faces.
-        points: (P, 3), length.
-
-    Returns:
-        (P,) dimensionless.
-    """
+    """(P,) distances of points (P, 3) to the surface over √area: 0 on it, 0.28 in the centre of a ball, its maximum."""
     return np.linalg.norm(_to_surface(mesh, points), axis=1) / np.sqrt(mesh.area)
 
 
 def surface_direction(mesh: Mesh, points: Floats) -> Floats:
-    """Unit vectors from points to the nearest point of the surface; near it, the outward normal.
+    """(P, 3) unit vectors from points (P, 3) inside to the nearest of the surface, the outward normal near it; 0 on it.
 
     Where several points of the surface are nearest, as on the axis of a tube, it is one of their directions.
-
-    Args:
-        mesh: V vertices, F faces.
-        points: (P, 3) inside, length.
-
-    Returns:
-        (P, 3); zero for a point on the surface.
     """
     return unit(_to_surface(mesh, points))
 
@@ -90,18 +65,11 @@ def _to_surface(mesh: Mesh, points: Floats) -> Floats:
 
 
 def electrostatic_potential(mesh: Mesh, points: Floats) -> Floats:
-    """Electrostatic potential of a uniform unit charge on the surface, (1/√area) ∫ dS/|x − s|: √4π in a ball.
+    """(P,) potentials of a uniform unit charge on the surface, (1/√area) ∫ dS/|x − s| at points x: √4π in a ball.
 
     It is high where much surface is near: deep in thick parts and among folded ones, low in thin limbs and at their
     tips. Rustamov 2010, section 4, names electrostatic potentials as a further dimension; where a body has charges of
     its own (a protein), pass that potential as an attribute instead. It does not depend on how the surface is cut into
     triangles; on the surface it is finite. See `surface_potential` for the method and its error.
-
-    Args:
-        mesh: V vertices, F faces.
-        points: (P, 3), length.
-
-    Returns:
-        (P,) dimensionless.
     """
     return surface_potential(mesh.vertices, mesh.faces, points) / np.sqrt(mesh.area)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, get_args
 
+from igps._parameters import check_at_least, check_share
 from igps.signature.attributes import AttributeName, check_attributes
 from igps.signature.laplacian import Backend
 
@@ -64,19 +65,16 @@ class SignatureConfig:
     least_vertices: int | None = None
 
     def __post_init__(self) -> None:
-        smallest = {"n_eigenpairs": 1, "resolution": 1, "min_samples": 0, "n_surface_samples": 1, "least_vertices": 0}
-        for name, least in smallest.items():
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ValueError(f"{name}: expected at least {least}, got {value}.")
+        counts = {"resolution": self.resolution, "n_surface_samples": self.n_surface_samples}
+        check_at_least(1, n_eigenpairs=self.n_eigenpairs, **counts)
+        check_at_least(0, min_samples=self.min_samples, least_vertices=self.least_vertices)
         if self.backend not in ("cotangent", "robust"):
             raise ValueError(f"backend: expected 'cotangent' or 'robust', got {self.backend!r}.")
         if self.max_vertices is not None and self.max_vertices <= self.n_kept + 1:
             raise ValueError(
                 f"max_vertices: expected more than n_eigenpairs + 1 = {self.n_kept + 1}, got {self.max_vertices}."
             )
-        if self.accuracy is not None and not 0 < self.accuracy < 1:
-            raise ValueError(f"accuracy: expected None or a number between 0 and 1, got {self.accuracy}.")
+        check_share(accuracy=self.accuracy)
         check_attributes(self.attributes)
 
     @classmethod

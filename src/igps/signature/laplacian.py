@@ -63,17 +63,13 @@ def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, Floats]:
         longest = np.sqrt(squared[thin].max(axis=1, keepdims=True))
         lengths = np.sqrt(squared[thin]) + _MOLLIFIER * longest
         squared[thin] = lengths**2
-        double_area[thin] = 2 * _heron(lengths)
+        c, b, a = np.sort(lengths, axis=1).T  # Heron's formula in Kahan's arrangement, stable for needles
+        double_area[thin] = 2 * (np.sqrt((a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))) / 4)
     # cot at corner i = (b·b + c·c − a·a) / (4 area), a the edge opposite i.
     cotangents = (squared.sum(axis=1, keepdims=True) - 2 * squared) / (2 * double_area[:, None])
     return _stiffness(mesh.faces, cotangents, len(mesh.vertices)), _mixed_voronoi_mass(
         mesh.faces, cotangents, squared, double_area / 2, len(mesh.vertices)
     )
-
-
-def _heron(lengths: Floats) -> Floats:
-    c, b, a = np.sort(lengths, axis=1).T  # Kahan's arrangement, stable for needles
-    return np.sqrt((a + (b + c)) * (c - (a - b)) * (c + (a - b)) * (a + (b - c))) / 4
 
 
 def _stiffness(faces: Integers, cotangents: Floats, n_vertices: int) -> sparse.csr_matrix:

@@ -25,11 +25,9 @@ from igps._arrays import Floats, Integers
 from igps._threads import Team
 from igps.mesh.winding import checked_places
 from igps.signature._far_field import Clusters, Surface
-from igps.signature._spatial_order import spatial_order
+from igps.signature.ordering import spatial_order
 
 logger = logging.getLogger(__name__)
-
-__all__ = ["Extension", "extend", "mean_value_coordinates"]
 
 _BLOCK_BYTES = 256 * 2**20  # of weights at a time
 _GROUP = 192  # points that see the same clusters
@@ -150,11 +148,7 @@ class Extension:
         self._vertices, self._faces, self._accuracy = vertices, faces, accuracy
 
     def __call__(self, points: NDArray[np.floating]) -> Floats:
-        """(P, K) of points (P, 3).
-
-        Raises:
-            ValueError: points of another shape, or the weights of one sum to zero.
-        """
+        """(P, K) of points (P, 3); a ValueError of another shape, or where the weights of one sum to zero."""
         x = _scaled(self._vertices, self._faces, points)[2] @ self._surface.axes
         accuracy = self._accuracy
         setting = accuracy

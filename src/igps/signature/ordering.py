@@ -7,6 +7,7 @@ a spectral embedding, or in space, and so does not depend on place, numbering, o
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +17,6 @@ from scipy.spatial import cKDTree
 from igps._arrays import Floats, Integers
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import face_areas
-
-__all__ = ["crowding", "in_order_of_form", "one_in_each_share", "places", "places_in_space", "shares_around"]
 
 # λ·area at which the embedding's weights have fallen to 1/e of the commute time's: the eigenfunctions from the 60th on
 # count for nothing, and it does not matter whether the last ones are all of a multiplet.
@@ -41,15 +40,9 @@ def places(
     body with symmetries many points have one potential, and the anchors tell them apart; which of several like points
     becomes an anchor is decided by rounding, but whichever it is, all that follows is like what would follow another.
 
-    Args:
-        eigenfunctions: (P, K) at the points, 1/length.
-        eigenvalues: (K,) positive ascending, 1/length².
-        area: of the surface, length².
-        marks: (P,) of the order of 1: what else tells points apart. A body's symmetries need not be those of the points
-            that stand for it: around the axis of a vase the surface is the same, the grid or the triangles are not.
-
-    Returns:
-        (P,) dimensionless.
+    Of eigenfunctions (P, K) at the points it is (P,), dimensionless. Marks (P,) of the order of 1 are what else tells
+    points apart: a body's symmetries need not be those of the points that stand for it. Around the axis of a vase the
+    surface is the same, the grid or the triangles are not.
     """
     scaled = eigenvalues * area
     weights = np.sqrt(area / scaled) * np.exp(-scaled / _CUTOFF)
@@ -115,16 +108,37 @@ def shares_around(faces: Integers, areas: Floats) -> Floats:
 
 
 def one_in_each_share(sizes: Floats, n: int, generator: np.random.Generator) -> Integers:
-    """Draw n of some things laid end to end, each as often as its size asks: one at random in each n-th of the length.
+    """Draw n of things of sizes (F,) laid end to end: one at random in each n-th of the length; (n,) ascending indices.
 
-    Args:
-        sizes: (F,) non-negative, in their order.
-        n: how many to draw.
-        generator: of the draws.
-
-    Returns:
-        (n,) ascending indices; a large thing is drawn several times.
+    Each is drawn as often as its size asks, a large one several times.
     """
     ends = np.cumsum(sizes)
     position = (np.arange(n) + generator.random(n)) * (ends[-1] / n)
     return np.minimum(np.searchsorted(ends, position, side="right"), np.flatnonzero(sizes)[-1])
+
+
+def spatial_order(points: Floats, size: int) -> Integers:
+    """An order (n,) of points (n, 3) in which all runs of size·2ᵏ, counted from the start, are compact in space.
+
+    The median cut: halves along the longest side of their bounding box, again and again.
+    """
+    n_points = len(points)
+    n_cuts = max(0, math.ceil(math.log2(max(1, n_points) / size)))
+    order = np.minimum(np.arange(size << n_cuts), n_points)
+    # What is missing to 2ᵏ full runs is in the middle for the boxes, and behind all points for the cuts.
+    padded = np.ascontiguousarray(np.vstack([points, points.mean(axis=0) if n_points else np.zeros(3)]).T)
+    for cut in range(n_cuts):
+        boxes = padded.take(order, axis=1).reshape(3, 1 << cut, -1)
+        along = boxes[np.ptp(boxes, axis=2).argmax(axis=0), np.arange(1 << cut)]
+        along[order.reshape(along.shape) == n_points] = np.inf
+        halves = np.argpartition(along, along.shape[1] // 2 - 1, axis=1)
+        order = np.take_along_axis(order.reshape(along.shape), halves, axis=1).ravel()
+    return order[order < n_points]
+
+
+def principal_axes(points: Floats) -> Floats:
+    """The principal axes of points (n, 3), as columns (3, 3), towards the longer tails: cuts turn with the points."""
+    centred = points - points.mean(axis=0)
+    axes = np.linalg.eigh(centred.T @ centred).eigenvectors
+    skewness = ((centred @ axes) ** 3).sum(axis=0)
+    return np.where(skewness < 0, -axes, axes)

@@ -50,16 +50,9 @@ def screened_potential(molecule: Molecule, points: Floats) -> Floats:
 
 
 def residue_means(molecule: Molecule, points: Floats, values: Floats, width: float = WIDTH) -> Floats:
-    """Means of the residues' values at points, by a Gaussian of the distance.
+    """(P, D) means of the residues' values (R, D) at points (P, 3), Å, by a Gaussian of the distance.
 
-    Args:
-        molecule: R residues.
-        points: (P, 3), Å.
-        values: (R, D); NaN where a residue's is not known, which then does not count.
-        width: standard deviation of the Gaussian, Å.
-
-    Returns:
-        (P, D); NaN where none is known near a point.
+    A value that is not known, NaN, does not count; the mean is NaN where none is known near a point.
     """
     known = np.isfinite(values)
     filled = np.where(known, values, 0)
@@ -74,11 +67,7 @@ def residue_means(molecule: Molecule, points: Floats, values: Floats, width: flo
 
 
 def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
-    """A named attribute of points (P, 3), Å: (P,), of "residue_shares" (P, 25); see `RESIDUE_ATTRIBUTES`.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """A named attribute of points (P, 3), Å: (P,), of "residue_shares" (P, 25); a ValueError of an unknown name."""
     if name == "screened_potential":
         return screened_potential(molecule, points)
     if name not in _COLUMNS:

@@ -14,17 +14,11 @@ from igps.signature.ordering import one_in_each_share
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points on the faces of a mesh.
-
-    Args:
-        mesh: V vertices, F faces.
-        face: (P,) int64 the face of each point.
-        weights: (P, 3) float64 its barycentric coordinates there.
-    """
+    """Points on the faces of a mesh."""
 
     mesh: Mesh
-    face: Integers
-    weights: Floats
+    face: Integers  # (P,) of each point
+    weights: Floats  # (P, 3) its barycentric coordinates there
 
     @property
     def positions(self) -> Floats:
@@ -39,13 +33,9 @@ class SurfacePoints:
 def surface_points(mesh: Mesh, n_points: int, seed: int, places: Floats | None = None) -> SurfacePoints:
     """Random points evenly distributed over the surface.
 
-    Args:
-        mesh: the surface.
-        n_points: how many.
-        seed: the same seed gives the same points.
-        places: (V,) of the vertices, by which faces and corners are taken in an order that does not depend on how they
-            are numbered, see `igps.signature.ordering`. One point is then drawn in each of `n_points` equal shares of
-            the area, and the points come in that order.
+    By places (V,) of the vertices, faces and corners are taken in an order that does not depend on how they are
+    numbered, see `igps.signature.ordering`. One point is then drawn in each of `n_points` equal shares of the area, and
+    the points come in that order.
     """
     generator = np.random.default_rng(seed)
     area = face_areas(mesh.vertices, mesh.faces)

@@ -39,16 +39,11 @@ _RESIDUAL = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points that carry the eigenfunctions.
+    """Points that carry the eigenfunctions."""
 
-    Args:
-        points: (P, 3) float64, length.
-        eigenfunctions: (P, K) float32, 1/length, not scaled by any power of the eigenvalues.
-        attributes: by name, each (P,) or (P, C) float32; a direction has C = 3.
-    """
-
-    points: Floats
-    eigenfunctions: Singles
+    points: Floats  # (P, 3) length
+    eigenfunctions: Singles  # (P, K) 1/length, not scaled by any power of the eigenvalues
+    # By name, each (P,) or (P, C); a direction has C = 3
     attributes: Mapping[str, Singles] = field(default_factory=dict)
 
     def __len__(self) -> int:

@@ -19,9 +19,7 @@ import numpy as np
 from igps._arrays import Floats, Integers
 from igps.mesh.surface import longest_side
 from igps.signature._potential_loops import fill_potentials
-from igps.signature._spatial_order import spatial_order
-
-__all__ = ["surface_potential"]
+from igps.signature.ordering import spatial_order
 
 _POINTS = 32  # in a block; they see the same clusters
 _FACES = 8  # in the smallest clusters, and so many clusters of one level in one of the next
@@ -29,17 +27,10 @@ _FLAT = 1e-14  # a face's height over its length, below which it has no area and
 
 
 def surface_potential(vertices: Floats, faces: Integers, points: Floats, accuracy: float = 1e-3) -> Floats:
-    """∫ dS/|x − s| over a triangle mesh at points x anywhere, on the surface too.
+    """(P,) ∫ dS/|x − s|, length, over a triangle mesh at points x (P, 3) anywhere, on the surface too.
 
-    Args:
-        vertices: (V, 3), length.
-        faces: (F, 3) vertex indices.
-        points: (P, 3), length.
-        accuracy: a relative error that is proved for every value. The largest found with 10⁻³, on 26 bodies with and
-            without needles, was 4·10⁻⁶: what is left out changes its sign from patch to patch.
-
-    Returns:
-        (P,) length.
+    The accuracy is a relative error that is proved for every value. The largest found with 10⁻³, on 26 bodies with and
+    without needles, was 4·10⁻⁶: what is left out changes its sign from patch to patch.
     """
     corners = vertices[faces]
     centre, scale = corners.mean(axis=(0, 1)), longest_side(vertices)
@@ -72,19 +63,12 @@ def surface_potential(vertices: Floats, faces: Integers, points: Floats, accurac
 
 @dataclass(frozen=True)
 class _Patches:
-    """Pieces of the surface, as the series sees them.
+    """Pieces of the surface, as the series sees them."""
 
-    Args:
-        areas: (n,).
-        centres: (n, 3) centroids.
-        spreads: (n, 3, 3) covariance of the points.
-        radii: (n,) of a ball about the centroid that holds the patch.
-    """
-
-    areas: Floats
-    centres: Floats
-    spreads: Floats
-    radii: Floats
+    areas: Floats  # (n,)
+    centres: Floats  # (n, 3) centroids
+    spreads: Floats  # (n, 3, 3) covariance of the points
+    radii: Floats  # (n,) of a ball about the centroid that holds the patch
 
     @staticmethod
     def of(corners: Floats) -> _Patches:

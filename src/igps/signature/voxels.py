@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._arrays import Booleans, Floats, Integers
+from igps._parameters import check_at_least
 from igps.mesh.limits import check_grid
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import box_sides, directed_edges, longest_side
@@ -20,26 +21,18 @@ _MAX_CELLS = 2**25
 
 
 def interior_samples(mesh: Mesh, resolution: int = 32, min_samples: int = 0) -> Floats:
-    """Centres of the cubic voxels inside the mesh (Rustamov 2010, section 3).
+    """(P, 3) centres, length, of the cubic voxels inside the mesh (Rustamov 2010, section 3).
 
     The grid is centred on the bounding box, with cells of 1/`resolution` of its longest side, so that moving the mesh,
     or turning it by the symmetries of the grid, moves and turns the samples.
 
-    Args:
-        mesh: the body.
-        resolution: cells along the longest side of the bounding box.
-        min_samples: refine the grid until at least so many cells are inside; 0 keeps `resolution`.
-
-    Returns:
-        (P, 3) points in the mesh's coordinates, length.
+    Until at least `min_samples` cells are inside, the grid is refined; 0 keeps the resolution.
 
     Raises:
         MeshError: no cell centre is inside, `min_samples` is out of reach, or the grid would fill the memory.
     """
-    if resolution < 1:
-        raise ValueError(f"resolution: expected at least 1, got {resolution}.")
-    if min_samples < 0:
-        raise ValueError(f"min_samples: expected at least 0, got {min_samples}.")
+    check_at_least(1, resolution=resolution)
+    check_at_least(0, min_samples=min_samples)
     finest = _finest_resolution(mesh)
     if resolution > finest:
         raise MeshError(
@@ -85,14 +78,11 @@ def grid_axes(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Floats]:
 
 
 def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
-    """For each point of the grid spanned by `axes`, whether the mesh's winding number there is above one half.
+    """(X, Y, Z) whether the mesh's winding number is above one half, at each point of the grid spanned by `axes`.
 
     Along each axis the signed crossings of every grid line are summed from both ends. On a closed mesh the six sums
     agree, and are the winding number. Where a hole lets one line through, the other five outvote it; where more
     disagree, the winding number is computed from solid angles (Jacobson et al. 2013). Points on the surface are out.
-
-    Returns:
-        (X, Y, Z) booleans.
     """
     shape = tuple(len(axis) for axis in axes)
     votes = np.zeros(shape, dtype=np.int8)
@@ -157,18 +147,13 @@ def _scan(
     before = -np.cumsum(at, axis=0)[:-1]
 
     touched = np.zeros(size, dtype=bool)
-    cell = _cell(axes, vertices)
+    # The first axis tells the cell, or where that has one point, as across a flat body, the next does.
+    cell = next((float(axis[1] - axis[0]) for axis in axes if len(axis) > 1), longest_side(vertices))
     for neighbour in (position - 1, position):
         clipped = np.clip(neighbour, 0, len(x_axis) - 1)
         close = np.abs(x_axis[clipped] - crossing) < _ON_SURFACE * cell
         touched[clipped[close], column[close], row[segment][close]] = True
     return after, before, touched[:-1]
-
-
-def _cell(axes: tuple[Floats, ...], vertices: Floats) -> float:
-    """The grid's cell: the first axis tells it, or where that has one point, as across a flat body, the next does."""
-    steps = (float(axis[1] - axis[0]) for axis in axes if len(axis) > 1)
-    return next(steps, longest_side(vertices))
 
 
 def _ranges(first: Integers, last: Integers) -> tuple[Integers, Integers]:

@@ -32,19 +32,12 @@ COLUMNS_AT_ONCE = 8192
 
 @dataclass(frozen=True)
 class RitzPairs:
-    """Eigenpairs of the projected problem, in the order of their eigenvalues.
+    """Eigenpairs of the projected problem, in the order of their eigenvalues."""
 
-    Attributes:
-        eigenvalues: (m,) of A.
-        residuals: (m,) ‖A y − λ y‖ of the Ritz vectors after one more application of the operator.
-        coefficients: (m + b, m) of those Ritz vectors, not normalised, in the basis with its next block.
-        below_shift: (m,) whether θ < 0.
-    """
-
-    eigenvalues: torch.Tensor
-    residuals: torch.Tensor
-    coefficients: torch.Tensor
-    below_shift: torch.Tensor
+    eigenvalues: torch.Tensor  # (m,) of A
+    residuals: torch.Tensor  # (m,) ‖A y − λ y‖ of the Ritz vectors after one more application of the operator
+    coefficients: torch.Tensor  # (m + b, m) of those Ritz vectors, not normalised, in the basis with its next block
+    below_shift: torch.Tensor  # (m,) whether θ < 0
 
     def leading(self, n_below: int, tolerance: float) -> torch.Tensor:
         """Indices of the pairs up to the first that has not converged; none if fewer than n_below lie below σ."""
@@ -152,7 +145,7 @@ class Krylov(Basis):
         Entry i of a vector becomes row ``order[i]``.
         """
         coefficients = _coefficients(ritz, index)
-        vectors = _empty(self._basis.shape[1], len(index)).numpy()
+        vectors = torch.empty(self._basis.shape[1], len(index), dtype=torch.float64).numpy()
 
         def combine(piece: slice) -> None:
             vectors[order[piece]] = combinations(self._basis[1 : self._stop], coefficients, piece)
@@ -271,10 +264,6 @@ def _coefficients(ritz: RitzPairs, index: torch.Tensor) -> torch.Tensor:
     """(m + b, K) of the Ritz pairs with these indices, of length 1."""
     coefficients = ritz.coefficients[:, index]
     return coefficients / torch.linalg.norm(coefficients, dim=0)
-
-
-def _empty(n_rows: int, n_columns: int) -> torch.Tensor:
-    return torch.empty(n_rows, n_columns, dtype=torch.float64)
 
 
 def _inverse(factor: torch.Tensor) -> torch.Tensor:

@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable
 from functools import partial
+from operator import call
 from typing import Any
 
 import numpy as np
@@ -93,7 +94,7 @@ def lanczos(
                 else:  # side by side
                     vectors, filling = krylov.eigenvectors(ritz, wanted, order)
                     steps: list[Callable[[], Any]] = [count, *filling]
-                    n_negative = team.each(_call, steps)[0]
+                    n_negative = team.each(call, steps)[0]
                 n_present = n_negative - 1
                 if n_present == n_found:
                     if vectors is None:
@@ -140,10 +141,6 @@ def _factorize_inside(
             break
     assert best is not None
     return best[2:]
-
-
-def _call(step: Callable[[], Any]) -> Any:
-    return step()
 
 
 def gap_behind(eigenvalues: torch.Tensor, n_eigenpairs: int) -> tuple[int, float] | None:

@@ -47,37 +47,23 @@ LARGE = 127
 AT_ONCE = 256
 
 
-SINGULAR = "a pivot block of the shifted matrix is singular: use a slightly different shift"
-
-
 class SingularMatrixError(ValueError):
     """A pivot block of the shifted matrix is singular: the shift hits an eigenvalue of it."""
 
 
 @dataclass(frozen=True)
 class Tree(Nodes):
-    """Elimination order and fronts for one sparsity pattern; serves any number of values and shifts.
+    """Elimination order and fronts for one sparsity pattern; serves any number of values and shifts."""
 
-    Attributes:
-        indptr, indices: (V + 1,), (E,) int32, of the csr matrix.
-        block_start: (N + 1,) where each node's block [D E] starts among all blocks.
-        update_start: (N,) where its complement starts among those that wait to be added.
-        n_updates: entries of all complements that wait at the same time, at most.
-        subtrees: ranges of nodes that may be eliminated, and solved, side by side.
-        above: the other nodes, as ranges, each behind its children.
-        carried_start: (N,) where the rows that a node adds to its boundary start among those that wait to be added.
-        n_carried: rows that wait at the same time, at most.
-    """
-
-    indptr: np.ndarray
-    indices: np.ndarray
-    block_start: np.ndarray
-    update_start: np.ndarray
-    n_updates: int
-    subtrees: list[tuple[int, int]]
-    above: list[tuple[int, int]]
-    carried_start: np.ndarray
-    n_carried: int
+    indptr: np.ndarray  # (V + 1,) int32, of the csr matrix
+    indices: np.ndarray  # (E,) int32
+    block_start: np.ndarray  # (N + 1,) where each node's block [D E] starts among all blocks
+    update_start: np.ndarray  # (N,) where its complement starts among those that wait to be added
+    n_updates: int  # entries of all complements that wait at the same time, at most
+    subtrees: list[tuple[int, int]]  # ranges of nodes that may be eliminated, and solved, side by side
+    above: list[tuple[int, int]]  # the other nodes, as ranges, each behind its children
+    carried_start: np.ndarray  # (N,) where the rows that a node adds to its boundary start among those that wait
+    n_carried: int  # rows that wait at the same time, at most
 
     @property
     def structure(self) -> loops.Structure:
@@ -163,16 +149,10 @@ class Tree(Nodes):
 
 @dataclass(frozen=True)
 class Factors:
-    """The factors of one matrix: solves with it, and its number of negative eigenvalues.
+    """The factors of one matrix: solves with it, and its number of negative eigenvalues."""
 
-    Attributes:
-        tree: the structure they were made with.
-        blocks: each node's (S, S + B) block [D E], end to end.
-        n_negative: number of negative eigenvalues of the matrix.
-    """
-
-    tree: Tree
-    blocks: np.ndarray
+    tree: Tree  # the structure they were made with
+    blocks: np.ndarray  # each node's (S, S + B) block [D E], end to end
     n_negative: int
 
     def solve(self, right_hand_sides: torch.Tensor, team: Team = ALONE) -> torch.Tensor:
@@ -263,7 +243,7 @@ def _invert(pivot: torch.Tensor) -> tuple[torch.Tensor, int]:
         return torch.cholesky_inverse(factor), 0
     factor, order, failed = torch.linalg.ldl_factor_ex(pivot)
     if failed:
-        raise SingularMatrixError(SINGULAR)
+        raise SingularMatrixError("a pivot block of the shifted matrix is singular: use a slightly different shift")
     inverse = torch.linalg.ldl_solve(factor, order, torch.eye(len(pivot), dtype=pivot.dtype))
     # Bunch & Kaufman's pivots: a 1×1 one counts by its sign, a 2×2 one (marked by a negative index) has one eigenvalue
     # of either sign

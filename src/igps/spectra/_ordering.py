@@ -34,11 +34,7 @@ def hop_coordinates(graph: sparse.csr_array, n_landmarks: int = 3) -> np.ndarray
 
 
 def checked_graph(matrix: sparse.csr_array, coordinates: np.ndarray | None) -> tuple[sparse.csr_array, np.ndarray]:
-    """The matrix with sorted entries, and coordinates for its vertices; the arguments are those of `analyse`.
-
-    Raises:
-        ValueError: the pattern is not symmetric or lacks diagonal entries, or coordinates do not fit it.
-    """
+    """The matrix with sorted entries, and coordinates for its vertices; arguments and errors are those of `analyse`."""
     matrix = canonical(matrix)
     n_vertices = matrix.shape[0]
     transpose = matrix.tocsc()

@@ -46,13 +46,8 @@ def invert(matrix: np.ndarray, n: int, width: int, rows: np.ndarray, columns: np
     """Replace a symmetric matrix (n, width) by its inverse; its negative pivots, -1 if one is 0 or not finite.
 
     Gauss and Jordan's elimination of AT_ONCE unknowns at a time, of which the width is a multiple. As the pivots are
-    taken as they come, the inverse is accurate where the matrix is definite; elsewhere see `invert_front`.
-
-    Args:
-        matrix: flat.
-        n, width: its size, and that of its rows; what is behind n must be 0.
-        rows: (AT_ONCE · width,) room.
-        columns: ((n + AT_ONCE) · AT_ONCE,) room.
+    taken as they come, the inverse is accurate where the matrix is definite; elsewhere see `invert_front`. What is
+    behind n in a row must be 0; rows (AT_ONCE · width,) and columns ((n + AT_ONCE) · AT_ONCE,) are room.
     """
     n_negative = 0
     pivot = columns[n * AT_ONCE :]

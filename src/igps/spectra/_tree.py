@@ -17,23 +17,15 @@ SUBTREE, MOST_SUBTREES = 2**13, 3
 
 @dataclass(frozen=True)
 class Nodes:
-    """The nodes of the tree, N in number, and their vertices.
+    """The nodes of the tree, N in number, and their vertices."""
 
-    Attributes:
-        order, number: (V,) the vertex of each number, the number of each vertex.
-        first: (N + 1,) where each node's own numbers start.
-        children: (N, 2) nodes, or -1.
-        start, boundary: (N + 1,) where each node's boundary starts among all boundaries, sorted numbers each.
-        parent_row: the row of each vertex of a boundary in the front of the node's parent.
-    """
-
-    order: np.ndarray
-    number: np.ndarray
-    first: np.ndarray
-    children: np.ndarray
-    start: np.ndarray
-    boundary: np.ndarray
-    parent_row: np.ndarray
+    order: np.ndarray  # (V,) the vertex of each number
+    number: np.ndarray  # (V,) the number of each vertex
+    first: np.ndarray  # (N + 1,) where each node's own numbers start
+    children: np.ndarray  # (N, 2) nodes, or -1
+    start: np.ndarray  # (N + 1,) where each node's boundary starts among all boundaries
+    boundary: np.ndarray  # sorted numbers each
+    parent_row: np.ndarray  # the row of each vertex of a boundary in the front of the node's parent
 
 
 def tree_nodes(node: np.ndarray, n_levels: int, indptr: np.ndarray, indices: np.ndarray) -> Nodes:

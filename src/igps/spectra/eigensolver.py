@@ -206,8 +206,7 @@ def _residual(
 ) -> tuple[float, np.ndarray]:
     """The largest relative residual, and what makes of the eigenvalues Rayleigh's quotients of their vectors (K,).
 
-    Raises:
-        ConvergenceError: one is above the tolerance though rounding allows a smaller one, or above RESIDUAL_LIMIT.
+    A ConvergenceError if one is above the tolerance though rounding allows a smaller one, or above RESIDUAL_LIMIT.
     """
     largest = 0.0
     squares, corrections = _defects(

@@ -9,20 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from igps.descriptors.pretrained._merge_loops import merge
+from igps._arrays import Integers
+from igps._compiled import compiled
 
 
 class MergeTree(NamedTuple):
-    """Branches by the elder rule, and the pieces of superlevel sets.
+    """Branches by the elder rule, and the pieces of superlevel sets, by the numbers of points."""
 
-    peaks: (B,) the highest point of each branch, numbers of points.
-    saddles: (B,) the point where it joins the branch of a higher peak; the lowest point of all where it joins none.
-    pieces: (L, P) of each point the peak of the piece of the superlevel set that it belongs to; −1 where it is below.
-    """
-
-    peaks: Tensor
-    saddles: Tensor
-    pieces: Tensor
+    peaks: Tensor  # (B,) the highest point of each branch
+    saddles: Tensor  # (B,) where it joins the branch of a higher peak; the lowest point of all where it joins none
+    pieces: Tensor  # (L, P) of each point the peak of the piece of the superlevel set it belongs to; −1 where below
 
 
 def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = ()) -> MergeTree:
@@ -39,6 +35,72 @@ def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = ()) -
     order = torch.argsort(values.detach(), descending=True, stable=True).cpu().numpy()
     ends = np.empty((len(values), 2), np.int64)
     pieces = np.full((len(counts), len(values)), -1, np.int64)
-    n = merge(order, neighbours.cpu().numpy(), np.array(counts, np.int64), ends, pieces)
+    n = _merge(order, neighbours.cpu().numpy(), np.array(counts, np.int64), ends, pieces)
     found = torch.from_numpy(ends[:n]).to(values.device)
     return MergeTree(found[:, 0], found[:, 1], torch.from_numpy(pieces).to(values.device))
+
+
+@compiled()
+def _merge(
+    order: Integers, neighbours: Integers, counts: Integers, ends: Integers,
+    pieces: Integers,
+) -> int:  # fmt: skip
+    """Write the branches and the pieces of a function on a graph, see `merge_tree`; how many branches there are.
+
+    The points (P,) come in order, the highest first. Written are the peak and the saddle of each branch to (P, 2), and
+    the peak of the piece of each point to (L, P), which holds −1.
+    """
+    n_points, n_neighbours = neighbours.shape
+    place = np.empty(n_points, np.int64)
+    for k in range(n_points):
+        place[order[k]] = k
+    # of each point the others that name it, one list after the other; while they are filled, point i has place i + 1
+    starts = np.zeros(n_points + 2, np.int64)
+    for i in range(n_points):
+        for j in range(n_neighbours):
+            starts[neighbours[i, j] + 2] += 1
+    parent = np.empty(n_points, np.int64)
+    for i in range(n_points):
+        starts[i + 1] += starts[i]
+        parent[i] = i
+    naming = np.empty(n_points * n_neighbours, np.int64)
+    for i in range(n_points):
+        for j in range(n_neighbours):
+            named = neighbours[i, j]
+            naming[starts[named + 1]] = i
+            starts[named + 1] += 1
+    n_branches = level = 0
+    for reached in range(n_points):
+        point = order[reached]
+        for j in range(n_neighbours + starts[point + 1] - starts[point]):
+            other = neighbours[point, j] if j < n_neighbours else naming[starts[point] + j - n_neighbours]
+            if place[other] >= reached:
+                continue
+            first, second = point, other
+            while parent[first] != first:
+                parent[first] = parent[parent[first]]
+                first = parent[first]
+            while parent[second] != second:
+                parent[second] = parent[parent[second]]
+                second = parent[second]
+            if first == second:
+                continue
+            if place[first] < place[second]:
+                first, second = second, first
+            parent[first] = second  # the higher peak lives on
+            if first != point:
+                ends[n_branches, 0], ends[n_branches, 1] = first, point
+                n_branches += 1
+        while level < len(counts) and counts[level] == reached + 1:
+            for k in range(reached + 1):
+                root = order[k]
+                while parent[root] != root:
+                    root = parent[root]
+                pieces[level, order[k]] = root
+            level += 1
+    for k in range(n_points):
+        point = order[k]
+        if parent[point] == point:
+            ends[n_branches, 0], ends[n_branches, 1] = point, order[n_points - 1]
+            n_branches += 1
+    return n_branches

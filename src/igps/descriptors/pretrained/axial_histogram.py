@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from igps.data.requirements import Requirements, embedding_requirements
+from igps.data.requirements import Requirements
 from igps.nn.axes.points import soft_memberships
 from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential
@@ -54,7 +54,7 @@ class AxialHistogram(SampleHistogram):
         super().__init__(samples, n_samples, n_training_samples)
         if len(n_bins) != 4 or min(n_bins) < 2:
             raise ValueError(f"n_bins: expected four numbers, each at least 2, got {n_bins}.")
-        self.embedding: nn.Module = embedding or SpectralEmbedding()
+        self.embedding = embedding or SpectralEmbedding()
         self.n_bins = n_bins
         ends = {"along": (-_REACH, _REACH), "beside": (0, _REACH), "cosine": (-1, 1), "outward": (-1, 1)}
         for n, (name, (first, last)) in zip(n_bins, ends.items(), strict=True):
@@ -68,7 +68,7 @@ class AxialHistogram(SampleHistogram):
     @property
     def requirements(self) -> Requirements:
         """Those of the embedding, and the directions."""
-        return embedding_requirements(self.embedding) | Requirements(attributes=("surface_direction",))
+        return super().requirements | Requirements(attributes=("surface_direction",))
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, 3, ...) histograms of some samples of N shapes."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from igps.data.requirements import Requirements, embedding_requirements
 from igps.descriptors.pretrained._merge_tree import merge_tree
 from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding
@@ -45,18 +44,13 @@ class BranchHistogram(SampleHistogram):
         super().__init__(samples, n_samples, n_training_samples)
         if n_branches < 2:
             raise ValueError(f"n_branches: expected at least 2, got {n_branches}.")
-        self.embedding: nn.Module = embedding or SpectralEmbedding()
+        self.embedding = embedding or SpectralEmbedding()
         self.n_branches = n_branches
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Branches."""
         return (self.n_branches,)
-
-    @property
-    def requirements(self) -> Requirements:
-        """Those of the embedding."""
-        return embedding_requirements(self.embedding)
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, B) histograms of some samples of N shapes."""

@@ -81,14 +81,8 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
 
     It needs no label of the shapes that it compares: by the head's distance, other poses of a body come first, then
     other bodies of its class. The head's `short` makes vectors of 256 numbers of its 1,210. The model card is in the
-    documentation.
-
-    Args:
-        path: of the parameters, as `save_pretrained` wrote them; those that the package ships by default.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: it holds other parameters.
+    documentation. The parameters are those of a file that `save_pretrained` wrote, a FileNotFoundError without one, and
+    a ValueError where it holds others.
     """
     module = EmbeddedDescriptor(
         pretrained_parts(),

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from igps.data.requirements import Requirements, embedding_requirements
 from igps.descriptors.pretrained._merge_tree import merge_tree
 from igps.nn.axes.points import soft_memberships
 from igps.nn.batch_features import SampleFeatures, SampleKind
@@ -63,7 +62,7 @@ class PieceHistogram(SampleHistogram):
         if len(n_bins) != 2 or min(n_bins) < 2:
             raise ValueError(f"n_bins: expected two numbers, each at least 2, got {n_bins}.")
         self.levels, self.n_bins = tuple(levels), n_bins
-        self.embedding: nn.Module = embedding or SpectralEmbedding()
+        self.embedding = embedding or SpectralEmbedding()
         self.register_buffer("sizes", torch.linspace(_SMALLEST, _LARGEST, n_bins[0]))
         self.register_buffer("lengths", torch.linspace(_ROUNDEST, _LONGEST, n_bins[1]))
 
@@ -71,11 +70,6 @@ class PieceHistogram(SampleHistogram):
     def shape(self) -> tuple[int, ...]:
         """Levels, and the bins of size and length."""
         return (len(self.levels), *self.n_bins)
-
-    @property
-    def requirements(self) -> Requirements:
-        """Those of the embedding."""
-        return embedding_requirements(self.embedding)
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, L, ...) histograms of some samples of N shapes."""

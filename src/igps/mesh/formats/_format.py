@@ -20,29 +20,17 @@ from igps.mesh.surface import compact, face_parts, stacked
 
 @dataclass(frozen=True, eq=False)
 class RawBody:
-    """A surface as a file has it, unchecked.
+    """A surface as a file has it, unchecked; a cloud of points has no faces."""
 
-    Args:
-        vertices: (V, 3) length.
-        faces: (F, 3) vertex indices; none of a cloud of points.
-        part: its name among the bodies of the file; None where the file is one body.
-        unit: of length, such as "mm"; None where the file does not tell.
-        normals: (V, 3) of a cloud of points that has them.
-        notes: what was noticed on reading, in words.
-        fault: why there is no surface of this body, where there are others.
-        make: makes the surface, where that takes time; see `made`.
-        voxels: that the surface was made of, of a label.
-    """
-
-    vertices: Floats = field(default_factory=lambda: np.zeros((0, 3)))
-    faces: Integers = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
-    part: str | None = None
-    unit: str | None = None
-    normals: Floats | None = None
-    notes: tuple[str, ...] = ()
-    fault: MeshError | None = None
-    make: Callable[[], RawBody] | None = None
-    voxels: Callable[[], LabelVoxels] | None = None
+    vertices: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (V, 3) length
+    faces: Integers = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))  # (F, 3) vertex indices
+    part: str | None = None  # its name among the bodies of the file; None where the file is one body
+    unit: str | None = None  # of length, such as "mm"; None where the file does not tell
+    normals: Floats | None = None  # (V, 3) of a cloud of points that has them
+    notes: tuple[str, ...] = ()  # what was noticed on reading, in words
+    fault: MeshError | None = None  # why there is no surface of this body, where there are others
+    make: Callable[[], RawBody] | None = None  # makes the surface, where that takes time; see `made`
+    voxels: Callable[[], LabelVoxels] | None = None  # that the surface was made of, of a label
 
     def made(self) -> RawBody:
         """The same with its surface, or with the fault for which there is none."""
@@ -53,24 +41,17 @@ class RawBody:
 class Format:
     """A file format.
 
-    Args:
-        name: for messages.
-        suffixes: lower case, with the dot. The longest that ends a file's name decides.
-        read: the bodies of a file, with distinct names, or the one named; raises anything where the file is faulty.
-            Surfaces that take time are made later, see `RawBody.make`.
-        bodies: what a body of the file may be, the usual first. "whole" and "pieces" are made of what `read` gives.
-        is_searched: whether files below a folder are taken for bodies by their suffix.
-        ignored: suffixes of files of the same format that hold no surface.
-        extra: the extra of this package with the modules that it needs.
+    `read` gives the bodies of a file, with distinct names, or the one named, and raises anything where the file is
+    faulty. Surfaces that take time are made later, see `RawBody.make`; "whole" and "pieces" are made of what it gives.
     """
 
-    name: str
-    suffixes: tuple[str, ...]
+    name: str  # for messages
+    suffixes: tuple[str, ...]  # lower case, with the dot; the longest that ends a file's name decides
     read: Callable[[Path, LoadOptions, str | None], Sequence[RawBody]]
-    bodies: tuple[BodyKind, ...] = ("whole",)
-    is_searched: bool = True
-    ignored: tuple[str, ...] = ()
-    extra: str | None = None
+    bodies: tuple[BodyKind, ...] = ("whole",)  # what a body of the file may be, the usual first
+    is_searched: bool = True  # whether files below a folder are taken for bodies by their suffix
+    ignored: tuple[str, ...] = ()  # suffixes of files of the same format that hold no surface
+    extra: str | None = None  # the extra of this package with the modules that it needs
 
 
 def made_later(

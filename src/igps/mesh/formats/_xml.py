@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import lzma
 import zlib
 from collections.abc import Callable
@@ -44,11 +43,6 @@ def _refuse(name: str, *_: object) -> None:
 def from_text(text: str, kind: np.dtype) -> NDArray[np.generic]:
     """Numbers separated by white space."""
     return np.array(text.split(), dtype="U").astype(kind) if text.split() else np.zeros(0, kind)
-
-
-def from_base64(text: str) -> bytes:
-    """Bytes, white space passed over."""
-    return base64.b64decode("".join(text.split()), validate=True)
 
 
 def inflated(content: bytes, n_bytes: int, name: str = "zlib") -> bytes:

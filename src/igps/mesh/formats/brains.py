@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from math import prod
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -51,7 +52,7 @@ def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.gen
     if encoding == "ASCII":
         values = _xml.from_text(text, kind)
     elif encoding in ("Base64Binary", "GZipBase64Binary"):
-        content = _xml.from_base64(text)
+        content = base64.b64decode("".join(text.split()), validate=True)
         content = _xml.inflated(content, n_bytes) if encoding.startswith("GZip") else content
         values = np.frombuffer(content, kind.newbyteorder("<" if element.get("Endian") == "LittleEndian" else ">"))
     else:

@@ -47,27 +47,17 @@ _NOTES = {
 
 @dataclass(frozen=True, eq=False)
 class Molecule:
-    """The balls of a body, and its residues.
+    """The A balls of a body, and its R residues."""
 
-    Args:
-        name: of the file, with the model, chain or assembly.
-        positions, radii, charges: (A, 3) and (A,) of the balls: Å, van der Waals radii in Å, elementary charges.
-        residue_of: (A,) the residue of each ball, from 0.
-        residue_names: of the R residues, three letters; a modified amino acid has the name of the one that it was.
-        residue_positions: (R, 3) of the Cα atoms, or else the mean of a residue's atoms, Å.
-        b_factors: (R,) means of the residue's atoms: B-factors, Å², or a model's confidence (pLDDT); NaN of a PQR file.
-        notes: what was done to the structure, in words.
-    """
-
-    name: str
-    positions: Floats
-    radii: Floats
-    charges: Floats
-    residue_of: Integers
-    residue_names: tuple[str, ...]
-    residue_positions: Floats
-    b_factors: Floats
-    notes: tuple[str, ...] = ()
+    name: str  # of the file, with the model, chain or assembly
+    positions: Floats  # (A, 3) Å
+    radii: Floats  # (A,) van der Waals radii, Å
+    charges: Floats  # (A,) elementary charges
+    residue_of: Integers  # (A,) the residue of each ball, from 0
+    residue_names: tuple[str, ...]  # three letters; a modified amino acid has the name of the one that it was
+    residue_positions: Floats  # (R, 3) of the Cα atoms, or else the mean of a residue's atoms, Å
+    b_factors: Floats  # (R,) means of the residue's atoms: B-factors, Å², or a model's pLDDT; NaN of a PQR file
+    notes: tuple[str, ...] = ()  # what was done to the structure, in words
 
     def __repr__(self) -> str:
         return f"Molecule({self.name!r}, {len(self.residue_names)} residues, {len(self.radii)} balls)"
@@ -99,7 +89,6 @@ def read_molecule(
         (('ZN',), [1.39])
 
     Args:
-        path: the file.
         bodies: "chains" or "models", each by itself, or of every model the first biological "assembly" that the file
             names. Those without usable atoms are left out, which is logged.
         ligands: keep what belongs to no polymer, as is done in a file without polymers.

@@ -52,26 +52,17 @@ class LabelVolume:
         >>> [(body.label, body.name, body.n_voxels) for body in volume.bodies]
         [(1, '1', 2048), (2, 'liver', 2048)]
 
-    Args:
-        layers: arrays (X, Y, Z) of whole numbers from 0, the background; several where segments overlap.
-        affine: (4, 4) from indices of voxels to the world.
-        name: what error messages call the volume, usually its file.
-        names: of labels.
-        segments: (label, layer, value in it) of files that list their segments; None for one layer of labels.
-        unit: of length, None if unknown.
-        notes: what was done to the volume.
-
-    Raises:
-        MeshError: no labels, labels that are no whole numbers from 0, names that repeat, or a singular affine.
+    A MeshError of no labels, labels that are no whole numbers from 0, names that repeat, or a singular affine.
     """
 
-    layers: tuple[NDArray[Any], ...]
-    affine: Floats
-    name: str = "volume"
-    names: dict[int, str] | None = None
+    layers: tuple[NDArray[Any], ...]  # (X, Y, Z) whole numbers, 0 the background; several where segments overlap
+    affine: Floats  # (4, 4) from indices of voxels to the world
+    name: str = "volume"  # what error messages call it, usually its file
+    names: dict[int, str] | None = None  # of labels
+    # (label, layer, value in it) of files that list their segments; None for one layer of labels
     segments: tuple[tuple[int, int, int], ...] | None = None
-    unit: str | None = "mm"
-    notes: tuple[str, ...] = ()
+    unit: str | None = "mm"  # of length, None if unknown
+    notes: tuple[str, ...] = ()  # what was done to it
 
     def __post_init__(self) -> None:
         checked_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
@@ -122,10 +113,7 @@ def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) ->
 
     Names of labels come from `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, extensions of NIfTI), else
     from a table beside it (see `names_beside`); without one a label is its number, and the only label 1 of a mask has
-    the name of the file.
-
-    Raises:
-        MeshError: the file is missing, cut short, too large, or holds no labels; or its library is missing.
+    the name of the file. A MeshError of a file that is missing, cut short, too large, or holds no labels.
     """
     path = Path(path)
     if not path.is_file():

@@ -58,11 +58,7 @@ AXES: dict[str, type[PointAxis | PairAxis]] = {
 
 
 def axis_of(name: str) -> PointAxis | PairAxis:
-    """The axis of a name, as it is by default.
-
-    Raises:
-        ValueError: no axis has this name.
-    """
+    """The axis of a name, as it is by default; a ValueError where no axis has this name."""
     if name not in AXES:
         raise ValueError(f"axes: expected one of {', '.join(AXES)}, or an axis, got {name!r}.")
     return AXES[name]()  # type: ignore[call-arg]

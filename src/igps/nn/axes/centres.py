@@ -16,11 +16,7 @@ _LEAST_GAP = 1e-3
 
 
 def middles(n: int, largest: float, name: str) -> Tensor:
-    """(n,) middles of n equal intervals of [0, largest].
-
-    Raises:
-        ValueError: no interval, or no positive range; `name` is that of the argument without its "n_".
-    """
+    """(n,) middles of n equal intervals of [0, largest]; a ValueError of the argument n_`name` where there are none."""
     if n < 1 or not 0 < largest < math.inf:
         raise ValueError(f"expected at least one of {name} and a positive range, got n_{name}={n} and {largest}.")
     return (torch.arange(n) + 0.5) * (largest / n)

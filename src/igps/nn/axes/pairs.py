@@ -71,9 +71,12 @@ def _bin_middles(n_bins: int, reach: float) -> Tensor:
 
 
 class DistanceAxis(PairAxis):
-    """Bins of a distance: `n_bins` equal intervals of [0, `reach`] at the start."""
+    """Bins of a distance: `n_bins` equal intervals of [0, `reach`] at the start, whose centres may be parameters.
 
-    def __init__(self, n_bins: int, reach: float, learnable: bool) -> None:
+    What lies beyond counts in the last.
+    """
+
+    def __init__(self, n_bins: int = 16, reach: float = 1.0, *, learnable: bool = False) -> None:
         super().__init__()
         self.reach = reach
         self.centres = OrderedCentres(_bin_middles(n_bins, reach), learnable)
@@ -88,16 +91,14 @@ class InteriorDistance(DistanceAxis):
     """Bins of the interior distance, the Euclidean distance of embeddings (Rustamov 2010, equation 5).
 
     Args:
-        n_bins: B.
-        reach: end of the last bin; what lies beyond counts in the last bin.
         embedding: other than the histogram's: for a second scale.
-        learnable: whether the centres are parameters.
+        n_bins, reach, learnable: see `DistanceAxis`.
     """
 
     def __init__(
         self, n_bins: int = 64, reach: float = 4.0, *, embedding: nn.Module | None = None, learnable: bool = False
     ) -> None:
-        super().__init__(n_bins, reach, learnable)
+        super().__init__(n_bins, reach, learnable=learnable)
         self.embedding = embedding
 
     def requirements(self, embedding: nn.Module) -> Requirements:
@@ -110,16 +111,7 @@ class InteriorDistance(DistanceAxis):
 
 
 class EuclideanDistance(DistanceAxis):
-    """Bins of the distance in space, over √area.
-
-    Args:
-        n_bins: B.
-        reach: end of the last bin; what lies beyond counts in the last bin.
-        learnable: whether the centres are parameters.
-    """
-
-    def __init__(self, n_bins: int = 16, reach: float = 1.0, *, learnable: bool = False) -> None:
-        super().__init__(n_bins, reach, learnable)
+    """Bins of the distance in space, over √area; see `DistanceAxis`."""
 
     def pairs(self, features: SampleFeatures, embedding: nn.Module) -> PairValues:
         """Samples over √area."""
@@ -127,7 +119,7 @@ class EuclideanDistance(DistanceAxis):
 
 
 class _CosineAxes(PairAxis):
-    def __init__(self, n_bins: int, learnable: bool) -> None:
+    def __init__(self, n_bins: int = 5, *, learnable: bool = False) -> None:
         super().__init__()
         cosines = _bin_middles(n_bins, 2.0) - 1
         self.towards_centres = OrderedCentres(cosines, learnable)
@@ -146,15 +138,8 @@ class PairCosines(_CosineAxes):
     """Bins of the three cosines of point pair features in space (Wahl et al. 2003; Drost et al. 2010).
 
     The direction of a sample is that to the nearest point of the surface, on the surface the outward normal. They see
-    corners, hollows and symmetry, which distances alone tell little of.
-
-    Args:
-        n_bins: A, of each cosine.
-        learnable: whether the centres are parameters.
+    corners, hollows and symmetry, which distances alone tell little of. Each cosine has A bins.
     """
-
-    def __init__(self, n_bins: int = 5, *, learnable: bool = False) -> None:
-        super().__init__(n_bins, learnable)
 
     def requirements(self, embedding: nn.Module) -> Requirements:
         """The directions."""
@@ -170,14 +155,7 @@ class EmbeddedPairCosines(_CosineAxes):
 
     The direction of an interior sample is to the embedded surface samples nearest to it, that of a surface sample away
     from the interior ones.
-
-    Args:
-        n_bins: A, of each cosine.
-        learnable: whether the centres are parameters.
     """
-
-    def __init__(self, n_bins: int = 5, *, learnable: bool = False) -> None:
-        super().__init__(n_bins, learnable)
 
     def requirements(self, embedding: nn.Module) -> Requirements:
         """Those of the embedding."""

@@ -55,26 +55,15 @@ class PointAxis(Specified, ABC):
             raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
 
     def memberships(self, values: Tensor) -> Tensor:
-        """(..., P, C) non-negative, rows of sum 1, from (..., P) values.
-
-        Raises:
-            ValueError: values that are not finite.
-        """
+        """(..., P, C) non-negative, rows of sum 1, from (..., P) values; a ValueError if one is not finite."""
         self._check(values)
         return soft_memberships(values, self.centres()) if self.soft else _nearest(values, self.centres())
 
     def members(self, values: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """The classes that points belong to, and how much: `memberships` without its zeros.
+        """The classes that points of values (N, P) belong to, and how much: `memberships` without its zeros.
 
-        Args:
-            values: (N, P).
-            mask: (N, P) true where a point is real.
-
-        Returns:
-            (N, P, M) integers and weights of sum 1, M = 2 for soft classes and 1 for hard ones.
-
-        Raises:
-            ValueError: values that are not finite.
+        They are (N, P, M) integers and weights of sum 1, M = 2 for soft classes and 1 for hard ones. A ValueError of
+        values that are not finite where the mask is true.
         """
         self._check(torch.where(mask, values, 0))
         centres = self.centres().to(values.dtype)
@@ -150,11 +139,7 @@ class BallRadius(PointAxis):
         return Requirements(attributes=("surface_direction",))
 
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
-        """(N, P) logarithms of the radii over √area.
-
-        Raises:
-            ValueError: interior samples.
-        """
+        """(N, P) logarithms of the radii over √area; a ValueError of interior samples."""
         if features.kind != "surface":
             raise ValueError("samples: expected surface samples, which balls touch, got interior ones.")
         return features.ball_radii()[..., ("inside", "outside").index(self.side)].log()
@@ -214,11 +199,7 @@ class Attribute(PointAxis):
         return attribute_requirements(self.name)
 
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
-        """(N, P) of the attribute.
-
-        Raises:
-            ValueError: the samples have no such attribute, or it is a direction.
-        """
+        """(N, P) of the attribute; a ValueError if the samples have none of this name, or it is a direction."""
         if not self.is_fitted:
             raise ValueError(
                 f"{self.name}: expected centres, got {self.quantiles} quantiles of no collection. Call "
@@ -241,14 +222,9 @@ def attribute_requirements(name: str) -> Requirements:
 
 
 def soft_memberships(values: Tensor, centres: Tensor) -> Tensor:
-    """Soft classes: linear kernels (hats) around ascending centres; all in the first below it, in the last beyond it.
+    """Soft classes (..., P, C) of values (..., P), rows of sum 1: linear kernels (hats) around ascending centres (C,).
 
-    Args:
-        values: (..., P) of the points.
-        centres: (C,) ascending.
-
-    Returns:
-        (..., P, C) non-negative, rows of sum 1; differentiable in both arguments.
+    Below the first and beyond the last a value is of that class alone. Differentiable in both arguments.
     """
     # How far past each centre on the way to the next, 0 to 1: successive differences are the hats, and sum to 1.
     passed = ((values.unsqueeze(-1) - centres[:-1]) / centres.diff()).clamp(0, 1)

@@ -20,7 +20,8 @@ class Head(Specified, ABC):
     """Descriptions to embeddings of length 1, and the distance that compares embeddings.
 
     A head of your own defines `fit` and `forward`, and `distances` where the cosine distance is not its own. Its
-    buffers take their sizes from what it is fitted to, also when it is loaded.
+    buffers take their sizes from what it is fitted to, also when it is loaded. One that must be fitted before it is
+    used raises a RuntimeError.
     """
 
     @abstractmethod
@@ -32,6 +33,9 @@ class Head(Specified, ABC):
             labels: (N,) classes, integers.
             part_cells: cells of each part of a description, see `HistogramDescriptor.part_cells`; None takes all as one
                 part.
+
+        Raises:
+            ValueError: shapes that do not match, or too few classes, or shapes of a class.
         """
 
     @abstractmethod
@@ -43,11 +47,7 @@ class Head(Specified, ABC):
         return cosine(queries, gallery)
 
     def short(self, embeddings: Tensor) -> Tensor:
-        """(N, D) embeddings to (N, ≤ 256) of length 1 whose cosines are nearly theirs.
-
-        Raises:
-            ValueError: the head has none.
-        """
+        """(N, D) embeddings to (N, ≤ 256) of length 1 whose cosines are nearly theirs; a ValueError if it has none."""
         raise ValueError(
             f"short: expected a head that shortens its embeddings, as the TwoLevelHead of pretrained does, got "
             f"{type(self).__name__} and embeddings of {embeddings.shape[1]} numbers."
@@ -65,11 +65,7 @@ class Head(Specified, ABC):
 
 
 def square_roots(histograms: Tensor) -> Tensor:
-    """(N, ...) histograms to the (N, cells) square roots of their cells, unit vectors with a finite gradient.
-
-    Raises:
-        ValueError: an entry below zero, as embeddings have.
-    """
+    """(N, cells) roots of the cells of histograms (N, ...), with a finite gradient; a ValueError of one below zero."""
     cells = histograms.flatten(1)
     if bool((cells < 0).any()):
         raise ValueError("descriptions: expected histograms, entries ≥ 0, got a negative one.")
@@ -80,14 +76,6 @@ def check_cells(cells: Tensor, n_expected: int) -> None:
     """Raise a ValueError unless these (N, cells) are as many as the head was fitted to."""
     if cells.shape[1] != n_expected:
         raise ValueError(f"descriptions: expected {n_expected} cells as in training, got {cells.shape[1]}.")
-
-
-def check_directions(n_directions: int, shrinkage: float) -> None:
-    """Raise a ValueError unless there is a direction and the shrinkage is positive."""
-    if n_directions < 1:
-        raise ValueError(f"n_directions: expected at least 1, got {n_directions}.")
-    if shrinkage <= 0:
-        raise ValueError(f"shrinkage: expected a positive number, got {shrinkage}.")
 
 
 def checked_parts(cells: Tensor, part_cells: Sequence[int] | None) -> Tensor:
@@ -108,11 +96,7 @@ def checked_labels(descriptions: Tensor, labels: Tensor) -> Tensor:
 
 
 def class_members(descriptions: Tensor, labels: Tensor) -> Tensor:
-    """The classes (N,) of descriptions (N, ...), numbered from 0 without a gap.
-
-    Raises:
-        ValueError: labels that are not aligned, or no class of two shapes.
-    """
+    """The classes (N,) of descriptions (N, ...), numbered from 0; a ValueError if not aligned, or all are single."""
     _, members = checked_labels(descriptions, labels).unique(return_inverse=True)
     if int(members.max()) + 1 == len(members):
         raise ValueError("labels: expected a class of at least two shapes, got as many classes as shapes.")
@@ -128,8 +112,7 @@ def class_means(rows: Tensor, members: Tensor) -> Tensor:
 def principal_directions(rows: Tensor, n: int) -> tuple[Tensor, Tensor]:
     """The n orthonormal directions along which rows (N, D) differ most from the origin, and the sums of their squares.
 
-    Returns:
-        (k, D) and (k,), the largest first; k ≤ n, as directions without extent are left out.
+    They are (k, D) and (k,), the largest first; k ≤ n, as directions without extent are left out.
     """
     n_rows, width = rows.shape
     wide = width > n_rows
@@ -146,14 +129,8 @@ def within_class_whitening(residuals: Tensor, rank: int, shrinkage: float, n: in
     factor, the identity but for a gain along each eigenvector of W. Source: within-class covariance normalisation,
     Hatch, Kajarekar and Stolcke 2006.
 
-    Args:
-        residuals: (N, D) rows of the training shapes, less the mean of their class.
-        rank: number of eigenvalues that the mean is taken over.
-        shrinkage: s.
-        n: directions, at most; those of the largest eigenvalues.
-
-    Returns:
-        directions (k, D), orthonormal, and gains (k,) in (0, 1].
+    Of residuals (N, D), rows of the training shapes less the mean of their class, these are at most n orthonormal
+    directions (k, D), of the largest eigenvalues, and gains (k,) in (0, 1]. The mean is taken over `rank` eigenvalues.
     """
     directions, squares = principal_directions(residuals, min(n, rank))
     relative = squares * rank / residuals.square().sum()

@@ -100,11 +100,9 @@ class ClassifierHead(KernelHead):
 
 
 def folds(labels: Tensor, n_folds: int = _MOST_FOLDS) -> Iterator[Tensor]:
-    """(N,) masks of what is held out in turn: each shape once, of each class at most all but one; singles never.
+    """(N,) masks of what is held out in turn: each shape once, of each class (N,) at most all but one; singles never.
 
-    Args:
-        labels: (N,) integer classes.
-        n_folds: at most so many, fewer where all classes are smaller.
+    There are fewer folds where all classes are smaller.
     """
     generator = torch.Generator().manual_seed(0)
     fold = torch.full(labels.shape, -1)

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from igps._parameters import check_at_least, check_positive, check_share
 from igps.nn.heads.base import (
     Head,
     check_cells,
-    check_directions,
     checked_labels,
     checked_parts,
     class_means,
@@ -72,8 +72,9 @@ class WhitenedHead(Head):
         self, n_directions: int = 64, shrinkage: float = 0.3, prior: Head | None = None, prior_share: float = 1 / 3
     ) -> None:
         super().__init__()
-        check_directions(n_directions, shrinkage)
-        _check_share(prior_share)
+        check_at_least(1, n_directions=n_directions)
+        check_positive(shrinkage=shrinkage)
+        check_share(prior_share=prior_share)
         self.n_directions, self.shrinkage, self.prior = n_directions, shrinkage, prior
         self.register_buffer("prior_share", torch.tensor(prior_share))
         self.register_buffer("mean", torch.zeros(0))
@@ -84,11 +85,7 @@ class WhitenedHead(Head):
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Take mean and directions from the training shapes, see `Head.fit`.
-
-        Raises:
-            ValueError: shapes that do not match, or no class of two shapes.
-        """
+        """Take mean and directions from the training shapes, see `Head.fit`."""
         roots = square_roots(descriptions)
         members = class_members(roots, labels)
         means = class_means(roots, members)
@@ -197,10 +194,8 @@ class KernelHead(Head):
         temperature: float = 0.05,
     ) -> None:
         super().__init__()
-        for name, value in (("ridge", ridge), ("temperature", temperature)):
-            if value <= 0:
-                raise ValueError(f"{name}: expected a positive number, got {value}.")
-        _check_share(prior_share)
+        check_positive(ridge=ridge, temperature=temperature)
+        check_share(prior_share=prior_share)
         self.whitened = WhitenedHead(n_directions, shrinkage)
         self.prior, self.ridge, self.prior_share = prior, ridge, prior_share
         self.register_buffer("temperature", torch.tensor(temperature))
@@ -212,11 +207,7 @@ class KernelHead(Head):
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Fit whitening and regression to the training shapes, see `Head.fit`.
-
-        Raises:
-            ValueError: shapes that do not match, or fewer than two classes.
-        """
+        """Fit whitening and regression to the training shapes, see `Head.fit`."""
         self.classes, members = checked_labels(descriptions, labels).unique(return_inverse=True)
         if len(self.classes) < 2:
             raise ValueError(f"labels: expected at least two classes, got {len(self.classes)}.")
@@ -241,11 +232,7 @@ class KernelHead(Head):
         return self
 
     def scores(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, n_classes), about 1 for the class that a shape is of and 0 for others.
-
-        Raises:
-            RuntimeError: it has not been fitted.
-        """
+        """(N, ...) histograms to (N, n_classes), about 1 for the class that a shape is of and 0 for others."""
         if not len(self.anchors):
             raise self._not_fitted()
         return self._kernel(self._vectors(descriptions)) @ self.coefficients
@@ -280,11 +267,6 @@ class KernelHead(Head):
         if self.prior is not None:
             found.append(self.prior.distances(split[0][-1], split[1][-1]))
         return torch.stack(found)
-
-
-def _check_share(prior_share: float) -> None:
-    if not 0 < prior_share < 1:
-        raise ValueError(f"prior_share: expected a number between 0 and 1, got {prior_share}.")
 
 
 def _discriminant(vectors: Tensor, members: Tensor) -> Tensor:

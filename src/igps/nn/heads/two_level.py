@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from igps._parameters import check_share
 from igps.nn.heads.base import Head, principal_directions
 from igps.nn.heads.wccn import MEDIAN, WCCNHead
 from igps.retrieval.distances import cosine, euclidean, square_root
@@ -85,8 +86,7 @@ class TwoLevelHead(Head):
             raise ValueError(
                 "body_heads, individual_head: expected heads with lengths. Make them by WCCNHead(..., lengths=True)."
             )
-        if not 0 < weight < 1:
-            raise ValueError(f"weight: expected a number between 0 and 1, got {weight}.")
+        check_share(weight=weight)
         self.register_buffer("scales", torch.tensor(list(scales)))
         self.register_buffer("share", torch.tensor(share))
         self.register_buffer("weight", None if individual_head is None else torch.tensor(weight))
@@ -115,11 +115,7 @@ class TwoLevelHead(Head):
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, D) of length 1, the individuals' numbers last.
-
-        Raises:
-            RuntimeError: it has not been fitted.
-        """
+        """(N, ...) histograms to (N, D) of length 1, the individuals' numbers last."""
         levels = self._two_levels(descriptions)
         if self.individual_head is None:
             return levels
@@ -130,11 +126,7 @@ class TwoLevelHead(Head):
     def fit_individuals(
         self, descriptions: Tensor, individuals: Tensor, part_cells: Sequence[int] | None = None
     ) -> Self:
-        """Fit the individual head to histograms (N, ...) of individuals (N,) in poses; the other levels stay.
-
-        Raises:
-            ValueError: there is no individual head.
-        """
+        """Fit the individual head, if there is one, to histograms (N, ...) of individuals (N,) in poses."""
         if self.individual_head is None:
             raise ValueError("individual_head: expected a head to fit, got None.")
         self.individual_head.fit(descriptions, individuals, part_cells)
@@ -144,11 +136,7 @@ class TwoLevelHead(Head):
         """(N, D) embeddings to (N, ≤ 256) of length 1, along the principal directions of those of the training shapes.
 
         For engines that take no more numbers: their cosines are nearly those of the embeddings without the individuals,
-        farther from them the less a shape is like those of training.
-
-        Raises:
-            RuntimeError: it has not been fitted.
-            ValueError: other embeddings than its own.
+        farther from them the less a shape is like those of training. A ValueError of other embeddings than its own.
         """
         if not len(self.principal):
             raise self._not_fitted()

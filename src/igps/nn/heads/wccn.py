@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from igps._parameters import check_at_least, check_positive
 from igps.nn.heads.base import (
     Head,
     check_cells,
-    check_directions,
     checked_parts,
     class_means,
     class_members,
@@ -62,7 +62,8 @@ class WCCNHead(Head):
         lengths: bool = False,
     ) -> None:
         super().__init__()
-        check_directions(n_directions, shrinkage)
+        check_at_least(1, n_directions=n_directions)
+        check_positive(shrinkage=shrinkage)
         self.n_directions, self.shrinkage = n_directions, shrinkage
         self._parts = None if parts is None else tuple(parts)
         self.register_buffer("mean", torch.zeros(0))
@@ -72,11 +73,7 @@ class WCCNHead(Head):
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
-        """Take mean and directions from the training shapes, see `Head.fit`.
-
-        Raises:
-            ValueError: shapes that do not match, a part that is not there, or no class of two shapes.
-        """
+        """Take mean and directions from the training shapes, see `Head.fit`."""
         roots = square_roots(descriptions)
         members = class_members(roots, labels)
         self.part_cells = checked_parts(roots, part_cells)
@@ -96,11 +93,7 @@ class WCCNHead(Head):
         return self
 
     def forward(self, descriptions: Tensor) -> Tensor:
-        """(N, ...) histograms to (N, D) of length 1.
-
-        Raises:
-            RuntimeError: it has not been fitted.
-        """
+        """(N, ...) histograms to (N, D) of length 1."""
         roots = square_roots(descriptions)
         if not len(self.mean):
             raise self._not_fitted()

@@ -7,10 +7,11 @@ from abc import ABC, abstractmethod
 from functools import reduce
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from igps._parameters import check_at_least
 from igps.data.batch import SignatureBatch
-from igps.data.requirements import Requirements
+from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn.batch_features import BatchFeatures, SampleFeatures, SampleKind, check_kind
 from igps.nn.specification import Specified
 
@@ -65,17 +66,22 @@ class SampleHistogram(DescriptionPart):
         ValueError: an unknown kind of samples, or fewer than two.
     """
 
+    embedding: nn.Module
+
     def __init__(
         self, samples: SampleKind, n_samples: int | None = None, n_training_samples: int | None = None
     ) -> None:
         super().__init__()
         check_kind(samples)
-        for name, value in (("n_samples", n_samples), ("n_training_samples", n_training_samples)):
-            if value is not None and value < 2:
-                raise ValueError(f"{name}: expected None or at least 2, got {value}.")
+        check_at_least(2, n_samples=n_samples, n_training_samples=n_training_samples)
         self.samples: SampleKind = samples
         self.n_samples = n_samples
         self.n_training_samples = n_training_samples
+
+    @property
+    def requirements(self) -> Requirements:
+        """Those of the embedding."""
+        return embedding_requirements(self.embedding)
 
     @abstractmethod
     def of_samples(self, features: SampleFeatures) -> Tensor:
@@ -92,11 +98,7 @@ def joint(memberships: list[Tensor]) -> Tensor:
 
 
 def counted(one: Tensor, other: Tensor, n_points: Tensor) -> Tensor:
-    """(..., C, D) shares of points in combinations of classes, from memberships (..., P, C) and (..., P, D).
-
-    Raises:
-        ValueError: no point.
-    """
+    """(..., C, D) shares of points, at least one, in combinations of classes (..., P, C) and (..., P, D)."""
     if not torch.compiler.is_compiling() and int(n_points.min()) < 1:
         raise ValueError("samples: expected at least one of each body, got none.")
     return one.mT @ other / n_points[..., None, None]

@@ -69,7 +69,7 @@ class PairHistogram(SampleHistogram):
         self.axes = nn.ModuleList(given)
         if not self.pair_axes:
             raise ValueError("axes: expected at least one of pairs, such as 'interior_distance', got none.")
-        self.embedding: nn.Module = embedding or SpectralEmbedding()
+        self.embedding = embedding or SpectralEmbedding()
 
     @property
     def point_axes(self) -> list[PointAxis]:

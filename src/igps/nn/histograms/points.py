@@ -49,7 +49,7 @@ class PointHistogram(SampleHistogram):
                 "pairs belong to a PairHistogram."
             )
         self.axes = nn.ModuleList(axes)
-        self.embedding: nn.Module = embedding or SpectralEmbedding()
+        self.embedding = embedding or SpectralEmbedding()
 
     @property
     def point_axes(self) -> list[PointAxis]:

@@ -1,4 +1,4 @@
-"""Checks of the parameters of descriptors, in one wording."""
+"""Checks of parameters, in one wording; None, where a parameter may be that, is right."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 from collections.abc import Sequence
 
 
-def check_at_least(least: int, **values: int) -> None:
+def check_at_least(least: int, **values: float | None) -> None:
     """Raise a ValueError that names the first of the values that is smaller."""
     for name, value in values.items():
-        if value < least:
+        if value is not None and value < least:
             raise ValueError(f"{name}: expected at least {least}, got {value}.")
 
 
@@ -20,8 +20,15 @@ def check_positive(**values: float) -> None:
             raise ValueError(f"{name}: expected a positive number, got {value}.")
 
 
-def check_one_of(allowed: Sequence[str], **values: str) -> None:
+def check_share(**values: float | None) -> None:
+    """Raise a ValueError that names the first of the values that does not lie between 0 and 1."""
+    for name, value in values.items():
+        if value is not None and not 0 < value < 1:
+            raise ValueError(f"{name}: expected a number between 0 and 1, got {value}.")
+
+
+def check_one_of(allowed: Sequence[str], **values: str | None) -> None:
     """Raise a ValueError that names the first of the values that is not allowed."""
     for name, value in values.items():
-        if value not in allowed:
+        if value is not None and value not in allowed:
             raise ValueError(f"{name}: expected one of {', '.join(map(repr, allowed))}, got {value!r}.")

@@ -9,7 +9,7 @@ import trimesh
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from igps.report import gallery
+from igps.report import drawing
 
 
 @pytest.fixture
@@ -33,14 +33,14 @@ def root(tmp_path: Path) -> Path:
 
 def test_ranked_results_show_each_class_with_hits_and_misses(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Figure] = []
-    make = gallery.new_figure
+    make = drawing.new_figure
 
     def remember(width: float, height: float) -> Figure:
         made.append(make(width, height))
         return made[-1]
 
-    monkeypatch.setattr(gallery, "new_figure", remember)
-    gallery.ranked_results(root, root / "ranking.csv", root / "out" / "ranked.png", top=3)
+    monkeypatch.setattr(drawing, "new_figure", remember)
+    drawing.ranked_results(root, root / "ranking.csv", root / "out" / "ranked.png", top=3)
     axes = np.array(made[0].axes).reshape(2, 4)
     titles = [[axis.get_title() for axis in row] for row in axes]
     assert titles[0] == ["query ball/0.off", "ball/1.off\n0.100", "egg/0.off\n0.200", "egg/1.off\n0.300"]
@@ -54,7 +54,7 @@ def test_ranked_results_show_each_class_with_hits_and_misses(root: Path, monkeyp
 def test_turned_body_is_drawn_alike() -> None:
     body = trimesh.creation.cone(radius=0.4, height=2.0, sections=24)
     turned = body.vertices @ trimesh.transformations.rotation_matrix(2.0, [1, 2, 3])[:3, :3].T
-    straight, back = gallery.seen_from_the_front(body.vertices), gallery.seen_from_the_front(turned)
+    straight, back = drawing.seen_from_the_front(body.vertices), drawing.seen_from_the_front(turned)
     np.testing.assert_allclose(np.ptp(back, axis=0)[1], np.ptp(straight, axis=0)[1], rtol=1e-6)
     for view in (straight, back):
         tip = view[np.argmax(np.linalg.norm(view - view.mean(axis=0), axis=1))]
@@ -63,5 +63,5 @@ def test_turned_body_is_drawn_alike() -> None:
 
 def test_view_is_no_mirror_image() -> None:
     points = np.random.default_rng(0).random((50, 3)) * [1, 2, 3]
-    frame = np.linalg.lstsq(points, gallery.seen_from_the_front(points), rcond=None)[0]
+    frame = np.linalg.lstsq(points, drawing.seen_from_the_front(points), rcond=None)[0]
     assert np.linalg.det(frame) == pytest.approx(1)
