@@ -18,16 +18,28 @@ def quick(vectors: NDArray[np.float64], groups: list[str] = PAIR, seed: int = 0,
     return group_test(vectors, groups, seed=seed, **options)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("is_confounded", [False, True])
-def test_without_a_difference_one_test_in_twenty_rejects(is_confounded: bool) -> None:
+def whitened_kernel(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gaussian kernel of Mahalanobis distances by the covariance of all, a tenth of its mean variance added to each."""
+    centred = vectors - vectors.mean(axis=0)
+    scatter = centred.T @ centred
+    inverse = np.linalg.inv(scatter + 0.1 * np.trace(scatter) / (len(vectors) - 1) * np.eye(vectors.shape[1]))
+    apart = vectors[:, None] - vectors
+    squares = np.einsum("ijk,kl,ijl->ij", apart, inverse, apart)
+    kernel: NDArray[np.float64] = np.exp(-squares / (2 * np.median(squares[np.triu_indices(len(vectors), 1)])))
+    return kernel
+
+
+@pytest.mark.parametrize(("is_confounded", "n_numbers"), [(False, 6), (True, 6), (True, 40)])
+def test_without_a_difference_one_test_in_twenty_rejects(is_confounded: bool, n_numbers: int) -> None:
     """Of 1,000 draws; also where a covariate that differs between the groups, and the strata, cause a difference."""
     random = np.random.default_rng(1)
     found = []
     for draw in range(1000):
-        vectors, given = random.normal(size=(24, 6)), {}
+        vectors, given = random.normal(size=(24, n_numbers)), {}
         if is_confounded:
             age, scanner = random.normal(size=24) + np.repeat([0, 1], 12), random.integers(0, 2, 24)
-            vectors += np.outer(age, [2, 1, 0, 0, 0, 0]) + 2 * scanner[:, None]
+            vectors[:, :2] += np.outer(age, [2, 1])
+            vectors += 2 * scanner[:, None]
             given = {"covariates": age[:, None], "strata": [str(one) for one in scanner]}
         test = quick(vectors, seed=draw, **given)
         found.append((test.permanova_p, test.kernel_p))
@@ -45,6 +57,14 @@ def test_power_grows_with_the_difference() -> None:
         powers.append([np.mean([getattr(one, name) <= 0.05 for one in tests]) for name in ("permanova_p", "kernel_p")])
     assert (np.diff(powers, axis=0) > 0).all(), powers
     assert min(powers[-1]) > 0.95
+
+
+def test_the_kernel_test_finds_a_small_direction_that_distances_drown() -> None:
+    random = np.random.default_rng(9)
+    scales, shift = np.array([10.0, 5, 2, 1, 1]), np.outer(np.repeat([0, 1], 20), [0, 0, 0, 2.0, 0])
+    tests = [quick(random.normal(size=(40, 5)) * scales + shift, ["a"] * 20 + ["b"] * 20, i) for i in range(60)]
+    shares = [np.mean([getattr(one, name) <= 0.05 for one in tests]) for name in ("permanova_p", "kernel_p")]
+    assert shares[0] < 0.2 < 0.9 < shares[1], shares
 
 
 def test_a_covariate_that_causes_all_the_difference_explains_it() -> None:
@@ -71,7 +91,7 @@ def test_statistics_are_those_of_the_textbook() -> None:
     assert test.permanova_f == pytest.approx(between / (within / 22))
     squares = squared_distances(vectors)
     np.testing.assert_allclose(squares, ((vectors[:, None] - vectors) ** 2).sum(axis=2), atol=1e-12)
-    kernel = np.exp(-squares / (2 * np.median(squares[np.triu_indices(24, 1)])))
+    kernel = whitened_kernel(vectors)
     means = kernel[:12, :12].mean() + kernel[12:, 12:].mean() - 2 * kernel[:12, 12:].mean()
     assert test.kernel == pytest.approx(means)
     # Without bias: of the variance of all, the squared distance of the means less what chance adds to it
@@ -95,10 +115,17 @@ def test_a_probability_is_that_of_all_arrangements() -> None:
     from itertools import combinations
 
     values = np.random.default_rng(6).normal(size=10) + np.repeat([0, 0.8], 5)
-    apart = [abs(values[list(one)].mean() - np.delete(values, one).mean()) for one in combinations(range(10), 5)]
-    exact = np.mean([one >= abs(values[:5].mean() - values[5:].mean()) - 1e-12 for one in apart])
+    kernel = whitened_kernel(values[:, None])
+    of_means, of_kernel = [], []
+    for one in combinations(range(10), 5):  # the groups themselves first
+        side = np.isin(np.arange(10), one)
+        of_means.append(abs(values[side].mean() - values[~side].mean()))
+        of_kernel.append(
+            kernel[side][:, side].mean() + kernel[~side][:, ~side].mean() - 2 * kernel[side][:, ~side].mean()
+        )
+    exact = [np.mean([one >= each[0] - 1e-12 for one in each]) for each in (of_means, of_kernel)]
     test = quick(values[:, None], ["a"] * 5 + ["b"] * 5, n_permutations=20_000)
-    assert test.permanova_p == pytest.approx(exact, abs=0.01)
+    assert [test.permanova_p, test.kernel_p] == pytest.approx(exact, abs=0.01)
 
 
 @pytest.mark.parametrize(

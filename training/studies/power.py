@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import reduce
+from operator import or_
 from pathlib import Path
 from typing import Any
 
@@ -19,61 +21,84 @@ from igps.signature.signature import SignatureConfig, compute_signature
 # Of each proportion of a subject, as a share
 _SCATTER = 0.02
 _N_EIGENVALUES = 30
+_LAPY = "ShapeDNA (LaPy)"
+
+Rows = NDArray[np.float64]
 
 
 def power(
     out: Path = Path("build/power"),
-    descriptor: str = "interior",
+    descriptors: Sequence[str] = ("pretrained", "interior", "shape_dna"),
     differences: Sequence[float] = (0.0, 0.01, 0.02, 0.03),
-    n_pool: int = 60,
+    n_pool: int = 600,
     n_each: int = 30,
-    n_draws: int = 200,
+    n_draws: int = 400,
     seed: int = 0,
 ) -> None:
-    """The share of draws in which PERMANOVA rejects at 5 %.
+    """The share of draws in which the tests reject at 5 %.
 
     Subjects are eggs with a waist, whose height, width, depth and waist each scatter by 2 %. Groups differ in the mean
     height. The spectrum is LaPy's, of the same surfaces, divided by the first eigenvalue, the size.
 
     Args:
         out: folder for power.csv and power.json.
-        descriptor: a name.
+        descriptors: names.
         differences: of the mean height, as shares.
-        n_pool: subjects of each mean that draws choose from.
-        n_each: of a group in a draw.
-        n_draws: of two groups.
+        n_pool: subjects of each mean; the groups without a difference are drawn from two pools, too.
+        n_each: of a group in a draw. Draws share no subject until the pools are used up; then they are mixed anew.
+        n_draws: of two groups, for each difference.
         seed: of all.
     """
+    first = pool(0.0, n_pool, descriptors, np.random.default_rng([seed, 0]))
+    rows: list[dict[str, Any]] = []
+    for number, difference in enumerate(differences, start=1):
+        second = pool(difference, n_pool, descriptors, np.random.default_rng([seed, number]))
+        rows += [{"difference": difference, **row} for row in shares(first, second, n_each, n_draws, seed)]
+    write_answer(out, "power", rows)
+
+
+def shares(
+    first: Mapping[str, Rows], second: Mapping[str, Rows], n_each: int, n_draws: int, seed: int
+) -> list[dict[str, Any]]:
+    """Of draws from two pools of vectors by descriptor, in which each test rejects."""
+    rows: list[dict[str, Any]] = []
+    for name in first:
+        random, orders = np.random.default_rng(seed), list[list[NDArray[np.int64]]]()
+        while len(orders) < n_draws:
+            mixed = [random.permutation(len(side[name])) for side in (first, second)]
+            count = min(map(len, mixed)) // n_each
+            orders += [[one[i * n_each : (i + 1) * n_each] for one in mixed] for i in range(count)]
+        tests = [
+            group_test(
+                np.vstack([first[name][a], second[name][b]]), ["a"] * n_each + ["b"] * n_each,
+                n_permutations=199, n_bootstraps=0, n_repeats=0, seed=draw,
+            )
+            for draw, (a, b) in enumerate(orders[:n_draws])
+        ]  # fmt: skip
+        rejected = {
+            what: float(np.mean([getattr(one, f"{what}_p") <= 0.05 for one in tests]))
+            for what in ("permanova", "kernel")
+        }
+        rows.append({"descriptor": name, **rejected})
+        print(rows[-1], flush=True)
+    return rows
+
+
+def pool(difference: float, n_pool: int, descriptors: Sequence[str], random: np.random.Generator) -> dict[str, Rows]:
+    """Vectors (n_pool, D) of subjects, by descriptor, and LaPy's."""
     from lapy import TriaMesh, shapedna  # the extra `studies`
 
-    random, chosen = np.random.default_rng(seed), descriptor_of(descriptor)
-    config = chosen.requirements.apply_to(SignatureConfig())
-    vectors: dict[float, dict[str, list[NDArray[np.float64]]]] = {}
-    # The groups without a difference are two as well
-    for number, difference in enumerate((0.0, *differences)):
-        found = vectors.setdefault(-1.0 if number == 0 else difference, {descriptor: [], "ShapeDNA (LaPy)": []})
-        for _ in range(n_pool):
-            mesh = subject(difference, random)
-            description = chosen(collate([compute_signature(mesh, config)])).detach()
-            found[descriptor].append(vectors_of(chosen, description)[0])
-            surface = TriaMesh(mesh.vertices, mesh.faces)
-            values = shapedna.compute_shapedna(surface, k=_N_EIGENVALUES)["Eigenvalues"][1:]
-            found["ShapeDNA (LaPy)"].append(np.log(values / values[0])[1:])
-    rows: list[dict[str, Any]] = []
-    for difference in differences:
-        for name in vectors[difference]:
-            rejected = []
-            for draw in range(n_draws):
-                sides = [random.choice(len(vectors[of][name]), n_each, replace=False) for of in (-1.0, difference)]
-                both = [vectors[of][name][i] for of, side in zip((-1.0, difference), sides, strict=True) for i in side]
-                test = group_test(
-                    np.array(both), ["a"] * n_each + ["b"] * n_each,
-                    n_permutations=199, n_bootstraps=0, n_repeats=0, seed=draw,
-                )  # fmt: skip
-                rejected.append((test.permanova_p or 1) <= 0.05)
-            rows.append({"descriptor": name, "difference": difference, "power": float(np.mean(rejected))})
-            print(rows[-1], flush=True)
-    write_answer(out, "power", rows)
+    chosen = [descriptor_of(name) for name in descriptors]
+    config = reduce(or_, [one.requirements for one in chosen]).apply_to(SignatureConfig())
+    found: dict[str, list[Rows]] = {name: [] for name in (*descriptors, _LAPY)}
+    for _ in range(n_pool):
+        mesh = subject(difference, random)
+        batch = collate([compute_signature(mesh, config)])
+        for name, one in zip(descriptors, chosen, strict=True):
+            found[name].append(vectors_of(one, one(batch).detach())[0])
+        values = shapedna.compute_shapedna(TriaMesh(mesh.vertices, mesh.faces), k=_N_EIGENVALUES)["Eigenvalues"][1:]
+        found[_LAPY].append(np.log(values / values[0])[1:])
+    return {name: np.array(rows) for name, rows in found.items()}
 
 
 def subject(difference: float, random: np.random.Generator) -> Mesh:
