@@ -84,8 +84,8 @@ def group_test(
     pseudo-F of these, and sees what is large beside the usual differences. The kernel test also sees what is small: it
     whitens what is left of the vectors by their covariance, with a tenth of the mean variance as ridge (as Harchaoui,
     Bach and Moulines 2008; of all bodies, so that permutations share it), and is the pseudo-F of a Gaussian kernel with
-    the median distance as its width. A probability is (1 + permutations as extreme) / (1 + permutations) (Phipson and
-    Smyth 2010).
+    the median distance as its width; beside covariates or strata, and of few bodies, it rejects too seldom. A
+    probability is (1 + permutations as extreme) / (1 + permutations) (Phipson and Smyth 2010).
 
     Args:
         vectors: (N, D) of N bodies, one of each subject.
