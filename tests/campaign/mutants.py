@@ -64,8 +64,6 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
     {
         # `is` in place of `==`: both sides are truth values.
         ("src/igps/retrieval/metric.py", "if self.labels and (ids is None) is bool(self.ids):"),
-        # Centres at equal distances are taken for unequal ones, which only costs time.
-        ("src/igps/nn/_kernels/pair_loops.py", "mean = (last - first) + (n - 1)"),
         # The sum over the other dimension: the matrix is symmetric.
         ("src/igps/retrieval/reranking.py", "joins = (2 / 3 * half.sum(dim= 0) <= inside.T) & members"),
         # Exact principal components in place of approximate ones, which are only faster; of all, either is exact.
@@ -78,7 +76,7 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         ("src/igps/mesh/_union.py", "_DIRECTIONS, _PLACES_PER_PATCH = 99, 30"),
         ("src/igps/mesh/limits.py", "_OBJ_BYTES, _TEXT_STL_BYTES = 34, 200"),
         (
-            "src/igps/nn/heads/wccn.py",
+            "src/igps/nn/heads/closed_form.py",
             "n_directions: int = 59,",
         ),
         # Points whose classes are not side by side only cost time.
@@ -86,8 +84,6 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
             "src/igps/nn/_kernels/count_by_loops.py",
             "key = key * layout.n_classes - torch.where(own[:, k] > 0, classes[:, k], 0)",
         ),
-        # Two columns more, which nothing reads.
-        ("src/igps/nn/_kernels/pair_loops.py", "inverse = np.empty((n_axes, most_centres + 1), centres.dtype)"),
         # No resolution is larger than the finest: one that is asked for is refused before, one that grows is cut.
         ("src/igps/signature/voxels.py", "if min_samples == 0 or resolution == finest:"),
         # Nothing compares two of them.
