@@ -111,25 +111,26 @@ def group_test(
     if why := _senseless(untested.sizes, group, stratum):
         return replace(untested, refused=why)
     # What is known of the bodies, and what the groups add to that, both orthonormal
-    known = np.column_stack([_indicators(stratum), known - known.mean(axis=0)])
-    known = _orthonormal(known, _ROUNDING)
+    means = _orthonormal(_indicators(stratum), _ROUNDING)
+    known = _orthonormal(known - known.mean(axis=0), _ROUNDING)
+    # Of covariates alone: no permutation within strata changes the means of these
+    along = _orthonormal(known - means @ (means.T @ known), _ROUNDING)
+    known = np.column_stack([means, along])
     indicators = _indicators(group)
     added = _orthonormal(indicators - known @ (known.T @ indicators), 1e-6)
     if added.shape[1] < len(untested.sizes) - 1:
         return replace(untested, refused="covariates or strata tell the groups apart by themselves.")
     if n - known.shape[1] - added.shape[1] < 3:
         return replace(untested, refused=f"{n} bodies are too few for so many strata and covariates.")
-    within_known = known @ known.T
-    rows = vectors - within_known @ vectors
+    beside = np.eye(n) - known @ known.T
+    rows = beside @ vectors
     gram = rows @ rows.T
     if np.trace(gram) <= _ROUNDING * np.square(vectors).sum():
         return replace(untested, refused="the vectors do not differ, but for what covariates and strata explain.")
     squares = _squares(gram)
     ridge = _RIDGE * np.trace(gram) / (n - known.shape[1])
     whitened = _squares(np.linalg.solve(gram + ridge * np.eye(n), gram))
-    kernel = np.exp(-whitened / (2 * np.median(whitened[np.triu_indices(n, 1)]) + 1e-300))
-    kernel -= known @ (known.T @ kernel)
-    kernel -= (kernel @ known) @ known.T
+    kernel = beside @ np.exp(-whitened / (2 * np.median(whitened[np.triu_indices(n, 1)]) + 1e-300)) @ beside
 
     random = np.random.default_rng(seed)
     # Of the distances and of the kernel
@@ -141,7 +142,7 @@ def group_test(
             orders[0] = np.arange(n)
         part = slice(first, first + len(orders))
         for i, matrix in enumerate((gram, kernel)):
-            of_groups[i, part], of_known[i, part] = _along(matrix, added, orders), _along(matrix, known, orders)
+            of_groups[i, part], of_known[i, part] = _along(matrix, added, orders), _along(matrix, along, orders)
     left = np.array([[np.trace(gram)], [np.trace(kernel)]]) - of_groups - of_known
     pseudo_f = of_groups / added.shape[1] / (left / (n - known.shape[1] - added.shape[1]))
     sizes = np.bincount(group)
