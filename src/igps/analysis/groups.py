@@ -83,9 +83,9 @@ def group_test(
     is permuted within strata (Freedman and Lane 1983; with distances, McArdle and Anderson 2001). PERMANOVA is the
     pseudo-F of these, and sees what is large beside the usual differences. The kernel test also sees what is small: it
     whitens what is left of the vectors by their covariance, with a tenth of the mean variance as ridge (as Harchaoui,
-    Bach and Moulines 2008; of all bodies, so that permutations share it), and is the pseudo-F of a Gaussian kernel with
-    the median distance as its width; beside covariates or strata, and of few bodies, it rejects too seldom. A
-    probability is (1 + permutations as extreme) / (1 + permutations) (Phipson and Smyth 2010).
+    Bach and Moulines 2008; of all bodies, so that permutations share it), and takes a Gaussian kernel with the median
+    distance as its width, over the share of the groups that covariates do not explain. A probability is
+    (1 + permutations as extreme) / (1 + permutations) (Phipson and Smyth 2010).
 
     Args:
         vectors: (N, D) of N bodies, one of each subject.
@@ -133,27 +133,28 @@ def group_test(
     kernel = beside @ np.exp(-whitened / (2 * np.median(whitened[np.triu_indices(n, 1)]) + 1e-300)) @ beside
 
     random = np.random.default_rng(seed)
-    # Of the distances and of the kernel
-    of_groups, of_known = np.empty((2, 2, n_permutations + 1))
+    of_groups, of_known, of_kernel, overlap = np.empty((4, n_permutations + 1))
     block = max(1, _BLOCK // (n * (known.shape[1] + added.shape[1])))
     for first in range(0, n_permutations + 1, block):
         orders = _orders(stratum, min(block, n_permutations + 1 - first), random)
         if first == 0:
             orders[0] = np.arange(n)
         part = slice(first, first + len(orders))
-        for i, matrix in enumerate((gram, kernel)):
-            of_groups[i, part], of_known[i, part] = _along(matrix, added, orders), _along(matrix, along, orders)
-    left = np.array([[np.trace(gram)], [np.trace(kernel)]]) - of_groups - of_known
+        of_groups[part], of_known[part] = _along(gram, added, orders), _along(gram, along, orders)
+        of_kernel[part], overlap[part] = _along(kernel, added, orders), _along(along @ along.T, added, orders)
+    left = np.trace(gram) - of_groups - of_known
     pseudo_f = of_groups / added.shape[1] / (left / (n - known.shape[1] - added.shape[1]))
+    # Covariates explain a share of permuted groups, of which the kernel then sees nothing
+    unexplained = np.maximum(1 - overlap / added.shape[1], _ROUNDING)
     sizes = np.bincount(group)
     weights = [random.multinomial(k, np.full(k, 1 / k), n_bootstraps) for k in sizes]
     low, high = np.quantile(_effects(squares, group, weights), (0.025, 0.975)) if n_bootstraps else (None, None)
     return replace(
         untested,
-        permanova_f=float(pseudo_f[0, 0]),
-        permanova_p=_probability(pseudo_f[0]),
-        kernel=float(of_groups[1, 0] * (n / np.prod(sizes) if len(sizes) == 2 else 1 / n)),
-        kernel_p=_probability(pseudo_f[1]),
+        permanova_f=float(pseudo_f[0]),
+        permanova_p=_probability(pseudo_f),
+        kernel=float(of_kernel[0] * (n / np.prod(sizes) if len(sizes) == 2 else 1 / n)),
+        kernel_p=_probability(of_kernel / unexplained),
         effect=float(_effects(squares, group, [np.ones((1, k)) for k in sizes])[0]),
         effect_low=None if low is None else float(low),
         effect_high=None if high is None else float(high),
