@@ -167,7 +167,8 @@ def gradient_block(
 def interpolate(upstream: Numbers, begin: Any, shares: Numbers, j: int, weight: float, slopes: Floats) -> float:
     """What is upstream (cells·2^K,) of a pair, by its shares (K, J) between the corners of a cell, from one on.
 
-    Adds its derivatives by the shares, times a weight, to the slopes (K,).
+    Adds its derivatives by the shares, times a weight, to the slopes (K,). Of the last two axes it takes the four
+    corners at once, which stay in registers; over the corners of the others it sums.
     """
     n_outer = len(shares) - 2
     if n_outer < 0:
