@@ -11,6 +11,9 @@ from igps._arrays import Floats, Integers
 from igps._compiled import compiled
 from igps.retrieval.ranking import SearchResult
 
+MOST_WHOLE = 2000
+"""Shapes whose pairs are all taken, and the sums over walks of them by the inverse."""
+
 # Of conjugate gradients, for walks whose condition is below 40
 _ROUNDS = 40
 _TINY = np.finfo(np.float64).tiny
@@ -23,16 +26,18 @@ def rerank_graph(
     n_expanded: int = 6,
     share: float = 0.3,
     diffusion: float = 0.95,
+    *,
+    keep_nearest: bool = True,
 ) -> SearchResult:
     """`rerank` of a collection of which each shape's nearest are known.
 
     Walks are those among a shape and its nearest (Yang, Hinami, Matsui, Ly and Satoh 2019). With lists of all others,
-    this is `rerank`; the nearest of each stays its nearest.
+    this is `rerank`.
 
     Args:
         found: of each of N shapes, the M others that are nearest, closest first: (N, M).
         mean: distance of two shapes of the collection, over all pairs or a sample of them.
-        n_neighbours, n_expanded, share, diffusion: see `rerank`.
+        n_neighbours, n_expanded, share, diffusion, keep_nearest: see `rerank`.
 
     Returns:
         the same shapes in their new order, (N, M), and their distances, without unit; of two shapes of which neither is
@@ -57,8 +62,12 @@ def rerank_graph(
         tied = _symmetric(ends, np.exp(-np.square(given[:, :half]) / np.maximum(scale[:, None] * scale[ends], _TINY)))
         degree = sparse.diags_array(1 / np.sqrt(np.maximum(tied.sum(axis=1), _TINY)))
         steps = sparse.csr_array(diffusion * (degree @ tied @ degree))
-        alike = np.zeros((n, m + 1))
-        walks(np.column_stack([np.arange(n), lists]), steps.indptr, steps.indices, steps.data, _ROUNDS, alike)
+        inside = np.column_stack([np.arange(n), lists])
+        if m == n - 1 < MOST_WHOLE:
+            alike = np.take_along_axis(np.linalg.inv(np.eye(n) - steps.toarray()), inside, axis=1)
+        else:
+            alike = np.zeros((n, m + 1))
+            walks(inside, steps.indptr, steps.indices, steps.data, _ROUNDS, alike)
         length = 1 / np.sqrt(alike[:, 0])
         alike = (1 - length[:, None] * alike[:, 1:] * length[lists]).clip(0)
         walked = _symmetric(lists, alike).data
@@ -66,7 +75,7 @@ def rerank_graph(
         average = 1 - (own.nnz - walked.sum()) / n_pairs  # of those in no list, it is 1
         apart = (1 - share) * walked / max(average, _TINY) + share * own.data / mean
     before = apart.sum()
-    if diffusion:
+    if diffusion and keep_nearest:
         apart = _brought_forward(apart, own, lists[:, 0])
     order = np.empty((n, n_near + 1), dtype=np.int64)
     nearest_of_rows(own.indptr, own.indices, apart, order)
@@ -87,8 +96,9 @@ def rerank_graph(
     smaller = np.zeros(own.nnz)
     common(own.indptr, own.indices, weights.indptr, weights.indices, weights.data, smaller)
     average = 1 + (apart.sum() - before) / n_pairs
-    anew = (1 - share) * (1 - smaller / (2 - smaller)) + share * apart / average
-    anew = _brought_forward(anew, own, lists[:, 0])
+    anew = (1 - share) * (1 - smaller / (2 - smaller)).clip(0) + share * apart / average
+    if keep_nearest:
+        anew = _brought_forward(anew, own, lists[:, 0])
     ranked = _values(anew, own, np.repeat(np.arange(n), m), lists.ravel()).reshape(n, m)
     best = np.argsort(ranked, axis=1, kind="stable")
     return SearchResult(*(torch.from_numpy(np.take_along_axis(one, best, axis=1)) for one in (lists, ranked)))
