@@ -74,10 +74,15 @@ def rerank(
     if n < 2:
         return torch.zeros_like(distances)
     k, n_expanded = min(n_neighbours, n - 1), min(n_expanded, n)
-    n_listed = n - 1 if n <= MOST_WHOLE else max(_LISTED, k, n_expanded)
+    n_listed = n - 1 if n <= MOST_WHOLE else min(max(_LISTED, k, n_expanded), n - 1)
     mean = float((distances.sum(dtype=torch.float64) - distances.trace()) / (n * (n - 1)))
     mean = max(mean, torch.finfo(torch.float64).tiny)
-    order = distances.clone().fill_diagonal_(-1).argsort(dim=1, stable=True)[:, 1 : n_listed + 1]
+    others = distances.clone().fill_diagonal_(torch.inf)
+    order = (
+        others.argsort(dim=1, stable=True)[:, :-1]
+        if n_listed == n - 1
+        else others.topk(n_listed, largest=False).indices
+    )
     near = SearchResult(order.cpu(), distances.gather(1, order).cpu())
     found = rerank_graph(near, mean, k, n_expanded, share, diffusion, keep_nearest=keep_nearest)
     whole = distances / mean  # of those without a common neighbour
