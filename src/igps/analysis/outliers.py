@@ -1,7 +1,5 @@
 """Which bodies are unlike their class: for checking segmentations and labels before anybody trusts them."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections import Counter

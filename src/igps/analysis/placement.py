@@ -1,7 +1,5 @@
 """Labels in their grid: which share voxels."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ What is a share of the voxels comes as its square root, whose scatter is about t
 (Bartlett 1936), so that a speck in one body of many weighs little and a piece in a body of one much.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage

@@ -1,7 +1,5 @@
 """`igps gallery`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial

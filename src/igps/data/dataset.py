@@ -1,7 +1,5 @@
 """A torch Dataset of Signatures, computed on first touch and cached."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor

@@ -1,7 +1,5 @@
 """The triangles of a surface tidied up: welded, turned alike, without fins, specks, small holes, and what is hidden."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 
 import numpy as np

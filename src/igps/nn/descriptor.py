@@ -1,7 +1,5 @@
 """What a descriptor is: how bodies are described, what that needs, and how two descriptions are compared."""
 
-from __future__ import annotations
-
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Re-ranking on the graph of nearest neighbours: time and memory grow with the number of shapes, not its square."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

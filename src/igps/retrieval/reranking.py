@@ -1,7 +1,5 @@
 """Re-ranking: distances of a collection are changed by which neighbours shapes have in common, without labels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

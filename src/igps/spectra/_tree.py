@@ -3,8 +3,6 @@
 Nodes and unknowns are numbered depth first, each node behind its children: in the order of their elimination.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How the spectrum of a body departs from Weyl's law."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

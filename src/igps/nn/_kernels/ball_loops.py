@@ -1,7 +1,5 @@
 """A loop that Numba compiles for `balls`: a row of pairs at a time, and no matrix of all of them."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

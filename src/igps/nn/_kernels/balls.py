@@ -1,7 +1,5 @@
 """The largest balls that touch a surface at its samples, from inside and from outside."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -10,8 +10,6 @@ compiler turns into vectors (`pair_cells`). Then each pair is added to its corne
 reads them.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 Of a weight w and a share s one corner gets w·s and the other w − w·s, which rounding makes no less than 0.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

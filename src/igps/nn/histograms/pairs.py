@@ -1,7 +1,5 @@
 """Joint histograms over all pairs of the samples of a body, as products of axes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
