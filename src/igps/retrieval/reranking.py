@@ -76,11 +76,8 @@ def rerank(
     mean = float((distances.sum(dtype=torch.float64) - distances.trace()) / (n * (n - 1)))
     mean = max(mean, torch.finfo(torch.float64).tiny)
     others = distances.clone().fill_diagonal_(torch.inf)
-    order = (
-        others.argsort(dim=1, stable=True)[:, :-1]
-        if n_listed == n - 1
-        else others.topk(n_listed, largest=False).indices
-    )
+    order = others.argsort(dim=1, stable=True) if n <= MOST_WHOLE else others.topk(n_listed, largest=False).indices
+    order = order[:, :n_listed]
     near = SearchResult(order.cpu(), distances.gather(1, order).cpu())
     found = rerank_graph(near, mean, k, n_expanded, share, diffusion, keep_nearest=keep_nearest)
     whole = distances / mean  # of those without a common neighbour
