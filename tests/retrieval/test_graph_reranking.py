@@ -81,7 +81,8 @@ def test_common_weights_are_the_sums_of_the_smaller() -> None:
     weights.sort_indices()
     pairs = sparse.random_array((30, 30), density=0.2, random_state=generator, format="csr")
     found, dense = np.zeros(pairs.nnz), weights.toarray()
-    common(pairs.indptr, pairs.indices, weights.indptr, weights.indices, weights.data, found)
+    for part in ((0, 12), (12, 30)):
+        common(part, pairs.indptr, pairs.indices, weights.indptr, weights.indices, weights.data, found)
     rows = np.repeat(np.arange(30), np.diff(pairs.indptr))
     np.testing.assert_allclose(found, np.minimum(dense[rows], dense[pairs.indices]).sum(axis=1), atol=1e-12)
 

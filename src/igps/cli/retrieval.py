@@ -55,7 +55,7 @@ def retrieve(
     summary = _summary(found, scores)
     print(scores_table(scores))
     if rerank:
-        distances["reranked"] = reranked_distances(distances["distances"])
+        distances["reranked"] = reranked_distances(distances["distances"], progress=True)
         scores = retrieval_scores(distances["reranked"], labels)
         summary["reranked"] = scores.mean()
         print(f"\nre-ranked by the whole collection, without its labels\n{scores_table(scores)}")

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import sparse
+from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
 from igps._compiled import compiled
@@ -14,6 +15,8 @@ MOST_WHOLE = 2000
 
 # Of conjugate gradients, for walks whose condition is below 40
 _ROUNDS = 40
+# Rows between two steps of the bar
+_AT_ONCE = 100
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -26,6 +29,7 @@ def rerank_graph(
     diffusion: float = 0.95,
     *,
     keep_nearest: bool = True,
+    progress: bool = False,
 ) -> SearchResult:
     """`rerank` of a collection of which each shape's nearest are known.
 
@@ -35,7 +39,7 @@ def rerank_graph(
     Args:
         found: of each of N shapes, the M others that are nearest, closest first: (N, M).
         mean: distance of two shapes of the collection, over all pairs or a sample of them.
-        n_neighbours, n_expanded, share, diffusion, keep_nearest: see `rerank`.
+        n_neighbours, n_expanded, share, diffusion, keep_nearest, progress: see `rerank`.
 
     Returns:
         the same shapes in their new order, (N, M), and their distances, without unit; of two shapes of which neither is
@@ -92,7 +96,11 @@ def rerank_graph(
     weights = sparse.csr_array(weights)
     weights.sort_indices()
     smaller = np.zeros(own.nnz)
-    common(own.indptr, own.indices, weights.indptr, weights.indices, weights.data, smaller)
+    with tqdm(total=n, desc="re-ranked", disable=not progress) as bar:
+        for first in range(0, n, _AT_ONCE):
+            rows = first, min(first + _AT_ONCE, n)
+            common(rows, own.indptr, own.indices, weights.indptr, weights.indices, weights.data, smaller)
+            bar.update(rows[1] - first)
     average = 1 + (apart.sum() - before) / n_pairs
     anew = (1 - share) * (1 - smaller / (2 - smaller)).clip(0) + share * apart / average
     if keep_nearest:
@@ -191,10 +199,11 @@ def nearest_of_rows(starts: Integers, others: Integers, values: Floats, order: I
 
 @compiled()
 def common(
-    starts: Integers, others: Integers, row_starts: Integers, members: Integers, weights: Floats, smaller: Floats
-) -> None:
-    """Write, of each pair of a graph, the sum of the smaller of their weights; rows of weights are sorted."""
-    for i in range(len(starts) - 1):
+    rows: tuple[int, int], starts: Integers, others: Integers, row_starts: Integers, members: Integers,
+    weights: Floats, smaller: Floats,
+) -> None:  # fmt: skip
+    """Write, of each pair of a range of a graph's rows, the sum of the smaller of their weights, sorted by member."""
+    for i in range(rows[0], rows[1]):
         for e in range(starts[i], starts[i + 1]):
             a, b = row_starts[i], row_starts[others[e]]
             while a < row_starts[i + 1] and b < row_starts[others[e] + 1]:

@@ -24,6 +24,7 @@ def rerank(
     diffusion: float = 0.95,
     *,
     keep_nearest: bool = True,
+    progress: bool = False,
 ) -> Tensor:
     """Diffusion, then k-reciprocal re-ranking: shapes are close that share neighbours.
 
@@ -50,6 +51,7 @@ def rerank(
         diffusion: how slowly walks fade, from 0 to less than 1; with 0 there is no such step.
         keep_nearest: pairs of which one is the other's nearest come before all others, in their own order, after each
             step; the papers leave them where they fall.
+        progress: show a bar.
 
     Returns:
         (N, N) distances ≥ 0, symmetric, 0 on the diagonal; without unit.
@@ -79,7 +81,7 @@ def rerank(
     order = others.argsort(dim=1, stable=True) if n <= MOST_WHOLE else others.topk(n_listed, largest=False).indices
     order = order[:, :n_listed]
     near = SearchResult(order.cpu(), distances.gather(1, order).cpu())
-    found = rerank_graph(near, mean, k, n_expanded, share, diffusion, keep_nearest=keep_nearest)
+    found = rerank_graph(near, mean, k, n_expanded, share, diffusion, keep_nearest=keep_nearest, progress=progress)
     whole = distances / mean  # of those without a common neighbour
     for _ in range(2 if diffusion else 1):
         whole = whole.mul_(share).add_(1 - share)
