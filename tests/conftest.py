@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from matplotlib.figure import Figure
 
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
@@ -30,6 +32,23 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 def either_processor(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The basis is multiplied as on a processor where loops are faster than BLAS, and as where they are not."""
     monkeypatch.setattr(products, "loops_beat_blas", lambda: request.param == "loops")
+
+
+@pytest.fixture
+def figures_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], list[Figure]]:
+    """A list to which the figures come that a module makes from now on."""
+
+    def remembered(module: Any) -> list[Figure]:
+        made, make = list[Figure](), module.new_figure
+
+        def remember(width: float, height: float) -> Figure:
+            made.append(make(width, height))
+            return made[-1]
+
+        monkeypatch.setattr(module, "new_figure", remember)
+        return made
+
+    return remembered
 
 
 @contextlib.contextmanager

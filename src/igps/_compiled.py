@@ -5,8 +5,6 @@ machine and version. Compiled code releases the interpreter's lock and uses one 
 run side by side.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 from collections.abc import Callable

@@ -5,8 +5,6 @@ that takes too long is ended by killing its process. Any other `concurrent.futur
 cluster, may do the work instead.
 """
 
-from __future__ import annotations
-
 import errno
 import queue
 import time

@@ -1,7 +1,5 @@
 """Checks of parameters, in one wording; None, where a parameter may be that, is right."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """A worker process, of which it is known which job it has: one that is killed costs no other job its result."""
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """The descriptors as a scikit-learn transformer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self

@@ -64,8 +64,6 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
     {
         # `is` in place of `==`: both sides are truth values.
         ("src/igps/retrieval/metric.py", "if self.labels and (ids is None) is bool(self.ids):"),
-        # The sum over the other dimension: the matrix is symmetric.
-        ("src/igps/retrieval/reranking.py", "joins = (2 / 3 * half.sum(dim= 0) <= inside.T) & members"),
         # Exact principal components in place of approximate ones, which are only faster; of all, either is exact.
         (
             "src/igps/retrieval/vectors.py",
@@ -94,12 +92,12 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         ("src/igps/mesh/_tidying.py", "disc.append(_circle((np.arange(size) + ring / 3) / size, radius))"),
         # Below zero there is only rounding.
         (
-            "src/igps/retrieval/reranking.py",
-            "apart = (1 - length[:, None] * alike * length).clamp_min( -1)",
+            "src/igps/retrieval/graph_reranking.py",
+            "alike = (1 - length[:, None] * alike[:, 1:] * length[lists]).clip( -1)",
         ),
         (
-            "src/igps/retrieval/reranking.py",
-            "return _mixed((jaccard + jaccard.T).clamp_min( -1) / 2, own, share)",
+            "src/igps/retrieval/graph_reranking.py",
+            "anew = (1 - share) * (1 - smaller / (2 - smaller)).clip( -1) + share * apart / average",
         ),
     }
 )

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,15 +33,10 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_ranked_results_show_each_class_with_hits_and_misses(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[Figure] = []
-    make = drawing.new_figure
-
-    def remember(width: float, height: float) -> Figure:
-        made.append(make(width, height))
-        return made[-1]
-
-    monkeypatch.setattr(drawing, "new_figure", remember)
+def test_ranked_results_show_each_class_with_hits_and_misses(
+    root: Path, figures_of: Callable[[Any], list[Figure]]
+) -> None:
+    made = figures_of(drawing)
     drawing.ranked_results(root, root / "ranking.csv", root / "out" / "ranked.png", top=3)
     axes = np.array(made[0].axes).reshape(2, 4)
     titles = [[axis.get_title() for axis in row] for row in axes]

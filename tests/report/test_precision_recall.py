@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pytest
 import torch
 from matplotlib.figure import Figure
 from matplotlib.image import imread
@@ -14,15 +15,8 @@ from igps.report import answers
 from igps.retrieval import precision_recall_curve
 
 
-def test_curves_are_drawn_in_percent_and_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[Figure] = []
-    make = answers.new_figure
-
-    def remember(width: float, height: float) -> Figure:
-        made.append(make(width, height))
-        return made[-1]
-
-    monkeypatch.setattr(answers, "new_figure", remember)
+def test_curves_are_drawn_in_percent_and_told_apart(tmp_path: Path, figures_of: Callable[[Any], list[Figure]]) -> None:
+    made = figures_of(answers)
     labels = [0, 0, 0, 1, 1, 1]
     draws = np.random.default_rng(0).random((12, 6, 6))
     curves = {f"descriptor {i}": precision_recall_curve(torch.from_numpy(draw), labels) for i, draw in enumerate(draws)}

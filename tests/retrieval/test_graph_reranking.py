@@ -8,7 +8,7 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
-from igps.retrieval import SearchResult, euclidean, rerank, rerank_graph, reranking, retrieval_scores
+from igps.retrieval import SearchResult, euclidean, graph_reranking, rerank, rerank_graph, reranking, retrieval_scores
 from igps.retrieval.graph_reranking import common, walks
 
 
@@ -31,11 +31,14 @@ def mean_of(distances: Tensor) -> float:
     [{}, {"diffusion": 0}, {"n_neighbours": 6, "n_expanded": 3, "share": 0.5, "diffusion": 0.8}, {"share": 0.1},
      {"n_neighbours": 4, "n_expanded": 7}],
 )  # fmt: skip
-def test_with_lists_of_all_it_is_that_of_the_collection(numbers: dict[str, float]) -> None:
+def test_with_lists_of_all_walks_by_steps_are_those_of_the_inverse(
+    numbers: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
     points = torch.randn(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     distances = own_distances(points)
-    found = rerank_graph(nearest(distances, 59), mean_of(distances), **numbers)  # type: ignore[arg-type]
     expected = rerank(distances, **numbers)  # type: ignore[arg-type]
+    monkeypatch.setattr(graph_reranking, "MOST_WHOLE", 0)
+    found = rerank_graph(nearest(distances, 59), mean_of(distances), **numbers)  # type: ignore[arg-type]
     torch.testing.assert_close(found.distances, expected.gather(1, found.indices), rtol=0, atol=2e-5)
     assert (found.distances.diff(dim=1) >= 0).all()
     assert torch.equal(found.indices.sort().values, nearest(distances, 59).indices.sort().values)
@@ -47,7 +50,7 @@ def test_short_lists_find_classes_as_well(monkeypatch: pytest.MonkeyPatch) -> No
     points = (torch.randn(12, 1, 20, generator=generator) + torch.randn(12, 20, 20, generator=generator)).flatten(0, 1)
     labels, own = torch.arange(12).repeat_interleave(20), own_distances(points)
     whole = rerank(own)
-    monkeypatch.setattr(reranking, "_MOST_WHOLE", 200)
+    monkeypatch.setattr(reranking, "MOST_WHOLE", 200)
     monkeypatch.setattr(reranking, "_LISTED", 120)
     found = rerank(own)
     before, expected, tier = (retrieval_scores(one, labels).mean()["ft"] for one in (own, whole, found))
@@ -78,7 +81,8 @@ def test_common_weights_are_the_sums_of_the_smaller() -> None:
     weights.sort_indices()
     pairs = sparse.random_array((30, 30), density=0.2, random_state=generator, format="csr")
     found, dense = np.zeros(pairs.nnz), weights.toarray()
-    common(pairs.indptr, pairs.indices, weights.indptr, weights.indices, weights.data, found)
+    for part in ((0, 12), (12, 30)):
+        common(part, pairs.indptr, pairs.indices, weights.indptr, weights.indices, weights.data, found)
     rows = np.repeat(np.arange(30), np.diff(pairs.indptr))
     np.testing.assert_allclose(found, np.minimum(dense[rows], dense[pairs.indices]).sum(axis=1), atol=1e-12)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -58,17 +59,9 @@ def open_ring(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+def drawn(figures_of: Callable[[Any], list[Figure]]) -> list[Figure]:
     """The figures that were made."""
-    made: list[Figure] = []
-    make = paper.new_figure
-
-    def remember(width: float, height: float) -> Figure:
-        made.append(make(width, height))
-        return made[-1]
-
-    monkeypatch.setattr(paper, "new_figure", remember)
-    return made
+    return figures_of(paper)
 
 
 def igps(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:

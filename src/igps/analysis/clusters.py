@@ -1,7 +1,5 @@
 """Bodies in clusters, by their distances alone, and which of these clusters another sample would show again."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, get_args
 

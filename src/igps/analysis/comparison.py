@@ -1,7 +1,5 @@
 """Descriptors side by side on a labelled collection: what each can describe, what that costs, and how it retrieves."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import time

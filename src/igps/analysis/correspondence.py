@@ -1,7 +1,5 @@
 """How unlike the places of a body are to those of another body that correspond to them, whatever the poses."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree

@@ -1,7 +1,5 @@
 """What is wrong with the bodies of files, what will be done about it, and what that will cost."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Where two bodies differ: their distance, shared out among the parts of the description and the samples of each."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """From a labelled collection to a metric or a classifier, and its answers."""
 
-from __future__ import annotations
-
 import importlib.metadata
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Whether groups of bodies differ: two tests by permutation, how large the difference is, and how well it sorts."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Bodies as points in the plane, as far from each other as their distances are, as well as that goes."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from typing import Literal, get_args

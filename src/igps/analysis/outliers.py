@@ -1,7 +1,5 @@
 """Which bodies are unlike their class: for checking segmentations and labels before anybody trusts them."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections import Counter
@@ -14,8 +12,7 @@ from numpy.typing import NDArray
 
 from igps._parallel import Failed, run
 from igps._threads import n_cores
-from igps.analysis.placement import Place, overlaps
-from igps.analysis.segmentation import cavity_root, cut_end, gap_root, hole_root, stray_root
+from igps.analysis.segmentation import Place, cavity_root, cut_end, gap_root, hole_root, overlaps, stray_root
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import by_file
 from igps.data.pipeline import SignaturePipeline

@@ -1,7 +1,5 @@
 """The command line: what follows `igps` is a function by name."""
 
-from __future__ import annotations
-
 import contextlib
 import inspect
 import json

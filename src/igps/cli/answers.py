@@ -1,7 +1,5 @@
 """`igps groups`, `igps outliers` and `igps explain`."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -82,11 +80,7 @@ def groups(
 
 
 def outliers(
-    root: Path,
-    descriptor: str = "pretrained",
-    top: int = 20,
-    out: Path | None = None,
-    **reading: Any,
+    root: Path, descriptor: str = "pretrained", top: int = 20, out: Path | None = None, **reading: Any
 ) -> list[dict[str, Any]]:
     """List the bodies that are most unlike their class, to look at before the collection is trusted.
 

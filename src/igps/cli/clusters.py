@@ -1,7 +1,5 @@
 """`igps clusters`, and the map of `igps figure map`."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Any

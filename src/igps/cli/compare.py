@@ -1,7 +1,5 @@
 """`igps compare`."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

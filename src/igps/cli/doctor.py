@@ -1,7 +1,5 @@
 """`igps doctor`."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import Any

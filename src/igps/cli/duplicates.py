@@ -1,7 +1,5 @@
 """`igps duplicates` and `igps distance`."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Descriptions as a table, for statistics packages: a row for each body, or for each file."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`igps fit` and `igps classify`."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`igps gallery`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
@@ -20,14 +18,7 @@ from igps.signature.signature import SignatureConfig
 
 
 def build(
-    root: Path,
-    out: Path,
-    descriptor: str = "pretrained",
-    size: Size = "auto",
-    mirror: Mirror = "same",
-    n_workers: int | None = None,
-    strict: bool = False,
-    **reading: Any,
+    root: Path, out: Path, descriptor: str = "pretrained", size: Size = "auto", mirror: Mirror = "same", **reading: Any
 ) -> None:
     """Describe the bodies of a folder into a gallery, to be asked by igps query without their files.
 
@@ -38,9 +29,10 @@ def build(
     """
     descriptor = with_side(descriptor, mirror)
     chosen = descriptor_of(descriptor)
-    dataset, unread = signatures(Folder(root), [chosen], n_workers=n_workers, strict=strict, **reading)
+    dataset, unread = signatures(Folder(root), [chosen], **reading)
     descriptor = sized(descriptor, size, dataset)
-    gallery, undescribed = Gallery.build(out, dataset, descriptor, n_workers=n_workers, strict=strict, progress=True)
+    how: dict[str, Any] = {"n_workers": reading.get("n_workers"), "strict": reading.get("strict", False)}
+    gallery, undescribed = Gallery.build(out, dataset, descriptor, progress=True, **how)
     _print_state(gallery, [*unread, *undescribed])
 
 

@@ -1,7 +1,5 @@
 """`igps precompute` and `igps cache`."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import re

@@ -1,7 +1,5 @@
 """How commands read meshes: the options they share, and the signatures these give."""
 
-from __future__ import annotations
-
 import csv
 from collections import Counter
 from collections.abc import Iterable, Sequence

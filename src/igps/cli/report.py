@@ -1,7 +1,5 @@
 """`igps report`, and the `--report` of other commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from igps.descriptors import descriptor as descriptor_of

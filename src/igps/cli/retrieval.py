@@ -1,7 +1,5 @@
 """`igps retrieve`, `igps extract` and `igps query`."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

@@ -5,8 +5,6 @@ than a tenth is not known, the body is refused. Not known is what lies outside o
 what is not finite, and what is so large that it stands for nothing (10¹⁵).
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

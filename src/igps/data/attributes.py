@@ -1,7 +1,5 @@
 """Attributes of samples that come from elsewhere: an image, a field, a function of position."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 from collections.abc import Callable, Iterable, Mapping

@@ -110,12 +110,10 @@ class SignatureBatch:
     """N Signatures, padded so that no descriptor changes by it.
 
     Example:
-        >>> from igps.data.collation import collate
         >>> import trimesh
-        >>> from igps.signature.signature import SignatureConfig, compute_signature
+        >>> from igps import SignatureConfig, collate, compute_signature
         >>> bodies = [trimesh.creation.icosphere(subdivisions=2), trimesh.creation.capsule(height=2.0, radius=0.5)]
-        >>> config = SignatureConfig(n_eigenpairs=20)
-        >>> batch = collate([compute_signature(Mesh(body.vertices, body.faces), config) for body in bodies])
+        >>> batch = collate([compute_signature(body, SignatureConfig(n_eigenpairs=20)) for body in bodies])
         >>> len(batch), [body.area for body in batch.bodies()] == batch.area.tolist()
         (2, True)
 

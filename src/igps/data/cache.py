@@ -1,7 +1,5 @@
 """A content-addressed store of Signatures and descriptions on disk, one safetensors file each."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Data loaders over the parts of a labelled collection, for Lightning."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

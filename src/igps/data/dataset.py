@@ -1,7 +1,5 @@
 """A torch Dataset of Signatures, computed on first touch and cached."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -234,11 +232,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     @classmethod
     def from_file(
-        cls,
-        path: str | Path,
-        *,
-        descriptor: AnyDescriptor | None = None,
-        cache_dir: Path | None = None,
+        cls, path: str | Path, *, descriptor: AnyDescriptor | None = None, cache_dir: Path | None = None
     ) -> Self:
         """The Signatures of a file that `to_file` wrote; it is read by memory map, and runs no code.
 

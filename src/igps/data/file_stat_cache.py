@@ -1,7 +1,5 @@
 """Which Signature in a cache serves a body, remembered, so that files that did not change are not read again."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

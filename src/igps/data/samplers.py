@@ -1,7 +1,5 @@
 """Batches of shapes of like size, so that padding costs little."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Seeded splits of a labelled collection into training, validation and test parts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -4,8 +4,6 @@ Each takes a seed. With one, a Signature is changed alike at every reading, by s
 that PyTorch's global generator draws, which a DataLoader seeds anew in every worker.
 """
 
-from __future__ import annotations
-
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable

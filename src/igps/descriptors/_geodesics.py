@@ -6,8 +6,6 @@ triangle inequality, and never shorter than the surface allows. They need no wel
 heat method and fast marching.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

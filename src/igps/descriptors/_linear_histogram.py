@@ -1,7 +1,5 @@
 """Histograms with a linear kernel: a value between the centres of two bins counts for both."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import product
 

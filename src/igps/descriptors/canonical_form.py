@@ -1,7 +1,5 @@
 """Canonical forms: a bent surface is unbent, and then compared like a rigid one (Elad and Kimmel 2003)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 from typing import Literal, get_args

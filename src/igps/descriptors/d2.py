@@ -1,7 +1,5 @@
 """Shape distributions: the histogram of a simple function of random points of the surface (Osada et al. 2002)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal, get_args

@@ -1,7 +1,5 @@
 """What tells descriptors apart: a checksum of their parameters, and a tag of all that their descriptions depend on."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.metadata
 import json

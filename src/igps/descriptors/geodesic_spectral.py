@@ -1,7 +1,5 @@
 """Eigenvalues of the affinities of geodesic distances (Jain and Zhang 2007)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The Global Point Signature of the surface: the paper's histograms without the volume (Rustamov 2007)."""
 
-from __future__ import annotations
-
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding

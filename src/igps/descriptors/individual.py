@@ -1,7 +1,5 @@
 """What tells individuals apart beside their form: size, and which of two mirror images a body is."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Literal

@@ -7,8 +7,6 @@ of the cells' body, and where all cells between two samples are inside, as in a 
 their Euclidean distance.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The paper's own descriptor: joint histograms of interior distance and potential (Rustamov 2010)."""
 
-from __future__ import annotations
-
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding

@@ -1,7 +1,5 @@
 """Pose-oblivious signature: how thick a body is at its surface, and how central (Gal, Shamir and Cohen-Or 2007)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Interior distances of a molecule, joined with what its residues are like."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """Interior distances alone, on several scales, side by side."""
 
-from __future__ import annotations
-
 from igps.nn.axes import EmbeddedPairCosines, InteriorDistance, Potential
 from igps.nn.batch_features import SampleKind
 from igps.nn.descriptor import HistogramDescriptor

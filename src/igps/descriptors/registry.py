@@ -1,7 +1,5 @@
 """Descriptors by name."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import re

@@ -1,7 +1,5 @@
 """Interior distances joined with all else there is of the body in space."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from igps.descriptors.multiscale import N_ORIENTED_SAMPLES, N_SAMPLES

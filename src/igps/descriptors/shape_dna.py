@@ -1,7 +1,5 @@
 """Shape-DNA: the first eigenvalues of the surface (Reuter, Wolter and Peinecke 2005)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, get_args
 

@@ -11,8 +11,6 @@ each with the same weight; between the samples, at the given times, the bounds h
 eigenfunctions are those that Rustamov 2010 extends from the surface: the volumetric counterpart he leaves to others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args

@@ -13,8 +13,6 @@ symmetric second-order form of Gibou, Fedkiw, Cheng and Kang 2002. Parts thinner
 only add eigenvalues far above the first ones.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, get_args
 

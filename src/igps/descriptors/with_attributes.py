@@ -1,7 +1,5 @@
 """Any descriptor, and beside it what bodies are like inside: attributes of their own, by interior distance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

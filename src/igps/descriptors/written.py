@@ -1,7 +1,5 @@
 """Descriptors that are written down, in YAML: parts, histograms, axes, centres. Nothing runs when one is read."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping
 from functools import cache

@@ -1,7 +1,5 @@
 """The closed surface on which a function on a grid is zero: marching cubes, then fewer and better triangles."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from igps._arrays import Floats, Integers, Singles, Surface

@@ -1,7 +1,5 @@
 """Loops over the balls of a molecule: where a probe may be, and how far each point of a grid is from there."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

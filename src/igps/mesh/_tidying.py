@@ -1,7 +1,5 @@
 """The triangles of a surface tidied up: welded, turned alike, without fins, specks, small holes, and what is hidden."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 
 import numpy as np
@@ -11,15 +9,7 @@ from scipy.spatial import Delaunay
 
 from igps._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh.mesh import Mesh, MeshError
-from igps.mesh.surface import (
-    compact,
-    diagonal,
-    directed_edges,
-    face_areas,
-    face_parts,
-    signed_volume,
-    undirected_edges,
-)
+from igps.mesh.surface import compact, diagonal, directed_edges, face_areas, face_parts, signed_volume, undirected_edges
 from igps.mesh.winding import winding_number
 
 # Vertices closer than this share of the bounding box's diagonal are one.

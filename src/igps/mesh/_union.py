@@ -1,7 +1,5 @@
 """One surface of parts that overlap: the outer shape, exactly, where a grid would only come near it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from igps._arrays import Booleans, Floats, Integers, Surface

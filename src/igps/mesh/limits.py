@@ -1,7 +1,5 @@
 """Whether a file, or a grid in a body, fits into memory, checked before any is taken."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

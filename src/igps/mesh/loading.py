@@ -1,7 +1,5 @@
 """A file becomes bodies: which it holds, and each as a closed surface."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ A mesh that is a body already and not noisy is left as it is, bit for bit. Every
 did, and `mended_by` tells from the notes which steps were needed.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable
 from dataclasses import replace

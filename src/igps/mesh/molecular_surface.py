@@ -5,8 +5,6 @@ of a probe may be. These are bounded by spheres, by the arcs in which two of the
 the distance to them is known exactly at every point of a grid. The triangles are where it equals the radius.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Literal, get_args

@@ -1,7 +1,5 @@
 """Surfaces of other libraries, in memory, recognised by their attributes: none of the libraries is imported."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

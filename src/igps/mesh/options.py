@@ -1,7 +1,5 @@
 """How a file is read, and which bodies it gives."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 

@@ -1,7 +1,5 @@
 """Properties of the residues of proteins and nucleic acids, by their names."""
 
-from __future__ import annotations
-
 import math
 
 VOLUMES = {

@@ -1,7 +1,5 @@
 """Fewer triangles for the same body, or more vertices on the same surface."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

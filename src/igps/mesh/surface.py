@@ -1,7 +1,5 @@
 """What the arrays of a triangle surface say: edges, components, areas, normals. They are not checked here."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

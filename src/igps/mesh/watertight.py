@@ -11,8 +11,6 @@ pieces retrieve nearly as the whole body does; the spectra of all pieces side by
 largest piece alone is another body: both retrieve far worse.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

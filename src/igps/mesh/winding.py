@@ -1,7 +1,5 @@
 """Winding numbers of a triangle mesh."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Matrix products whose rounding no setting of the process may coarsen."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any

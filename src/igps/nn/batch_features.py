@@ -1,7 +1,5 @@
 """Features of a batch that histograms share: embeddings, positions, attributes, each computed once."""
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 import torch

@@ -1,7 +1,5 @@
 """A classifier that is trained by gradients, through a descriptor."""
 
-from __future__ import annotations
-
 from torch import Tensor, nn
 
 from igps.data.batch import SignatureBatch

@@ -1,7 +1,5 @@
 """Descriptions of a whole dataset."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

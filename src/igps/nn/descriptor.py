@@ -1,7 +1,5 @@
 """What a descriptor is: how bodies are described, what that needs, and how two descriptions are compared."""
 
-from __future__ import annotations
-
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -39,9 +37,7 @@ class Descriptor(Specified, ABC):
 
     Example:
         >>> import trimesh
-        >>> from igps.data.collation import collate
-        >>> from igps.mesh.mesh import Mesh
-        >>> from igps.signature.signature import SignatureConfig, compute_signature
+        >>> from igps import SignatureConfig, collate, compute_signature
         >>> from igps.retrieval.distances import euclidean
         >>> class Spectrum(Descriptor):  # eigenvalues times the area (Reuter et al. 2006)
         ...     name = "spectrum"
@@ -53,7 +49,7 @@ class Descriptor(Specified, ABC):
         ...     def distances(self, queries, gallery):
         ...         return euclidean(queries, gallery)
         >>> ball = trimesh.creation.icosphere(subdivisions=3)
-        >>> signature = compute_signature(Mesh(ball.vertices, ball.faces), SignatureConfig(n_eigenpairs=20))
+        >>> signature = compute_signature(ball, SignatureConfig(n_eigenpairs=20))
         >>> (Spectrum()(collate([signature])) / (4 * torch.pi)).round().int().tolist()  # n (n + 1), 2n + 1 times
         [[2, 2, 2, 6, 6, 6, 6, 6, 12, 12]]
 
@@ -133,9 +129,7 @@ class BodyDescriptor(Descriptor):
 
     Example:
         >>> import trimesh
-        >>> from igps.data.collation import collate
-        >>> from igps.mesh.mesh import Mesh
-        >>> from igps.signature.signature import SignatureConfig, compute_signature
+        >>> from igps import SignatureConfig, collate, compute_signature
         >>> class Roundness(BodyDescriptor):
         ...     name = "roundness"
         ...
@@ -145,7 +139,7 @@ class BodyDescriptor(Descriptor):
         ...     def distances(self, queries, gallery):
         ...         return (queries - gallery.T).abs()
         >>> cube = trimesh.creation.box().subdivide().subdivide().subdivide()
-        >>> signature = compute_signature(Mesh(cube.vertices, cube.faces), SignatureConfig(n_eigenpairs=20))
+        >>> signature = compute_signature(cube, SignatureConfig(n_eigenpairs=20))
         >>> round(float(Roundness()(collate([signature]))), 4)  # π / 6; of a ball 1
         0.5236
     """

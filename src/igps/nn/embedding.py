@@ -1,7 +1,5 @@
 """Spectral embeddings: eigenfunctions, weighted by a function of their eigenvalues, as coordinates of a point."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal, get_args
 

@@ -1,7 +1,5 @@
 """The mathematics of the modules as functions of tensors, without parameters or state."""
 
-from __future__ import annotations
-
 from igps.nn._kernels.balls import ball_radii
 from igps.nn._kernels.pair_values import euclidean_distances, oriented_pairs, point_pair_features
 from igps.nn.axes.points import soft_memberships

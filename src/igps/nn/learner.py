@@ -1,7 +1,5 @@
 """Training a descriptor and a head end to end, as a LightningModule."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Self

@@ -1,7 +1,5 @@
 """Modules in files: what they were made with, in words, and their parameters; nothing runs when they are read."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import json

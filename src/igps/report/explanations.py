@@ -1,7 +1,5 @@
 """Where each body of a folder of results differs from its nearest, for the page."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 from collections.abc import Mapping

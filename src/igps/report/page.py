@@ -1,7 +1,5 @@
 """The page of results: one HTML file that loads nothing, to look at rankings, scores and bodies."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import re

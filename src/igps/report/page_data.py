@@ -1,7 +1,5 @@
 """The numbers that the page of results is drawn from, as its scripts read them."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections import Counter

@@ -1,7 +1,5 @@
 """What a folder of results holds, read again for its page; and where its meshes lie and how they were read."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Small surfaces of meshes for the page of results: few vertices, quantised, with the barycentroid potential."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass

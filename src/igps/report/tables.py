@@ -1,7 +1,5 @@
 """Results as tables of text, for a terminal."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from igps.analysis.comparison import Result

@@ -1,7 +1,5 @@
 """Loops that Numba compiles for `distances`: sums over the cells, and no temporary of all pairs and cells."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

@@ -7,8 +7,6 @@ that do not fit, for NaN or infinite entries, and those of histograms for negati
 device once per argument.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from functools import partial

@@ -1,18 +1,22 @@
 """Re-ranking on the graph of nearest neighbours: time and memory grow with the number of shapes, not its square."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import sparse
+from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
 from igps._compiled import compiled
 from igps.retrieval.ranking import SearchResult
 
+MOST_WHOLE = 2000
+"""Shapes whose pairs are all taken, and the sums over walks of them by the inverse."""
+
 # Of conjugate gradients, for walks whose condition is below 40
 _ROUNDS = 40
+# Rows between two steps of the bar
+_AT_ONCE = 100
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -23,16 +27,19 @@ def rerank_graph(
     n_expanded: int = 6,
     share: float = 0.3,
     diffusion: float = 0.95,
+    *,
+    keep_nearest: bool = True,
+    progress: bool = False,
 ) -> SearchResult:
     """`rerank` of a collection of which each shape's nearest are known.
 
     Walks are those among a shape and its nearest (Yang, Hinami, Matsui, Ly and Satoh 2019). With lists of all others,
-    this is `rerank`; the nearest of each stays its nearest.
+    this is `rerank`.
 
     Args:
         found: of each of N shapes, the M others that are nearest, closest first: (N, M).
         mean: distance of two shapes of the collection, over all pairs or a sample of them.
-        n_neighbours, n_expanded, share, diffusion: see `rerank`.
+        n_neighbours, n_expanded, share, diffusion, keep_nearest, progress: see `rerank`.
 
     Returns:
         the same shapes in their new order, (N, M), and their distances, without unit; of two shapes of which neither is
@@ -57,8 +64,12 @@ def rerank_graph(
         tied = _symmetric(ends, np.exp(-np.square(given[:, :half]) / np.maximum(scale[:, None] * scale[ends], _TINY)))
         degree = sparse.diags_array(1 / np.sqrt(np.maximum(tied.sum(axis=1), _TINY)))
         steps = sparse.csr_array(diffusion * (degree @ tied @ degree))
-        alike = np.zeros((n, m + 1))
-        walks(np.column_stack([np.arange(n), lists]), steps.indptr, steps.indices, steps.data, _ROUNDS, alike)
+        inside = np.column_stack([np.arange(n), lists])
+        if m == n - 1 < MOST_WHOLE:
+            alike = np.take_along_axis(np.linalg.inv(np.eye(n) - steps.toarray()), inside, axis=1)
+        else:
+            alike = np.zeros((n, m + 1))
+            walks(inside, steps.indptr, steps.indices, steps.data, _ROUNDS, alike)
         length = 1 / np.sqrt(alike[:, 0])
         alike = (1 - length[:, None] * alike[:, 1:] * length[lists]).clip(0)
         walked = _symmetric(lists, alike).data
@@ -66,7 +77,7 @@ def rerank_graph(
         average = 1 - (own.nnz - walked.sum()) / n_pairs  # of those in no list, it is 1
         apart = (1 - share) * walked / max(average, _TINY) + share * own.data / mean
     before = apart.sum()
-    if diffusion:
+    if diffusion and keep_nearest:
         apart = _brought_forward(apart, own, lists[:, 0])
     order = np.empty((n, n_near + 1), dtype=np.int64)
     nearest_of_rows(own.indptr, own.indices, apart, order)
@@ -85,10 +96,15 @@ def rerank_graph(
     weights = sparse.csr_array(weights)
     weights.sort_indices()
     smaller = np.zeros(own.nnz)
-    common(own.indptr, own.indices, weights.indptr, weights.indices, weights.data, smaller)
+    with tqdm(total=n, desc="re-ranked", disable=not progress) as bar:
+        for first in range(0, n, _AT_ONCE):
+            rows = first, min(first + _AT_ONCE, n)
+            common(rows, own.indptr, own.indices, weights.indptr, weights.indices, weights.data, smaller)
+            bar.update(rows[1] - first)
     average = 1 + (apart.sum() - before) / n_pairs
-    anew = (1 - share) * (1 - smaller / (2 - smaller)) + share * apart / average
-    anew = _brought_forward(anew, own, lists[:, 0])
+    anew = (1 - share) * (1 - smaller / (2 - smaller)).clip(0) + share * apart / average
+    if keep_nearest:
+        anew = _brought_forward(anew, own, lists[:, 0])
     ranked = _values(anew, own, np.repeat(np.arange(n), m), lists.ravel()).reshape(n, m)
     best = np.argsort(ranked, axis=1, kind="stable")
     return SearchResult(*(torch.from_numpy(np.take_along_axis(one, best, axis=1)) for one in (lists, ranked)))
@@ -183,10 +199,11 @@ def nearest_of_rows(starts: Integers, others: Integers, values: Floats, order: I
 
 @compiled()
 def common(
-    starts: Integers, others: Integers, row_starts: Integers, members: Integers, weights: Floats, smaller: Floats
-) -> None:
-    """Write, of each pair of a graph, the sum of the smaller of their weights; rows of weights are sorted."""
-    for i in range(len(starts) - 1):
+    rows: tuple[int, int], starts: Integers, others: Integers, row_starts: Integers, members: Integers,
+    weights: Floats, smaller: Floats,
+) -> None:  # fmt: skip
+    """Write, of each pair of a range of a graph's rows, the sum of the smaller of their weights, sorted by member."""
+    for i in range(rows[0], rows[1]):
         for e in range(starts[i], starts[i + 1]):
             a, b = row_starts[i], row_starts[others[e]]
             while a < row_starts[i + 1] and b < row_starts[others[e] + 1]:

@@ -1,7 +1,5 @@
 """Retrieval scores accumulated over batches, as a metric of torchmetrics."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Rank a gallery against queries."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,22 +1,19 @@
 """Re-ranking: distances of a collection are changed by which neighbours shapes have in common, without labels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from igps.retrieval.distances import Distance
-from igps.retrieval.graph_reranking import rerank_graph
+from igps.retrieval.graph_reranking import MOST_WHOLE, rerank_graph
 from igps.retrieval.ranking import SearchResult, rank
 
 N_RERANKED = 200
 """Nearest entries whose neighbourhoods among each other put those of a single query in order."""
 
-# More shapes are put in order by the graph of so many nearest each; all pairs would take time as their number cubed.
-_MOST_WHOLE, _LISTED = 2000, 300
+# Of more than `MOST_WHOLE` shapes each is tied to so many nearest; all pairs would take time as their number cubed.
+_LISTED = 300
 
 
 def rerank(
@@ -74,22 +71,25 @@ def rerank(
     if not 0 <= diffusion < 1:
         raise ValueError(f"diffusion: expected 0 to less than 1, got {diffusion}.")
     n = len(distances)
-    k = min(n_neighbours, n - 1)
-    if k < 1:
+    if n < 2:
         return torch.zeros_like(distances)
-    if n > _MOST_WHOLE and keep_nearest:
-        return _by_graph(distances, k, n_expanded, share, diffusion)
-    own = distances.double().clone().fill_diagonal_(0)
-    nearest = _order(own)[:, 1]
-    found = own
-    if diffusion:
-        found = _diffused(own, max(1, round(k / 2)), share, diffusion)
-        if keep_nearest:
-            _bring_forward(found, own, nearest)
-    found = _by_neighbourhoods(found, k, n_expanded, share, progress)
-    if keep_nearest:
-        _bring_forward(found, own, nearest)
-    return found.to(distances.dtype)
+    k, n_expanded = min(n_neighbours, n - 1), min(n_expanded, n)
+    n_listed = n - 1 if n <= MOST_WHOLE else min(max(_LISTED, k, n_expanded), n - 1)
+    mean = float((distances.sum(dtype=torch.float64) - distances.trace()) / (n * (n - 1)))
+    mean = max(mean, torch.finfo(torch.float64).tiny)
+    others = distances.clone().fill_diagonal_(torch.inf)
+    order = others.argsort(dim=1, stable=True) if n <= MOST_WHOLE else others.topk(n_listed, largest=False).indices
+    order = order[:, :n_listed]
+    near = SearchResult(order.cpu(), distances.gather(1, order).cpu())
+    found = rerank_graph(near, mean, k, n_expanded, share, diffusion, keep_nearest=keep_nearest, progress=progress)
+    whole = distances / mean  # of those without a common neighbour
+    for _ in range(2 if diffusion else 1):
+        whole = whole.mul_(share).add_(1 - share)
+    rows, columns = torch.arange(n, device=whole.device)[:, None].expand(-1, n_listed), found.indices.to(whole.device)
+    values = found.distances.to(whole)
+    whole[rows, columns] = values
+    whole[columns, rows] = values
+    return whole.fill_diagonal_(0)
 
 
 def rerank_found(
@@ -109,91 +109,3 @@ def rerank_found(
         best = rank(anew)[:, :top]
         results.append((entries[best[0].to(entries.device)], anew.gather(1, best)[0]))
     return SearchResult(*(torch.stack(each) for each in zip(*results, strict=True)))
-
-
-def _by_graph(distances: Tensor, k: int, n_expanded: int, share: float, fading: float) -> Tensor:
-    """The same of many, by the graph of nearest neighbours."""
-    n, n_listed = len(distances), min(max(_LISTED, k, n_expanded), len(distances) - 1)
-    mean = float(_above_zero((distances.sum(dtype=torch.float64) - distances.trace()) / (n * (n - 1))))
-    near = distances.clone().fill_diagonal_(torch.inf).topk(n_listed, dim=1, largest=False)
-    found = rerank_graph(SearchResult(near.indices.cpu(), near.values.cpu()), mean, k, n_expanded, share, fading)
-    whole = distances / mean  # of those without a common neighbour
-    for _ in range(2 if fading else 1):
-        whole = whole.mul_(share).add_(1 - share)
-    rows, values = torch.arange(n)[:, None].expand(-1, n_listed), found.distances.to(whole)
-    whole[rows, found.indices] = values
-    whole[found.indices, rows] = values
-    return whole.fill_diagonal_(0)
-
-
-def _diffused(own: Tensor, k: int, share: float, fading: float) -> Tensor:
-    """(N, N) distances by all walks between shapes, mixed with their own; each is tied to its k nearest."""
-    near = _order(own)[:, 1 : k + 1]
-    scale = own.gather(1, near).mean(dim=1)
-    tied = torch.zeros(own.shape, dtype=torch.bool, device=own.device).scatter_(1, near, True)
-    weights = torch.exp(-own.square() / _above_zero(scale[:, None] * scale)) * (tied | tied.T)
-    degree = _above_zero(weights.sum(dim=1)).rsqrt()
-    walks = torch.eye(len(own), dtype=own.dtype, device=own.device) - fading * degree[:, None] * weights * degree
-    alike = torch.cholesky_inverse(torch.linalg.cholesky(walks))
-    length = alike.diagonal().rsqrt()
-    apart = (1 - length[:, None] * alike * length).clamp_min(0)
-    return _mixed((apart + apart.T) / (2 * _above_zero(_mean(apart))), own, share)
-
-
-def _by_neighbourhoods(own: Tensor, k: int, n_expanded: int, share: float, progress: bool) -> Tensor:
-    """(N, N) distances by k-reciprocal neighbourhoods, mixed with their own."""
-    order = _order(own)
-    members = _reciprocal(order, k)
-    half = _reciprocal(order, max(1, round(k / 2)))
-    inside = half.float() @ members.float().T  # of the neighbourhood of j, how many belong to that of i: [j, i]
-    joins = (2 / 3 * half.sum(dim=1) <= inside.T) & members
-    members = members | ((joins.float() @ half.float()) > 0)
-
-    near = _above_zero(own.gather(1, order[:, 1 : k + 1]).mean(dim=1, keepdim=True))
-    weights = members * torch.exp(-own / near)
-    weights /= weights.sum(dim=1, keepdim=True)
-    weights = weights[order[:, :n_expanded]].mean(dim=1)
-    columns = weights.T.contiguous()
-    smaller = torch.empty_like(weights)
-    for i, row in enumerate(tqdm(weights, desc="re-ranked", disable=not progress)):
-        among = row.nonzero().flatten()  # few: of the others the smaller weight is 0
-        smaller[i] = torch.minimum(row[among, None], columns[among]).sum(dim=0)
-    jaccard = 1 - smaller / (2 - smaller)
-    return _mixed((jaccard + jaccard.T).clamp_min(0) / 2, own, share)
-
-
-def _mixed(found: Tensor, own: Tensor, share: float) -> Tensor:
-    return ((1 - share) * found + share * own / _above_zero(_mean(own))).fill_diagonal_(0)
-
-
-def _mean(distances: Tensor) -> Tensor:
-    """Of a collection's distances to itself, () without those of shapes to themselves."""
-    n = len(distances)
-    return distances.sum() / (n * (n - 1))
-
-
-def _above_zero(values: Tensor) -> Tensor:
-    return values.clamp_min(torch.finfo(values.dtype).tiny)
-
-
-def _order(distances: Tensor) -> Tensor:
-    """(N, N) the shapes as each ranks them, itself first, also where another is at distance 0."""
-    return distances.clone().fill_diagonal_(-1).argsort(dim=1, stable=True)
-
-
-def _bring_forward(mixed: Tensor, own: Tensor, nearest: Tensor) -> None:
-    """Make each shape's nearest by its own distances, (N,), its nearest by the mixed ones, in place."""
-    pairs = torch.zeros(mixed.shape, dtype=torch.bool, device=mixed.device).scatter_(1, nearest[:, None], True)
-    pairs = pairs | pairs.T
-    others = mixed[~pairs & (mixed > 0)]
-    least = others.min() if len(others) else mixed.new_ones(())
-    largest = _above_zero(own[pairs].max())
-    # half of the least, so that single precision leaves no tie
-    mixed[pairs] = 0.5 * least * own[pairs] / largest
-
-
-def _reciprocal(order: Tensor, k: int) -> Tensor:
-    """(N, N) whether j is among the k nearest of i and i among those of j; each its own."""
-    among = torch.zeros(order.shape, dtype=torch.bool, device=order.device)
-    among.scatter_(1, order[:, : k + 1], True)
-    return among & among.T

@@ -5,8 +5,6 @@ where the entry at rank k has the label of the query, R is the number of relevan
 R = 0 has no defined score: it is NaN for that query and left out of every mean.
 """
 
-from __future__ import annotations
-
 import numbers
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass

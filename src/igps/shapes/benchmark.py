@@ -1,7 +1,5 @@
 """The benchmark itself: numbered classes and shapes, generated on demand or written to a folder."""
 
-from __future__ import annotations
-
 import json
 import logging
 import operator

@@ -1,7 +1,5 @@
 """From a posed body to a triangle mesh: blending, marching cubes, relaxation, surface noise, and the final check."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The named classes: twelve skeletons made by hand, of animals and of things."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

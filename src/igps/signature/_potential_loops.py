@@ -1,7 +1,5 @@
 """Loops that Numba compiles for `igps.signature.surface_potential`: what its tree gives at blocks of points."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 Points x are (3, n) and close together. What describes the surface is explained in `igps.signature._far_field`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

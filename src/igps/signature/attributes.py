@@ -1,7 +1,5 @@
 """Scalars and directions of samples that a histogram may be split by, beside the potential."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Literal, get_args
 

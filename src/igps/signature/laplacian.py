@@ -1,7 +1,5 @@
 """The Laplace–Beltrami operator of a triangle mesh: positive semi-definite stiffness and lumped mass."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

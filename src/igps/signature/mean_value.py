@@ -10,8 +10,6 @@ vertices count as near, the weights are exact.
 Coordinates are scaled to the mesh: its bounding box gets a half-diagonal of 1.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ the body is turned or its mesh numbered anew. Here points are ordered by one num
 a spectral embedding, or in space, and so does not depend on place, numbering, or sign and basis of eigenfunctions.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ Each is a mean over the residues by a Gaussian of their distance, so that it is 
 little when atoms do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 

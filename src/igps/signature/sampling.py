@@ -1,7 +1,5 @@
 """Random points of a surface."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

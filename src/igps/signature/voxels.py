@@ -1,7 +1,5 @@
 """Which cells of a cubic grid lie inside a surface: scan lines along three axes, winding numbers in doubt."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The rows of a basis that grows, in memory, and the sums over their columns that a team makes piece by piece."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 

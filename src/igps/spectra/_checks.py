@@ -1,7 +1,5 @@
 """What the matrices must be, before anything is computed with them."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components

@@ -1,7 +1,5 @@
 """The compiled loops of `_multifrontal`: elimination of fronts, and the two ways through the tree of a solve."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A block Krylov basis that grows block by block, and the eigenpairs of the operator projected on it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Block Lanczos with a shift inside the wanted part of the spectrum, or below it; explained in `eigensolver`."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable

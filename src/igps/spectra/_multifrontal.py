@@ -35,6 +35,7 @@ import numpy as np
 import torch
 from scipy import sparse
 
+from igps._arrays import Floats
 from igps._threads import ALONE, Team
 from igps.spectra import _fronts as loops
 from igps.spectra._checks import canonical, check_entries
@@ -111,13 +112,7 @@ class Tree(Nodes):
         return sum(team.each(eliminate, self.subtrees)) + sum(map(eliminate, self.above))
 
     def _eliminate_range(
-        self,
-        nodes: tuple[int, int],
-        values: np.ndarray,
-        shift: float,
-        updates: np.ndarray,
-        blocks: np.ndarray | None,
-        team: Team,
+        self, nodes: tuple[int, int], values: Floats, shift: float, updates: Floats, blocks: Floats | None, team: Team
     ) -> int:
         """Write the blocks of a range of nodes, and what they leave to nodes behind it; their negative pivots."""
         begin, end = nodes

@@ -3,8 +3,6 @@
 It is the first step of a factorization, see `_multifrontal`. Only the pattern of the matrix is read.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra

@@ -1,7 +1,5 @@
 """The compiled loops that invert the pivot blocks of `_fronts`."""
 
-from __future__ import annotations
-
 from typing import cast
 
 import numpy as np

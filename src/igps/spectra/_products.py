@@ -13,8 +13,6 @@ processors compiled loops take down to half the time of PyTorch's BLAS. On Intel
 they take up to twice its time, and all of `eigenpairs` 1.14 times. So the processor decides (`loops_beat_blas`).
 """
 
-from __future__ import annotations
-
 from functools import cache, partial
 from typing import Any, TypeVar, cast
 

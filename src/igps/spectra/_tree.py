@@ -3,12 +3,11 @@
 Nodes and unknowns are numbered depth first, each node behind its children: in the order of their elimination.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
+from igps._arrays import Integers
 from igps._compiled import compiled
 
 # Unknowns from which a subtree is worth a thread of its own, and the most subtrees, as a power of two
@@ -53,12 +52,7 @@ def tree_nodes(node: np.ndarray, n_levels: int, indptr: np.ndarray, indices: np.
 
 @compiled()
 def _boundaries(
-    first: np.ndarray,
-    children: np.ndarray,
-    order: np.ndarray,
-    number: np.ndarray,
-    indptr: np.ndarray,
-    indices: np.ndarray,
+    first: Integers, children: Integers, order: Integers, number: Integers, indptr: Integers, indices: Integers
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where each node's boundary starts, and the boundaries, not sorted.
 

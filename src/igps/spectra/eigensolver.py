@@ -20,8 +20,6 @@ Lewis & Simon 1994):
    vectors and the iteration goes on: so a multiplet larger than the block is found.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass

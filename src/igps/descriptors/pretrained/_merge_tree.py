@@ -1,7 +1,5 @@
 """The merge tree of a function on points: how its peaks grow together as the level falls."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

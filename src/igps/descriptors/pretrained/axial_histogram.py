@@ -1,7 +1,5 @@
 """How the samples of a body lie to its principal axes."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize

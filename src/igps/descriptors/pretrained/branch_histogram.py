@@ -1,7 +1,5 @@
 """How many limbs the samples of a body make, and how far each reaches."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """Histograms of a body's interior and surface under a head that was fitted to generated shapes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from safetensors.torch import load_file, save_file

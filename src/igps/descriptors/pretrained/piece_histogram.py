@@ -1,7 +1,5 @@
 """Into which pieces a body falls when its middle is taken away."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """How the spectrum of a body departs from Weyl's law."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
@@ -22,11 +20,9 @@ class SpectrumShares(DescriptionPart):
         Of a sphere λ = l (l + 1), 2 l + 1 times; what is over is the number k, from 2 on.
 
         >>> import trimesh
-        >>> from igps.data.collation import collate
-        >>> from igps.mesh.mesh import Mesh
-        >>> from igps.signature.signature import SignatureConfig, compute_signature
+        >>> from igps import SignatureConfig, collate, compute_signature
         >>> ball = trimesh.creation.icosphere(subdivisions=3)
-        >>> signature = compute_signature(Mesh(ball.vertices, ball.faces), SignatureConfig(n_eigenpairs=8))
+        >>> signature = compute_signature(ball, SignatureConfig(n_eigenpairs=8))
         >>> shares = SpectrumShares(8)(collate([signature]))[0]
         >>> expected = torch.tensor([2 / 2, 2 / 3, 6 / 4, 6 / 5, 6 / 6, 6 / 7, 6 / 8])
         >>> bool((shares / shares[0] - expected).abs().max() < 0.02)

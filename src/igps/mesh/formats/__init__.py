@@ -7,8 +7,6 @@ header claims is checked before memory is taken (`check_unpacked`), modules that
 `read`, and no path that the file holds leads out of its folder.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from igps.mesh._label_measures import LabelVoxels, VoxelMeasures

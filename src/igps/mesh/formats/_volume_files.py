@@ -1,7 +1,5 @@
 """What files of volumes hold, read by nibabel, SimpleITK, highdicom and tifffile; sizes are checked before."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The surface of cells as VTK numbers their kinds: polygons as they are, of volumes the sides that no two share."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from igps._arrays import Integers

@@ -1,7 +1,5 @@
 """XML of strangers: no entities, nothing from elsewhere, and arrays that unpack to no more than they announce."""
 
-from __future__ import annotations
-
 import lzma
 import zlib
 from collections.abc import Callable

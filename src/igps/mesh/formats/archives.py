@@ -1,7 +1,5 @@
 """Archives and compressed files: unpacked to a folder of their own, as far as is allowed, and read there."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import io

@@ -1,7 +1,5 @@
 """Surfaces of brains: GIFTI, and FreeSurfer's triangle files (lh.pial, ...). Both are in millimetres."""
 
-from __future__ import annotations
-
 import base64
 from math import prod
 from pathlib import Path

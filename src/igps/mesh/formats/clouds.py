@@ -1,7 +1,5 @@
 """Clouds of points as text: lines of three coordinates, or of six with normals."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

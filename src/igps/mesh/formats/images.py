@@ -1,7 +1,5 @@
 """Images and grids of values that lie beside bodies, as an array and its place in space."""
 
-from __future__ import annotations
-
 import math
 import re
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Names of labels: by a table of ITK-SNAP, 3D Slicer or FreeSurfer, of nnU-Net, by CSV, or by a NIfTI extension."""
 
-from __future__ import annotations
-
 import csv
 import html
 import json

@@ -1,7 +1,5 @@
 """Wavefront OBJ: places and polygons as text, in objects or groups; textures, normals and curves are passed over."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

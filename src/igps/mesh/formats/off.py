@@ -1,7 +1,5 @@
 """OFF: coordinates and polygons as text."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """PLY: vertices and polygons, or points with normals, as text or bytes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from igps.mesh.formats._format import Format, RawBody

@@ -1,7 +1,5 @@
 """Scenes and CAD files: GLB, glTF, COLLADA, 3DXML and XAML, STEP. An object is what stands at a place of the scene."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

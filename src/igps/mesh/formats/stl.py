@@ -1,7 +1,5 @@
 """STL: the corners of triangles, as text or bytes. Corners in one place are one vertex: the format has no others."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

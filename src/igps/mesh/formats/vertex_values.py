@@ -1,7 +1,5 @@
 """Values at the vertices of a surface, or at the points of tetrahedra, as files have them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path

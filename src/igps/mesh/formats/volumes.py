@@ -3,8 +3,6 @@
 The world is RAS, x to the patient's right, y to the front and z up, in millimetres. No volume is resampled.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path

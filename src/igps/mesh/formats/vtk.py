@@ -4,8 +4,6 @@ Read here, because meshio knows no PolyData, and VTK itself is a hundred megabyt
 promises too much.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,14 +1,17 @@
 """The largest balls that touch a surface at its samples, from inside and from outside."""
 
-from __future__ import annotations
+from typing import TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from igps._arrays import Singles
-from igps.nn._kernels.ball_loops import bends
+from igps._compiled import compiled
 from igps.nn._precision import full_precision
+
+Real = TypeVar("Real", np.float32, np.float64)
 
 # Points that lie so nearly in the tangent plane, by the sine, tell of the sampled normal's error and not of a ball
 _TANGENTIAL = 0.1
@@ -16,6 +19,7 @@ _TANGENTIAL = 0.1
 _RANK = 3
 # Radii over the unit of length: what is smaller is below any sampling, what is larger is flat
 _SMALLEST, _LARGEST = 1e-3, 10.0
+_NORMAL = 2.0**-126  # the smallest normal number of single precision
 
 
 def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
@@ -74,3 +78,42 @@ def _radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
 def _array(vectors: Tensor) -> Singles:
     """(3, P) of vectors (P, 3)."""
     return vectors.detach().T.contiguous().numpy()
+
+
+@compiled()
+def bends(points: NDArray[Real], directions: NDArray[Real], tangential: float, found: NDArray[Real]) -> None:
+    """Write one over the third smallest radius of each point's balls, inside and outside, to (P, 2); 0 for none.
+
+    A row of pairs at a time, and no matrix of all of them.
+
+    Args:
+        points: (3, P), and their directions (3, P).
+        tangential: sine of the angle to the tangent plane up to which points do not count.
+        found: (P, 2), zeros.
+    """
+    n = points.shape[1]
+    one = points.dtype.type(1)
+    least = one * tangential * tangential
+    smallest = one * _NORMAL
+    of_row = np.empty(n, points.dtype)
+    for i in range(n):
+        x, y, z = points[0, i], points[1, i], points[2, i]
+        a, b, c = directions[0, i], directions[1, i], directions[2, i]
+        for j in range(n):
+            u, v, w = x - points[0, j], y - points[1, j], z - points[2, j]
+            square = u * u + v * v + w * w
+            depth = a * u + b * v + c * w
+            counts = depth * depth > least * square
+            of_row[j] = (depth + depth) / max(square, smallest) if counts else 0 * one
+        for side in range(2):
+            first = second = third = 0 * one
+            for j in range(n):
+                bend = of_row[j] if side == 0 else -of_row[j]
+                if bend > third:
+                    if bend > first:
+                        first, second, third = bend, first, second
+                    elif bend > second:
+                        second, third = bend, second
+                    else:
+                        third = bend
+            found[i, side] = third

@@ -1,7 +1,5 @@
 """The count of pairs in operations of PyTorch, a block of pairs at a time: for any device, and where it is traced."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """The smallest entries of each row, for the few nearest of many points."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

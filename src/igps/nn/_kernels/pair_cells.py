@@ -1,7 +1,5 @@
 """Compiled loops that find, of a row of pairs, the cells that they fall into and their shares along each axis."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -10,8 +10,6 @@ compiler turns into vectors (`pair_cells`). Then each pair is added to its corne
 reads them.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -27,6 +25,7 @@ from igps.nn._kernels.pair_sums import (
     add_whole_pairs,
     flush,
     pack_pairs,
+    pair_row,
     unpack,
 )  # fmt: skip
 
@@ -128,8 +127,7 @@ def gradient_block(
                     of_column = weights[n, other]
                     if of_row == 0 and of_column == 0:
                         continue
-                    a, b = min(classes[m, point], classes[n, other]), max(classes[m, point], classes[n, other])
-                    pair = np.uint32(a * n_classes - a * (a - 1) // 2 + b - a)
+                    pair = np.uint32(pair_row(classes[m, point], classes[n, other], n_classes))
                     mean = interpolate(upstream[pair], begin, shares, j, of_row * of_column, slopes)
                     by_weights[m, point] += of_column * mean
                     by_weights[n, other] += of_row * mean

@@ -3,8 +3,6 @@
 Of a weight w and a share s one corner gets w·s and the other w − w·s, which rounding makes no less than 0.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -129,6 +127,13 @@ def add_axes(cell: Places, home: Places, shares: Numbers, first: int, weights: F
         add_two_axes(cell, home, shares[n_outer, first:], shares[n_outer + 1, first:], rest, sums, np.int64(4 * corner))
 
 
+@compiled(error_model="numpy", inline="always")
+def pair_row(one: int, other: int, n_classes: int) -> int:
+    """The row of a histogram in which pairs of two classes count, see `class_pairs`."""
+    a, b = min(one, other), max(one, other)
+    return a * n_classes - a * (a - 1) // 2 + b - a
+
+
 @compiled(error_model="numpy")
 def flush(sums: Floats, lowest: int, highest: int, classes: Places, weights: Floats, point: int, total: Floats) -> None:
     """Add the sums (C, cells·corners) of rows like a point, by its weights (M, P) in its classes, and clear them.
@@ -138,8 +143,7 @@ def flush(sums: Floats, lowest: int, highest: int, classes: Places, weights: Flo
     n_classes = len(sums)
     for other in range(n_classes):
         for m in range(len(classes)):
-            a, b = min(classes[m, point], other), max(classes[m, point], other)
-            pair = a * n_classes - a * (a - 1) // 2 + b - a
+            pair = pair_row(classes[m, point], other, n_classes)
             for c in range(lowest, highest):
                 total[pair, c] += weights[m, point] * sums[other, c]
         for c in range(lowest, highest):

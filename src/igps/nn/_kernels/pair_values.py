@@ -1,7 +1,5 @@
 """What is measured of pairs of points: the values that axes of pairs sort into bins."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

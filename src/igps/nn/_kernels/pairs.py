@@ -6,8 +6,6 @@ operations of PyTorch (`count_by_torch`). Both count in double precision, hold n
 all pairs, and have gradients by all that the values are computed from, by the weights and by the centres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
 

@@ -4,8 +4,6 @@ An axis of your own is a subclass of `PointAxis` or `PairAxis`. One that belongs
 folder, exported here, and entered in `AXES` by its name if it has a default layout.
 """
 
-from __future__ import annotations
-
 from igps.nn._kernels.pair_values import (
     PairValues,
     euclidean_distances,

@@ -1,7 +1,5 @@
 """Centres of bins and classes, and where values lie among them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ By interior distance, by Euclidean distance, by the cosines that tell how two sa
 surface next to them, or by the twist between them, which alone tells left from right.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 from torch import Tensor, nn

@@ -1,7 +1,5 @@
 """Axes of points: classes of the samples of a body, by their potential, the balls that touch them, or an attribute."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

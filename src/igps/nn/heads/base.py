@@ -1,7 +1,5 @@
 """What a head is, and the mathematics that several share: class means, principal directions, whitening."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Self

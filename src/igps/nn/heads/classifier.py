@@ -1,7 +1,5 @@
 """A head that tells classes with calibrated probabilities, and what is of none of them."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Iterator, Sequence

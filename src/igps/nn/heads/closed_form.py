@@ -1,7 +1,5 @@
 """Heads fitted in closed form: within seconds, without a choice of step or stop, and the same every time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Self
 

@@ -1,7 +1,5 @@
 """What gradients learn on top of histograms: an embedding, and a distance blended of the plain one and a head's."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Self
 

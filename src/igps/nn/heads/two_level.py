@@ -1,7 +1,5 @@
 """A head of levels: poses of an individual come first, then its like, then other bodies of its class, then the rest."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from typing import Self

@@ -1,7 +1,5 @@
 """A head whitened within classes, which keeps what tells classes apart."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Self

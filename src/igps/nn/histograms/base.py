@@ -1,7 +1,5 @@
 """What the parts of a description share, and the histograms of samples among them."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from functools import reduce

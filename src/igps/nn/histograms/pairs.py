@@ -1,7 +1,5 @@
 """Joint histograms over all pairs of the samples of a body, as products of axes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,11 +29,9 @@ class PairHistogram(SampleHistogram):
 
     Example:
         >>> import trimesh
-        >>> from igps.data.collation import collate
-        >>> from igps.mesh.mesh import Mesh
-        >>> from igps.signature.signature import SignatureConfig, compute_signature
+        >>> from igps import SignatureConfig, collate, compute_signature
         >>> ball = trimesh.creation.icosphere(subdivisions=2)
-        >>> signature = compute_signature(Mesh(ball.vertices, ball.faces), SignatureConfig(n_eigenpairs=20))
+        >>> signature = compute_signature(ball, SignatureConfig(n_eigenpairs=20))
         >>> histograms = PairHistogram()(collate([signature]))
         >>> tuple(histograms.shape), round(float(histograms.sum()), 4)
         ((1, 10, 64), 1.0)

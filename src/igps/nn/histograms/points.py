@@ -1,7 +1,5 @@
 """Joint histograms over the samples of a body, as products of axes of points."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import reduce
 from operator import or_
