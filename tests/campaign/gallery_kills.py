@@ -47,7 +47,8 @@ def changed(rows: Rows, writer: int, number: int) -> Rows:
     kind, chosen, value = change(writer, number)
     ids = [f"{writer}/{i}" for i in chosen]
     if kind == "add":
-        return {**rows, **{id_: (0.0, 1000 * value + i) for id_, i in zip(ids, chosen, strict=True)}}
+        seeds = (1000 * (2 * value + writer) + i for i in chosen)  # no two vectors are equal
+        return {**rows, **{id_: (0.0, seed) for id_, seed in zip(ids, seeds, strict=True)}}
     if kind == "remove":
         return {id_: row for id_, row in rows.items() if id_ not in ids}
     return {id_: (float(value), row[1]) if id_ in ids else row for id_, row in rows.items()}

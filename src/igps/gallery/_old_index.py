@@ -13,9 +13,9 @@ import torch
 
 from igps.data.sources import file_and_part
 from igps.gallery._table import alone, exists, write
-from igps.gallery.about import Batch
+from igps.gallery.about import MANIFEST, Batch
 
-MANIFEST, _ROWS_AT_ONCE = "manifest.json", 1024
+_ROWS_AT_ONCE = 1024
 
 
 def convert(path: Path) -> None:

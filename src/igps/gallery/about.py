@@ -22,6 +22,9 @@ KNOWN: dict[str, type] = {"id": str, "name": str, "class": str, "file": str, "pa
                           "thumbnail": bytes}  # fmt: skip
 """What every row tells beside its description, and of which type."""
 
+MANIFEST = "manifest.json"
+"""What an index of an earlier version has."""
+
 Row = Mapping[str, Any]
 Batch = tuple[Tensor, Sequence[Row]]
 """Descriptions (N, ...) and what is known of each: `KNOWN`, and further columns, of text or numbers."""
@@ -72,7 +75,7 @@ def in_words(sentence: str) -> Iterator[None]:
 
 def is_gallery(path: str | Path) -> bool:
     """Whether a folder is a gallery, or an index of an earlier version."""
-    return any((Path(path) / name).exists() for name in ("bodies.lance", "manifest.json"))
+    return any((Path(path) / name).exists() for name in ("bodies.lance", MANIFEST))
 
 
 def tables() -> Any:
@@ -84,7 +87,7 @@ def tables() -> Any:
 
 def open_table(path: str | Path, version: int | None = None) -> Any:
     """The table of a gallery, or of an index of an earlier version, which becomes a gallery."""
-    if not tables().exists(Path(path)) and (Path(path) / "manifest.json").exists():
+    if not tables().exists(Path(path)) and (Path(path) / MANIFEST).exists():
         from igps.gallery._old_index import convert
 
         convert(Path(path))

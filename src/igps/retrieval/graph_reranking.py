@@ -2,7 +2,6 @@
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import sparse
 from tqdm import tqdm
 
@@ -73,9 +72,9 @@ def rerank_graph(
         length = 1 / np.sqrt(alike[:, 0])
         alike = (1 - length[:, None] * alike[:, 1:] * length[lists]).clip(0)
         walked = _symmetric(lists, alike).data
-        del alike, tied, steps
         average = 1 - (own.nnz - walked.sum()) / n_pairs  # of those in no list, it is 1
         apart = (1 - share) * walked / max(average, _TINY) + share * own.data / mean
+        del alike, tied, steps, walked
     before = apart.sum()
     if diffusion and keep_nearest:
         apart = _brought_forward(apart, own, lists[:, 0])
@@ -103,6 +102,7 @@ def rerank_graph(
             bar.update(rows[1] - first)
     average = 1 + (apart.sum() - before) / n_pairs
     anew = (1 - share) * (1 - smaller / (2 - smaller)).clip(0) + share * apart / average
+    del apart, smaller
     if keep_nearest:
         anew = _brought_forward(anew, own, lists[:, 0])
     ranked = _values(anew, own, np.repeat(np.arange(n), m), lists.ravel()).reshape(n, m)
@@ -113,16 +113,14 @@ def rerank_graph(
 def _symmetric(lists: Integers, values: Floats) -> sparse.csr_array:
     """(N, N) of values (N, M) of pairs (i, lists[i]) and of those the other way round; the mean of both where given."""
     n, m = lists.shape
-
-    def both_ways(given: Floats | NDArray[np.int8]) -> sparse.csr_array:
-        one_way = sparse.csr_array((given.ravel(), lists.ravel(), np.arange(n + 1) * m), shape=(n, n), copy=True)
-        one_way.sort_indices()
-        return one_way + one_way.T.tocsr()
-
-    # One is added, as SciPy drops sums of 0
-    total, count = both_ways(values + 1), both_ways(np.ones(lists.shape, dtype=np.int8))
-    total.data = total.data / count.data - 1
-    return total
+    given = sparse.csr_array((values.ravel(), lists.ravel(), np.arange(n + 1) * m), shape=(n, n), copy=True)
+    given.sort_indices()
+    ones = sparse.csr_array((np.ones(n * m, dtype=np.int8), given.indices, given.indptr), shape=(n, n))
+    pairs = ones + ones.T.tocsr()
+    del ones
+    means = np.empty(pairs.nnz)
+    means_both_ways(pairs.indptr, pairs.indices, given.indptr, given.indices, given.data, means)
+    return sparse.csr_array((means, pairs.indices, pairs.indptr), shape=(n, n))
 
 
 def _binary(lists: Integers) -> sparse.csr_array:
@@ -132,21 +130,53 @@ def _binary(lists: Integers) -> sparse.csr_array:
 
 def _values(values: Floats, graph: sparse.csr_array, rows: Integers, columns: Integers) -> Floats:
     """Those of pairs of a graph, by place; infinite of others."""
-    n = graph.shape[0]
-    keys = np.repeat(np.arange(n), np.diff(graph.indptr)) * n + graph.indices
-    wanted = rows.astype(np.int64) * n + columns
-    place = np.searchsorted(keys, wanted).clip(max=len(keys) - 1)
-    return np.where(keys[place] == wanted, values[place], np.inf)
+    found = np.full(len(rows), np.inf)
+    values_of(graph.indptr, graph.indices, values, rows, columns, found)
+    return found
 
 
 def _brought_forward(values: Floats, own: sparse.csr_array, nearest: Integers) -> Floats:
     """The values of pairs, with those of which one is the other's nearest before all others, in their own order."""
-    rows = np.repeat(np.arange(own.shape[0]), np.diff(own.indptr))
+    nearest = nearest.astype(own.indices.dtype)
+    rows = np.repeat(np.arange(own.shape[0], dtype=nearest.dtype), np.diff(own.indptr))
     first = (nearest[rows] == own.indices) | (nearest[own.indices] == rows)
-    others = values[~first & (values > 0)]
-    least = others.min() if len(others) else 1.0
+    least = values.min(where=~first & (values > 0), initial=np.inf)
+    found, forward = values.copy(), own.data[first]
     # half of the least, so that single precision leaves no tie
-    return np.where(first, 0.5 * least * own.data / max(own.data[first].max(), _TINY), values)
+    found[first] = 0.5 * (least if np.isfinite(least) else 1.0) * forward / max(forward.max(), _TINY)
+    return found
+
+
+@compiled()
+def place_of(starts: Integers, others: Integers, i: int, j: int) -> int:
+    """Where a graph, whose rows are sorted, has a pair; -1 if it has not."""
+    e = starts[i] + np.searchsorted(others[starts[i] : starts[i + 1]], j)
+    return e if e < starts[i + 1] and others[e] == j else -1
+
+
+@compiled()
+def values_of(
+    starts: Integers, others: Integers, values: Floats, rows: Integers, columns: Integers, found: Floats
+) -> None:
+    """Write the values of those of some pairs that a graph has."""
+    for p in range(len(rows)):
+        e = place_of(starts, others, rows[p], columns[p])
+        if e >= 0:
+            found[p] = values[e]
+
+
+@compiled()
+def means_both_ways(
+    starts: Integers, others: Integers, row_starts: Integers, listed: Integers, values: Floats, means: Floats
+) -> None:
+    """Write, of each pair of a graph, the mean of the values that it and its reverse have in another."""
+    for i in range(len(starts) - 1):
+        for e in range(starts[i], starts[i + 1]):
+            there, back = place_of(row_starts, listed, i, others[e]), place_of(row_starts, listed, others[e], i)
+            if there >= 0 and back >= 0:
+                means[e] = (values[there] + values[back]) / 2
+            else:
+                means[e] = values[max(there, back)]
 
 
 @compiled()
