@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from igps.data import _handing_over
 from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch
 from igps.data.collation import collate
 from igps.mesh.mesh import Mesh
@@ -245,7 +247,7 @@ class Several(Dataset[Signature]):
         return self.signatures[index]
 
 
-def test_workers_give_the_batches_of_this_process_in_shared_memory(signatures: list[Signature]) -> None:
+def test_workers_give_the_batches_of_this_process_in_one_piece_of_memory(signatures: list[Signature]) -> None:
     """Of like shapes, which are written as they are, and of others, which are padded in every dimension."""
     (batch,) = DataLoader(Several(signatures), batch_size=3, num_workers=1, collate_fn=collate)
     expected = collate(signatures)
@@ -258,10 +260,52 @@ def test_workers_give_the_batches_of_this_process_in_shared_memory(signatures: l
     (batch,) = DataLoader(Several(alike), batch_size=2, num_workers=1, collate_fn=collate)
     assert equal(batch, collate(alike))
     assert torch.equal(batch.interior.eigenfunctions, collate(alike).interior.eigenfunctions)
-    assert batch.interior.eigenfunctions.is_shared()
     whole = {one.untyped_storage().data_ptr() for one in (batch.interior.points, batch.surface.eigenfunctions)}
     assert len(whole) == 1
     batch.interior.points.zero_()  # writable, as any batch is
+
+
+def test_a_worker_takes_memory_again_only_when_its_batch_is_gone(signatures: list[Signature]) -> None:
+    """Batches of other sizes, kept, dropped, or in part kept, hold what this process makes of the same bodies."""
+    order = [[0, 1], [2], [1, 2, 0], [0], [2, 1], [0, 0, 0]] * 6
+    expected = [collate([signatures[i] for i in some]) for some in order]
+    loader = DataLoader(
+        Several(signatures), batch_sampler=order, num_workers=2, collate_fn=collate, persistent_workers=True
+    )
+    kept: list[tuple[SignatureBatch, SignatureBatch]] = []
+    parts: list[tuple[Tensor, Tensor]] = []
+    for epoch in range(3):
+        for i, (batch, right) in enumerate(zip(loader, expected, strict=True)):
+            assert equal(batch, right)
+            if i % 4 == epoch:
+                kept.append((batch, right))
+            if i % 5 == epoch:
+                parts.append((batch.surface.eigenfunctions[-1], right.surface.eigenfunctions[-1]))
+    assert all(equal(batch, right) for batch, right in kept)
+    assert all(torch.equal(part, right) for part, right in parts)
+
+
+def changed_in_worker(items: list[Signature]) -> SignatureBatch:
+    batch = collate(items)
+    return replace(batch, labels=torch.arange(len(batch)), interior=batch.interior.map(lambda values: values[:, ::2]))
+
+
+def test_a_worker_hands_over_what_its_user_makes_of_a_batch(signatures: list[Signature]) -> None:
+    loader = DataLoader(Several(signatures), batch_size=2, num_workers=1, collate_fn=changed_in_worker)
+    for batch, right in zip(loader, map(changed_in_worker, (signatures[:2], signatures[2:])), strict=True):
+        assert equal(batch, right)
+        assert batch.labels.tolist() == right.labels.tolist()
+
+
+def memory_of_worker(items: list[Signature]) -> int:
+    """How many blocks the worker has after one more batch, which is let go."""
+    collate(items)
+    return len(_handing_over._blocks)
+
+
+def test_a_worker_does_not_gather_memory(signatures: list[Signature]) -> None:
+    n_blocks = list(DataLoader(Several(signatures * 10), batch_size=2, num_workers=1, collate_fn=memory_of_worker))
+    assert n_blocks == [1] * 15
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")

@@ -1,9 +1,8 @@
-"""Signatures become a batch: padded to the longest, in one piece of memory that worker processes hand over."""
+"""Signatures become a batch, padded to the longest."""
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,13 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import get_worker_info
 
+from igps.data._handing_over import arrays
 from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature
-
-_ALIGNED = 64  # bytes
 
 
 def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mesh] | None = None) -> SignatureBatch:
@@ -52,85 +49,51 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
     wanted: list[list[Any]] = [[np.asarray(s.eigenvalues, dtype=np.float64) for s in signatures]]
     wanted += [[np.float64(getattr(s, name)) for s in signatures] for name in ("area", "volume")]
     wanted.append([np.int64(item.label) for item in labelled])
-    eigenvalues, area, volume, labels = _padded(wanted, padding=math.inf)
-    interior, surface = _pad_samples([[s.interior for s in signatures], [s.surface for s in signatures]])
+    rooms = [[s.interior for s in signatures], [s.surface for s in signatures]]
+    for room in rooms:
+        wanted += _of_samples(room)
+    eigenvalues, area, volume, labels, *tensors = _padded(wanted)
+    rest = iter(tensors)
+    interior, surface = (
+        SampleBatch(next(rest), next(rest), next(rest), {name: next(rest) for name in sorted(room[0].attributes)})
+        for room in rooms
+    )
     ids, units = tuple(item.id for item in labelled), tuple(s.unit for s in signatures)
     given = None if meshes is None else tuple(meshes)
     return SignatureBatch(eigenvalues, interior, surface, area, volume, labels, ids, given, units)
 
 
-def _pad_samples(rooms: Sequence[Sequence[Samples]]) -> list[SampleBatch]:
-    wanted: list[list[NDArray[Any]]] = []
-    for samples in rooms:
-        names = sorted(samples[0].attributes)
-        for s in samples:
-            if sorted(s.attributes) != names:
-                raise ValueError(
-                    f"items: all must carry the same sample attributes, got {names} and {sorted(s.attributes)}."
-                )
+def _of_samples(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:
+    """Points, eigenfunctions, masks, and attributes by their names, of each."""
+    names = sorted(samples[0].attributes)
+    for s in samples:
+        if sorted(s.attributes) != names:
+            raise ValueError(
+                f"items: all must carry the same sample attributes, got {names} and {sorted(s.attributes)}."
+            )
+    return [
         # Centred before the cast, or a shape far from the origin would lose its digits.
-        wanted.append([(s.points - s.points.mean(axis=0)).astype(np.float32) for s in samples])
-        wanted.append([np.asarray(s.eigenfunctions, dtype=np.float32) for s in samples])
-        wanted.append([np.ones(len(s), dtype=bool) for s in samples])
-        wanted += [[np.asarray(s.attributes[name], dtype=np.float32) for s in samples] for name in names]
-    padded = iter(_padded(wanted))
-    return [
-        SampleBatch(
-            next(padded), next(padded), next(padded), {name: next(padded) for name in sorted(one[0].attributes)}
-        )
-        for one in rooms
+        [(s.points - s.points.mean(axis=0)).astype(np.float32) for s in samples],
+        [np.asarray(s.eigenfunctions, dtype=np.float32) for s in samples],
+        [np.ones(len(s), dtype=bool) for s in samples],
+        *([np.asarray(s.attributes[name], dtype=np.float32) for s in samples] for name in names),
     ]
 
 
-def _padded(wanted: Sequence[Sequence[Any]], padding: float = 0) -> list[Tensor]:
-    """Of each list of N arrays an (N, ...) tensor, padded up to the largest size along each dimension."""
-    shapes = [(len(some), *map(max, zip(*(one.shape for one in some), strict=True))) for some in wanted]
-    if get_worker_info() is not None and hasattr(os, "memfd_create"):
-        return _shared(wanted, shapes, padding)
-    return [torch.from_numpy(_filled(some, shape, padding)) for some, shape in zip(wanted, shapes, strict=True)]
+def _padded(wanted: Sequence[Sequence[Any]]) -> list[Tensor]:
+    """Of each list of N arrays an (N, ...) tensor, padded to the largest size along each dimension.
 
-
-def _filled(arrays: Sequence[Any], shape: tuple[int, ...], padding: float) -> NDArray[Any]:
-    filled = np.empty(shape, arrays[0].dtype)  # for which NumPy asks for large pages: they come many times faster
-    for i, one in enumerate(arrays):
-        if one.shape[1:] != shape[2:]:
-            filled[i] = padding
-        where: tuple[Any, ...] = (i, *map(slice, one.shape))
-        filled[where] = one
-        if len(shape) > 1:
-            filled[i, len(one) :] = padding
-    return filled
-
-
-def _shared(wanted: Sequence[Sequence[Any]], shapes: Sequence[tuple[int, ...]], padding: float) -> list[Tensor]:
-    """`_padded` in a worker process: all in one piece of shared memory, which goes to the parent by its handle.
-
-    What is written to it as to a file, rather than to its pages, costs half the time.
+    Double precision, which only eigenvalues have, is padded by infinity, all else by zero.
     """
-    kinds = [some[0].dtype for some in wanted]
-    sizes = [math.prod(shape) * kind.itemsize for shape, kind in zip(shapes, kinds, strict=True)]
-    *starts, end = np.cumsum([0, *(-(-size // _ALIGNED) * _ALIGNED for size in sizes)]).tolist()
-    handle = os.memfd_create("batch")
-    try:
-        os.ftruncate(handle, max(end, _ALIGNED))  # zeros
-        for some, shape, start in zip(wanted, shapes, starts, strict=True):
-            as_it_is = padding == 0 and all(one.shape[1:] == shape[2:] for one in some)
-            pieces = some if as_it_is else [_filled(some, shape, padding)]
-            stride = math.prod(shape[1:]) * some[0].itemsize
-            for i, piece in enumerate(pieces):
-                _write(handle, np.ascontiguousarray(piece), start + i * stride)
-        storage = torch.UntypedStorage._new_shared_fd_cpu(handle, max(end, _ALIGNED))  # type: ignore[attr-defined]
-    finally:
-        os.close(handle)
-    block = torch.empty(0, dtype=torch.uint8).set_(storage)
-    return [
-        block[start : start + size].view(torch.from_numpy(np.empty(0, kind)).dtype).view(shape)
-        for start, size, shape, kind in zip(starts, sizes, shapes, kinds, strict=True)
-    ]
-
-
-def _write(handle: int, array: NDArray[Any], start: int) -> None:
-    content = array.reshape(-1).view(np.uint8).data
-    while len(content):
-        n_written = os.pwrite(handle, content, start)
-        content, start = content[n_written:], start + n_written
+    shapes = [(len(some), *map(max, zip(*(one.shape for one in some), strict=True))) for some in wanted]
+    padded = arrays(shapes, [some[0].dtype for some in wanted])
+    for some, filled in zip(wanted, padded, strict=True):
+        padding = math.inf if filled.dtype == np.float64 else 0
+        for i, one in enumerate(some):
+            if one.shape[1:] != filled.shape[2:]:
+                filled[i] = padding
+            where: tuple[Any, ...] = (i, *map(slice, one.shape))
+            filled[where] = one
+            if filled.ndim > 1:
+                filled[i, len(one) :] = padding
+    return [torch.from_numpy(filled) for filled in padded]

@@ -1,0 +1,132 @@
+"""Batches go from a worker process of a DataLoader to its consumer in memory that both see, and that is used again.
+
+New shared memory costs several times the copy of a batch into it, as the system has to find and clear its pages. So a
+worker keeps its blocks, and fills one anew when nothing in either process refers to it any more.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import weakref
+from collections.abc import Sequence
+from multiprocessing.reduction import DupFd, ForkingPickler
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import get_worker_info
+
+from igps.data.batch import SignatureBatch
+
+_ALIGNED = 64  # bytes; so many in front tell whether the consumer has the block
+_N_SPARE = 4  # blocks without use that a worker keeps
+
+
+class _Block:
+    """Memory of a worker process, for one batch at a time."""
+
+    def __init__(self, n_bytes: int) -> None:
+        self.handle = os.memfd_create("igps-batch")
+        os.ftruncate(self.handle, _ALIGNED + n_bytes)
+        self.memory = mmap.mmap(self.handle, _ALIGNED + n_bytes)
+        self.lend()
+
+    def lend(self) -> NDArray[np.uint8]:
+        array = np.frombuffer(self.memory, np.uint8, offset=_ALIGNED)
+        self.start, self.n_bytes = array.ctypes.data, len(array)
+        self._lent = weakref.ref(array)
+        return array
+
+    @property
+    def free(self) -> bool:
+        # In this order: a batch is marked as sent before the last reference to it here goes.
+        return self._lent() is None and not self.memory[0]
+
+    def close(self) -> None:
+        self.memory.close()
+        os.close(self.handle)
+
+
+class _Place(NamedTuple):
+    """Where a tensor lies in a block."""
+
+    start: int  # bytes
+    dtype: torch.dtype
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+
+
+_blocks: list[_Block] = []
+
+
+def arrays(shapes: Sequence[tuple[int, ...]], kinds: Sequence[np.dtype[Any]]) -> list[NDArray[Any]]:
+    """Empty arrays of these shapes and types; in a worker process, where the system can, in one block to hand over."""
+    if get_worker_info() is None or not hasattr(os, "memfd_create"):
+        # NumPy asks for large pages, which come many times faster.
+        return [np.empty(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)]
+    sizes = [int(np.prod(shape)) * kind.itemsize for shape, kind in zip(shapes, kinds, strict=True)]
+    *starts, end = np.cumsum([0, *(-(-size // _ALIGNED) * _ALIGNED for size in sizes)]).tolist()
+    whole = _block(end).lend()
+    return [
+        whole[start : start + size].view(kind).reshape(shape)
+        for start, size, shape, kind in zip(starts, sizes, shapes, kinds, strict=True)
+    ]
+
+
+def _block(n_bytes: int) -> _Block:
+    """The smallest free block of at least this size."""
+    free = sorted((block for block in _blocks if block.free), key=lambda block: block.n_bytes)
+    found = next((block for block in free if block.n_bytes >= n_bytes), None)
+    # Those too small go first: batches of an epoch are of about one size.
+    for block in [block for block in free if block is not found][: max(len(free) - _N_SPARE, int(found is None))]:
+        _blocks.remove(block)
+        block.close()
+    if found is None:
+        found = _Block(n_bytes)
+        _blocks.append(found)
+    return found
+
+
+def _sent(batch: SignatureBatch) -> Any:
+    """What a batch is pickled as for another process."""
+    at = batch.labels.data_ptr()
+    block = next((one for one in _blocks if one.start <= at < one.start + one.n_bytes and not one.memory[0]), None)
+    if block is None:
+        return batch.__reduce_ex__(2)
+
+    def place(values: Tensor) -> Any:
+        start = values.data_ptr() - block.start
+        if 0 <= start < block.n_bytes:
+            return _Place(start, values.dtype, tuple(values.shape), values.stride())
+        return values
+
+    block.memory[0] = 1
+    return _received, (DupFd(block.handle), _ALIGNED + block.n_bytes, vars(batch.map(place)))
+
+
+def _received(handle: Any, n_bytes: int, fields: dict[str, Any]) -> SignatureBatch:
+    """The batch in the consumer's process; its worker has the memory back when the last of its tensors goes."""
+    descriptor = handle.detach()
+    memory = mmap.mmap(descriptor, n_bytes)
+    os.close(descriptor)
+    array = np.frombuffer(memory, np.uint8, offset=_ALIGNED)
+    weakref.finalize(array, _give_back, memory, os.getpid()).atexit = False
+    whole = torch.from_numpy(array)
+
+    def tensor(place: Any) -> Tensor:
+        if isinstance(place, Tensor):
+            return place
+        return whole[place.start :].view(place.dtype).as_strided(place.shape, place.strides)
+
+    return SignatureBatch(**fields).map(tensor)
+
+
+def _give_back(memory: mmap.mmap, process: int) -> None:
+    if os.getpid() == process:  # a forked child has a copy of the tensors, not the batch
+        memory[0] = 0
+
+
+ForkingPickler.register(SignatureBatch, _sent)
