@@ -6,6 +6,7 @@ worker keeps its blocks, and fills one anew when nothing in either process refer
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import weakref
@@ -32,11 +33,10 @@ class _Block:
         self.handle = os.memfd_create("igps-batch")
         os.ftruncate(self.handle, _ALIGNED + n_bytes)
         self.memory = mmap.mmap(self.handle, _ALIGNED + n_bytes)
-        self.lend()
+        self.start, self.n_bytes = self.lend().ctypes.data, n_bytes
 
     def lend(self) -> NDArray[np.uint8]:
         array = np.frombuffer(self.memory, np.uint8, offset=_ALIGNED)
-        self.start, self.n_bytes = array.ctypes.data, len(array)
         self._lent = weakref.ref(array)
         return array
 
@@ -67,7 +67,7 @@ def arrays(shapes: Sequence[tuple[int, ...]], kinds: Sequence[np.dtype[Any]]) ->
     if get_worker_info() is None or not hasattr(os, "memfd_create"):
         # NumPy asks for large pages, which come many times faster.
         return [np.empty(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)]
-    sizes = [int(np.prod(shape)) * kind.itemsize for shape, kind in zip(shapes, kinds, strict=True)]
+    sizes = [math.prod(shape) * kind.itemsize for shape, kind in zip(shapes, kinds, strict=True)]
     *starts, end = np.cumsum([0, *(-(-size // _ALIGNED) * _ALIGNED for size in sizes)]).tolist()
     whole = _block(end).lend()
     return [
@@ -77,17 +77,16 @@ def arrays(shapes: Sequence[tuple[int, ...]], kinds: Sequence[np.dtype[Any]]) ->
 
 
 def _block(n_bytes: int) -> _Block:
-    """The smallest free block of at least this size."""
-    free = sorted((block for block in _blocks if block.free), key=lambda block: block.n_bytes)
-    found = next((block for block in free if block.n_bytes >= n_bytes), None)
-    # Those too small go first: batches of an epoch are of about one size.
-    for block in [block for block in free if block is not found][: max(len(free) - _N_SPARE, int(found is None))]:
+    """A free block of at least this size."""
+    free = sorted((block for block in _blocks if block.free), key=lambda block: block.n_bytes, reverse=True)
+    fits = bool(free) and free[0].n_bytes >= n_bytes
+    for block in free[_N_SPARE:] if fits else free:
         _blocks.remove(block)
         block.close()
-    if found is None:
-        found = _Block(n_bytes)
-        _blocks.append(found)
-    return found
+    if fits:
+        return free[0]
+    _blocks.append(_Block(n_bytes))
+    return _blocks[-1]
 
 
 def _sent(batch: SignatureBatch) -> Any:
