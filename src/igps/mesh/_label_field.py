@@ -26,7 +26,7 @@ _BENDS, _WINDOW = (0.3, 0.5), 0.7
 # Weight of the distance to the voxels of the other side, beside that of the second derivatives.
 _NEARNESS = 0.01
 _RELAXATION = 1.4
-# Of the first solution, and of the second: half as many leave bumps on a ball that descriptors see.
+# Of the first solution, and of the second: with 15 and 10 a ball keeps bumps that descriptors see.
 _N_SWEEPS = 20
 # Voxels from the border within which the function is free.
 _BAND = 2
