@@ -86,7 +86,7 @@ def voxel_surface(
     share = np.pad(np.where(mask, np.maximum(share, 0.5), share), PAD)
     check_grid(share.size, name)
     sides = spacing * factor
-    field = smooth_field(share, sides, is_mask=bool((factor == 1).all()))
+    field = smooth_field(share, sides)
     # Into how many parts each side goes, so that the parts are about equal and make vertices enough.
     finer = min(max(math.ceil(math.sqrt(_FEWEST / _n_vertices(mask, sides))), 1), _MOST_REFINED)
     fineness = np.maximum(np.round(finer * sides / sides.min()), 1).astype(np.int64)
