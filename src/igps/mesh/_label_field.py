@@ -20,9 +20,11 @@ from igps._compiled import compiled
 # bodies allow), and weight of second derivatives: of smooth places and of edges. Those of smooth places leave round
 # bodies smooth, those of edges let faces run on to them.
 _MARGINS, _STIFFNESS = (0.05, 0.3), (1.0, 0.1)
-# The Laplacian of a first solution that tells smooth places, at most, from edges, at least, and the standard deviation
-# of its window, in voxels. A ball of eight voxels has a half; over long voxels edges are blunter.
-_BENDS, _WINDOW = (0.3, 0.5), 0.7
+# How much more than around it the Laplacian of a first solution is in smooth places, at most, and at edges, at least.
+# An edge bends more than the faces beside it; a thin round body bends everywhere.
+_BENDS = (0.05, 0.2)
+# Standard deviations of the windows of the Laplacian and of what is around, in voxels.
+_WINDOW, _WIDE_WINDOW = 0.7, 3.0
 # Weight of the distance to the voxels of the other side, beside that of the second derivatives.
 _NEARNESS = 0.01
 _RELAXATION = 1.4
@@ -66,8 +68,12 @@ def smooth_field(share: Floats, spacing: Floats) -> Floats:
         )  # fmt: skip
 
     relax(np.zeros_like(field))
+    # Over long voxels edges are blunter.
     bend = np.abs(ndimage.gaussian_filter(laplacian, _WINDOW, truncate=3)) * np.sqrt(sides.max())
-    relax(np.interp(bend, _BENDS, (0, 1)))
+    around, weight = (
+        ndimage.gaussian_filter(values, _WIDE_WINDOW, truncate=3) for values in (bend * border, border.astype(float))
+    )
+    relax(np.interp(bend - around / np.maximum(weight, 1e-3), _BENDS, (0, 1)))
     return field * scale
 
 
