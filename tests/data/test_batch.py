@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -303,6 +304,7 @@ def memory_of_worker(items: list[Signature]) -> int:
     return len(_handing_over._blocks)
 
 
+@pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="only Linux has memory that is a file without a name")
 def test_a_worker_does_not_gather_memory(signatures: list[Signature]) -> None:
     n_blocks = list(DataLoader(Several(signatures * 10), batch_size=2, num_workers=1, collate_fn=memory_of_worker))
     assert n_blocks == [1] * 15
