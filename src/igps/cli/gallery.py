@@ -18,8 +18,9 @@ from igps.signature.signature import SignatureConfig
 
 
 def build(
-    root: Path, out: Path, descriptor: str = "pretrained", size: Size = "auto", mirror: Mirror = "same", **reading: Any
-) -> None:
+    root: Path, out: Path, descriptor: str = "pretrained", size: Size = "auto", mirror: Mirror = "same",
+    n_workers: int | None = None, strict: bool = False, **reading: Any,
+) -> None:  # fmt: skip
     """Describe the bodies of a folder into a gallery, to be asked by igps query without their files.
 
     A gallery that is there keeps its state until the new one is complete, which then is a version of it.
@@ -29,10 +30,9 @@ def build(
     """
     descriptor = with_side(descriptor, mirror)
     chosen = descriptor_of(descriptor)
-    dataset, unread = signatures(Folder(root), [chosen], **reading)
+    dataset, unread = signatures(Folder(root), [chosen], n_workers=n_workers, strict=strict, **reading)
     descriptor = sized(descriptor, size, dataset)
-    how: dict[str, Any] = {"n_workers": reading.get("n_workers"), "strict": reading.get("strict", False)}
-    gallery, undescribed = Gallery.build(out, dataset, descriptor, progress=True, **how)
+    gallery, undescribed = Gallery.build(out, dataset, descriptor, n_workers=n_workers, strict=strict, progress=True)
     _print_state(gallery, [*unread, *undescribed])
 
 

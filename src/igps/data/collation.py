@@ -1,8 +1,5 @@
 """Signatures become a batch, padded to the longest."""
 
-from __future__ import annotations
-
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from igps.data._handing_over import arrays
+from igps.data._shared_memory import empty_arrays
 from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature
@@ -46,7 +43,8 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
         raise ValueError(f"meshes: expected one for each of {len(items)} signatures, got {len(meshes)}.")
     labelled = [one if isinstance(one, LabelledSignature) else LabelledSignature(one, -1, one.name) for one in items]
     signatures = [item.signature for item in labelled]
-    wanted: list[list[Any]] = [[np.asarray(s.eigenvalues, dtype=np.float64) for s in signatures]]
+    n_most = max(len(s.eigenvalues) for s in signatures)
+    wanted: list[list[Any]] = [[_lengthened(s.eigenvalues, n_most) for s in signatures]]
     wanted += [[np.float64(getattr(s, name)) for s in signatures] for name in ("area", "volume")]
     wanted.append([np.int64(item.label) for item in labelled])
     rooms = [[s.interior for s in signatures], [s.surface for s in signatures]]
@@ -61,6 +59,13 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
     ids, units = tuple(item.id for item in labelled), tuple(s.unit for s in signatures)
     given = None if meshes is None else tuple(meshes)
     return SignatureBatch(eigenvalues, interior, surface, area, volume, labels, ids, given, units)
+
+
+def _lengthened(eigenvalues: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    """(n,) of eigenvalues (K,): infinite behind the last, so that every spectral weight is zero there."""
+    found = np.full(n, np.inf)
+    found[: len(eigenvalues)] = eigenvalues
+    return found
 
 
 def _of_samples(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:
@@ -81,19 +86,15 @@ def _of_samples(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:
 
 
 def _padded(wanted: Sequence[Sequence[Any]]) -> list[Tensor]:
-    """Of each list of N arrays an (N, ...) tensor, padded to the largest size along each dimension.
-
-    Double precision, which only eigenvalues have, is padded by infinity, all else by zero.
-    """
+    """Of each list of N arrays an (N, ...) tensor, padded by zeros to the largest size along each dimension."""
     shapes = [(len(some), *map(max, zip(*(one.shape for one in some), strict=True))) for some in wanted]
-    padded = arrays(shapes, [some[0].dtype for some in wanted])
+    padded = empty_arrays(shapes, [some[0].dtype for some in wanted])
     for some, filled in zip(wanted, padded, strict=True):
-        padding = math.inf if filled.dtype == np.float64 else 0
         for i, one in enumerate(some):
             if one.shape[1:] != filled.shape[2:]:
-                filled[i] = padding
+                filled[i] = 0
             where: tuple[Any, ...] = (i, *map(slice, one.shape))
             filled[where] = one
             if filled.ndim > 1:
-                filled[i, len(one) :] = padding
+                filled[i, len(one) :] = 0
     return [torch.from_numpy(filled) for filled in padded]

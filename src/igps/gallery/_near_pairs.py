@@ -1,7 +1,5 @@
 """Pairs of bodies that are near by their descriptions, among all or in a gallery, and how far they are."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """The folders that `igps index` wrote, read once to become galleries."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ ranked by the distance of the descriptions themselves; of few bodies all are com
 what a killed process leaves behind belongs to no version.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

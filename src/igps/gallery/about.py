@@ -1,7 +1,5 @@
 """What a gallery records: of each body, and of how its descriptions were made, which others are compared by."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """What distances mean: how far apart pairs of generated bodies are, by how much they have in common."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass

@@ -5,8 +5,6 @@ Two surfaces are laid onto each other, which tells the same shape from another p
 gallery, whose descriptions are near. And no file joins two that are not the same as each other.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import islice

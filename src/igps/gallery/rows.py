@@ -1,7 +1,5 @@
 """Bodies become rows of a gallery: described, and with what is known of them."""
 
-from __future__ import annotations
-
 import io
 import math
 import os

@@ -6,8 +6,6 @@ explains: about as far as the coarser of the two is from itself with every verte
 same.
 """
 
-from __future__ import annotations
-
 import contextlib
 import filecmp
 import math

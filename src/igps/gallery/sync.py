@@ -1,7 +1,5 @@
 """A gallery brought up to a folder, in the time that the changes take."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -4,11 +4,10 @@ Voxels tell where a body is by their centres, or by the share of each that it fi
 with that, one is taken that bends little: no stairs are left, since the zero level is free between the last voxels
 inside and the first outside; and nothing thin is lost, since no voxel changes sides. (Whitaker 2000 and Gibson 1998
 hold surfaces by the same constraint; Lempitsky 2010 takes second derivatives, which shrink nothing, in place of area.)
-Where it bends much, it is solved again with less weight on bending, as at the creases of Blake and Zisserman 1987.
+Where it bends more than around, at edges, it is solved again with less weight on bending (creases: Blake and
+Zisserman 1987).
 The level is moved as a whole to give the voxels' volume: if it were moved nearby, that would write their stairs back.
 """
-
-from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage

@@ -6,8 +6,6 @@ interpolated by cubic splines along the long sides of the voxels, marching cubes
 and Heckbert 1997) leave as many vertices as are wanted, and the volume is made that of the voxels.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,10 +1,8 @@
-"""Batches go from a worker process of a DataLoader to its consumer in memory that both see, and that is used again.
+"""Shared memory in which worker processes of a DataLoader hand batches over, and which they use again.
 
 New shared memory costs several times the copy of a batch into it, as the system has to find and clear its pages. So a
 worker keeps its blocks, and fills one anew when nothing in either process refers to it any more.
 """
-
-from __future__ import annotations
 
 import math
 import mmap
@@ -62,7 +60,7 @@ class _Place(NamedTuple):
 _blocks: list[_Block] = []
 
 
-def arrays(shapes: Sequence[tuple[int, ...]], kinds: Sequence[np.dtype[Any]]) -> list[NDArray[Any]]:
+def empty_arrays(shapes: Sequence[tuple[int, ...]], kinds: Sequence[np.dtype[Any]]) -> list[NDArray[Any]]:
     """Empty arrays of these shapes and types; in a worker process, where the system can, in one block to hand over."""
     if get_worker_info() is None or not hasattr(os, "memfd_create"):
         # NumPy asks for large pages, which come many times faster.
@@ -89,8 +87,8 @@ def _block(n_bytes: int) -> _Block:
     return _blocks[-1]
 
 
-def _sent(batch: SignatureBatch) -> Any:
-    """What a batch is pickled as for another process."""
+def _reduced(batch: SignatureBatch) -> Any:
+    """A batch as its block and where its tensors lie in it; as usual if it lies in none, or was sent before."""
     at = batch.labels.data_ptr()
     block = next((one for one in _blocks if one.start <= at < one.start + one.n_bytes and not one.memory[0]), None)
     if block is None:
@@ -103,16 +101,16 @@ def _sent(batch: SignatureBatch) -> Any:
         return values
 
     block.memory[0] = 1
-    return _received, (DupFd(block.handle), _ALIGNED + block.n_bytes, vars(batch.map(place)))
+    return _rebuilt, (DupFd(block.handle), _ALIGNED + block.n_bytes, vars(batch.map(place)))
 
 
-def _received(handle: Any, n_bytes: int, fields: dict[str, Any]) -> SignatureBatch:
+def _rebuilt(handle: Any, n_bytes: int, fields: dict[str, Any]) -> SignatureBatch:
     """The batch in the consumer's process; its worker has the memory back when the last of its tensors goes."""
     descriptor = handle.detach()
     memory = mmap.mmap(descriptor, n_bytes)
     os.close(descriptor)
     array = np.frombuffer(memory, np.uint8, offset=_ALIGNED)
-    weakref.finalize(array, _give_back, memory, os.getpid()).atexit = False
+    weakref.finalize(array, _release, memory, os.getpid()).atexit = False
     whole = torch.from_numpy(array)
 
     def tensor(place: Any) -> Tensor:
@@ -123,9 +121,9 @@ def _received(handle: Any, n_bytes: int, fields: dict[str, Any]) -> SignatureBat
     return SignatureBatch(**fields).map(tensor)
 
 
-def _give_back(memory: mmap.mmap, process: int) -> None:
+def _release(memory: mmap.mmap, process: int) -> None:
     if os.getpid() == process:  # a forked child has a copy of the tensors, not the batch
         memory[0] = 0
 
 
-ForkingPickler.register(SignatureBatch, _sent)
+ForkingPickler.register(SignatureBatch, _reduced)
