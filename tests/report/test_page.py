@@ -101,7 +101,7 @@ def test_names_from_files_are_harmless_everywhere(page: str) -> None:
     seen = Elements(page)
     tags = {tag for tag, _ in seen.elements}
     assert not {"img", "b", "i", "iframe"} & tags
-    assert sum(tag == "script" for tag, _ in seen.elements) == 7  # numbers, surfaces, three.js, and four of ours
+    assert sum(tag == "script" for tag, _ in seen.elements) == 8  # numbers, surfaces, three.js, and five of ours
     assert not any(name.startswith("on") for _, attributes in seen.elements for name in attributes)
     for told in (*NAMES, EVIL, NOTE, "bad<b>.off: it is open."):
         assert told in seen.text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -178,7 +179,9 @@ def places_on_the_map(visit: Visit) -> np.ndarray:
 
 
 def selected(visit: Visit) -> set[int]:
-    return {int(one.get_attribute("data-point")) for one in visit.page.locator('[aria-selected="true"]').all()}
+    return {
+        int(one.get_attribute("data-point")) for one in visit.page.locator('[data-point][aria-selected="true"]').all()
+    }
 
 
 def test_the_map_has_the_places_of_the_distances_and_tells_the_one_under_the_mouse(answers: Visit) -> None:
@@ -253,6 +256,52 @@ def test_the_map_is_walked_through_by_the_keyboard(answers: Visit) -> None:
     page.keyboard.press("Escape")
     answers.wait_until(lambda: page.locator("dialog[open]").count() == 0)
     assert here() == last
+
+
+def test_the_tree_joins_what_is_near_and_selects_what_lies_under_a_branch(answers: Visit) -> None:
+    page, distances = answers.page, np.asarray(distances_of(0), dtype=float)
+    distances = (distances + distances.T) / 2
+    groups, expected = {frozenset([i]) for i in range(len(NAMES))}, []
+    while len(groups) > 1:  # by hand: the two groups that are nearest in the mean
+        apart = {pair: distances[np.ix_(*map(sorted, pair))].mean() for pair in itertools.combinations(groups, 2)}
+        one, other = min(apart, key=lambda pair: apart[pair])
+        groups = groups - {one, other} | {one | other}
+        expected.append((one | other, apart[one, other]))
+    page.locator("#tree-plot").scroll_into_view_if_needed()
+    branches = page.locator("#tree-plot .branch").all()[::-1]
+    assert len(branches) == len(expected)
+    for branch, (members, distance) in zip(branches, expected, strict=True):
+        branch.focus()
+        page.keyboard.press("Enter")
+        assert selected(answers) == members
+        assert branch.get_attribute("aria-selected") == "true"
+        assert f"distance {distance:.3g}" in str(branch.get_attribute("aria-label"))
+        faint = {int(one.get_attribute("data-leaf")) for one in page.locator("#tree-plot .faint").all()}
+        assert faint == set(range(len(NAMES))) - members
+    lowest, (pair, _) = branches[0], expected[0]
+    box = lowest.bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    assert selected(answers) == pair
+    walked = [lowest.get_attribute("aria-label")]
+    while page.evaluate("document.activeElement.getAttribute('aria-label')") != branches[-1].get_attribute(
+        "aria-label"
+    ):
+        page.keyboard.press("ArrowUp")
+        walked.append(page.evaluate("document.activeElement.getAttribute('aria-label')"))
+    assert walked == [
+        one.get_attribute("aria-label") for one, (members, _) in zip(branches, expected, strict=True) if members >= pair
+    ]
+    page.keyboard.press("Escape")
+    assert selected(answers) == set()
+
+
+def test_leaves_of_the_tree_have_the_colours_of_the_map(answers: Visit) -> None:
+    for colour in ("class", "cluster", "column dose"):
+        answers.page.locator("#map-colour").select_option(colour)
+        for i in range(len(NAMES)):
+            point, leaf = (answers.page.locator(f'[data-{kind}="{i}"]') for kind in ("point", "leaf"))
+            filled = [one.evaluate("(mark) => getComputedStyle(mark).fill") for one in (point, leaf)]
+            assert filled[0] == filled[1] != "rgb(0, 0, 0)"
 
 
 @pytest.mark.parametrize(

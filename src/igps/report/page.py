@@ -15,7 +15,7 @@ from igps.report.surfaces import Surface
 from igps.report.tables import TITLES
 
 _TEMPLATE = files("igps.report") / "template"
-_SCRIPTS = ("three.min.js", "bodies.js", "tables.js", "map.js", "page.js")
+_SCRIPTS = ("three.min.js", "bodies.js", "tables.js", "map.js", "tree.js", "page.js")
 N_OUTLIERS = 50
 """How many of the most unlike bodies the page lists."""
 # Inside the axes of the plot of precision and recall, in units of its drawing.

@@ -115,7 +115,8 @@ def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str],
 
 
 def _map(system: System) -> dict[str, Any] | None:
-    """Where the shapes lie, (N, 2) `points` and the `stress`; the `cluster` of each, and the `stability` of these."""
+    """Where the shapes lie, (N, 2) `points` and the `stress`; the `cluster` of each, the `stability` of these, and the
+    `tree`: of each joining, the lowest first, two branches and their distance; rows come before joinings."""
     distances = system.distances.double().numpy()
     if not _LEAST_MAPPED <= len(distances) <= _MOST_MAPPED or not np.isfinite(distances).all():
         return None
@@ -126,6 +127,7 @@ def _map(system: System) -> dict[str, Any] | None:
         "stress": round(found.stress, 3),
         "cluster": clusters.numbers.tolist(),
         "stability": _numbers(list(clusters.stability)),
+        "tree": [[int(one), int(other), _significant(height)] for one, other, height, _ in clusters.tree.tolist()],
     }
 
 

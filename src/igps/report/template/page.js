@@ -12,6 +12,7 @@ let turntable = null; // made when the first body is opened
 let system = 0;
 let current = null; // the shape in the window
 const MOST_SELECTED = 120; // pictures beside the map
+const STABLE = 0.75; // as `igps.analysis.clusters` has it
 let opener = null; // the picture that opened the window, if it is not on the wall
 
 for (const one of systems) {
@@ -190,18 +191,40 @@ const bodyMap = byId("map")
       changed: (selected) => {
         byId("map-chosen").textContent = selected.length ? `${selected.length} selected` : "";
         byId("map-selected").replaceChildren(...selected.slice(0, MOST_SELECTED).map((shape) => element("li", {}, picture(shape))));
+        tree.mark(new Set(selected));
       },
     })
   : null;
 
+const tree = bodyMap
+  ? new ClusterTree(byId("tree-plot"), {
+      told: (selected, height) => {
+        const { map, row } = systems[system];
+        const numbers = new Set(selected.map((shape) => map.cluster[row.get(shape)]));
+        const [number] = numbers;
+        const isCluster = numbers.size === 1 && map.cluster.filter((one) => one === number).length === selected.length;
+        const parts = [`${selected.length} shapes`, `distance ${Number(height.toPrecision(3))}`];
+        return [...parts, ...(isCluster ? [`cluster ${number + 1}${stabilityOf(number)}`] : [])].join(", ");
+      },
+      select: (selected) => bodyMap.select(selected),
+    })
+  : null;
+
+function stabilityOf(cluster) {
+  const stability = systems[system].map.stability[cluster];
+  return stability === null ? "" : `, stability ${stability.toFixed(2)}`;
+}
+
 function showMap() {
   if (!bodyMap) return;
   const one = systems[system];
-  const { points, stress } = one.map ?? { points: [] };
-  byId("map-plot").toggleAttribute("hidden", !one.map);
+  const { points, stress, tree: joinings, stability } = one.map ?? { points: [], tree: [] };
+  for (const name of ["map-plot", "tree-plot"]) byId(name).toggleAttribute("hidden", !one.map);
   byId("map-stress").textContent = one.map
     ? `Its stress is ${stress.toFixed(2)}: 0 would tell every distance, above 0.2 much is distorted.`
     : "There is no map of these shapes.";
+  byId("tree-told").textContent = one.map ? `${stability.filter((share) => share >= STABLE).length} of ${stability.length} clusters are stable.` : "";
+  tree.show(one.map ? one.shapes : [], joinings);
   bodyMap.show(points.map(([x, y], row) => ({ shape: one.shapes[row], x, y })));
   colourMap();
 }
@@ -214,12 +237,12 @@ function colourMap() {
     if (kind === "cluster") return one.map?.cluster[one.row.get(i)] ?? null;
     return kind === "volume" ? (shape.mesh?.[3] ?? null) : data.columns[kind.slice("column ".length)][i];
   });
-  const stability = (place) => (one.map.stability[place] === null ? "" : `, stability ${one.map.stability[place].toFixed(2)}`);
   const titles = {
-    cluster: (value) => (value === null ? "" : `cluster ${value + 1}${stability(value)}`),
+    cluster: (value) => (value === null ? "" : `cluster ${value + 1}${stabilityOf(value)}`),
     volume: (value) => (value === null ? "" : `volume ${value}`),
   };
   bodyMap.colour(values, titles[kind] ?? ((value) => value ?? ""));
+  tree.colour(new Map(bodyMap.points.map(({ shape, mark }) => [shape, mark])));
 }
 
 // A shape and its nearest, painted from two sides.
