@@ -55,59 +55,74 @@ def rerank_graph(
             f"found, mean: expected at least {n_near} neighbours of each shape and a mean above 0, got {m} and {mean}."
         )
     n_pairs, half = n * (n - 1), max(1, round(n_neighbours / 2))
-    own = _symmetric(lists, given)
-    apart = own.data / mean
+    graph = _symmetric(lists, given)
+    apart = graph.data / mean
     if diffusion:
-        scale = np.maximum(given[:, :half].mean(axis=1), _TINY)
-        ends = lists[:, :half]
-        tied = _symmetric(ends, np.exp(-np.square(given[:, :half]) / np.maximum(scale[:, None] * scale[ends], _TINY)))
-        degree = sparse.diags_array(1 / np.sqrt(np.maximum(tied.sum(axis=1), _TINY)))
-        steps = sparse.csr_array(diffusion * (degree @ tied @ degree))
-        inside = np.column_stack([np.arange(n), lists])
-        if m == n - 1 < MOST_WHOLE:
-            alike = np.take_along_axis(np.linalg.inv(np.eye(n) - steps.toarray()), inside, axis=1)
-        else:
-            alike = np.zeros((n, m + 1))
-            walks(inside, steps.indptr, steps.indices, steps.data, _ROUNDS, alike)
-        length = 1 / np.sqrt(alike[:, 0])
-        alike = (1 - length[:, None] * alike[:, 1:] * length[lists]).clip(0)
-        walked = _symmetric(lists, alike).data
-        average = 1 - (own.nnz - walked.sum()) / n_pairs  # of those in no list, it is 1
-        apart = (1 - share) * walked / max(average, _TINY) + share * own.data / mean
-        del alike, tied, steps, walked
+        walked = _symmetric(lists, _diffused(lists, given, half, diffusion)).data
+        average = 1 - (graph.nnz - walked.sum()) / n_pairs  # of those in no list, it is 1
+        apart = (1 - share) * walked / max(average, _TINY) + share * apart
+        del walked
     before = apart.sum()
     if diffusion and keep_nearest:
-        apart = _brought_forward(apart, own, lists[:, 0])
-    order = np.empty((n, n_near + 1), dtype=np.int64)
-    nearest_of_rows(own.indptr, own.indices, apart, order)
-    neighbours = _binary(order[:, : n_neighbours + 1])
-    members = neighbours.multiply(neighbours.T).tocsr()
-    halves = _binary(order[:, : half + 1])
-    halves = halves.multiply(halves.T).tocsr()
+        apart = _brought_forward(apart, graph, lists[:, 0])
+    average = 1 + (apart.sum() - before) / n_pairs
+    weights = _neighbourhoods(apart, graph, n_neighbours, half, n_expanded)
+    anew = (1 - share) * _jaccard(weights, graph, progress) + share * apart / average
+    if keep_nearest:
+        anew = _brought_forward(anew, graph, lists[:, 0])
+    ranked = _values(anew, graph, np.repeat(np.arange(n), m), lists.ravel()).reshape(n, m)
+    best = np.argsort(ranked, axis=1, kind="stable")
+    return SearchResult(*(torch.from_numpy(np.take_along_axis(one, best, axis=1)) for one in (lists, ranked)))
+
+
+def _diffused(lists: Integers, given: Floats, half: int, diffusion: float) -> Floats:
+    """Distances (N, M) of each shape to its list: one minus the scaled sums over the walks between them."""
+    n, m = lists.shape
+    scale = np.maximum(given[:, :half].mean(axis=1), _TINY)
+    ends = lists[:, :half]
+    tied = _symmetric(ends, np.exp(-np.square(given[:, :half]) / np.maximum(scale[:, None] * scale[ends], _TINY)))
+    degree = sparse.diags_array(1 / np.sqrt(np.maximum(tied.sum(axis=1), _TINY)))
+    steps = sparse.csr_array(diffusion * (degree @ tied @ degree))
+    inside = np.column_stack([np.arange(n), lists])
+    if m == n - 1 < MOST_WHOLE:
+        alike = np.take_along_axis(np.linalg.inv(np.eye(n) - steps.toarray()), inside, axis=1)
+    else:
+        alike = np.zeros((n, m + 1))
+        walks(inside, steps.indptr, steps.indices, steps.data, _ROUNDS, alike)
+    length = 1 / np.sqrt(alike[:, 0])
+    return (1 - length[:, None] * alike[:, 1:] * length[lists]).clip(0)
+
+
+def _neighbourhoods(
+    apart: Floats, graph: sparse.csr_array, n_neighbours: int, half: int, n_expanded: int
+) -> sparse.csr_array:
+    """(N, N) weights of the members of each shape's neighbourhood, averaged over its nearest; rows add up to 1."""
+    n = graph.shape[0]
+    order = np.empty((n, max(n_neighbours, n_expanded - 1) + 1), dtype=np.int64)
+    nearest_of_rows(graph.indptr, graph.indices, apart, order)
+    members, halves = (_reciprocal(order[:, : k + 1]) for k in (n_neighbours, half))
     joins = sparse.csr_array(members @ halves.T).multiply(members).tocsr()
     joins.data = (2 / 3 * halves.sum(axis=1)[joins.indices] <= joins.data).astype(np.float64)
     of, to = (members + joins @ halves).nonzero()
     nearest = order[:, 1 : n_neighbours + 1]
-    near = _values(apart, own, np.repeat(np.arange(n), n_neighbours), nearest.ravel()).reshape(n, -1).mean(axis=1)
-    weight = np.exp(-np.where(of == to, 0.0, _values(apart, own, of, to)) / np.maximum(near, _TINY)[of])
+    near = _values(apart, graph, np.repeat(np.arange(n), n_neighbours), nearest.ravel()).reshape(n, -1).mean(axis=1)
+    weight = np.exp(-np.where(of == to, 0.0, _values(apart, graph, of, to)) / np.maximum(near, _TINY)[of])
     weights = sparse.csr_array((weight, (of, to)), shape=(n, n))
     weights = _binary(order[:, :n_expanded]) @ sparse.diags_array(1 / (n_expanded * weights.sum(axis=1))) @ weights
     weights = sparse.csr_array(weights)
     weights.sort_indices()
-    smaller = np.zeros(own.nnz)
+    return weights
+
+
+def _jaccard(weights: sparse.csr_array, graph: sparse.csr_array, progress: bool) -> Floats:
+    """Distances of the pairs of a graph, 0 to 1, by the share of weights that their neighbourhoods have in common."""
+    n, smaller = graph.shape[0], np.zeros(graph.nnz)
     with tqdm(total=n, desc="re-ranked", disable=not progress) as bar:
         for first in range(0, n, _AT_ONCE):
             rows = first, min(first + _AT_ONCE, n)
-            common(rows, own.indptr, own.indices, weights.indptr, weights.indices, weights.data, smaller)
+            common(rows, graph.indptr, graph.indices, weights.indptr, weights.indices, weights.data, smaller)
             bar.update(rows[1] - first)
-    average = 1 + (apart.sum() - before) / n_pairs
-    anew = (1 - share) * (1 - smaller / (2 - smaller)).clip(0) + share * apart / average
-    del apart, smaller
-    if keep_nearest:
-        anew = _brought_forward(anew, own, lists[:, 0])
-    ranked = _values(anew, own, np.repeat(np.arange(n), m), lists.ravel()).reshape(n, m)
-    best = np.argsort(ranked, axis=1, kind="stable")
-    return SearchResult(*(torch.from_numpy(np.take_along_axis(one, best, axis=1)) for one in (lists, ranked)))
+    return (1 - smaller / (2 - smaller)).clip(0)
 
 
 def _symmetric(lists: Integers, values: Floats) -> sparse.csr_array:
@@ -128,6 +143,12 @@ def _binary(lists: Integers) -> sparse.csr_array:
     return sparse.csr_array((np.ones(n * m), (np.repeat(np.arange(n), m), lists.ravel())), shape=(n, n))
 
 
+def _reciprocal(lists: Integers) -> sparse.csr_array:
+    """Ones of the pairs of which each lies in the other's list."""
+    ones = _binary(lists)
+    return ones.multiply(ones.T).tocsr()
+
+
 def _values(values: Floats, graph: sparse.csr_array, rows: Integers, columns: Integers) -> Floats:
     """Those of pairs of a graph, by place; infinite of others."""
     found = np.full(len(rows), np.inf)
@@ -135,13 +156,13 @@ def _values(values: Floats, graph: sparse.csr_array, rows: Integers, columns: In
     return found
 
 
-def _brought_forward(values: Floats, own: sparse.csr_array, nearest: Integers) -> Floats:
+def _brought_forward(values: Floats, graph: sparse.csr_array, nearest: Integers) -> Floats:
     """The values of pairs, with those of which one is the other's nearest before all others, in their own order."""
-    nearest = nearest.astype(own.indices.dtype)
-    rows = np.repeat(np.arange(own.shape[0], dtype=nearest.dtype), np.diff(own.indptr))
-    first = (nearest[rows] == own.indices) | (nearest[own.indices] == rows)
+    nearest = nearest.astype(graph.indices.dtype)
+    rows = np.repeat(np.arange(graph.shape[0], dtype=nearest.dtype), np.diff(graph.indptr))
+    first = (nearest[rows] == graph.indices) | (nearest[graph.indices] == rows)
     least = values.min(where=~first & (values > 0), initial=np.inf)
-    found, forward = values.copy(), own.data[first]
+    found, forward = values.copy(), graph.data[first]
     # half of the least, so that single precision leaves no tie
     found[first] = 0.5 * (least if np.isfinite(least) else 1.0) * forward / max(forward.max(), _TINY)
     return found
