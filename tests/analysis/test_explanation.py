@@ -99,6 +99,51 @@ def test_shares_of_a_squared_euclidean_distance_are_products(batches: list[Signa
     assert distance == pytest.approx(float(shares.sum()))
 
 
+@pytest.mark.parametrize("name", ["pretrained", "whitened"])
+def test_shares_behind_a_head_are_those_of_small_steps(name: str, batches: list[SignatureBatch]) -> None:
+    """Along the line on which the roots come apart, the distance grows step by step: in one cell alone, by differences.
+
+    The cells that differ most, and one that differs little.
+    """
+    chosen = described_by(name).double().eval()
+    assert isinstance(chosen, EmbeddedDescriptor)
+    cells = torch.stack([chosen.descriptor(batch).detach().flatten().double() for batch in batches])
+    units, _ = unit_shares(chosen, *cells)
+    roots = cells.sqrt()
+    middle, half = roots.mean(dim=0), (roots[0] - roots[1]) / 2
+    order = half.abs().argsort(descending=True)
+    for cell in order[[0, 1, 2, 5, 20, 50]].tolist():
+        step = torch.zeros_like(half)
+        step[cell] = 1e-4 * half[cell]
+        share = 0.0
+        for along in (torch.arange(100) + 0.5) / 100:
+            ends = torch.stack([middle + along * half, middle - along * half])
+            moved = torch.stack([ends[0] + step, ends[1] - step, ends[0] - step, ends[1] + step])
+            with torch.no_grad():
+                vectors = chosen.head(moved.square())
+                apart = chosen.distances(vectors[[0, 2]], vectors[[1, 3]]).diagonal()
+            share += float(apart[0] - apart[1]) / 2e-4 / 100
+        found = float(units[cell] * (cells[0, cell] - cells[1, cell]))
+        assert found == pytest.approx(share, rel=0.02, abs=1e-8)
+        assert share != 0
+
+
+def test_what_a_sample_has_is_what_more_of_it_changes(batches: list[SignatureBatch]) -> None:
+    """Of one histogram: the derivative by the weight of a sample, over the two samples of a pair, by differences."""
+    chosen = descriptor("interior")
+    found = explain(chosen, *batches)
+    units, _ = unit_shares(chosen, *(chosen(batch).detach().flatten().double() for batch in batches))
+    samples = batches[0].interior
+    for i in (0, 17, len(samples.points[0]) - 1):
+        changed = []
+        for weight in (0.5, 1.5):
+            weights = torch.ones_like(samples.points[..., 0])
+            weights[0, i] = weight
+            heavier = replace(samples, attributes={**samples.attributes, "weight": weights})
+            changed.append(chosen(replace(batches[0], interior=heavier)).double().flatten() @ units)
+        assert found.samples[0]["interior"][i] == pytest.approx(float(changed[1] - changed[0]) / 2, rel=0.02)
+
+
 @pytest.mark.parametrize("name", ["interior", "rich"])
 def test_a_bump_is_painted_where_it_is(name: str, signatures: list[Signature], batches: list[SignatureBatch]) -> None:
     found = explain(descriptor(name), *batches)
