@@ -121,12 +121,12 @@ def on_threads(
         yield from pool.map(alone, jobs)
 
 
-def is_machines(error: OSError) -> bool:
+def is_machine_error(error: OSError) -> bool:
     """Whether an error tells of the machine and not of a file: no room, no right to write, a broken disk."""
     return error.errno in _MACHINES
 
 
-def machines_words(error: OSError) -> str:
+def machine_error_text(error: OSError) -> str:
     """What to do about it."""
     remedy = "Choose a folder that can be written" if error.errno in _FORBIDDEN else "Make room"
     return f"{error}. {remedy} and run again: what is done is kept."
@@ -145,8 +145,8 @@ def attempt(result: Callable[[], Result], limits: Limits = Limits()) -> Result |
     except ImportError as error:
         raise MachineError(f"{str(error).rstrip('.')}. Install it and run again: what is done is kept.") from error
     except OSError as error:
-        if is_machines(error):
-            raise MachineError(machines_words(error)) from error
+        if is_machine_error(error):
+            raise MachineError(machine_error_text(error)) from error
         return Failed(_sentence(error))
     except Exception as error:
         # Dask raises it after several workers died with the same job.

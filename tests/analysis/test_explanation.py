@@ -11,7 +11,7 @@ import trimesh
 from sklearn.metrics import roc_auc_score
 
 from conftest import as_mesh
-from igps.analysis.explanation import explain, explain_groups, held, on_surface, unit_shares
+from igps.analysis.explanation import explain, explain_groups, on_surface, significant_cells, unit_shares
 from igps.data.batch import SignatureBatch
 from igps.data.collation import collate
 from igps.descriptors import descriptor
@@ -64,7 +64,7 @@ def test_all_shares_add_up_to_the_distance(name: str, batches: list[SignatureBat
     by_place = np.concatenate([values for of_body in found.places or () for values in of_body.values()])
     assert by_place.sum() == pytest.approx(found.distance, rel=1e-6)
     assert by_place.min() >= 0
-    assert "%" in found.told()
+    assert "%" in found.summary()
 
 
 def test_shares_of_chi_square_are_those_of_a_loop_over_all_pairs(batches: list[SignatureBatch]) -> None:
@@ -177,7 +177,7 @@ def test_bodies_that_are_alike_have_nothing_to_share(batches: list[SignatureBatc
     found = explain(descriptor("interior"), batches[0], batches[0])
     assert found.distance == 0
     assert not any(values.any() for of_body in found.samples for values in of_body.values())
-    assert found.told() == "no difference"
+    assert found.summary() == "no difference"
 
 
 def test_what_knows_no_samples_is_refused(batches: list[SignatureBatch]) -> None:
@@ -188,12 +188,13 @@ def test_what_knows_no_samples_is_refused(batches: list[SignatureBatch]) -> None
 def test_chance_holds_no_cell_but_one_time_in_twenty() -> None:
     random = torch.Generator().manual_seed(0)
     any_held = [
-        bool(held(*torch.rand(2, 12, 30, generator=random), n_permutations=99, seed=i).any()) for i in range(400)
+        bool(significant_cells(*torch.rand(2, 12, 30, generator=random), n_permutations=99, seed=i).any())
+        for i in range(400)
     ]
     assert 0.02 <= np.mean(any_held) <= 0.08
     rows = torch.rand(2, 12, 30, generator=random)
     rows[1, :, 7] += 2
-    assert held(*rows, n_permutations=999).nonzero().flatten().tolist() == [7]
+    assert significant_cells(*rows, n_permutations=999).nonzero().flatten().tolist() == [7]
 
 
 def test_groups_are_explained_by_the_cells_that_are_held(batches: list[SignatureBatch]) -> None:

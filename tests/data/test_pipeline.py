@@ -36,7 +36,7 @@ def pipeline(tmp_path: Path) -> SignaturePipeline:
 
 def is_cached(pipeline: SignaturePipeline, body: BodyRef) -> bool:
     try:
-        return pipeline.served([body]) != [None]
+        return pipeline.lookup([body]) != [None]
     except MeshError:
         return False
 
@@ -62,7 +62,7 @@ def test_fill_caches_and_returns_only_what_serves(pipeline: SignaturePipeline, p
     filled = pipeline.fill([BodyRef(path)])
     assert len(pickle.dumps(filled)) < 1000
     assert is_cached(pipeline, BodyRef(path))
-    assert pipeline.served([BodyRef(path)]) == filled == pipeline.fill([BodyRef(path)])
+    assert pipeline.lookup([BodyRef(path)]) == filled == pipeline.fill([BodyRef(path)])
 
 
 def test_a_worker_gets_a_small_copy(pipeline: SignaturePipeline, path: Path) -> None:
@@ -146,7 +146,7 @@ def test_a_mended_body_of_before_versions_of_the_mending_is_made_again(tmp_path:
 
 
 USUAL = replace(CONFIG, n_eigenpairs=None)
-NEEDED = USUAL.needing(50)
+NEEDED = USUAL.with_eigenpairs(50)
 
 
 @pytest.fixture

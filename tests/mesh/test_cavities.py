@@ -12,7 +12,7 @@ import trimesh
 from igps import LoadOptions, Mesh, MeshError, SignatureConfig, collate, compute_signature, descriptor, load_mesh
 from igps.descriptors.interior import interior
 from igps.mesh.label_surface import voxel_surface
-from igps.mesh.mending import mend, mended_by
+from igps.mesh.mending import mend, repair_steps
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import signed_volume
 from igps.signature.voxels import interior_samples
@@ -56,7 +56,7 @@ def test_a_hidden_part_that_is_turned_outwards_is_turned_for_a_cavity_and_kept_o
         "turned the surface of a cavity towards the inside",
         "dropped 1 parts hidden inside",
     )
-    assert mended_by(hollow.notes) == ("welded",)
+    assert repair_steps(hollow.notes) == ("welded",)
 
 
 def test_loose_triangles_are_welded_before() -> None:

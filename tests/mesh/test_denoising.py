@@ -10,7 +10,7 @@ from training.studies.disturbances import noise
 
 from igps.mesh import denoising
 from igps.mesh.denoising import denoised, is_noisy, noise_over_edge
-from igps.mesh.mending import mend, mended_by
+from igps.mesh.mending import mend, repair_steps
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import area_vectors
 
@@ -225,6 +225,6 @@ def test_boundaries_stay(sphere: Mesh) -> None:
 def test_mending_smooths_noise_only(sphere: Mesh) -> None:
     noisy = noise(sphere, 0.004, 1)
     mesh = mend(noisy.vertices, noisy.faces)
-    assert mended_by(mesh.notes) == ("smoothed",)
+    assert repair_steps(mesh.notes) == ("smoothed",)
     np.testing.assert_array_equal(mesh.faces, sphere.faces)
     np.testing.assert_array_equal(mesh.vertices, denoised(noisy.vertices, noisy.faces))

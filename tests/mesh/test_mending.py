@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from training.studies.damages import DAMAGES, halves, holes
 
 from igps.mesh._tidying import welded, with_small_holes_filled
-from igps.mesh.mending import mend, mended_by
+from igps.mesh.mending import mend, repair_steps
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.simplification import subdivided
 from igps.mesh.surface import area_vectors
@@ -47,19 +47,19 @@ def test_a_body_is_left_as_it_is(blob: Mesh) -> None:
     np.testing.assert_array_equal(mesh.vertices, blob.vertices)
     np.testing.assert_array_equal(mesh.faces, blob.faces)
     assert mesh.notes == ()
-    assert mended_by(mesh.notes) == ()
+    assert repair_steps(mesh.notes) == ()
 
 
 @pytest.mark.parametrize("name", ["soup", "turned", "fins", "parts"])
 def test_welding_and_dropping_gives_the_very_surface(blob: Mesh, name: str) -> None:
     mesh = mend(*DAMAGES[name].apply(blob, 3))
-    assert mended_by(mesh.notes) == ("welded",)
+    assert repair_steps(mesh.notes) == ("welded",)
     assert same_surface(mesh, blob)
 
 
 def test_holes_are_filled_where_the_surface_was(sphere: Mesh) -> None:
     mesh = mend(*holes(sphere, seed=1))
-    assert mended_by(mesh.notes) == ("filled",)
+    assert repair_steps(mesh.notes) == ("filled",)
     assert mesh.notes == ("filled 3 small holes",)
     # The old vertices stay, and the new ones go on like the sphere.
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.01
@@ -99,21 +99,21 @@ def test_a_patch_has_as_many_vertices_as_its_rim_asks_for(sphere: Mesh) -> None:
 
 def test_halves_that_overlap_are_the_body_again(blob: Mesh) -> None:
     mesh = mend(*halves(blob))
-    assert mended_by(mesh.notes) == ("united",)
+    assert repair_steps(mesh.notes) == ("united",)
     assert mesh.volume == pytest.approx(blob.volume, rel=1e-9)
     assert mesh.area == pytest.approx(blob.area, rel=1e-9)
 
 
 def test_halves_that_overlap_and_are_always_made_watertight_come_near_it(blob: Mesh) -> None:
     mesh = mend(*halves(blob), how="always")
-    assert mended_by(mesh.notes) == ("watertight",)
+    assert repair_steps(mesh.notes) == ("watertight",)
     assert mesh.volume == pytest.approx(blob.volume, rel=0.01)
     assert mesh.area == pytest.approx(blob.area, rel=0.01)
 
 
 def test_all_at_once(blob: Mesh) -> None:
     mesh = mend(*DAMAGES["everything"].apply(blob, 0))
-    assert mended_by(mesh.notes)[-1] == "watertight"
+    assert repair_steps(mesh.notes)[-1] == "watertight"
     assert mesh.volume == pytest.approx(blob.volume, rel=0.03)
 
 
@@ -121,7 +121,7 @@ def test_a_cup_is_not_filled() -> None:
     surface = trimesh.creation.icosphere(subdivisions=3)
     open_faces = np.asarray(surface.faces)[surface.triangles_center[:, 2] < 0.2]
     mesh = mend(np.asarray(surface.vertices), open_faces)
-    assert mended_by(mesh.notes) == ("welded", "watertight")  # the cap's vertices were left unused
+    assert repair_steps(mesh.notes) == ("welded", "watertight")  # the cap's vertices were left unused
     assert mesh.volume < 0.1 * surface.volume
 
 
@@ -130,13 +130,13 @@ def test_a_part_that_sticks_out_is_not_hidden() -> None:
     knob.apply_translation([1, 0, 0])
     whole = trimesh.util.concatenate([surface, knob])
     mesh = mend(np.asarray(whole.vertices), np.asarray(whole.faces))
-    assert mended_by(mesh.notes) == ("united",)
+    assert repair_steps(mesh.notes) == ("united",)
     assert mesh.vertices[:, 0].max() == pytest.approx(1.3, abs=1e-9)
 
 
 def test_too_few_vertices_are_more_on_the_same_surface() -> None:
     mesh = mend(box().vertices, box().faces, least_vertices=52)
-    assert mended_by(mesh.notes) == ("subdivided",)
+    assert repair_steps(mesh.notes) == ("subdivided",)
     assert len(mesh.vertices) >= 52
     assert mesh.volume == pytest.approx(6, rel=1e-12)
     assert mesh.area == pytest.approx(22, rel=1e-12)
@@ -161,7 +161,7 @@ def test_never_refuses_and_always_makes_watertight(blob: Mesh) -> None:
     with pytest.raises(MeshError, match="open surface"):
         mend(vertices, faces, how="never")
     mesh = mend(vertices, faces, how="always")
-    assert mended_by(mesh.notes) == ("watertight",)
+    assert repair_steps(mesh.notes) == ("watertight",)
     assert mesh.volume == pytest.approx(blob.volume, rel=0.01)
     with pytest.raises(ValueError, match="how"):
         mend(vertices, faces, how="sometimes")  # type: ignore[arg-type]
@@ -180,7 +180,7 @@ def test_what_lies_side_by_side_stays_apart_always() -> None:
     assert watertight(near.vertices, near.faces).area < 0.97 * near.area
     for vertices, faces in ((near.vertices, near.faces), DAMAGES["soup"].apply(near, 0)):
         mesh = mend(vertices, faces, how="always")
-        assert "watertight" not in mended_by(mesh.notes)
+        assert "watertight" not in repair_steps(mesh.notes)
         assert mesh.area == pytest.approx(near.area, rel=1e-6)
 
 
@@ -189,7 +189,7 @@ def test_a_closed_surface_that_crosses_itself_passes_and_is_always_made_watertig
     crossing = coil(turns=2.2, pitch=0.3)
     assert mend(crossing.vertices, crossing.faces).notes == ()
     mesh = mend(crossing.vertices, crossing.faces, how="always")
-    assert mended_by(mesh.notes) == ("watertight",)
+    assert repair_steps(mesh.notes) == ("watertight",)
     points = np.random.default_rng(0).uniform(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), (100_000, 3))
     turn = np.linspace(0, 2.2, 3000)
     middles = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn), 0.3 * turn], axis=1)
@@ -226,7 +226,7 @@ def coil(turns: float, pitch: float, radius: float = 0.2) -> Mesh:
 def test_a_cloud_is_a_surface(sphere: Mesh) -> None:
     mesh = mend(sphere.vertices, None)
     assert mesh.volume == pytest.approx(sphere.volume, rel=0.03)
-    assert mended_by(mesh.notes) == ("watertight",)
+    assert repair_steps(mesh.notes) == ("watertight",)
 
 
 def test_neighbours_are_turned_alike_in_every_part(blob: Mesh) -> None:

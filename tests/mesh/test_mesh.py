@@ -89,9 +89,9 @@ def test_numbered_by_faces_is_the_same_surface_whatever_the_numbers(blob: Mesh) 
 
 
 def test_more_notes_and_a_unit_leave_the_surface_as_it_is(blob: Mesh) -> None:
-    told = blob.told(notes=("first",), unit="mm")
+    told = blob.annotated(notes=("first",), unit="mm")
     assert told.notes == ("first", *blob.notes)
-    assert (told.unit, told.told().unit, blob.unit) == ("mm", "mm", None)
+    assert (told.unit, told.annotated().unit, blob.unit) == ("mm", "mm", None)
     assert told.vertices is blob.vertices
     assert told.area == blob.area
 

@@ -2,7 +2,7 @@ import numpy as np
 import trimesh
 
 from igps.mesh._union import united, without_walls
-from igps.mesh.mending import mend, mended_by
+from igps.mesh.mending import mend, repair_steps
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import face_patches
 from igps.shapes import ArticulatedShapes
@@ -23,7 +23,7 @@ def together(*surfaces):
 def test_boxes_that_overlap_are_one_body_of_the_right_volume_and_area():
     surface = together(box([0, 0, 0], [2, 1, 1]), box([1.3, 0.2, 0.25], [3, 0.7, 0.75]))
     body = mend(*surface)
-    assert mended_by(body.notes) == ("united",)
+    assert repair_steps(body.notes) == ("united",)
     # The second box reaches 0.7 into the first.
     np.testing.assert_allclose(body.volume, 2 + 1.0 * 0.5 * 0.5, rtol=1e-12)
     np.testing.assert_allclose(body.area, 10 + 4 * 0.5 * 1.0, rtol=1e-12)
@@ -49,7 +49,7 @@ def with_wall():
 def test_a_wall_between_two_halves_is_dropped_and_nothing_else():
     body = mend(*with_wall())
     assert any("dropped 1 walls inside" in note for note in body.notes)
-    assert "watertight" not in mended_by(body.notes)
+    assert "watertight" not in repair_steps(body.notes)
     np.testing.assert_allclose((body.volume, body.area), (2, 10), rtol=1e-12)
 
 
@@ -63,7 +63,7 @@ def test_two_halves_with_a_wall_each_that_overlap_are_the_body_that_they_were_cu
     reach = 0.02 * np.ptp(centred, axis=0).max()
     meshes = [solid.trim_by_plane(normal, -reach).to_mesh64() for normal in ([1.0, 0, 0], [-1.0, 0, 0])]
     body = mend(*together(*((np.asarray(m.vert_properties)[:, :3], np.asarray(m.tri_verts, np.int64)) for m in meshes)))
-    assert "watertight" not in mended_by(body.notes)
+    assert "watertight" not in repair_steps(body.notes)
     np.testing.assert_allclose((body.volume, body.area), (shape.volume, shape.area), rtol=1e-9)
 
 

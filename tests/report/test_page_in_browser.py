@@ -150,7 +150,7 @@ def test_bodies_of_one_file_are_shown_together_with_part_unit_and_volume(browser
     np.savez(tmp_path / "distances.npz", distances=1 - np.eye(3), names=names, labels=("liver", "spleen", "liver"))
     files = [{"file": name, "part": name[6:]} for name in names]
     (tmp_path / "meshes.json").write_text(json.dumps({"meshes": files}))
-    body = as_mesh(trimesh.creation.icosphere(subdivisions=2)).told(unit="mm")
+    body = as_mesh(trimesh.creation.icosphere(subdivisions=2)).annotated(unit="mm")
     one = next(iter(surfaces(body).values()))
     write_page(tmp_path / "page.html", read_results(tmp_path), dict.fromkeys(names, one))
     with Visit(browser, tmp_path / "page.html") as visit:

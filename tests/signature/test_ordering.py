@@ -18,7 +18,13 @@ from igps.mesh.mesh import Mesh
 from igps.nn.axes import EuclideanDistance, InteriorDistance, Potential
 from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import chi_square
-from igps.signature.ordering import crowding, in_order_of_form, one_in_each_share, places, shares_around
+from igps.signature.ordering import (
+    canonically_ordered,
+    nearest_spacing,
+    ordering_keys,
+    systematic_sample,
+    vertex_area_shares,
+)
 from igps.signature.signature import SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=40, resolution=16, min_samples=0, n_surface_samples=400)
@@ -40,16 +46,18 @@ def spectrum_of(n_points: int) -> tuple[np.ndarray, np.ndarray]:
 def test_places_go_with_the_points_and_leave_signs_and_bases_alone() -> None:
     functions, eigenvalues = spectrum_of(500)
     eigenvalues[7:10] = eigenvalues[7]  # a multiplet, of which any basis may come
-    expected = places(functions, eigenvalues, 1.0)
+    expected = ordering_keys(functions, eigenvalues, 1.0)
     order = np.random.default_rng(0).permutation(500)
-    np.testing.assert_allclose(places(functions[order], eigenvalues, 1.0), expected[order], rtol=1e-12)
-    np.testing.assert_allclose(places(functions * np.where(np.arange(30) % 2, -1, 1), eigenvalues, 1.0), expected)
+    np.testing.assert_allclose(ordering_keys(functions[order], eigenvalues, 1.0), expected[order], rtol=1e-12)
+    np.testing.assert_allclose(
+        ordering_keys(functions * np.where(np.arange(30) % 2, -1, 1), eigenvalues, 1.0), expected
+    )
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     turned = functions.copy()
     turned[:, 7:10] = functions[:, 7:10] @ turn
-    np.testing.assert_allclose(places(turned, eigenvalues, 1.0), expected, rtol=1e-12)
+    np.testing.assert_allclose(ordering_keys(turned, eigenvalues, 1.0), expected, rtol=1e-12)
     np.testing.assert_allclose(
-        places(functions / 3, eigenvalues / 9, 9.0), expected, rtol=1e-12
+        ordering_keys(functions / 3, eigenvalues / 9, 9.0), expected, rtol=1e-12
     )  # three times as large
 
 
@@ -58,9 +66,9 @@ def test_points_of_one_potential_have_different_places() -> None:
     functions, eigenvalues = spectrum_of(300)
     mirror = np.where(np.arange(30) % 3 == 0, -1.0, 1.0)
     both = np.concatenate([functions, functions * mirror])
-    found = places(both, eigenvalues, 1.0)
+    found = ordering_keys(both, eigenvalues, 1.0)
     assert np.diff(np.sort(found)).min() > 1e-9
-    exchanged = places(np.concatenate([functions * mirror, functions]), eigenvalues, 1.0)
+    exchanged = ordering_keys(np.concatenate([functions * mirror, functions]), eigenvalues, 1.0)
     np.testing.assert_allclose(np.sort(exchanged), np.sort(found), rtol=1e-9)
 
 
@@ -68,21 +76,23 @@ def test_marks_are_counts_of_what_is_around() -> None:
     line = np.zeros((9, 3))
     line[:, 0] = np.arange(9)
     expected = np.abs(line[:, 0] - line[:, :1]).mean(axis=1)  # all are nearest
-    np.testing.assert_allclose(crowding(line), expected / expected.mean())
+    np.testing.assert_allclose(nearest_spacing(line), expected / expected.mean())
     areas = np.array([1.0, 2.0, 4.0])
-    np.testing.assert_allclose(shares_around(np.array([[0, 1, 2], [0, 2, 3], [1, 2, 3]]), areas) * 21 / 4, [3, 5, 7, 6])
+    np.testing.assert_allclose(
+        vertex_area_shares(np.array([[0, 1, 2], [0, 2, 3], [1, 2, 3]]), areas) * 21 / 4, [3, 5, 7, 6]
+    )
 
 
 def test_each_share_gets_one() -> None:
     sizes = np.random.default_rng(0).random(50) ** 3
     sizes[[0, 20, 49]] = 0
     ends = np.cumsum(sizes)
-    drawn = one_in_each_share(sizes, 400, np.random.default_rng(1))
+    drawn = systematic_sample(sizes, 400, np.random.default_rng(1))
     assert (np.diff(drawn) >= 0).all()
     assert not set(drawn) & {0, 20, 49}
     counts = np.bincount(drawn, minlength=50)
     assert (np.abs(counts - 400 * sizes / ends[-1]) < 2).all()  # a plain draw would be off by up to twenty
-    many = sum(np.bincount(one_in_each_share(sizes, 7, np.random.default_rng(i)), minlength=50) for i in range(3000))
+    many = sum(np.bincount(systematic_sample(sizes, 7, np.random.default_rng(i)), minlength=50) for i in range(3000))
     np.testing.assert_allclose(many / 21000, sizes / ends[-1], atol=0.004)
 
 
@@ -156,15 +166,15 @@ def test_subsets_take_equal_steps() -> None:
 
 
 def test_the_order_of_form_takes_out_every_numbering(blob: Mesh) -> None:
-    expected = in_order_of_form(blob)
+    expected = canonically_ordered(blob)
     for seed in range(3):
-        found = in_order_of_form(renumbered(blob, seed))
+        found = canonically_ordered(renumbered(blob, seed))
         np.testing.assert_array_equal(found.vertices, expected.vertices)
         np.testing.assert_array_equal(found.faces, expected.faces)
 
 
 def test_the_order_of_form_keeps_the_surface(blob: Mesh) -> None:
-    found = in_order_of_form(blob)
+    found = canonically_ordered(blob)
 
     def corners(mesh: Mesh) -> set[bytes]:
         """Every face by its corners' places, from each of the three on, so that orientation counts."""
@@ -178,6 +188,6 @@ def test_the_order_of_form_keeps_the_surface(blob: Mesh) -> None:
 def test_the_order_of_form_does_not_depend_on_place_and_scale(blob: Mesh) -> None:
     turn = Rotation.from_rotvec([0.3, 1.1, -0.7]).as_matrix()
     moved = replace(blob, vertices=2.5 * blob.vertices @ turn.T + [3, -1, 2])
-    expected, found = in_order_of_form(blob), in_order_of_form(moved)
+    expected, found = canonically_ordered(blob), canonically_ordered(moved)
     np.testing.assert_array_equal(found.faces, expected.faces)
     np.testing.assert_allclose(found.vertices, 2.5 * expected.vertices @ turn.T + [3, -1, 2], atol=1e-12)

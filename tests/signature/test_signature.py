@@ -232,7 +232,7 @@ def test_a_signature_is_the_beginning_of_one_with_more(blob: Mesh, n_eigenpairs:
     exact = replace(CONFIG, n_eigenpairs=n_eigenpairs)
     more = replace(exact, n_eigenpairs=250, attributes=("electrostatic_potential", "surface_direction"))
     alone, whole = compute_signature(blob, exact), compute_signature(blob, more)
-    found = whole.beginning(exact)
+    found = whole.truncated(exact)
     assert (found.config, found.interior.attributes, found.surface.attributes) == (exact, {}, {})
     assert (found.area, found.volume, found.notes) == (alone.area, alone.volume, alone.notes)
     np.testing.assert_allclose(found.eigenvalues, alone.eigenvalues, rtol=1e-9)
@@ -242,7 +242,7 @@ def test_a_signature_is_the_beginning_of_one_with_more(blob: Mesh, n_eigenpairs:
         assert one.eigenfunctions.flags.c_contiguous
         signs = np.sign((one.eigenfunctions * other.eigenfunctions).sum(axis=0))
         np.testing.assert_allclose(one.eigenfunctions * signs, other.eigenfunctions, atol=1e-4)
-    attributed = whole.beginning(replace(exact, attributes=("surface_direction",)))
+    attributed = whole.truncated(replace(exact, attributes=("surface_direction",)))
     assert set(attributed.interior.attributes) == set(attributed.surface.attributes) == {"surface_direction"}
     np.testing.assert_allclose(histogram(found), histogram(alone), atol=1e-6)
     with pytest.raises(AssertionError):  # the number does matter
@@ -254,13 +254,13 @@ def test_no_number_of_eigenpairs_is_the_usual_one(blob: Mesh) -> None:
     assert config.as_dict() == replace(config, n_eigenpairs=250).as_dict() == config.resolved().as_dict()
     assert config.as_dict()["n_eigenpairs"] == 250
     assert "least_vertices" not in config.as_dict()
-    assert config.needing(50).as_dict() == {**config.as_dict(), "n_eigenpairs": 64, "least_vertices": 252}
+    assert config.with_eigenpairs(50).as_dict() == {**config.as_dict(), "n_eigenpairs": 64, "least_vertices": 252}
     signature = compute_signature(blob, config)
     assert len(signature.eigenvalues) == signature.config.n_eigenpairs == 250
 
 
 def test_larger_configurations_have_all_and_more() -> None:
-    small = SignatureConfig(resolution=17, attributes=("depth",)).needing(50)
+    small = SignatureConfig(resolution=17, attributes=("depth",)).with_eigenpairs(50)
     larger = list(small.larger())
     assert {one.n_eigenpairs for one in larger} == {64, 100, 250}
     assert [one.n_kept for one in larger] == sorted(one.n_kept for one in larger)
@@ -270,7 +270,7 @@ def test_larger_configurations_have_all_and_more() -> None:
         assert same == small
     # What a plain dataset, and what one for `rich`, has in its cache.
     plain = SignatureConfig(resolution=17).as_dict()
-    assert plain in [one.as_dict() for one in SignatureConfig(resolution=17).needing(0).larger()]
+    assert plain in [one.as_dict() for one in SignatureConfig(resolution=17).with_eigenpairs(0).larger()]
     rich = ("depth", "electrostatic_potential", "surface_direction")
     assert {**plain, "attributes": rich} in [one.as_dict() for one in SignatureConfig(resolution=17).larger()]
     assert {one.n_kept for one in SignatureConfig(n_eigenpairs=40).larger()} == {40}  # other samples

@@ -76,7 +76,7 @@ def explaining(
             )
             rows.append({
                 "body": drawn[1].name, "alteration": how, "size": round(size, 4), "descriptor": name,
-                "distance": found.distance, "auc": by_place, "auc_of_pairs": by_samples, "told": found.told(),
+                "distance": found.distance, "auc": by_place, "auc_of_pairs": by_samples, "told": found.summary(),
             })  # fmt: skip
             print(rows[-1], flush=True)
         write_answer(out, "explaining", rows)

@@ -14,11 +14,11 @@ _COARSE, _FINE = 0.01 * 2.0 ** np.arange(6), 0.0008 * 2.0 ** np.arange(5)
 _CORRESPONDING, _NEAREST = 10, 4
 # Least scatter at a place, over that of the whole body
 _LEAST = 0.1
-# Of the root of the area, over which unlikeness is averaged
+# Of the root of the area, over which dissimilarity is averaged
 _REACH = 0.06
 
 
-def unlikeness(body: SignatureBatch, other: SignatureBatch) -> Values:
+def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Values:
     """(P,) positive numbers of the surface samples of a body: how unlike they are to what corresponds to them.
 
     Samples of the surface correspond where heat flows alike (Sun, Ovsjanikov and Guibas 2009) over large times, which

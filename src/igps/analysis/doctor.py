@@ -13,7 +13,7 @@ from igps.data.filling import by_file
 from igps.data.sources import Bodies, BodyRef
 from igps.mesh.formats import RawBody, VoxelMeasures
 from igps.mesh.loading import each_surface, surface_body
-from igps.mesh.mending import Step, mended_by
+from igps.mesh.mending import Step, repair_steps
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
@@ -109,5 +109,5 @@ def _finding(ref: BodyRef, raw: RawBody, reading: LoadOptions, config: Signature
     n_after = min(len(mesh.vertices), config.max_vertices or len(mesh.vertices))
     seconds, memory = expected_cost(n_after, config.n_kept)
     seconds += time.process_time() - start
-    found = replace(found, steps=mended_by(mesh.notes), notes=mesh.notes, n_vertices_after=len(mesh.vertices))
+    found = replace(found, steps=repair_steps(mesh.notes), notes=mesh.notes, n_vertices_after=len(mesh.vertices))
     return replace(found, seconds=seconds, memory=memory)

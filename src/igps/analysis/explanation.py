@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from igps.analysis.correspondence import unlikeness
+from igps.analysis.correspondence import dissimilarity
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.nn.batch_features import WEIGHT, BatchFeatures, SampleKind
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
@@ -44,7 +44,7 @@ class Explanation:
     samples: tuple[Shares, Shares]
     places: tuple[Shares, Shares] | None = None
 
-    def told(self, most: int = 3) -> str:
+    def summary(self, most: int = 3) -> str:
         """The largest shares in words."""
         if not self.distance:
             return "no difference"
@@ -93,7 +93,7 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
 
 def _placed(body: SignatureBatch, other: SignatureBatch, samples: Shares, distance: float) -> Shares:
     """Half of the distance, shared out among the surface samples of a body."""
-    weights = unlikeness(body, other)
+    weights = dissimilarity(body, other)
     return {"interior": np.zeros(len(samples["interior"])), "surface": distance / 2 * weights / weights.sum()}
 
 
@@ -178,7 +178,7 @@ def _shared(histograms: HistogramDescriptor, batch: SignatureBatch, units: Tenso
             share = 1 / (len(histograms.parts) * len(group)) if len(histograms.histograms) > 1 else 1.0
             values = share * part.of_features(features).flatten() @ units[first : first + part.n_cells]
             first += part.n_cells
-            name = told_of(part)
+            name = part_name(part)
             parts[name] = parts.get(name, 0.0) + float(values.detach())
             if not values.requires_grad:
                 raise ValueError(
@@ -198,7 +198,7 @@ _AXES = {
 }  # fmt: skip
 
 
-def told_of(part: DescriptionPart) -> str:
+def part_name(part: DescriptionPart) -> str:
     """What a part of a description counts, in words."""
     axes = [type(axis).__name__ for axis in getattr(part, "axes", [part])]
     words = list(dict.fromkeys(_AXES.get(name, name) for name in axes if name != "Potential" or len(axes) == 1))
@@ -206,7 +206,9 @@ def told_of(part: DescriptionPart) -> str:
     return " and ".join(words) + place
 
 
-def held(one: Tensor, other: Tensor, *, level: float = 0.05, n_permutations: int = 1000, seed: int = 0) -> Tensor:
+def significant_cells(
+    one: Tensor, other: Tensor, *, level: float = 0.05, n_permutations: int = 1000, seed: int = 0
+) -> Tensor:
     """(cells,) in which the means of two groups differ by more than chance, any false one with probability `level`.
 
     A permutation test of the largest difference in standard deviations (Westfall and Young 1993).
@@ -234,21 +236,21 @@ def explain_groups(
 ) -> tuple[Explanation, Tensor]:
     """Share the distance of two groups' mean descriptions out, on a body of each, by cells that a test holds alone.
 
-    The distance is what is left of it in those cells, see `held`; the two bodies' shares sum to it where their own
-    descriptions are the means.
+    The distance is what is left of it in those cells, see `significant_cells`; the two bodies' shares sum to it where
+    their own descriptions are the means.
 
     Args:
         descriptor: see `explain`.
         one, other: (N, ...) descriptions of its histograms (for a head, those that the head is given).
         batches: two bodies to be painted, one of each group.
-        test: see `held`.
+        test: see `significant_cells`.
 
     Returns:
         the explanation, and the (cells,) that are held.
     """
     descriptor = copy.deepcopy(descriptor).double().eval()
     rows = [group.double().flatten(1) for group in (one, other)]
-    kept = held(rows[0].sqrt(), rows[1].sqrt(), **test)
+    kept = significant_cells(rows[0].sqrt(), rows[1].sqrt(), **test)
     means = [group.mean(dim=0) for group in rows]
     units, _ = unit_shares(descriptor, *means)
     units = torch.where(kept, units, 0)
@@ -259,5 +261,5 @@ def explain_groups(
         own = slice(first, first + part.n_cells)
         first += part.n_cells
         share = float(units[own] @ (means[0] - means[1])[own])
-        parts[told_of(part)] = parts.get(told_of(part), 0.0) + share
+        parts[part_name(part)] = parts.get(part_name(part), 0.0) + share
     return Explanation(sum(parts.values()), parts, (shared[0][1], shared[1][1])), kept

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from docstring_parser import parse
 from jsonargparse import ArgumentParser, Namespace
 
-from igps._parallel import MachineError, is_machines, machines_words
+from igps._parallel import MachineError, is_machine_error, machine_error_text
 from igps._threads import one_thread
 from igps.cli import gallery
 from igps.cli.answers import explain, groups, outliers
@@ -94,8 +94,8 @@ def main(commands: Commands | None = None, program: str = "igps") -> None:
             found = command(**options)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         # Expected of bad input, and said in full by the message; a traceback would bury it.
-        full = isinstance(error, OSError) and is_machines(error)
-        print(f"igps: {machines_words(error) if full else error}", file=sys.stderr)  # type: ignore[arg-type]
+        full = isinstance(error, OSError) and is_machine_error(error)
+        print(f"igps: {machine_error_text(error) if full else error}", file=sys.stderr)  # type: ignore[arg-type]
         sys.exit(2 if full or isinstance(error, MachineError) else 1)
     verdict = found if isinstance(found, Verdict) else Verdict(found, True)
     if as_json:

@@ -150,7 +150,7 @@ def explain(
             raise ValueError(f"meshes: expected two bodies, got {len(dataset)}. Name two files, or FILE#PART.")
         found = explain_pair(module, *(dataset.batch([i]) for i in chosen))
     names = [dataset.bodies.names[i] for i in chosen]
-    print(f"{' and '.join(names)}: {found.distance:.4g} by {descriptor}: {found.told()}")
+    print(f"{' and '.join(names)}: {found.distance:.4g} by {descriptor}: {found.summary()}")
     painted = [_painted(dataset, i, found, place) for place, i in enumerate(chosen)]
     for name, (_, values) in zip(names, painted, strict=True):
         print(f"{name}: half of what is its own lies on {_half(values):.0%} of its surface")

@@ -19,7 +19,7 @@ from igps.data.sources import Bodies, ClassRule, find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
-from igps.mesh.mending import mended_by
+from igps.mesh.mending import repair_steps
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe, fit_centres
 from igps.nn.descriptor import Descriptor
@@ -220,7 +220,7 @@ def chosen_dataset(
 
 def mending_summary(dataset: SignatureDataset, n_given: int) -> str:
     """How many meshes were mended and by what, in one line; nothing where none was."""
-    steps = [mended_by(notes) for notes in dataset.all_notes()]
+    steps = [repair_steps(notes) for notes in dataset.all_notes()]
     counts = Counter(step for taken in steps for step in taken)
     if not counts:
         return ""

@@ -78,7 +78,7 @@ def _takes_body(function: Callable[..., Any]) -> bool:
     )
 
 
-def sorted_out(
+def split_attributes(
     given: Mapping[str, AttributeSource | PointFunction],
 ) -> tuple[dict[str, AttributeSource], dict[str, PointFunction]]:
     """Attributes that are kept in the cache, and functions of points, which are called at each reading."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from igps._parallel import Failed, Limits
-from igps.data.attributes import ROOMS, AttributeSource, PointFunction, sorted_out, with_attribute
+from igps.data.attributes import ROOMS, AttributeSource, PointFunction, split_attributes, with_attribute
 from igps.data.batch import LabelledSignature, Several, SignatureBatch, chosen_of
 from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.collation import collate
@@ -84,7 +84,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         if descriptor is not None:
             requirements = requirements_of(descriptor)
             config, given = requirements.apply_to(config), {**requirements.sources, **given}
-        sources, self._functions = sorted_out(given)
+        sources, self._functions = split_attributes(given)
         self.bodies = bodies_of(root_or_paths, labels, reading, sources.values()).classed(classes or "folder")
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
         if pre_transform is not None and pre_transform.cache_tag and self._functions:

@@ -88,7 +88,7 @@ def hits_in_cache(pipeline: SignaturePipeline, bodies: Bodies, look: bool = True
     new: dict[BodyRef, CacheHit] = {}
     for group in by_file(bodies, (i for i, hit in enumerate(found) if hit is None and look)):
         with contextlib.suppress(MeshError):  # computing it will say why
-            for i, hit in zip(group, pipeline.served([bodies[i] for i in group]), strict=True):
+            for i, hit in zip(group, pipeline.lookup([bodies[i] for i in group]), strict=True):
                 if hit is not None:
                     found[i] = new[bodies[i]] = hit
     known.remember(new)

@@ -19,7 +19,7 @@ from igps._parallel import Failed, MachineError, attempt
 from igps.data.attributes import ROOMS, AttributeSource, with_attribute
 from igps.data.cache import AttributeCache, SignatureCache, content_digest, stamp_of
 from igps.mesh.loading import BodyRef, each_body, load_mesh
-from igps.mesh.mending import MENDING_VERSION, mended_by
+from igps.mesh.mending import MENDING_VERSION, repair_steps
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature, SignatureConfig, compute_signature
@@ -85,7 +85,7 @@ class SignaturePipeline:
     def signature(self, body: BodyRef) -> Signature:
         """The Signature of a body, from the cache where it or a larger one is there, and there afterwards."""
         file = BodyFile.of(body.path)
-        hit = self._served(body, file)
+        hit = self._lookup(body, file)
         found = None if hit is None else self.read(hit)
         return self._made(body, file)[1] if found is None else found
 
@@ -98,7 +98,7 @@ class SignaturePipeline:
         if len(bodies) == 1:
             return [self.hit(bodies[0])]
         file = BodyFile.of(bodies[0].path)
-        served = {body: self._served(body, file) for body in bodies}
+        served = {body: self._lookup(body, file) for body in bodies}
         done: dict[BodyRef, CacheHit | Failed] = {body: hit for body, hit in served.items() if hit is not None}
         missing = {body.part: body for body in bodies if body not in done}
         least = self.config.n_vertices_read
@@ -118,10 +118,10 @@ class SignaturePipeline:
         """What serves a body, which is in the cache then; a MeshError where it cannot be used."""
         return self._hit(body, BodyFile.of(body.path))
 
-    def served(self, bodies: Sequence[BodyRef]) -> list[CacheHit | None]:
+    def lookup(self, bodies: Sequence[BodyRef]) -> list[CacheHit | None]:
         """What in the cache serves each body of one file, None where nothing does; a MeshError if unreadable."""
         file = BodyFile.of(bodies[0].path)
-        return [self._served(body, file) for body in bodies]
+        return [self._lookup(body, file) for body in bodies]
 
     def with_attributes(self, body: BodyRef, hit: CacheHit) -> CacheHit | None:
         """What serves a body whose Signature in the cache is known, with its attributes; None if one is missing."""
@@ -139,7 +139,7 @@ class SignaturePipeline:
         signature = SignatureCache(self.cache_dir).get(hit.key)
         if signature is None:
             return None
-        signature = signature.beginning(self.config) if self.pre_transform is None else signature
+        signature = signature.truncated(self.config) if self.pre_transform is None else signature
         for name, key in hit.attributes.items():
             values = AttributeCache(self.cache_dir).get(key)
             if values is None:
@@ -152,9 +152,9 @@ class SignaturePipeline:
         return self._key(body, BodyFile.of(body.path), self.config, False)
 
     def _hit(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> CacheHit:
-        return self._served(body, file) or self._made(body, file, mesh)[0]
+        return self._lookup(body, file) or self._made(body, file, mesh)[0]
 
-    def _served(self, body: BodyRef, file: BodyFile) -> CacheHit | None:
+    def _lookup(self, body: BodyRef, file: BodyFile) -> CacheHit | None:
         cache = SignatureCache(self.cache_dir)
         if self.pre_transform is None:
             key = next(self._cached(body, file), None)
@@ -176,7 +176,7 @@ class SignaturePipeline:
             signature = self._with_attribute(body, signature, name, keys[name])
         if self.pre_transform is not None:
             signature = self.pre_transform(signature)
-            mended = bool(mended_by(signature.notes))
+            mended = bool(repair_steps(signature.notes))
             key, keys = self._changed_key(body, self._key(body, file, self.config, mended)), {}
             cache.put(key, signature)
         return CacheHit(key, cache.path(key).stat().st_size, tuple(signature.notes), file.stamp, keys), signature
@@ -187,9 +187,9 @@ class SignaturePipeline:
         for key in self._cached(body, file):
             signature = cache.get(key)
             if signature is not None:
-                return key, signature.beginning(self.config)
+                return key, signature.truncated(self.config)
         signature = compute_signature(self.mesh(body) if mesh is None else mesh, self.config)
-        key = self._key(body, file, self.config, bool(mended_by(signature.notes)))
+        key = self._key(body, file, self.config, bool(repair_steps(signature.notes)))
         cache.put(key, signature)
         return key, signature
 
@@ -211,7 +211,7 @@ class SignaturePipeline:
         for config, mended in product(_serving(self.config), (False, True)):
             key = self._key(body, file, config, mended)
             if key in cache:
-                steps = mended_by(cache.notes(key))
+                steps = repair_steps(cache.notes(key))
                 # A former version of the mending made another body.
                 of_this_version = mended or not steps
                 # A mesh that was subdivided for more vertices is another one.

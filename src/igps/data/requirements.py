@@ -42,7 +42,7 @@ class Requirements:
         A descriptor of the whole spectrum gets the usual number, if that is enough; a ValueError of too few eigenpairs.
         """
         usual = SignatureConfig.DEFAULT_EIGENPAIRS if self.whole_spectrum else 0
-        config = config.needing(max(usual, self.n_eigenpairs))
+        config = config.with_eigenpairs(max(usual, self.n_eigenpairs))
         self._check_eigenpairs(config.n_kept)
         return replace(config, attributes=tuple(dict.fromkeys((*config.attributes, *self.attributes))))
 

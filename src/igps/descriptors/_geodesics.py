@@ -16,7 +16,7 @@ from igps._arrays import Floats, Integers
 from igps.mesh.mesh import Mesh
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import undirected_edges
-from igps.signature.ordering import in_order_of_form, places_in_space
+from igps.signature.ordering import canonically_ordered, spatial_ordering_keys
 
 # Distances that differ by less than this share are equal but for rounding.
 _TIE = 1e-9
@@ -41,7 +41,7 @@ def geodesic_samples(mesh: Mesh, n_samples: int, max_vertices: int) -> FarthestP
 
     A ValueError of a mesh that has fewer vertices than samples, a MeshError of one that cannot be simplified.
     """
-    return farthest_points(simplify(in_order_of_form(mesh), max_vertices), n_samples)
+    return farthest_points(simplify(canonically_ordered(mesh), max_vertices), n_samples)
 
 
 def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> FarthestPoints:
@@ -49,7 +49,7 @@ def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> Far
 
     The first one is the farthest from the farthest from the one that sticks out most, an end of a long geodesic. Of
     equally far ones the one nearest to all taken before is taken, and of equal ones still that which comes last in
-    `places_in_space`: which they are does not depend on how the vertices are numbered.
+    `spatial_ordering_keys`: which they are does not depend on how the vertices are numbered.
 
     A ValueError if there are not so many vertices. For the points of an edge see `edge_graph`.
     """
@@ -69,7 +69,7 @@ def farthest_points(mesh: Mesh, n_samples: int, points_per_edge: int = 2) -> Far
         equal = equal[total[equal] <= (1 + _TIE) * total[equal].min()]
         return int(equal[np.argmax(places[equal])])
 
-    places = places_in_space(mesh)
+    places = spatial_ordering_keys(mesh)
     first = int(np.argmax(places))
     for _ in range(2):
         distance = from_vertex(first)

@@ -13,7 +13,7 @@ from igps.descriptors._linear_histogram import linear_histogram
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors, longest_side, unit, vertex_areas
 from igps.nn.descriptor import BodyDescriptor
-from igps.signature.ordering import in_order_of_form
+from igps.signature.ordering import canonically_ordered
 from igps.signature.sampling import surface_points
 
 # Rays start so far inside the surface, in units of the bounding box, that they do not meet the face they come from.
@@ -55,7 +55,7 @@ class LocalDiameterCentricity(BodyDescriptor):
 
     def describe_body(self, body: Body) -> Singles:
         """(n_diameter_bins, n_centricity_bins) histogram of sum 1; a MeshError where no ray meets the far side."""
-        mesh = in_order_of_form(body.mesh)
+        mesh = canonically_ordered(body.mesh)
         points = surface_points(mesh, self.n_samples, self.seed)
         diameter = local_diameters(mesh, points.face, points.weights, self.n_rays, self.opening_angle)
         central = points.interpolate(centricity(mesh, self.n_sources)[:, None])[:, 0]

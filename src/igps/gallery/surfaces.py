@@ -26,7 +26,7 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
 from igps.gallery.calibration import Calibration
 from igps.mesh.loading import load_mesh
-from igps.mesh.mending import Step, mended_by
+from igps.mesh.mending import Step, repair_steps
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import mean_of_neighbours
 from igps.signature.attributes import AttributeName
@@ -190,7 +190,7 @@ class Surfaces:
         mesh = self._mesh(i)
         blurred = TriangleSurface(mean_of_neighbours(self._placed(i, mesh), mesh.faces), mesh.faces)
         handles = None
-        if not set(mended_by(mesh.notes)) - _KEEP_HANDLES:
+        if not set(repair_steps(mesh.notes)) - _KEEP_HANDLES:
             with contextlib.suppress(MeshError):
                 handles = mesh.genus
         return offset_in_place(self._last(i), blurred), handles

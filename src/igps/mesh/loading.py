@@ -146,7 +146,7 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
         vertices, faces, how=options.mend, least_vertices=least_vertices, normals=raw.normals,
         cavities=options.cavities, name=name, notes=notes,
     )  # fmt: skip
-    return mesh.told(unit=raw.unit)
+    return mesh.annotated(unit=raw.unit)
 
 
 def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[RawBody]:

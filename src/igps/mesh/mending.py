@@ -1,7 +1,7 @@
 """The least that makes a body of a surface: as it is, welded, filled, united, smoothed, subdivided, or watertight.
 
 A mesh that is a body already and not noisy is left as it is, bit for bit. Every step says in the mesh's notes what it
-did, and `mended_by` tells from the notes which steps were needed.
+did, and `repair_steps` tells from the notes which steps were needed.
 """
 
 import logging
@@ -89,10 +89,10 @@ def mend(
         mesh = subdivided(mesh, _PLENTY * least_vertices + len(mesh.vertices) - n_outer)
     for note in mesh.notes:
         logger.info("%s: %s", name, note)
-    return mesh.told(notes=notes)
+    return mesh.annotated(notes=notes)
 
 
-def mended_by(notes: Iterable[str]) -> tuple[Step, ...]:
+def repair_steps(notes: Iterable[str]) -> tuple[Step, ...]:
     """The steps behind the notes of a `Mesh` or `Signature`, in order, each once."""
     return tuple(dict.fromkeys(step for note in notes for start, step in _WORDS.items() if note.startswith(start)))
 
@@ -111,7 +111,7 @@ def _mended(vertices: Floats, faces: Integers, name: str, cavities: bool) -> Mes
         if len(surface[1]) and (body := _body(*attempt(*surface, done), done, name, cavities)):
             return body
     body = watertight(_smoothed(vertices, faces, notes), faces, name=name)
-    return body.told(notes=tuple(notes))
+    return body.annotated(notes=tuple(notes))
 
 
 def _body(vertices: Floats, faces: Integers, notes: list[str], name: str, cavities: bool) -> Mesh | None:
@@ -139,7 +139,7 @@ def _remade(vertices: Floats, faces: Integers, name: str, cavities: bool) -> Mes
         notes = []
     smooth = _smoothed(*neat, notes)
     body = watertight(smooth, neat[1], name=name) if notes else watertight(vertices, faces, name=name)
-    return body.told(notes=tuple(notes))
+    return body.annotated(notes=tuple(notes))
 
 
 def _smoothed(vertices: Floats, faces: Integers, notes: list[str]) -> Floats:

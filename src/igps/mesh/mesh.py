@@ -133,7 +133,7 @@ class Mesh:
         name, raw = raw_of(body)
         return cls(raw.vertices, raw.faces, name=name, unit=raw.unit)
 
-    def told(self, *, notes: tuple[str, ...] = (), unit: str | None = None) -> Mesh:
+    def annotated(self, *, notes: tuple[str, ...] = (), unit: str | None = None) -> Mesh:
         """The same mesh with more notes, before its own, and with a unit if one is given; nothing is checked again."""
         return self._changed(notes=(*notes, *self.notes), unit=unit or self.unit)
 

@@ -94,7 +94,7 @@ def _painted(
         found = explain(descriptor, dataset.batch([0]), dataset.batch([1]))
     shares = found.places or found.samples
     one, other = (_values(dataset.mesh(i), dataset[i].signature, shares[i], surfaces[i]) for i in (0, 1))
-    return found.told(), (one, other)
+    return found.summary(), (one, other)
 
 
 def _values(mesh: Mesh, signature: Signature, shares: Shares, surface: Surface) -> NDArray[np.uint8]:

@@ -11,8 +11,8 @@ from igps._parameters import check_at_least, check_share
 from igps.signature.attributes import AttributeName, check_attributes
 from igps.signature.laplacian import Backend
 
-# The order of the samples, see `places`, depends on about so many eigenpairs. With as many or more of one body the same
-# samples come in the same order, to rounding.
+# The order of the samples, see `ordering_keys`, depends on about so many eigenpairs. With as many or more of one body
+# the same samples come in the same order, to rounding.
 _ORDERED_BY = 64
 
 
@@ -21,7 +21,7 @@ class SignatureConfig:
     """Every parameter that a Signature depends on.
 
     The samples of a Signature and their first eigenfunctions do not depend on how many there are, if at least 64. So
-    each is the beginning of those with more, see `larger` and `Signature.beginning`; but for that their meshes must be
+    each is the beginning of those with more, see `larger` and `Signature.truncated`; but for that their meshes must be
     the same, and one with fewer vertices than `least_vertices` is subdivided.
 
     Example:
@@ -96,7 +96,7 @@ class SignatureConfig:
         """The same with a number of eigenpairs."""
         return replace(self, n_eigenpairs=self.n_kept)
 
-    def needing(self, n_eigenpairs: int) -> SignatureConfig:
+    def with_eigenpairs(self, n_eigenpairs: int) -> SignatureConfig:
         """The same where only the first so many eigenpairs are needed, unless a number of them is given already.
 
         Meshes are subdivided as for the default number, so that this is the beginning of that Signature.

@@ -28,7 +28,7 @@ _MARK_SHARE = 0.03
 _ANCHOR_SHARES = 0.1 / np.sqrt([1.0, 2.0, 3.0, 5.0])
 
 
-def places(
+def ordering_keys(
     eigenfunctions: NDArray[np.floating], eigenvalues: Floats, area: float, marks: Floats | None = None
 ) -> Floats:
     """One number for each of some points of a body, by which they can be ordered whatever the order they come in.
@@ -48,7 +48,7 @@ def places(
     return _by_anchors(eigenfunctions[:, :n_kept] * weights[:n_kept], marks)
 
 
-def places_in_space(mesh: Mesh) -> Floats:
+def spatial_ordering_keys(mesh: Mesh) -> Floats:
     """(V,) the same for the vertices of a mesh, by straight distances from the surface's centroid and from anchors.
 
     This needs no eigenfunctions, but changes with pose.
@@ -57,12 +57,12 @@ def places_in_space(mesh: Mesh) -> Floats:
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     embedding = mesh.vertices - areas @ centres / areas.sum()
     embedding /= np.linalg.norm(embedding, axis=1).max()
-    return _by_anchors(embedding, shares_around(mesh.faces, areas))
+    return _by_anchors(embedding, vertex_area_shares(mesh.faces, areas))
 
 
-def in_order_of_form(mesh: Mesh) -> Mesh:
+def canonically_ordered(mesh: Mesh) -> Mesh:
     """The mesh with vertices, faces and the first corner of each in an order that its numbering does not change."""
-    found = places_in_space(mesh)
+    found = spatial_ordering_keys(mesh)
     order = np.argsort(found, kind="stable")
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
@@ -92,20 +92,20 @@ def _distances(points: Floats, from_point: Floats) -> Floats:
     return np.concatenate([np.linalg.norm(points[piece] - from_point, axis=1) for piece in pieces])
 
 
-def crowding(points: Floats) -> Floats:
-    """Mean distance of each of some points (P, 3) from its nearest ones, over that of all: marks for `places`."""
+def nearest_spacing(points: Floats) -> Floats:
+    """Mean distance of each of some points (P, 3) from its nearest ones, over that of all, for `ordering_keys`."""
     n_nearest = min(_N_NEAREST + 1, len(points))
     distance = cKDTree(points).query(points, n_nearest)[0].reshape(len(points), n_nearest).mean(axis=1)
     return distance / max(distance.mean(), np.finfo(float).tiny)
 
 
-def shares_around(faces: Integers, areas: Floats) -> Floats:
-    """Area of the faces (F, 3) around each vertex, over the mean: marks for `places`."""
+def vertex_area_shares(faces: Integers, areas: Floats) -> Floats:
+    """Area of the faces (F, 3) around each vertex, over the mean: marks for `ordering_keys`."""
     around = np.bincount(faces.ravel(), weights=np.repeat(areas, 3))
     return around / around.mean()
 
 
-def one_in_each_share(sizes: Floats, n: int, generator: np.random.Generator) -> Integers:
+def systematic_sample(sizes: Floats, n: int, generator: np.random.Generator) -> Integers:
     """Draw n of things of sizes (F,) laid end to end: one at random in each n-th of the length; (n,) ascending indices.
 
     Each is drawn as often as its size asks, a large one several times.

@@ -7,7 +7,7 @@ import numpy as np
 from igps._arrays import Floats, Integers
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import face_areas
-from igps.signature.ordering import one_in_each_share
+from igps.signature.ordering import systematic_sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ def surface_points(mesh: Mesh, n_points: int, seed: int, places: Floats | None =
         return SurfacePoints(mesh, face, _in_triangles(n_points, generator))
     at_corners = places[mesh.faces]
     order = np.argsort(at_corners.sum(axis=1), kind="stable")
-    face = order[one_in_each_share(area[order], n_points, generator)]
+    face = order[systematic_sample(area[order], n_points, generator)]
     weights = np.empty((n_points, 3))
     np.put_along_axis(weights, np.argsort(at_corners, axis=1)[face], _in_triangles(n_points, generator), axis=1)
     return SurfacePoints(mesh, face, weights)

@@ -20,7 +20,7 @@ from igps.signature.attributes import interior_attributes, surface_attributes
 from igps.signature.config import SignatureConfig
 from igps.signature.laplacian import laplacian
 from igps.signature.mean_value import Extension
-from igps.signature.ordering import crowding, places, shares_around
+from igps.signature.ordering import nearest_spacing, ordering_keys, vertex_area_shares
 from igps.signature.sampling import surface_points
 from igps.signature.voxels import interior_samples
 from igps.spectra import ConvergenceError, Spectrum, eigenpairs
@@ -97,7 +97,7 @@ class Signature:
         eigenvalues: (K,) float64 ascending, 1/length², without the zero of the constant eigenfunction.
         interior: P voxel centres inside the body, eigenfunctions extended by mean value coordinates.
         surface: area-weighted random points of the surface, eigenfunctions interpolated linearly. Both in an order that
-            depends on the body's form alone, see `places`.
+            depends on the body's form alone, see `ordering_keys`.
         area: of the surface, length².
         volume: of the body, length³.
         config: the parameters that made it.
@@ -124,7 +124,7 @@ class Signature:
         potential = np.square(self.interior.eigenfunctions, dtype=np.float64) @ (1 / self.eigenvalues)
         return self.interior.points[int(np.argmin(potential))]
 
-    def beginning(self, config: SignatureConfig) -> Signature:
+    def truncated(self, config: SignatureConfig) -> Signature:
         """The Signature of a configuration of which this one's is one of the larger, see `SignatureConfig.larger`."""
 
         def cut(samples: Samples) -> Samples:
@@ -257,14 +257,14 @@ def _interior(
     """Those at the points, by the extension of eigenfunctions over the roots of their eigenvalues."""
     values = extension(points)
     values *= np.sqrt(eigenvalues)
-    order = np.argsort(places(values, eigenvalues, mesh.area, crowding(points)), kind="stable")
+    order = np.argsort(ordering_keys(values, eigenvalues, mesh.area, nearest_spacing(points)), kind="stable")
     points, values = points[order], values[order]
     return Samples(points, np.asarray(values, dtype=np.float32), interior_attributes(mesh, points, config.attributes))
 
 
 def _surface(mesh: Mesh, functions: Floats, eigenvalues: Floats, config: SignatureConfig) -> Samples:
-    marks = shares_around(mesh.faces, face_areas(mesh.vertices, mesh.faces))
-    order = places(functions, eigenvalues, mesh.area, marks)
+    marks = vertex_area_shares(mesh.faces, face_areas(mesh.vertices, mesh.faces))
+    order = ordering_keys(functions, eigenvalues, mesh.area, marks)
     points = surface_points(mesh, config.n_surface_samples, config.seed, order)
     values = points.interpolate(functions).astype(np.float32)
     return Samples(points.positions, values, surface_attributes(mesh, points.face, config.attributes))
