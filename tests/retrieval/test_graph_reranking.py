@@ -51,7 +51,7 @@ def test_short_lists_find_classes_as_well(monkeypatch: pytest.MonkeyPatch) -> No
     labels, own = torch.arange(12).repeat_interleave(20), own_distances(points)
     whole = rerank(own)
     monkeypatch.setattr(reranking, "MOST_WHOLE", 200)
-    monkeypatch.setattr(reranking, "_LISTED", 120)
+    monkeypatch.setattr(reranking, "_LISTED", (120, 120))
     found = rerank(own)
     before, expected, tier = (retrieval_scores(one, labels).mean()["ft"] for one in (own, whole, found))
     assert expected > before + 0.1

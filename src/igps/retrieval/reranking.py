@@ -12,8 +12,9 @@ from igps.retrieval.ranking import SearchResult, rank
 N_RERANKED = 200
 """Nearest entries whose neighbourhoods among each other put those of a single query in order."""
 
-# Of more than `MOST_WHOLE` shapes each is tied to so many nearest; all pairs would take time as their number cubed.
-_LISTED = 300
+# Of more than `MOST_WHOLE` shapes each is tied to so many nearest: as many as make no more pairs than that, but within
+# these limits. All pairs would take time as the number of shapes cubed.
+_PAIRS, _LISTED = 3_000_000, (300, 1000)
 
 
 def rerank(
@@ -40,8 +41,8 @@ def rerank(
 
     The result of each step is mixed with the distances it started from. It depends on the whole collection: without
     one of the shapes, the others may rank differently. Common neighbours tell the class of a shape rather than its
-    body, so the nearest shape of each stays its nearest. Of more than 2,000 shapes each is tied to its nearest 300 by
-    `rerank_graph`, and others have no common neighbour with it.
+    body, so the nearest shape of each stays its nearest. Of more than 2,000 shapes each is tied to its nearest 1,000,
+    of more than 10,000 to 300, by `rerank_graph`; others have no common neighbour with it.
 
     Args:
         distances: (N, N) of a collection to itself, symmetric, ≥ 0.
@@ -74,7 +75,8 @@ def rerank(
     if n < 2:
         return torch.zeros_like(distances)
     k, n_expanded = min(n_neighbours, n - 1), min(n_expanded, n)
-    n_listed = n - 1 if n <= MOST_WHOLE else min(max(_LISTED, k, n_expanded), n - 1)
+    fewest, most = _LISTED
+    n_listed = n - 1 if n <= MOST_WHOLE else min(max(fewest, min(most, _PAIRS // n), k, n_expanded), n - 1)
     mean = float((distances.sum(dtype=torch.float64) - distances.trace()) / (n * (n - 1)))
     mean = max(mean, torch.finfo(torch.float64).tiny)
     others = distances.clone().fill_diagonal_(torch.inf)
