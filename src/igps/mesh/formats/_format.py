@@ -52,6 +52,7 @@ class Format:
     is_searched: bool = True  # whether files below a folder are taken for bodies by their suffix
     ignored: tuple[str, ...] = ()  # suffixes of files of the same format that hold no surface
     extra: str | None = None  # the extra of this package with the modules that it needs
+    beside: Callable[[Path, LoadOptions], Sequence[Path]] | None = None  # other files on which the bodies depend
 
 
 def made_later(
