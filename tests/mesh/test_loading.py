@@ -64,6 +64,15 @@ def test_comments_may_be_in_any_encoding(tmp_path: Path, suffix: str, comment: s
     np.testing.assert_array_equal(read_surface(tmp_path / "cloud.xyz").vertices, [[0, 0, 1], [0, 1, 0]])
 
 
+def test_a_byte_order_mark_costs_no_vertex(tmp_path: Path) -> None:
+    """Editors on Windows put it first, before the first vertex where no comment stands above."""
+    surface = trimesh.creation.icosphere(subdivisions=1)
+    text = "\n".join(line for line in surface.export(file_type="obj").split("\n") if not line.startswith("#"))
+    (tmp_path / "mesh.obj").write_text(text, encoding="utf-8-sig")
+    assert (tmp_path / "mesh.obj").read_bytes()[3:5] == b"v "
+    np.testing.assert_allclose(load_mesh(tmp_path / "mesh.obj").vertices, surface.vertices, atol=1e-6)
+
+
 def test_quads_become_triangles(tmp_path: Path) -> None:
     corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
     quads = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]])

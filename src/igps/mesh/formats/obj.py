@@ -16,7 +16,7 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The surface of an OBJ file; or its objects, if it has none its groups."""
     content = path.read_bytes()
     try:
-        text = content.decode()
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = content.decode("latin-1")  # which has a letter for any byte
     places: list[str] = []
