@@ -88,6 +88,22 @@ def test_the_class_is_the_folder_the_part_or_the_file(root: Path) -> None:
         find_bodies(root, classes="organ")  # type: ignore[arg-type]
 
 
+def test_an_empty_mask_among_organs_costs_no_other_its_class(tmp_path: Path) -> None:
+    """As TotalSegmentator writes them: a file for each organ, of which some are out of view."""
+    nibabel = pytest.importorskip("nibabel")
+    for subject, organ, value in (("s1", "liver", 1), ("s1", "spleen", 0), ("s2", "liver", 1), ("s2", "spleen", 1)):
+        mask = np.zeros((14, 14, 14), dtype=np.uint8)
+        mask[2:12, 3:10, 4:11] = value
+        (tmp_path / subject).mkdir(exist_ok=True)
+        nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), tmp_path / subject / f"{organ}.nii.gz")
+    dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", classes="body")
+    assert dataset.bodies.labels == ("liver", "spleen", "liver", "spleen")
+    failures = dataset.precompute(n_workers=1, progress=False)
+    assert [failure.id for failure in failures] == ["s1/spleen.nii.gz"]
+    assert "no voxel has a label" in failures[0].error
+    assert dataset.usable(failures).bodies.labels == ("liver", "liver", "spleen")
+
+
 def test_a_table_names_bodies_and_may_tell_more(root: Path) -> None:
     (root / "labels.csv").write_text("file,age,body,label\n2.obj,30,spleen,ill\n1.obj,40,,well\n")
     bodies = find_bodies(root, OBJECTS)

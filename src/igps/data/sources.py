@@ -99,12 +99,13 @@ class Bodies:
         if rule == "folder":
             return self
         if rule == "body":
-            unnamed = [name for name, part in zip(self.names, self.parts, strict=True) if part is None]
-            if unnamed:
+            if all(part is None for part in self.parts):
                 raise ValueError(
-                    f"classes: expected files of several bodies with 'body', but {unnamed[0]} is one body."
+                    f"classes: expected files of several bodies with 'body', but {self.names[0]} is one body."
                 )
-            return replace(self, labels=tuple(str(part) for part in self.parts))
+            # A file that cannot be read, such as an empty mask, has no parts; and costs the others nothing
+            words = [path.name.partition(".")[0] for path in self.paths]
+            return replace(self, labels=tuple(part or word for part, word in zip(self.parts, words, strict=True)))
         return replace(self, labels=tuple(map(file_of, self.names, self.parts)))
 
 
