@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -198,6 +199,14 @@ def test_what_is_read_beside_a_file_counts(tmp_path: Path, monkeypatch: pytest.M
         assert volumes("nifti", names) == {"x.nii.gz#liver": 864, "x.nii.gz#spleen": 1152}
         (tmp_path / table).write_text("label,name\n2,liver\n1,spleen\n")
         assert volumes("nifti", names) == {"x.nii.gz#liver": 1152, "x.nii.gz#spleen": 864}
+
+    (tmp_path / "nifti" / "x.csv").unlink()
+    for table, order in (("one.csv", (1, 2)), ("two.csv", (2, 1))):
+        (tmp_path / table).write_text("label,name\n{},liver\n{},spleen\n".format(*order))
+        os.utime(tmp_path / table, (1e9, 1e9))
+    (tmp_path / "nifti" / "x.nii.gz").touch()  # so that the tables tell nothing by their times and sizes
+    assert volumes("nifti", str(tmp_path / "one.csv"))["x.nii.gz#liver"] == 864
+    assert volumes("nifti", str(tmp_path / "two.csv"))["x.nii.gz#liver"] == 1152
 
     (tmp_path / "gltf").mkdir()
     scene = trimesh.Scene(trimesh.creation.icosphere(subdivisions=2, radius=9)).export(file_type="gltf")

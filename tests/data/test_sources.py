@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from igps.data.sources import file_and_part, find_bodies, given_bodies
+from igps.data.sources import bodies_of, file_and_part, find_bodies, given_bodies
 
 
 def touch(root: Path, *names: str) -> None:
@@ -81,6 +81,8 @@ def test_nothing_there(tmp_path: Path) -> None:
         find_bodies(tmp_path)
     with pytest.raises(FileNotFoundError, match="no such folder"):
         find_bodies(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match=r"nowhere: no such file or folder\. Check the path\."):
+        bodies_of(tmp_path / "nowhere")
 
 
 def test_given_files_need_one_label_each() -> None:

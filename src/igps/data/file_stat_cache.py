@@ -41,6 +41,7 @@ class FileStatCache:
         self._path = pipeline.cache_dir / _FILE
         changed = pipeline.pre_transform.cache_tag if pipeline.pre_transform else None
         words = [pipeline.reading.as_dict(), pipeline.config.as_dict(), MENDING_VERSION, changed]
+        words += [pipeline.reading.names] if pipeline.reading.names else []  # the time of another table may be as old
         self._name = hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()[:32]
         # What attributes depend on may change while the file does not, and a transform may depend on them.
         self._is_useful = not (pipeline.attributes and pipeline.pre_transform)

@@ -183,9 +183,11 @@ def bodies_of(
     options: LoadOptions | None = None,
     attributes: Iterable[AttributeSource] = (),
 ) -> Bodies:
-    """`find_bodies` of a folder, `given_bodies` of files, and bodies as they are."""
+    """`find_bodies` of a folder, `given_bodies` of files, and bodies as they are; a FileNotFoundError of neither."""
     if isinstance(given, Bodies):
         return given
+    if isinstance(given, str | Path) and not file_and_part(Path(given))[0].exists():
+        raise FileNotFoundError(f"{given}: no such file or folder. Check the path.")
     if isinstance(given, str | Path) and Path(given).is_dir():
         return find_bodies(given, options, attributes=attributes)
     return given_bodies([given] if isinstance(given, str | Path) else given, labels, options)
