@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,22 @@ def test_the_class_is_the_folder_the_part_or_the_file(root: Path) -> None:
         find_bodies(root, classes="organ")  # type: ignore[arg-type]
 
 
+def test_an_empty_mask_among_organs_costs_no_other_its_class(tmp_path: Path) -> None:
+    """As TotalSegmentator writes them: a file for each organ, of which some are out of view."""
+    nibabel = pytest.importorskip("nibabel")
+    for subject, organ, value in (("s1", "liver", 1), ("s1", "spleen", 0), ("s2", "liver", 1), ("s2", "spleen", 1)):
+        mask = np.zeros((14, 14, 14), dtype=np.uint8)
+        mask[2:12, 3:10, 4:11] = value
+        (tmp_path / subject).mkdir(exist_ok=True)
+        nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), tmp_path / subject / f"{organ}.nii.gz")
+    dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", classes="body")
+    assert dataset.bodies.labels == ("liver", "spleen", "liver", "spleen")
+    failures = dataset.precompute(n_workers=1, progress=False)
+    assert [failure.id for failure in failures] == ["s1/spleen.nii.gz"]
+    assert "no voxel has a label" in failures[0].error
+    assert dataset.usable(failures).bodies.labels == ("liver", "liver", "spleen")
+
+
 def test_a_table_names_bodies_and_may_tell_more(root: Path) -> None:
     (root / "labels.csv").write_text("file,age,body,label\n2.obj,30,spleen,ill\n1.obj,40,,well\n")
     bodies = find_bodies(root, OBJECTS)
@@ -153,6 +170,54 @@ def test_each_has_the_signature_of_its_own_surface(root: Path, tmp_path: Path, r
     assert len({dataset.key(i) for i in range(4)}) == 4
     if how == "at once":
         assert reads == [f"{1 + i // 2}.obj" for i in range(4)]  # for the meshes alone
+
+
+def test_what_is_read_beside_a_file_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two subjects whose headers are alike, a table of names that is put right, and numbers of a scene beside it."""
+    sitk, nibabel = pytest.importorskip("SimpleITK"), pytest.importorskip("nibabel")
+    monkeypatch.setattr("igps.data.file_stat_cache._YOUNG", 0)
+    labels = np.zeros((20, 20, 20), dtype=np.uint8)
+    labels[2:8, 4:16, 4:16], labels[10:18, 4:16, 4:16] = 1, 2
+
+    def volumes(folder: str, names: str | None = None) -> dict[str, int]:
+        dataset = SignatureDataset(tmp_path / folder, CONFIG, tmp_path / "cache", reading=LoadOptions(names=names))
+        dataset.precompute(n_workers=1, progress=False)
+        return {name: round(dataset[name].signature.volume) for name in dataset.bodies.names}
+
+    for subject, label in (("s1", 1), ("s2", 2)):
+        (tmp_path / "meta" / subject).mkdir(parents=True)
+        image = sitk.GetImageFromArray((labels == label).astype(np.uint8))
+        sitk.WriteImage(image, str(tmp_path / "meta" / subject / "x.mhd"))
+    headers = [(tmp_path / "meta" / subject / "x.mhd").read_bytes() for subject in ("s1", "s2")]
+    assert headers[0] == headers[1]
+    assert volumes("meta") == {"s1/x.mhd#x": 864, "s2/x.mhd#x": 1152}
+
+    (tmp_path / "nifti").mkdir()
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "nifti" / "x.nii.gz")
+    for table, names in (("nifti/x.csv", None), ("names.csv", str(tmp_path / "names.csv"))):
+        (tmp_path / table).write_text("label,name\n1,liver\n2,spleen\n")
+        assert volumes("nifti", names) == {"x.nii.gz#liver": 864, "x.nii.gz#spleen": 1152}
+        (tmp_path / table).write_text("label,name\n2,liver\n1,spleen\n")
+        assert volumes("nifti", names) == {"x.nii.gz#liver": 1152, "x.nii.gz#spleen": 864}
+
+    (tmp_path / "nifti" / "x.csv").unlink()
+    for table, order in (("one.csv", (1, 2)), ("two.csv", (2, 1))):
+        (tmp_path / table).write_text("label,name\n{},liver\n{},spleen\n".format(*order))
+        os.utime(tmp_path / table, (1e9, 1e9))
+    (tmp_path / "nifti" / "x.nii.gz").touch()  # so that the tables tell nothing by their times and sizes
+    assert volumes("nifti", str(tmp_path / "one.csv"))["x.nii.gz#liver"] == 864
+    assert volumes("nifti", str(tmp_path / "two.csv"))["x.nii.gz#liver"] == 1152
+
+    (tmp_path / "gltf").mkdir()
+    scene = trimesh.Scene(trimesh.creation.icosphere(subdivisions=2, radius=9)).export(file_type="gltf")
+    for name, content in scene.items():
+        (tmp_path / "gltf" / name.replace("buffer", "a buffer")).write_bytes(
+            content.replace(b"gltf_buffer", b"gltf_a%20buffer")
+        )
+    volume = volumes("gltf")["model.gltf"]
+    places = next(path for path in (tmp_path / "gltf").glob("*.bin") if path.stat().st_size == 162 * 12)
+    places.write_bytes((2 * np.frombuffer(places.read_bytes(), dtype=np.float32)).tobytes())
+    assert volumes("gltf")["model.gltf"] == pytest.approx(8 * volume, rel=1e-3)
 
 
 @pytest.mark.parametrize("how", ["here", "by two workers"])

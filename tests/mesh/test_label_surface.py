@@ -115,6 +115,16 @@ def test_the_affine_is_honoured(matrix: Array) -> None:
     assert area < 0.02
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e-2, 1e6])
+def test_the_unit_of_length_changes_nothing(unit: float) -> None:
+    """Voxels of a nanometre and of a mouse's micro-CT in millimetres, and of a kilometre."""
+    mask = voxels(solid("torus", 9), np.eye(3), np.random.default_rng(5))[0]
+    vertices, faces, _ = voxel_surface(mask, np.diag([1, 1, 2, 1]))
+    found, triangles, _ = voxel_surface(mask, unit * np.diag([1, 1, 2, 1 / unit]))
+    np.testing.assert_array_equal(triangles, faces)
+    np.testing.assert_allclose(found / unit, vertices, atol=1e-6)
+
+
 def test_many_voxels_are_put_on_a_coarser_grid_and_nothing_is_lost_by_it() -> None:
     mask, affine = voxels(ball(60), np.eye(3), np.random.default_rng(2))
     vertices, faces, _ = voxel_surface(mask, affine, max_vertices=2000)

@@ -64,6 +64,15 @@ def test_comments_may_be_in_any_encoding(tmp_path: Path, suffix: str, comment: s
     np.testing.assert_array_equal(read_surface(tmp_path / "cloud.xyz").vertices, [[0, 0, 1], [0, 1, 0]])
 
 
+def test_a_byte_order_mark_costs_no_vertex(tmp_path: Path) -> None:
+    """Editors on Windows put it first, before the first vertex where no comment stands above."""
+    surface = trimesh.creation.icosphere(subdivisions=1)
+    text = "\n".join(line for line in surface.export(file_type="obj").split("\n") if not line.startswith("#"))
+    (tmp_path / "mesh.obj").write_text(text, encoding="utf-8-sig")
+    assert (tmp_path / "mesh.obj").read_bytes()[3:5] == b"v "
+    np.testing.assert_allclose(load_mesh(tmp_path / "mesh.obj").vertices, surface.vertices, atol=1e-6)
+
+
 def test_quads_become_triangles(tmp_path: Path) -> None:
     corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
     quads = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [1, 3, 7, 5], [3, 2, 6, 7], [2, 0, 4, 6]])
@@ -71,6 +80,38 @@ def test_quads_become_triangles(tmp_path: Path) -> None:
     assert mesh.faces.shape == (12, 3)
     assert mesh.volume == pytest.approx(1)
     assert mesh.area == pytest.approx(6)
+
+
+@pytest.mark.parametrize("start", range(4))
+def test_polygons_with_corners_turned_inwards_do_not_fold(start: int, tmp_path: Path) -> None:
+    """Prisms over stars, whose area and volume are those of the polygon (Gauss's formula)."""
+    random = np.random.default_rng(start)
+    angle = np.sort(random.uniform(0, 2 * np.pi, 4)) if start == 3 else np.linspace(0, 2 * np.pi, 30, endpoint=False)
+    radius = np.where(np.arange(len(angle)) % 2, 1.0, random.uniform(0.1, 0.5, len(angle)))
+    x, y = np.roll(radius * (np.cos(angle), np.sin(angle)), start, axis=1)
+    area = abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
+    around = np.hypot(np.roll(x, -1) - x, np.roll(y, -1) - y).sum()
+    n, rings = len(x), [np.column_stack([x, y, np.full(len(x), z)]) for z in (0, 2)]
+    faces = [range(n, 0, -1), range(n + 1, 2 * n + 1)]
+    faces += [(i + 1, (i + 1) % n + 1, (i + 1) % n + n + 1, i + n + 1) for i in range(n)]
+    lines = [f"v {a!r} {b!r} {c!r}" for a, b, c in np.concatenate(rings).tolist()]
+    lines += ["f " + " ".join(map(str, face)) for face in faces]
+    (tmp_path / "star.obj").write_text("\n".join(lines))
+    mesh = load_mesh(tmp_path / "star.obj")
+    assert mesh.notes == ()
+    assert len(mesh.faces) == 2 * (n - 2) + 2 * n
+    assert mesh.volume == pytest.approx(2 * area)
+    assert mesh.area == pytest.approx(2 * area + 2 * around)
+
+
+def test_a_polygon_around_a_hole_does_not_fold(tmp_path: Path) -> None:
+    """A square with a square hole, reached by an edge that is run through twice, as CAD programs write it."""
+    square = [(0, 0), (3, 0), (3, 3), (0, 3), (1, 1), (1, 2), (2, 2), (2, 1)]
+    (tmp_path / "ring.obj").write_text("\n".join(f"v {x} {y} 0" for x, y in square) + "\nf 1 2 3 4 1 5 6 7 8 5\n")
+    corners = (surface := read_surface(tmp_path / "ring.obj")).vertices[surface.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (normals[:, 2] >= 0).all()
+    assert normals[:, 2].sum() / 2 == pytest.approx(8)
 
 
 def test_off_files_are_read_as_trimesh_reads_them(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from igps.mesh.formats import files_read
 from igps.mesh.formats.label_names import read_label_names
 from igps.mesh.formats.volumes import LabelVolume, label_surface, read_label_volume
 from igps.mesh.mesh import MeshError
@@ -150,6 +151,41 @@ def test_a_stack_of_pictures_has_the_spacing_of_imagej_or_none(tmp_path: Path) -
     assert label_surface(plain, 3).volume == pytest.approx(384, rel=1e-3)
 
 
+def write_nrrd(path: Path, *lines: str) -> None:
+    """Boxes in voxels of 1 × 1.5 × 2.5, by hand."""
+    sizes, spacing = ["sizes: 14 12 10", "encoding: raw"], ["spacings: 1 1.5 2.5"]
+    header = "\n".join(["NRRD0005", "type: uint8", "dimension: 3", *sizes, *spacing, *lines])
+    path.write_bytes(header.encode() + b"\n\n" + two_boxes().tobytes(order="F"))
+
+
+@pytest.mark.parametrize(
+    ("lines", "volume", "unit"),
+    [
+        ((), 1440, "mm"),
+        (('units: "microns" "microns" "microns"',), 1440e-9, "mm"),
+        (('units: "µm" "µm" "µm"',), 1440e-9, "mm"),
+        (('units: "pixel" "pixel" "pixel"',), 1440, None),
+    ],
+)
+def test_lengths_of_a_nrrd_file_are_in_its_unit(
+    lines: tuple[str, ...], volume: float, unit: str | None, tmp_path: Path
+) -> None:
+    write_nrrd(tmp_path / "x.nrrd", *lines)
+    found = read_label_volume(tmp_path / "x.nrrd")
+    assert found.unit == unit
+    assert label_surface(found, 3).volume == pytest.approx(volume, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["x.raw", "./x.raw"])
+def test_voxels_beside_their_header(name: str, tmp_path: Path) -> None:
+    write_nrrd(tmp_path / "x.nhdr", f"data file: {name}")
+    (tmp_path / "x.raw").write_bytes(two_boxes().tobytes(order="F"))
+    volume = read_label_volume(tmp_path / "x.nhdr")
+    assert label_bodies(volume) == [(3, "3", 384), (7, "7", 320)]
+    assert label_surface(volume, 3).volume == pytest.approx(1440, rel=1e-3)
+    assert files_read(tmp_path / "x.nhdr") == [tmp_path / "x.nhdr", tmp_path / "x.raw"]
+
+
 def test_segments_of_slicer_have_names_and_may_overlap(tmp_path: Path) -> None:
     one, two = two_boxes() == 3, two_boxes() > 0
     image = itk_image(np.stack([one, two], axis=-1).astype(np.uint8), vector=True)
@@ -212,6 +248,23 @@ def test_a_mask_without_names_is_called_by_its_file(tmp_path: Path) -> None:
     assert label_bodies(volume) == [(1, "left.kidney", 384)]
     (tmp_path / "left.kidney.csv").write_text("label,name\n1,kidney\n")
     assert label_bodies(read_label_volume(tmp_path / "left.kidney.nii.gz")) == [(1, "kidney", 384)]
+
+
+def test_a_mask_of_255_is_called_by_its_file_too(tmp_path: Path) -> None:
+    write_nibabel(tmp_path / "prostate.nii.gz", (two_boxes() == 3).astype(np.uint8) * 255)
+    assert label_bodies(read_label_volume(tmp_path / "prostate.nii.gz")) == [(255, "prostate", 384)]
+    write_nibabel(tmp_path / "labels.nii.gz", (two_boxes() == 3) * np.uint8(255) + (two_boxes() == 7) * np.uint8(254))
+    assert label_bodies(read_label_volume(tmp_path / "labels.nii.gz")) == [(254, "254", 320), (255, "255", 384)]
+
+
+def test_labels_that_were_given_as_numbers_with_a_fraction_are_whole_again(tmp_path: Path) -> None:
+    """nibabel writes them as scaled integers where the header of an image of integers comes with them."""
+    image = nibabel.Nifti1Image(two_boxes() * 1.0, AFFINE)
+    image.header.set_data_dtype(np.int16)
+    nibabel.save(image, tmp_path / "x.nii.gz")
+    stored = np.asanyarray(nibabel.load(tmp_path / "x.nii.gz").dataobj)
+    assert (stored != np.round(stored)).any()
+    assert label_bodies(read_label_volume(tmp_path / "x.nii.gz")) == [(3, "3", 384), (7, "7", 320)]
 
 
 def test_probabilities_are_cut_at_the_threshold(tmp_path: Path) -> None:
@@ -322,6 +375,18 @@ def test_no_header_leads_out_of_its_folder(tmp_path: Path) -> None:
     (tmp_path / "x.nrrd").write_text(header)
     with pytest.raises(MeshError, match="a file of its own folder expected"):
         read_label_volume(tmp_path / "x.nrrd")
+
+
+@pytest.mark.parametrize("line", ["\n\nElementDataFile =", " ElementDataFile =", "ElementDataFile :"])
+def test_no_header_of_metaimage_leads_out_however_it_is_written(line: str, tmp_path: Path) -> None:
+    """ITK reads these, too."""
+    write_itk(tmp_path / "x.mhd", two_boxes())
+    (tmp_path / "below").mkdir()
+    text = (tmp_path / "x.mhd").read_text().replace("ElementDataFile = ", f"{line} ../")
+    (tmp_path / "below" / "x.mhd").write_text(text)
+    assert sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / "below" / "x.mhd"))).any()
+    with pytest.raises(MeshError, match="a file of its own folder expected"):
+        read_label_volume(tmp_path / "below" / "x.mhd")
 
 
 def test_dicom_that_is_no_segmentation_is_refused(tmp_path: Path) -> None:

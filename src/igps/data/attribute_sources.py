@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from igps.data.attributes import AttributeSource
 from igps.data.cache import content_digest, stamp_of
-from igps.mesh.formats import images, vertex_values
+from igps.mesh.formats import files_read, images, vertex_values
 from igps.mesh.formats.molecules import Molecule, MoleculeBodies, is_structure, molecules_by_part
 from igps.mesh.loading import BodyRef, load_mesh, read_surface
 from igps.mesh.mesh import MeshError
@@ -99,7 +99,8 @@ class FileAttribute(ABC):
     def cache_tag(self, body: BodyRef) -> str:
         """The kind of source, the array's name, and the content of the file; a MeshError where there is none."""
         file, name = self.file(body)
-        return f"{type(self).__name__} 1 {name} {_checksum(file, stamp_of(file))}"
+        files = files_read(file)
+        return f"{type(self).__name__} 1 {name} {_checksum(*files, stamp=stamp_of(*files))}"
 
     def __call__(self, body: BodyRef, points: Values) -> Values:
         """(P,) or (P, C) at points (P, 3); a MeshError where the file is of no use, or knows too few of them."""
@@ -152,9 +153,9 @@ class FileAttribute(ABC):
 
 
 @lru_cache(maxsize=1000)
-def _checksum(file: Path, stamp: tuple[int, int, int]) -> str:
+def _checksum(*files: Path, stamp: tuple[int, int, int]) -> str:
     """Of the content; the many bodies of a volume may have one image."""
-    return content_digest(file).hex()
+    return content_digest(*files).hex()
 
 
 @dataclass(frozen=True)

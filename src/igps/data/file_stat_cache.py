@@ -8,11 +8,14 @@ import os
 import sqlite3
 import time
 from collections.abc import Generator, Iterable, Mapping
+from functools import lru_cache
 
 from igps.data.cache import SignatureCache, stamp_of
 from igps.data.pipeline import CacheHit, SignaturePipeline
+from igps.mesh.formats import files_read
 from igps.mesh.loading import BodyRef
 from igps.mesh.mending import MENDING_VERSION
+from igps.mesh.mesh import MeshError
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +41,7 @@ class FileStatCache:
         self._path = pipeline.cache_dir / _FILE
         changed = pipeline.pre_transform.cache_tag if pipeline.pre_transform else None
         words = [pipeline.reading.as_dict(), pipeline.config.as_dict(), MENDING_VERSION, changed]
+        words += [pipeline.reading.names] if pipeline.reading.names else []  # the time of another table may be as old
         self._name = hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()[:32]
         # What attributes depend on may change while the file does not, and a transform may depend on them.
         self._is_useful = not (pipeline.attributes and pipeline.pre_transform)
@@ -48,6 +52,7 @@ class FileStatCache:
         if not self._path.exists() or not self._is_useful:
             return found
         cache = SignatureCache(self._pipeline.cache_dir)
+        stamp_now = lru_cache(maxsize=1)(lambda path: stamp_of(*files_read(path, self._pipeline.reading)))
         with self._dispensable(), contextlib.closing(self._database()) as database:
             for body in bodies:
                 row = database.execute(
@@ -58,8 +63,8 @@ class FileStatCache:
                 if row is None:
                     continue
                 *stamp, key, n_bytes, notes = row
-                with contextlib.suppress(OSError):
-                    same = stamp_of(body.path) == tuple(stamp)
+                with contextlib.suppress(OSError, MeshError):
+                    same = stamp_now(body.path) == tuple(stamp)
                     if same and os.stat(cache.path(key)).st_size == n_bytes:
                         hit = CacheHit(key, n_bytes, tuple(json.loads(notes)), tuple(stamp))
                         if (whole := self._pipeline.with_attributes(body, hit)) is not None:

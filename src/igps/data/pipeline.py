@@ -18,6 +18,7 @@ import numpy as np
 from igps._parallel import Failed, MachineError, attempt
 from igps.data.attributes import ROOMS, AttributeSource, with_attribute
 from igps.data.cache import AttributeCache, SignatureCache, content_digest, stamp_of
+from igps.mesh.formats import files_read
 from igps.mesh.loading import BodyRef, each_body, load_mesh
 from igps.mesh.mending import MENDING_VERSION, repair_steps
 from igps.mesh.mesh import Mesh, MeshError
@@ -41,13 +42,14 @@ class BodyFile:
     """What a key needs to know of a file."""
 
     stamp: tuple[int, int, int]  # see `stamp_of`
-    digest: bytes  # of its content
+    digest: bytes  # of its content, and of what is read with it
 
     @staticmethod
-    def of(path: Path) -> BodyFile:
+    def of(path: Path, reading: LoadOptions) -> BodyFile:
         """What is known of a file; a MeshError where it cannot be read."""
         try:
-            return BodyFile(stamp_of(path), content_digest(path))
+            files = files_read(path, reading)
+            return BodyFile(stamp_of(*files), content_digest(*files))
         except OSError as error:
             raise MeshError(f"{path}: cannot be read ({error.strerror}). Check the path.") from error
 
@@ -84,7 +86,7 @@ class SignaturePipeline:
 
     def signature(self, body: BodyRef) -> Signature:
         """The Signature of a body, from the cache where it or a larger one is there, and there afterwards."""
-        file = BodyFile.of(body.path)
+        file = BodyFile.of(body.path, self.reading)
         hit = self._lookup(body, file)
         found = None if hit is None else self.read(hit)
         return self._made(body, file)[1] if found is None else found
@@ -97,7 +99,7 @@ class SignaturePipeline:
         """
         if len(bodies) == 1:
             return [self.hit(bodies[0])]
-        file = BodyFile.of(bodies[0].path)
+        file = BodyFile.of(bodies[0].path, self.reading)
         served = {body: self._lookup(body, file) for body in bodies}
         done: dict[BodyRef, CacheHit | Failed] = {body: hit for body, hit in served.items() if hit is not None}
         missing = {body.part: body for body in bodies if body not in done}
@@ -116,11 +118,11 @@ class SignaturePipeline:
 
     def hit(self, body: BodyRef) -> CacheHit:
         """What serves a body, which is in the cache then; a MeshError where it cannot be used."""
-        return self._hit(body, BodyFile.of(body.path))
+        return self._hit(body, BodyFile.of(body.path, self.reading))
 
     def lookup(self, bodies: Sequence[BodyRef]) -> list[CacheHit | None]:
         """What in the cache serves each body of one file, None where nothing does; a MeshError if unreadable."""
-        file = BodyFile.of(bodies[0].path)
+        file = BodyFile.of(bodies[0].path, self.reading)
         return [self._lookup(body, file) for body in bodies]
 
     def with_attributes(self, body: BodyRef, hit: CacheHit) -> CacheHit | None:
@@ -149,7 +151,7 @@ class SignaturePipeline:
 
     def key(self, body: BodyRef) -> str:
         """A Signature's name in the cache, by all that it depends on; a MeshError where the file cannot be read."""
-        return self._key(body, BodyFile.of(body.path), self.config, False)
+        return self._key(body, BodyFile.of(body.path, self.reading), self.config, False)
 
     def _hit(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> CacheHit:
         return self._lookup(body, file) or self._made(body, file, mesh)[0]

@@ -99,12 +99,13 @@ class Bodies:
         if rule == "folder":
             return self
         if rule == "body":
-            unnamed = [name for name, part in zip(self.names, self.parts, strict=True) if part is None]
-            if unnamed:
+            if all(part is None for part in self.parts):
                 raise ValueError(
-                    f"classes: expected files of several bodies with 'body', but {unnamed[0]} is one body."
+                    f"classes: expected files of several bodies with 'body', but {self.names[0]} is one body."
                 )
-            return replace(self, labels=tuple(str(part) for part in self.parts))
+            # A file that cannot be read, such as an empty mask, has no parts; and costs the others nothing
+            words = [path.name.partition(".")[0] for path in self.paths]
+            return replace(self, labels=tuple(part or word for part, word in zip(self.parts, words, strict=True)))
         return replace(self, labels=tuple(map(file_of, self.names, self.parts)))
 
 
@@ -182,9 +183,11 @@ def bodies_of(
     options: LoadOptions | None = None,
     attributes: Iterable[AttributeSource] = (),
 ) -> Bodies:
-    """`find_bodies` of a folder, `given_bodies` of files, and bodies as they are."""
+    """`find_bodies` of a folder, `given_bodies` of files, and bodies as they are; a FileNotFoundError of neither."""
     if isinstance(given, Bodies):
         return given
+    if isinstance(given, str | Path) and not file_and_part(Path(given))[0].exists():
+        raise FileNotFoundError(f"{given}: no such file or folder. Check the path.")
     if isinstance(given, str | Path) and Path(given).is_dir():
         return find_bodies(given, options, attributes=attributes)
     return given_bodies([given] if isinstance(given, str | Path) else given, labels, options)
@@ -192,8 +195,11 @@ def bodies_of(
 
 def file_and_part(path: Path) -> tuple[Path, str | None]:
     """The file and the part of ``FILE#PART``; no part where a file has this name, or none has what stands before."""
-    file, mark, part = str(path).partition("#")
-    return (Path(file), part) if mark and part and not path.exists() and Path(file).is_file() else (path, None)
+    name = str(path)
+    for at in [] if path.exists() else [i for i, letter in enumerate(name) if letter == "#"]:
+        if name[at + 1 :] and (file := Path(name[:at])).is_file():
+            return file, name[at + 1 :]
+    return path, None
 
 
 def file_of(name: str, part: str | None) -> str:
@@ -212,21 +218,29 @@ def _parts(path: Path, options: LoadOptions) -> Sequence[str | None]:
 def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
     file = root / LABELS_FILE
     with file.open(newline="", encoding="utf-8-sig") as stream:
-        reader = csv.DictReader(stream)
-        header = [name for name in reader.fieldnames or () if name]
+        reader = csv.DictReader(stream, skipinitialspace=True)
+        try:
+            reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
+            rows = [
+                (reader.line_num, {name: value.strip() for name, value in row.items() if isinstance(value, str)})
+                for row in reader
+            ]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise ValueError(f"{file}: not readable as a table ({error}). Save it as CSV in UTF-8.") from error
+        header = [name for name in reader.fieldnames if name]
         further = [name for name in header if name not in ("file", "body", "label")]
         if "file" not in header or not ("label" in header or further):
-            raise ValueError(f"{file}: expected the columns file,label in the first line, got {reader.fieldnames}.")
+            expected = "expected the columns file,label in the first line, parted by a comma"
+            raise ValueError(f"{file}: {expected}, got {reader.fieldnames}.")
         if len(set(header)) < len(header):
             raise ValueError(f"{file}: a column is named twice in {header}. Give each column a name of its own.")
-        rows = list(reader)
     needed = [name for name in ("file", "label") if name in header]
-    incomplete = [i for i, row in enumerate(rows, start=2) if not all(row[name] for name in needed)]
+    incomplete = [line for line, row in rows if not all(row.get(name) for name in needed)]
     if not rows or incomplete:
         where = f"line {incomplete[0]} lacks a file or a label" if incomplete else "no rows"
         raise ValueError(f"{file}: {where}. Each line names a mesh file and its class.")
-    columns = {name: [(row[name] or "").strip() or None for row in rows] for name in further}
-    found = [(root / row["file"], row["file"], row.get("label"), row.get("body") or None) for row in rows]
+    columns = {name: [row.get(name) or None for _, row in rows] for name in further}
+    found = [(root / row["file"], row["file"], row.get("label"), row.get("body") or None) for _, row in rows]
     bodies = _expanded(found, options, columns)
     twice = sorted(name for name, count in Counter(bodies.names).items() if count > 1)
     if twice:
@@ -251,6 +265,5 @@ def _expanded(
 
 
 def _files_in(folder: Path) -> list[Path]:
-    return sorted(
-        path for path in folder.rglob("*") if is_searched(path) and not path.name.startswith(".") and path.is_file()
-    )
+    found = (path for path in folder.rglob("*") if is_searched(path) and path.is_file())
+    return sorted(path for path in found if not any(name.startswith(".") for name in path.relative_to(folder).parts))

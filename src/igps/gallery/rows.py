@@ -5,6 +5,7 @@ import math
 import os
 import time
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,11 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from igps.data.cache import stamp_of
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import LABELS_FILE, Bodies
 from igps.gallery.about import KNOWN, Batch
+from igps.mesh.formats import files_read
 from igps.mesh.mesh import MeshError
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
@@ -64,24 +67,25 @@ def told_of(bodies: Bodies, kinds: Mapping[str, type]) -> list[dict[str, Any]]:
     folders = {folder: os.path.realpath(folder) for folder in {os.path.dirname(path) for path in bodies.paths}}
     files = [os.path.join(folders[os.path.dirname(path)], os.path.basename(path)) for path in bodies.paths]
     labels = bodies.labels or [None] * len(bodies)
+    stamps = {file: _stamp(Path(file)) for file in set(files)}
     told: list[dict[str, Any]] = []
     for file, part, name, label in zip(files, bodies.parts, bodies.names, labels, strict=True):
         id_ = file if part is None else f"{file}#{part}"
-        told.append({"id": id_, "name": name, "class": label, "file": file, "part": part, **_stamp(file)})
+        told.append({"id": id_, "name": name, "class": label, "file": file, "part": part, **stamps[file]})
     for column, values in bodies.columns.items():
         for row, value in zip(told, values, strict=True):
             row[column] = None if value is None else kinds[column](value)
     return told
 
 
-def _stamp(file: str) -> dict[str, int]:
+def _stamp(file: Path) -> dict[str, int]:
     """Size and time of the last change; −1 where the file may change again within the grain of its clock."""
     try:
-        stat = os.stat(file)
-    except OSError:  # describing it will say why
+        n_bytes, *times = stamp_of(*files_read(file))
+    except (OSError, MeshError):  # describing it will say why
         return {"bytes": -1, "modified": -1}
-    changed = max(stat.st_mtime_ns, stat.st_ctime_ns)
-    return {"bytes": stat.st_size, "modified": changed if time.time_ns() - changed > _YOUNG else -1}
+    changed = max(times)
+    return {"bytes": n_bytes, "modified": changed if time.time_ns() - changed > _YOUNG else -1}
 
 
 def key_of(dataset: SignatureDataset, i: int) -> str:

@@ -36,14 +36,12 @@ PAD = _BAND + 2
 """Empty voxels that the grid must have on every side."""
 
 
-def smooth_field(share: Floats, spacing: Floats) -> Floats:
-    """The function at the centres of the voxels, in units of length, about the distance to the surface nearby.
+def smooth_field(share: Floats, sides: Floats) -> Floats:
+    """The function at the centres of the voxels, in shortest sides, about the distance to the surface nearby.
 
     Shares (X, Y, Z) of each voxel that lies in the body, 0 to 1, have `PAD` empty layers around; those of a mask are 0
-    or 1 and tell whether the centre is in the body. The spacing (3,) are the sides of a voxel, length.
+    or 1 and tell whether the centre is in the body. The sides (3,) of a voxel have 1 as the shortest.
     """
-    scale = float(spacing.min())
-    sides = spacing / scale
     inside = share >= 0.5
     distance = ndimage.distance_transform_edt(inside, sampling=sides)
     distance += ndimage.distance_transform_edt(~inside, sampling=sides)
@@ -73,7 +71,7 @@ def smooth_field(share: Floats, spacing: Floats) -> Floats:
         ndimage.gaussian_filter(values, _WIDE_WINDOW, truncate=3) for values in (bend * border, border.astype(float))
     )
     relax(np.interp(bend - around / np.maximum(weight, 1e-3), _BENDS, (0, 1)))
-    return field * scale
+    return field
 
 
 def filled_share(field: Floats) -> tuple[Floats, Floats]:

@@ -83,7 +83,7 @@ def voxel_surface(
     mask = _joined(share >= 0.5)
     share = np.pad(np.where(mask, np.maximum(share, 0.5), share), PAD)
     check_grid(share.size, name)
-    sides = spacing * factor
+    sides = spacing * factor / (spacing * factor).min()  # nothing depends on the unit of length
     field = smooth_field(share, sides)
     # Into how many parts each side goes, so that the parts are about equal and make vertices enough.
     finer = min(max(math.ceil(math.sqrt(_FEWEST / _n_vertices(mask, sides))), 1), _MOST_REFINED)

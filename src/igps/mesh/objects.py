@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from igps.mesh.formats._format import RawBody, corners_of_rows, triangles
+from igps.mesh.formats._format import RawBody, corners_of_rows
+from igps.mesh.formats._polygons import flat_triangles
 
 
 def raw_of(thing: Any) -> tuple[str, RawBody]:
@@ -17,8 +18,10 @@ def raw_of(thing: Any) -> tuple[str, RawBody]:
             raise TypeError("the GIFTI image holds no surface: it lacks points or triangles. Give one of a surface.")
         return name, RawBody(np.asarray(points[0].data, np.float64), np.asarray(faces[0].data, np.int64), unit="mm")
     if hasattr(thing, "points") and hasattr(thing, "faces"):
-        faces = triangles(*corners_of_rows(np.asarray(thing.faces, dtype=np.int64)))
-        return name, RawBody(np.asarray(thing.points, np.float64), faces)
+        vertices = np.asarray(thing.points, np.float64)
+        return name, RawBody(
+            vertices, flat_triangles(*corners_of_rows(np.asarray(thing.faces, dtype=np.int64)), vertices)
+        )
     if hasattr(thing, "vertices") and hasattr(thing, "faces"):
         unit = getattr(thing, "units", None)
         return name, RawBody(np.asarray(thing.vertices, np.float64), np.asarray(thing.faces, np.int64), unit=unit)

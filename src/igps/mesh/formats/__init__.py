@@ -4,7 +4,7 @@
 and raises anything where the file is faulty; make it a `Format` with its suffixes; and add that to `FORMATS` below.
 The rest is done for it: error messages that name the file, "whole" and "pieces", mending, listing, caching. What a
 header claims is checked before memory is taken (`check_unpacked`), modules that not everybody has are imported within
-`read`, and no path that the file holds leads out of its folder.
+`read`, no path that the file holds leads out of its folder, and other files that it reads are told by `Format.beside`.
 """
 
 from pathlib import Path
@@ -12,9 +12,11 @@ from pathlib import Path
 from igps.mesh._label_measures import LabelVoxels, VoxelMeasures
 from igps.mesh.formats import archives, brains, clouds, molecules, obj, off, ply, scenes, stl, threemf, volumes, vtk
 from igps.mesh.formats._format import Format, RawBody
+from igps.mesh.options import LoadOptions
 
 __all__ = [
-    "FORMATS", "Format", "LabelVoxels", "RawBody", "VoxelMeasures", "format_of", "is_searched", "searched_suffixes",
+    "FORMATS", "Format", "LabelVoxels", "RawBody", "VoxelMeasures", "files_read", "format_of", "is_searched",
+    "searched_suffixes",
 ]  # fmt: skip
 
 FORMATS: tuple[Format, ...] = (
@@ -30,6 +32,13 @@ def format_of(path: str | Path) -> Format | None:
     found = [(len(suffix), kind) for kind in FORMATS for suffix in kind.suffixes if name.endswith(suffix)]
     ignored = any(name.endswith(suffix) for kind in FORMATS for suffix in kind.ignored)
     return None if ignored or not found else max(found, key=lambda one: one[0])[1]
+
+
+def files_read(path: Path, options: LoadOptions = LoadOptions()) -> list[Path]:
+    """All files on which the bodies of a file depend, as far as they are there: itself first."""
+    kind = format_of(path)
+    beside = () if kind is None or kind.beside is None or not path.is_file() else kind.beside(path, options)
+    return [path, *(one for one in beside if one.is_file())]
 
 
 def is_searched(path: str | Path) -> bool:

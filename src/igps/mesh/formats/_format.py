@@ -52,6 +52,7 @@ class Format:
     is_searched: bool = True  # whether files below a folder are taken for bodies by their suffix
     ignored: tuple[str, ...] = ()  # suffixes of files of the same format that hold no surface
     extra: str | None = None  # the extra of this package with the modules that it needs
+    beside: Callable[[Path, LoadOptions], Sequence[Path]] | None = None  # other files on which the bodies depend
 
 
 def made_later(
@@ -114,24 +115,6 @@ def distinct(names: Iterable[str]) -> list[str]:
         taken[new] += 1
         found.append(new)
     return found
-
-
-def triangles(corners: Integers, n_corners: Integers) -> Integers:
-    """Polygons, with their corners laid end to end, cut into triangles from their first corners, (F, 3).
-
-    Triangles come first, then the first and the second halves of quadrilaterals, then larger polygons.
-    """
-    starts = np.cumsum(n_corners) - n_corners
-    pieces = [corners[starts[n_corners == 3][:, None] + np.arange(3)]]
-    quads = corners[starts[n_corners == 4][:, None] + np.arange(4)]
-    pieces += [quads[:, [0, 1, 2]], quads[:, [2, 3, 0]]]
-    large = np.flatnonzero(n_corners > 4)
-    if len(large):
-        n = n_corners[large] - 2
-        at = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
-        first = np.repeat(starts[large], n)
-        pieces.append(np.stack([corners[first], corners[first + at + 1], corners[first + at + 2]], axis=1))
-    return np.concatenate(pieces)
 
 
 def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:

@@ -6,6 +6,7 @@ import logging
 from io import BytesIO
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import trimesh
@@ -18,22 +19,27 @@ from igps.mesh.options import LoadOptions
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
-class _Beside(trimesh.resolvers.Resolver):
+class Beside(trimesh.resolvers.Resolver):
     """The files of one folder, and those below it."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder.resolve()
 
-    def get(self, name: str) -> bytes:
+    def place(self, name: str) -> Path:
+        """The file of a name, in which blanks and the like may be written as in addresses."""
         place = (self._folder / name).resolve()
+        place = place if place.is_file() else (self._folder / unquote(name)).resolve()
         if not place.is_relative_to(self._folder):
             raise ValueError(f"it refers to {name!r}, outside of its folder")
-        return place.read_bytes()
+        return place
+
+    def get(self, name: str) -> bytes:
+        return self.place(name).read_bytes()
 
     def keys(self) -> list[str]:
         return []
 
-    def namespaced(self, namespace: str) -> _Beside:
+    def namespaced(self, namespace: str) -> Beside:
         return self
 
     def write(self, name: str, data: bytes) -> None:
@@ -44,7 +50,7 @@ def objects(path: Path, options: LoadOptions, content: bytes | None = None, **lo
     """A body for each place of a scene where a geometry stands; `loading` is for trimesh."""
     loading = {"file_type": path.suffix.lower().lstrip("."), **loading}
     stream = BytesIO(path.read_bytes() if content is None else content)
-    scene = trimesh.load_scene(stream, resolver=_Beside(path.parent), process=False, **loading)
+    scene = trimesh.load_scene(stream, resolver=Beside(path.parent), process=False, **loading)
     nodes = [(node, *scene.graph.get(node)) for node in scene.graph.nodes_geometry]
     sizes = {name: 24 * (len(one.vertices) + len(getattr(one, "faces", ()))) for name, one in scene.geometry.items()}
     check_unpacked(sum(sizes[name] for _, _, name in nodes), path, options.max_unpacked)

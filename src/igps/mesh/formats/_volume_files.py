@@ -19,6 +19,12 @@ from igps.mesh.mesh import MILLIMETRES, MeshError
 _BESIDE = 4
 _FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])  # from LPS, which DICOM and ITK have, to RAS
 _EXPORT = "Export the labels."
+_NRRD, _META = (".nrrd", ".nhdr"), (".mha", ".mhd")
+_MOST_HEADER = 1 << 24
+# Where a header says that the voxels lie; MetaImage takes ":" for "=", and blanks before it.
+_DATA_FILE = re.compile(
+    rb"(?:ElementDataFile[ \t]*[=:]|^data ?file:)[ \t]*(?:\./)?(.*?)[ \t]*\r?$", re.MULTILINE | re.IGNORECASE
+)
 
 
 @dataclass
@@ -92,7 +98,7 @@ def _nibabel(path: Path) -> RawVolume:
 def _simple_itk(path: Path) -> RawVolume:
     import SimpleITK
 
-    _check_detached(path)
+    detached(path)
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
@@ -109,7 +115,17 @@ def _simple_itk(path: Path) -> RawVolume:
     affine = np.eye(4)
     affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
     affine[:3, 3] = image.GetOrigin()
-    return RawVolume(layers, _FLIP @ affine, segments=[one for one in segments if one[1] < len(layers)])
+    unit = _nrrd_unit(_header(path)) if suffix_of(path) in _NRRD else "mm"
+    affine[:3] *= MILLIMETRES.get(unit, 1.0)
+    named = [one for one in segments if one[1] < len(layers)]
+    return RawVolume(layers, _FLIP @ affine, segments=named, unit="mm" if unit in MILLIMETRES else None)
+
+
+def _nrrd_unit(header: bytes) -> str:
+    """Of length, millimetres where a NRRD header does not say it; ITK passes it over."""
+    found = re.search(rb"^(?:space )?units:(.*)$", header, re.MULTILINE)
+    words = set(re.findall(r'"([^"]+)"', found[1].decode("utf-8", "replace"))) if found else set()
+    return (words.pop() if len(words) == 1 else "of several units") if words else "mm"
 
 
 def _slicer_segments(about: dict[str, str]) -> list[tuple[str, int, int]]:
@@ -122,16 +138,26 @@ def _slicer_segments(about: dict[str, str]) -> list[tuple[str, int, int]]:
     return segments
 
 
-def _check_detached(path: Path) -> None:
-    """Refuse a header whose voxels lie outside its folder."""
-    with path.open("rb") as file:
-        head = file.read(1 << 16)
-    key = rb"^(?:ElementDataFile[ \t]*=|data ?file:)[ \t]*(.*?)[ \t]*\r?$"
-    lines = re.findall(key, head.split(b"\n\n")[0], re.MULTILINE | re.IGNORECASE)
-    for name in (line.decode("utf-8", "replace") for line in lines):
+def detached(path: Path) -> list[Path]:
+    """The file of the voxels, where the header of a volume names another file; a MeshError if outside its folder."""
+    if suffix_of(path) not in (*_NRRD, *_META):
+        return []
+    names = [line.decode("utf-8", "replace") for line in _DATA_FILE.findall(_header(path))]
+    for name in names:
         if "/" in name or "\\" in name or name.upper().startswith("LIST"):
             elsewhere = f"{path}: its voxels are said to lie in {name!r}; a file of its own folder expected."
             raise MeshError(f"{elsewhere} Save the volume as one file.")
+    return [path.with_name(name) for name in names if name and name != "LOCAL"]
+
+
+def _header(path: Path) -> bytes:
+    """Of a NRRD or MetaImage file, whose voxels may follow."""
+    end = re.compile(rb"\n\r?\n" if suffix_of(path) in _NRRD else rb"^\s*ElementDataFile\s*[=:].*\n", re.MULTILINE)
+    with path.open("rb") as file:
+        header = b""
+        while (found := end.search(header)) is None and len(header) < _MOST_HEADER and (more := file.read(1 << 16)):
+            header += more
+    return header if found is None else header[: found.end()]
 
 
 def _highdicom(path: Path) -> RawVolume:
@@ -202,7 +228,7 @@ def _tiff_spacing(file: Any) -> tuple[float, float, float] | None:
 
 READERS: dict[str, Callable[[Path], RawVolume]] = {
     **dict.fromkeys((".nii", ".nii.gz", ".mgh", ".mgz"), _nibabel),
-    **dict.fromkeys((".nrrd", ".mha", ".mhd"), _simple_itk),
+    **dict.fromkeys((*_NRRD, *_META), _simple_itk),
     ".dcm": _highdicom,
     ".tif": _tifffile,
     ".tiff": _tifffile,

@@ -3,7 +3,7 @@
 import numpy as np
 
 from igps._arrays import Integers
-from igps.mesh.formats._format import triangles
+from igps.mesh.formats._polygons import triangles
 
 TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, TETRAHEDRON = 5, 6, 7, 8, 9, 10
 # Sides of volumes, seen from outside, as VTK orders their corners: of tetrahedra, voxels, hexahedra, wedges, pyramids.

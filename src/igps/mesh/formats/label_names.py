@@ -56,17 +56,18 @@ def read_label_names(path: str | Path) -> dict[int, str]:
     return names
 
 
-def names_beside(path: Path) -> dict[int, str]:
-    """Those of the first table beside a volume: under its name, or of FreeSurfer or nnU-Net for the folder; or none."""
+def table_beside(path: Path) -> Path | None:
+    """The first table of names beside a volume: under its name, or of FreeSurfer or nnU-Net for the folder; or none."""
     stem = re.sub(r"(\.seg)?\.[^.]+(\.gz)?$", "", path.name, flags=re.IGNORECASE)
     for name in (*(stem + suffix for suffix in _SUFFIXES), *_BESIDE):
         table = path.with_name(name)
         if table != path and table.is_file():
             try:
-                return read_label_names(table)
+                read_label_names(table)
+                return table
             except MeshError as error:
                 logger.info("%s: no names from the file beside it: %s", path, error)
-    return {}
+    return None
 
 
 def names_in_extensions(contents: Iterable[bytes]) -> dict[int, str]:

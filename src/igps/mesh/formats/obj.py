@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from igps._arrays import Booleans, Integers
-from igps.mesh.formats._format import Format, RawBody, distinct, triangles
+from igps.mesh.formats._format import Format, RawBody, distinct
+from igps.mesh.formats._polygons import flat_triangles
 from igps.mesh.options import LoadOptions
 
 _BEYOND_PLACE = re.compile(r"/\S*")
@@ -16,7 +17,7 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The surface of an OBJ file; or its objects, if it has none its groups."""
     content = path.read_bytes()
     try:
-        text = content.decode()
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = content.decode("latin-1")  # which has a letter for any byte
     places: list[str] = []
@@ -41,12 +42,12 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     corners, n_corners, kept = _corners(polygons, np.array(before, dtype=np.int64))
     names, owner = _owners(starts, len(polygons)) if options.bodies == "objects" else ([], np.zeros(0))
     if len(names) < 2:
-        return [RawBody(vertices, triangles(corners, n_corners))]
+        return [RawBody(vertices, flat_triangles(corners, n_corners, vertices))]
     owner = owner[kept]
     bodies = []
     for number, name in enumerate(names):
         mine = owner == number
-        faces = triangles(corners[np.repeat(mine, n_corners)], n_corners[mine])
+        faces = flat_triangles(corners[np.repeat(mine, n_corners)], n_corners[mine], vertices)
         used, index = np.unique(faces, return_inverse=True)
         if len(used) and (used[0] < 0 or used[-1] >= len(vertices)):
             raise ValueError(f"object {name!r} refers to vertices that are not there")

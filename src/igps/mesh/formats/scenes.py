@@ -1,5 +1,6 @@
 """Scenes and CAD files: GLB, glTF, COLLADA, 3DXML and XAML, STEP. An object is what stands at a place of the scene."""
 
+import json
 import shutil
 import subprocess
 import sys
@@ -9,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct, pieces
-from igps.mesh.formats._trimesh import objects
+from igps.mesh.formats._trimesh import Beside, objects
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.mesh.surface import signed_volume
@@ -33,6 +34,17 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
 def read_gltf(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The objects of a glTF scene, which is in metres."""
     return [replace(body, unit="m") for body in objects(path, options)]
+
+
+def _buffers(path: Path, options: LoadOptions) -> list[Path]:
+    """The files that hold the numbers of a glTF scene."""
+    if path.suffix.lower() != ".gltf":
+        return []
+    try:
+        names = [one.get("uri", "data:") for one in json.loads(path.read_bytes())["buffers"]]
+        return [Beside(path.parent).place(name) for name in names if not name.startswith("data:")]
+    except (ValueError, LookupError, TypeError, AttributeError):  # reading it says why
+        return []
 
 
 def read_step(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
@@ -61,7 +73,7 @@ def _converted(path: Path) -> bytes:
         return scene.read_bytes()
 
 
-GLTF = Format("glTF", (".glb", ".gltf"), read_gltf, bodies=("whole", "objects"))
+GLTF = Format("glTF", (".glb", ".gltf"), read_gltf, bodies=("whole", "objects"), beside=_buffers)
 STEP = Format("STEP", (".step", ".stp"), read_step, bodies=("whole", "objects"), extra="cad")
 OTHERS = Format(
     "COLLADA, 3DXML or XAML", (".dae", ".zae", ".3dxml", ".xaml"), read, bodies=("whole", "objects"), extra="formats"

@@ -16,8 +16,8 @@ from scipy.optimize import linear_sum_assignment
 from igps._arrays import Booleans, Floats
 from igps.mesh._label_measures import LabelVoxels
 from igps.mesh.formats._format import Format, RawBody, faults, made_later
-from igps.mesh.formats._volume_files import READERS, RawVolume, read_raw, suffix_of
-from igps.mesh.formats.label_names import names_beside, read_label_names
+from igps.mesh.formats._volume_files import READERS, RawVolume, detached, read_raw, suffix_of
+from igps.mesh.formats.label_names import read_label_names, table_beside
 from igps.mesh.label_surface import checked_spacing, voxel_surface
 from igps.mesh.mending import Cavities, Mending, mend
 from igps.mesh.mesh import Mesh, MeshError
@@ -25,6 +25,8 @@ from igps.mesh.options import LoadOptions
 
 # More different values are intensities of an image.
 _MOST_LABELS = 20_000
+# How far labels may be off whole numbers: NIfTI keeps what was given as numbers with a fraction as scaled integers.
+_ROUNDING = 0.01
 
 
 @dataclass(frozen=True)
@@ -107,11 +109,11 @@ class LabelVolume:
 
 
 def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) -> LabelVolume:
-    """Read a label volume: `.nii`, `.nii.gz`, `.mgh`, `.mgz`, `.nrrd`, `.mha`, `.mhd`, `.dcm` (SEG), `.tif`, `.tiff`.
+    """Read a label volume: `.nii`, `.nii.gz`, `.mgh`, `.mgz`, `.nrrd`, `.nhdr`, `.mha`, `.mhd`, `.dcm` (SEG), `.tif`.
 
     Names of labels come from `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, extensions of NIfTI), else
-    from a table beside it (see `names_beside`); without one a label is its number, and the only label 1 of a mask has
-    the name of the file. A MeshError of a file that is missing, cut short, too large, or holds no labels.
+    from a table beside it (see `table_beside`); without one a label is its number, and the only label of a mask, 1 or
+    255, has the name of the file. A MeshError of a file that is missing, cut short, too large, or holds no labels.
     """
     path = Path(path)
     if not path.is_file():
@@ -157,9 +159,11 @@ def _labelled(raw: RawVolume, path: Path, options: LoadOptions) -> LabelVolume:
     if options.names is not None:
         names = read_label_names(options.names)
     elif not names:
-        names = names_beside(path)
-        if not names and not raw.segments and layers[0].max(initial=0) == 1:  # a mask is called by its file
-            names = {1: path.name[: -len(suffix_of(path))]}
+        names = read_label_names(table) if (table := table_beside(path)) else {}
+        label = int(layers[0].max(initial=0))
+        is_mask = label in (1, 255) and bool(((layers[0] == 0) | (layers[0] == label)).all())
+        if not names and not raw.segments and is_mask:  # is called by its file
+            names = {label: path.name[: -len(suffix_of(path))]}
     return LabelVolume(layers, raw.affine, str(path), names, segments, raw.unit, tuple(dict.fromkeys(notes)))
 
 
@@ -168,7 +172,7 @@ def _whole_numbers(values: NDArray[Any], path: Path, threshold: float, notes: li
     if values.dtype.kind == "f":
         if n_bad := int(np.count_nonzero(~np.isfinite(values))):
             raise MeshError(f"{path}: {n_bad} voxels are NaN or infinite; labels expected. Set them to 0.")
-        odd = values[values != np.round(values)]
+        odd = values[np.abs(values - np.round(values)) > _ROUNDING]
         if len(odd) and values.min() >= 0 and values.max() <= 1:
             notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
             return (values >= threshold).astype(np.uint8)
@@ -177,6 +181,7 @@ def _whole_numbers(values: NDArray[Any], path: Path, threshold: float, notes: li
                 f"{path}: {len(odd)} voxels have fractional labels, such as {odd[0]:g}. Resample labels to the nearest "
                 "neighbour, or give probabilities between 0 and 1."
             )
+        values = np.round(values)
     low, high = (int(values.min()), int(values.max())) if values.size else (0, 0)
     if low < 0:
         raise MeshError(
@@ -227,4 +232,10 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     return [made_later(partial(made, name), name, volume.unit, partial(volume.voxels, name)) for name in names]
 
 
-FORMAT = Format("a label volume", tuple(READERS), read, ("labels",), extra="volumes")
+def _beside(path: Path, options: LoadOptions) -> list[Path]:
+    """The file of the voxels, if it is another one, and the table of names."""
+    table = table_beside(path) if options.names is None else Path(options.names)
+    return [*detached(path), *([table] if table else [])]
+
+
+FORMAT = Format("a label volume", tuple(READERS), read, ("labels",), extra="volumes", beside=_beside)

@@ -1,0 +1,62 @@
+"""Polygons of a file, cut into triangles."""
+
+import numpy as np
+
+from igps._arrays import Floats, Integers
+
+
+def triangles(corners: Integers, n_corners: Integers) -> Integers:
+    """Polygons, with their corners laid end to end, cut into triangles from their first corners, (F, 3).
+
+    Triangles come first, then the first and the second halves of quadrilaterals, then larger polygons.
+    """
+    starts = np.cumsum(n_corners) - n_corners
+    pieces = [corners[starts[n_corners == 3][:, None] + np.arange(3)]]
+    quads = corners[starts[n_corners == 4][:, None] + np.arange(4)]
+    pieces += [quads[:, [0, 1, 2]], quads[:, [2, 3, 0]]]
+    large = np.flatnonzero(n_corners > 4)
+    if len(large):
+        n = n_corners[large] - 2
+        at = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+        first = np.repeat(starts[large], n)
+        pieces.append(np.stack([corners[first], corners[first + at + 1], corners[first + at + 2]], axis=1))
+    return np.concatenate(pieces)
+
+
+def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> Integers:
+    """The same, but for polygons that would fold over themselves: of those ears are cut off (Meisters 1975), last."""
+    if not len(corners) or corners.min() < 0 or corners.max() >= len(vertices):
+        return triangles(corners, n_corners)
+    starts = np.cumsum(n_corners) - n_corners
+    owner = np.repeat(np.arange(len(n_corners)), n_corners)
+    first = np.repeat(corners[starts], n_corners)
+    following = np.roll(corners, -1)
+    following[starts + n_corners - 1] = corners[starts]
+    doubled = np.cross(vertices[corners] - vertices[first], vertices[following] - vertices[first])
+    whole = np.stack([np.bincount(owner, doubled[:, axis], len(n_corners)) for axis in range(3)], axis=1)
+    with np.errstate(invalid="ignore"):  # what is not finite is refused later
+        turned = np.einsum("ij,ij->i", doubled, whole[owner]) < -1e-9 * np.einsum("ij,ij->i", whole, whole)[owner]
+    folded = np.zeros(len(n_corners), dtype=bool)
+    folded[owner[turned]] = True
+    kept = triangles(corners[~folded[owner]], n_corners[~folded])
+    cut = [_without_ears(corners[starts[i] :][: n_corners[i]], vertices, whole[i]) for i in np.flatnonzero(folded)]
+    return np.concatenate([kept, *cut])
+
+
+def _without_ears(polygon: Integers, vertices: Floats, normal: Floats) -> Integers:
+    """Triangles (n − 2, 3) of a polygon (n,) that may have corners turned inwards."""
+    left, found, at, tried = polygon.tolist(), [], 0, 0
+    while len(left) > 3:
+        a, b, c = (left[(at + k) % len(left)] for k in (-1, 0, 1))
+        three = vertices[[a, b, c]]
+        sides = np.roll(three, -1, axis=0) - three
+        others = vertices[[k for k in left if k not in (a, b, c)]]
+        # On which side of each side the others lie, (n, 3)
+        beside = np.cross(sides, others[:, None] - three) @ normal
+        is_ear = np.cross(sides[0], sides[1]) @ normal > 0 and not (beside >= 0).all(axis=1).any()
+        if is_ear or tried > len(left):  # of a polygon that crosses itself any corner goes
+            found.append((a, b, c))
+            del left[at]
+            tried = -1
+        at, tried = (at + (not is_ear)) % len(left), tried + 1
+    return np.array([*found, left], dtype=np.int64)
