@@ -403,3 +403,17 @@ def test_a_table_that_names_nothing_is_refused(tmp_path: Path) -> None:
         read_label_names(tmp_path / "names.txt")
     with pytest.raises(MeshError, match="Check the path"):
         read_label_names(tmp_path / "missing.txt")
+
+
+def test_thin_branches_are_not_taken_for_noise() -> None:
+    """A tree of vessels two voxels wide, whose corners are as rough as a scanner's noise, has the voxels' volume."""
+    random, mask = np.random.default_rng(3), np.zeros((96, 96, 96), dtype=np.uint8)
+    ends = [np.array([48.0, 48.0, 4.0])]
+    for _ in range(60):
+        start = ends[random.integers(len(ends))]
+        ends.append(np.clip(start + random.normal(0, 18, 3), 4, 91))
+        for at in np.round(start + (ends[-1] - start) * np.linspace(0, 1, 200)[:, None]).astype(int):
+            mask[tuple(slice(i, i + 2) for i in at)] = 1
+    mesh = label_surface(LabelVolume((mask,), np.eye(4)), 1)
+    assert mesh.volume == pytest.approx(mask.sum(), rel=2e-3)
+    assert mesh.notes == ()

@@ -144,7 +144,7 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
                 raise
     mesh = mend(
         vertices, faces, how=options.mend, least_vertices=least_vertices, normals=raw.normals,
-        cavities=options.cavities, name=name, notes=notes,
+        cavities=options.cavities, denoise=raw.denoise, name=name, notes=notes,
     )  # fmt: skip
     return mesh.annotated(unit=raw.unit)
 

@@ -39,7 +39,8 @@ _PLENTY = 4
 
 def mend(
     vertices: Floats, faces: Integers | None, *, how: Mending = "auto", least_vertices: int = 0,
-    normals: Floats | None = None, cavities: Cavities = "fill", name: str = "mesh", notes: tuple[str, ...] = (),
+    normals: Floats | None = None, cavities: Cavities = "fill", denoise: bool = True, name: str = "mesh",
+    notes: tuple[str, ...] = (),
 ) -> Mesh:  # fmt: skip
     """A body from a surface in any state, by the least that helps.
 
@@ -57,6 +58,7 @@ def mend(
         normals: (V, 3) of a cloud of points, if known.
         cavities: "fill" drops closed parts inside the body; "keep" takes them for the surfaces of hollows, unless it is
             made watertight.
+        denoise: whether a surface that is rough with noise is smoothed; thin branches made of voxels look like noise.
         name: what error messages call the surface, usually its file.
         notes: what was done to it before.
 
@@ -83,7 +85,7 @@ def mend(
         if (corners == corners[:, :1]).all():
             raise MeshError(f"{name}: all faces are in one point; a surface was expected. Check the file.")
         check_size(corners.reshape(-1, 3), name)  # before squares of its lengths overflow or vanish
-        mesh = (_remade if how == "always" else _mended)(vertices, triangles, name, cavities == "keep")
+        mesh = (_remade if how == "always" else _mended)(vertices, triangles, name, cavities == "keep", denoise)
     n_outer = int(mesh.outer()[1].sum())
     if n_outer < least_vertices:
         mesh = subdivided(mesh, _PLENTY * least_vertices + len(mesh.vertices) - n_outer)
@@ -97,34 +99,34 @@ def repair_steps(notes: Iterable[str]) -> tuple[Step, ...]:
     return tuple(dict.fromkeys(step for note in notes for start, step in _WORDS.items() if note.startswith(start)))
 
 
-def _mended(vertices: Floats, faces: Integers, name: str, cavities: bool) -> Mesh:
+def _mended(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
     notes: list[str] = []
     given = vertices, faces
     hidden = partial(without_hidden, cavities=cavities)
     for step in (None, welded, tidied, with_small_holes_filled, hidden):
         if step is not None and len(faces):
             vertices, faces = step(vertices, faces, notes)
-        if body := _body(vertices, faces, notes, name, cavities):
+        if body := _body(vertices, faces, notes, name, cavities, denoise):
             return body
     # What may go wrong with a heap of parts is tried, and left behind where it makes no body.
     for attempt, surface, done in ((without_walls, (vertices, faces), list(notes)), (united, given, [])):
-        if len(surface[1]) and (body := _body(*attempt(*surface, done), done, name, cavities)):
+        if len(surface[1]) and (body := _body(*attempt(*surface, done), done, name, cavities, denoise)):
             return body
-    body = watertight(_smoothed(vertices, faces, notes), faces, name=name)
+    body = watertight(_smoothed(vertices, faces, notes, denoise), faces, name=name)
     return body.annotated(notes=tuple(notes))
 
 
-def _body(vertices: Floats, faces: Integers, notes: list[str], name: str, cavities: bool) -> Mesh | None:
+def _body(vertices: Floats, faces: Integers, notes: list[str], name: str, cavities: bool, denoise: bool) -> Mesh | None:
     """The body that these are, smoothed if it is noisy; None if they are none."""
     try:
         mesh = Mesh(vertices, faces, name=name, notes=tuple(notes), cavities=cavities)
     except MeshError:
         return None
-    smooth = _smoothed(mesh.vertices, mesh.faces, notes)
+    smooth = _smoothed(mesh.vertices, mesh.faces, notes, denoise)
     return mesh if smooth is mesh.vertices else replace(mesh, vertices=smooth, notes=tuple(notes))
 
 
-def _remade(vertices: Floats, faces: Integers, name: str, cavities: bool) -> Mesh:
+def _remade(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
     """The surface as it is, welded or smoothed, if it bounds one body then; otherwise what a grid makes of it.
 
     A grid would join what lies side by side nearer than a cell, as the coils of a spring do.
@@ -134,16 +136,16 @@ def _remade(vertices: Floats, faces: Integers, name: str, cavities: bool) -> Mes
     for step in (None, welded):
         if step is not None:
             neat = step(vertices, faces, notes)
-        if (body := _body(*neat, notes, name, cavities)) and not crosses_itself(body.vertices, body.faces):
+        if (body := _body(*neat, notes, name, cavities, denoise)) and not crosses_itself(body.vertices, body.faces):
             return body
         notes = []
-    smooth = _smoothed(*neat, notes)
+    smooth = _smoothed(*neat, notes, denoise)
     body = watertight(smooth, neat[1], name=name) if notes else watertight(vertices, faces, name=name)
     return body.annotated(notes=tuple(notes))
 
 
-def _smoothed(vertices: Floats, faces: Integers, notes: list[str]) -> Floats:
-    if not len(faces) or not is_noisy(vertices, faces):
+def _smoothed(vertices: Floats, faces: Integers, notes: list[str], denoise: bool) -> Floats:
+    if not denoise or not len(faces) or not is_noisy(vertices, faces):
         return vertices
     notes.append("smoothed: the surface was rough with noise")
     return denoised(vertices, faces)

@@ -31,6 +31,7 @@ class RawBody:
     fault: MeshError | None = None  # why there is no surface of this body, where there are others
     make: Callable[[], RawBody] | None = None  # makes the surface, where that takes time; see `made`
     voxels: Callable[[], LabelVoxels] | None = None  # that the surface was made of, of a label
+    denoise: bool = True  # whether it may be rough with noise; not a surface that was made here
 
     def made(self) -> RawBody:
         """The same with its surface, or with the fault for which there is none."""
@@ -65,7 +66,7 @@ def made_later(
             mesh = make()
         except MeshError as fault:
             return RawBody(part=part, fault=fault, voxels=voxels)
-        return RawBody(mesh.vertices, mesh.faces, part, unit, notes=mesh.notes, voxels=voxels)
+        return RawBody(mesh.vertices, mesh.faces, part, unit, notes=mesh.notes, voxels=voxels, denoise=False)
 
     return RawBody(part=part, make=made)
 

@@ -131,7 +131,8 @@ def label_surface(volume: LabelVolume, part: int | str, *, how: Mending = "auto"
     affine[:3, 3] += affine[:3, :3] @ [side.start for side in body.box]
     mask, affine = _canonical(volume.mask(part), affine)
     vertices, faces, notes = voxel_surface(mask, affine, cavities=cavities == "keep", name=name)
-    return mend(vertices, faces, how=how, cavities=cavities, name=name, notes=(*volume.notes, *notes))
+    notes = (*volume.notes, *notes)
+    return mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name, notes=notes)
 
 
 def _canonical(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
