@@ -210,3 +210,10 @@ def test_what_is_hopeless_stays_beyond_that() -> None:
 def test_samples_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match=r"points, normals: expected both \(P, 3\) .* got \(5, 3\) and \(4, 3\)"):
         SurfaceSamples.of(np.zeros((5, 3)), np.zeros((4, 3)), 1.0)
+
+
+def test_what_is_farther_than_asked_for_is_told_to_be() -> None:
+    one, other = bumpy(0.0), bumpy(0.1, seed=5)
+    far = surface_distance(one, other)
+    assert far / 3 < surface_distance(one, other, most=far / 3) <= far
+    assert surface_distance(one, other, most=1.01 * far) == far

@@ -21,7 +21,7 @@ from igps.data.sources import find_bodies
 from igps.descriptors.fingerprint import fingerprint
 from igps.gallery import rows
 from igps.gallery._table import BodyTable
-from igps.gallery.gallery import Gallery
+from igps.gallery.gallery import CANDIDATES, Gallery
 from igps.gallery.sync import sync
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
@@ -98,7 +98,7 @@ def test_more_are_ranked_under_a_head(
     for descriptor, descriptions in ((small_interior(), histograms), (embedded, embedded.head(histograms))):
         gallery, _ = Gallery.build(tmp_path / f"{len(asked)}.igps", dataset, descriptor, n_workers=1)
         gallery.nearest(descriptions[:1], top=3)
-    assert asked[1] > asked[0] >= 512
+    assert asked[1] > asked[0] >= CANDIDATES
 
 
 def test_adding_and_merging_are_building(dataset: SignatureDataset, root: Path, tmp_path: Path) -> None:

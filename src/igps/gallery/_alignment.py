@@ -113,8 +113,9 @@ class TriangleSurface:
 
 
 def surface_distance(
-    one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, hopeless: float = math.inf, patch: int = _PATCH
-) -> float:
+    one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, hopeless: float = math.inf,
+    most: float = math.inf, patch: int = _PATCH,
+) -> float:  # fmt: skip
     """How far apart two surfaces laid onto each other stay, over √area: root mean square of patches, of both ways.
 
     One is moved, turned, perhaps mirrored, and scaled by up to a tenth (their areas are equal already), from many
@@ -126,8 +127,9 @@ def surface_distance(
 
     The search ends at a distance that is `enough`. Beyond `hopeless` it matters no more how far apart they are: where
     few samples are farther after many steps, no more are taken; nor is the other surface itself asked for, where more
-    samples are farther than two thirds of it. With a `patch` of 1 instead of ten neighbours lost relief counts, and the
-    farthest sample instead of the mean. The result is symmetric but for where the search ends.
+    samples are farther than two thirds of it. What is farther than `most` is told to be, not how far: one way may do.
+    With a `patch` of 1 instead of ten neighbours lost relief counts, and the farthest sample instead of the mean. The
+    result is symmetric but for where the search ends.
     """
     best = math.inf
     is_ambiguous = min(_least_step(one), _least_step(other)) < _AMBIGUOUS
@@ -141,7 +143,7 @@ def surface_distance(
         else:
             fine = [_fitted(_subset(one, _N_FINE), other, placing, _FINE_STEPS) for _, placing in coarse[:2]]
             far, placing = min(fine, key=itemgetter(0))
-            best = min(best, far if far > hopeless / _FINER else _apart(one, other, placing, patch))
+            best = min(best, far if far > hopeless / _FINER else _apart(one, other, placing, patch, most))
         # A body may be nearly its own mirror image: near is not yet the nearest.
         if best <= enough or (best > hopeless and not is_ambiguous):
             break
@@ -153,14 +155,16 @@ def offset_in_place(samples: SurfaceSamples, surface: TriangleSurface) -> float:
     return math.sqrt(_mean_square(samples, surface))
 
 
-def _apart(one: SurfaceSamples, other: SurfaceSamples, placing: _Placing, patch: int) -> float:
-    """Root mean square of the patches of either, each laid onto all that is known of the other."""
+def _apart(one: SurfaceSamples, other: SurfaceSamples, placing: _Placing, patch: int, most: float) -> float:
+    """Root mean square of the patches of either, each laid onto all that is known of the other; or at least `most`."""
     squares = []
     for samples, target, way in ((one, other, placing), (other, one, placing.inverse())):
         finest = target if target.surface is None else target.surface()
         _, fitted = _fitted(samples, finest, way, _LAST_STEPS)
         # In units of the mean of both, so that neither is favoured.
         squares.append(_mean_square(fitted(samples), finest, patch) / fitted.scale)
+        if sum(squares) / 2 > most**2:
+            break
     return math.sqrt(sum(squares) / 2)
 
 

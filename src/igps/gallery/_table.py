@@ -1,8 +1,8 @@
 """The bodies of a gallery as rows of a LanceDB table. Each change is one commit, and makes a version.
 
-A short vector stands for each description (see `VectorMap`). LanceDB finds those of the nearest few hundred, which are
-ranked by the distance of the descriptions themselves; of few bodies all are compared. Writers wait for each other, and
-what a killed process leaves behind belongs to no version.
+The code of a short vector stands for each description (see `VectorMap` and `igps.gallery._codes`). By the codes, which
+are read once, the nearest few hundred are found, which are ranked by the distance of the descriptions themselves; of
+few bodies all are compared. Writers wait for each other, and what a killed process leaves behind belongs to no version.
 """
 
 import contextlib
@@ -19,26 +19,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from igps.gallery._codes import CODE, Coder, Codes
 from igps.gallery.about import KNOWN, Batch, Row, in_words
 from igps.retrieval.distances import Distance
-from igps.retrieval.vectors import SearchDistance, VectorMap
+from igps.retrieval.vectors import SearchDistance
 
 try:
     import lancedb
     import pyarrow as pa
     from filelock import FileLock
-    from lancedb.index import BTree, IvfFlat, IvfRq
+    from lancedb.index import BTree
 except ImportError as error:
     raise ImportError('a gallery needs LanceDB: pip install "interior-gps[index]".') from error
 
 _BODIES, _MAP, _ABOUT = "bodies", "map-", b"gallery"
-# Fewer are all compared; the map to short vectors is fitted to the first so many.
-_FEWEST_FOR_VECTORS = 4096
-# Of so many and fewer the short vectors are all compared; of more, those of the nearest so many clusters, but of all
-# where a condition holds, whose rows may be far away.
-_MOST_FLAT, _PROBED, _ALL, _ROWS_AT_ONCE = 20_000, 64, 10**6, 1024
-# Longer descriptions are kept in half precision; the width of short vectors is a multiple of the other.
-_MOST_IN_FULL, _STEP = 1024, 16
+# Fewer are all compared; short vectors and codes are fitted to so many, and anew when they have become as many times
+# more. Of more than the other, columns have indices, by which conditions are met.
+_FEWEST_FOR_CODES, _GROWN, _MOST_UNINDEXED = 4096, 8, 20_000
+# Longer descriptions are kept in half precision.
+_MOST_IN_FULL, _ROWS_AT_ONCE, _NUMBERS_AT_ONCE = 1024, 1024, 10**6
 _ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bytes: pa.binary()}
 
 
@@ -59,24 +58,30 @@ class BodyTable:
         with self._told(None):
             schema = self.table.schema
             self.head: dict[str, Any] = json.loads(schema.metadata[_ABOUT])
-            self.about, self.shape, self.vector_map = self.head["about"], tuple(self.head["shape"]), None
+            self.about, self.shape = self.head["about"], tuple(self.head["shape"])
+            self.coder: Coder | None = None
+            self._codes: Codes | None = None
             self.columns = {one.name: kind for one in schema for kind, known in _ARROW.items() if known == one.type}
+            if "short" in schema.names:
+                raise ValueError("a development version before 27 November 2026 made it")
             if schema.field("vector").type.list_size != np.prod(self.shape) + 1:
                 raise ValueError(f"descriptions of {schema.field('vector').type}, not of shape {self.shape}")
             if name := self.head["map"]:
                 kept = _opened(self.path, name).to_arrow()["arrays"][0].as_py()
                 with np.load(io.BytesIO(kept), allow_pickle=False) as arrays:
-                    self.vector_map = VectorMap.of_arrays(arrays)
+                    self.coder = Coder.of_arrays(arrays)
 
     def __len__(self) -> int:
         return int(self.table.count_rows())
 
-    def batches(self, where: str | None = None, columns: Sequence[str] = ()) -> Iterator[Any]:
+    def batches(
+        self, where: str | None = None, columns: Sequence[str] = (), at_once: int = _ROWS_AT_ONCE
+    ) -> Iterator[Any]:
         """Arrow tables of the rows, some at a time; of all that `decoded` needs if no columns are named."""
         with self._told(where):
             asked = self.table.search() if where is None else self.table.search().where(where)
             asked = asked.with_row_id("_rowid" in columns).select([*(columns or (*self.columns, "vector"))])
-            yield from (pa.Table.from_batches([one]) for one in asked.to_batches(_ROWS_AT_ONCE) if one.num_rows)
+            yield from (pa.Table.from_batches([one]) for one in asked.to_batches(at_once) if one.num_rows)
 
     def decoded(self, rows: Any) -> tuple[Tensor, list[dict[str, Any]]]:
         """Descriptions, and what is known of each, of an Arrow table of rows."""
@@ -92,18 +97,15 @@ class BodyTable:
     ) -> tuple[list[dict[str, Any]], Tensor, Tensor]:  # fmt: skip
         """Rows, distances (M,) and descriptions (M, ...) of the M ≤ top closest to a description (1, ...), ties by id.
 
-        Of `candidates` near by their short vectors; of all that satisfy `where` if exact, or if it leaves few near.
+        Of as many as `candidates`, or twice top, that seem near by their codes; of all if exact, or if there are none.
         """
         self._check_shape(query)
         groups = self.batches(where, ("_rowid", "vector"))
-        if not exact and self.vector_map is not None:
-            with self._told(where):
-                short = _short(self.vector_map, query.reshape(1, -1).cpu().float().numpy())[0]
-                asked = self.table.search(short, vector_column_name="short").distance_type("l2")
-                asked = asked.nprobes(_PROBED if where is None else _ALL)
-                asked = asked.limit(max(candidates, top)).select(["_rowid", "_distance"])
-                near = (asked if where is None else asked.where(where, prefilter=True)).to_arrow()
-            groups = iter([self._taken(near["_rowid"], "vector")]) if len(near) >= max(candidates, top) else groups
+        if not exact and self.coder is not None:
+            named = None if where is None else self._numbers(where)[0]
+            codes = self._all_codes(self.coder)
+            near = codes.nearest(query.reshape(-1).cpu().float().numpy(), max(candidates, 2 * top), named)
+            groups = iter([self._taken(near, "vector")] if len(near) else [])
         ids, distances, kept = np.zeros(0, np.uint64), torch.zeros(0), torch.zeros(0, *self.shape)
         for group in groups:
             ids, kept = np.append(ids, group["_rowid"].to_numpy()), torch.cat([kept, self._descriptions(group)])
@@ -115,6 +117,20 @@ class BodyTable:
         first = np.lexsort(([row["id"] for row in told], distances.numpy()))[:top]
         return [told[i] for i in first], distances[first], kept[first]
 
+    def _all_codes(self, coder: Coder) -> Codes:
+        if self._codes is None:
+            rows, codes = self._numbers(None, "code")
+            with self._told(None):
+                self._codes = Codes(coder, codes.view(CODE), rows)
+        return self._codes
+
+    def _numbers(self, where: str | None, *columns: str) -> list[Any]:
+        """LanceDB's numbers of rows, and lists of numbers one behind the other."""
+        read = list(self.batches(where, ("_rowid", *columns), _NUMBERS_AT_ONCE))
+        rows = [some["_rowid"].to_numpy() for some in read]
+        lists = ([np.asarray(some[name].combine_chunks().flatten()) for some in read] for name in columns)
+        return [np.concatenate([np.zeros(0, one[0].dtype if one else np.uint64), *one]) for one in (rows, *lists)]
+
     def _taken(self, row_ids: Any, *columns: str) -> Any:
         """An Arrow table of rows by LanceDB's numbers of them; few columns are read sooner than many."""
         with self._told(None):
@@ -124,17 +140,21 @@ class BodyTable:
         """Add rows, no id twice, in place of those of the same id; of columns beside `KNOWN`, further by name."""
         with self.changing():
             self._check_shape(descriptions)
+            n_before = len(self)
             for name, kind in further.items():
                 if self.columns.get(name, kind) not in (kind, str):
                     raise ValueError(f"{name}: expected numbers as in {self.path}, got text. Correct the labels.")
             if new := further.keys() - self.columns.keys():
                 self.table.add_columns(pa.schema([(name, _ARROW[further[name]]) for name in sorted(new)]))
                 self._read_head()
-            arrow = _encoded((descriptions, rows), self.columns, self.vector_map).select(self.table.schema.names)
+            arrow = _encoded((descriptions, rows), self.columns, self.coder).select(self.table.schema.names)
             merging = self.table.merge_insert("id").when_matched_update_all().when_not_matched_insert_all()
             merging.execute(arrow.cast(self.table.schema))
-            if self.vector_map is None and self.head["searched_by"] and len(self) >= _FEWEST_FOR_VECTORS:
-                _overwrite(self.path, self.head, map(self.decoded, self.batches()), self.columns)
+            steps = (_FEWEST_FOR_CODES, _GROWN * _FEWEST_FOR_CODES)
+            if self.head["searched_by"] and any(n_before < step <= len(self) for step in steps):
+                some = np.random.default_rng(0).choice(self._numbers(None)[0], _FEWEST_FOR_CODES, replace=False)
+                sample = self._descriptions(self._taken(some, "vector"))
+                _overwrite(self.path, self.head, map(self.decoded, self.batches()), self.columns, sample)
 
     @contextlib.contextmanager
     def changing(self, where: str | None = None) -> Iterator[Any]:
@@ -179,17 +199,21 @@ def write(
         _index(_opened(path, _BODIES))
 
 
-def _overwrite(path: Path, head: Row, batches: Iterable[Batch], columns: Mapping[str, type]) -> None:
-    """Under the lock: a version of these rows alone, with short vectors if they are many."""
-    batches, first, vector_map, name, database = iter(batches), list[Batch](), None, None, lancedb.connect(path)
-    while sum(len(rows) for _, rows in first) < _FEWEST_FOR_VECTORS and (batch := next(batches, None)):
-        first.append(batch)
-    if head["searched_by"] and sum(len(rows) for _, rows in first) >= _FEWEST_FOR_VECTORS:
-        sample = torch.cat([some.flatten(1) for some, _ in first]).float().numpy()
-        vector_map, file, name = VectorMap.fit(sample, head["searched_by"]), io.BytesIO(), _MAP + secrets.token_hex(8)
-        np.savez(file, **vector_map.arrays())
+def _overwrite(
+    path: Path, head: Row, batches: Iterable[Batch], columns: Mapping[str, type], sample: Tensor | None = None
+) -> None:
+    """Under the lock: a version of these rows alone, with codes if they are many, fitted to the sample or the first."""
+    batches, first, coder, name, database = iter(batches), list[Batch](), None, None, lancedb.connect(path)
+    if sample is None:
+        while sum(len(rows) for _, rows in first) < _FEWEST_FOR_CODES and (batch := next(batches, None)):
+            first.append(batch)
+        sample = torch.cat([some for some, _ in first])
+    if head["searched_by"] and len(sample) >= _FEWEST_FOR_CODES:
+        coder = Coder.fit(sample.flatten(1).float().numpy(), head["searched_by"])
+        file, name = io.BytesIO(), _MAP + secrets.token_hex(8)
+        np.savez(file, **coder.arrays())
         database.create_table(name, pa.table({"arrays": pa.array([file.getvalue()], pa.large_binary())}))
-    coming = (_encoded(some, columns, vector_map) for some in chain(first, batches))
+    coming = (_encoded(some, columns, coder) for some in chain(first, batches))
     begun = next(coming)
     schema = begun.schema.with_metadata({_ABOUT: json.dumps({**head, "map": name})})
     whole = (batch for some in chain([begun], coming) for batch in some.cast(schema).to_batches())
@@ -200,17 +224,16 @@ def _overwrite(path: Path, head: Row, batches: Iterable[Batch], columns: Mapping
 def _index(table: Any) -> None:
     """Under the lock: a large table gets indices, rows since the last time come to them, and versions of a month go."""
     n, listed = table.count_rows(), {one.columns[0]: one.name for one in table.list_indices()}
-    if n > _MOST_FLAT and "id" not in listed:
+    if n > _MOST_UNINDEXED and "id" not in listed:
         for one in (one for one in table.schema if one.type in _ARROW.values() and one.type != pa.binary()):
             table.create_index(one.name, config=BTree())
-        if (width := table.schema.field("short").type.list_size) > 1:  # of few numbers a bit of each tells little
-            kind = IvfRq if width > 64 else IvfFlat
-            table.create_index("short", config=kind(num_partitions=2 ** round(np.log2(n) / 2 - 1)))
-    elif table.version % 50 == 0 or (listed and table.index_stats(listed["id"]).num_unindexed_rows > _MOST_FLAT // 2):
+        return
+    n_new = table.index_stats(listed["id"]).num_unindexed_rows if listed else 0
+    if table.version % 50 == 0 or n_new > _MOST_UNINDEXED // 2:
         table.optimize(cleanup_older_than=timedelta(days=30))
 
 
-def _encoded(batch: Batch, columns: Mapping[str, type], vector_map: VectorMap | None) -> Any:
+def _encoded(batch: Batch, columns: Mapping[str, type], coder: Coder | None) -> Any:
     """An Arrow table; long descriptions in half precision, each number to 0.05 %, behind them the power of two."""
     descriptions, rows = batch
     values = descriptions.reshape(len(rows), -1).cpu().float().numpy()
@@ -222,15 +245,12 @@ def _encoded(batch: Batch, columns: Mapping[str, type], vector_map: VectorMap | 
     if values.shape[1] > _MOST_IN_FULL:
         scale, precision = np.frexp(np.abs(values).max(axis=1, keepdims=True))[1] - 15, "f2"
     kept = np.hstack([np.ldexp(values, -scale), scale]).astype(precision)
-    short = np.zeros((len(rows), 1), np.float32) if vector_map is None else _short(vector_map, values)
+    numbers = {"vector": kept}
+    if coder is not None:
+        numbers["code"] = coder(values).view(np.uint8).reshape(len(rows), -1)
     lists = {name: pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(one).ravel()), one.shape[1])
-             for name, one in (("vector", kept), ("short", short))}  # fmt: skip
+             for name, one in numbers.items()}  # fmt: skip
     return pa.table({**told, **lists})
-
-
-def _short(vector_map: VectorMap, values: Any) -> Any:
-    """Short vectors with zeros behind, which change no distance."""
-    return np.pad(vectors := vector_map(values), ((0, 0), (0, -vectors.shape[1] % _STEP)))
 
 
 def _opened(path: Path, name: str) -> Any:

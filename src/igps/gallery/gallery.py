@@ -29,7 +29,7 @@ from igps.signature.signature import SignatureConfig
 Found = tuple[list[dict[str, Any]], Tensor, Tensor]
 """Rows, their distances (M,) and descriptions (M, ...), the closest first."""
 
-CANDIDATES = 512
+CANDIDATES = 640
 """Bodies whose short vectors are the nearest, which are ranked again by the distance itself."""
 
 

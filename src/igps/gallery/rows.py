@@ -57,7 +57,7 @@ def further_columns(bodies: Bodies) -> dict[str, type]:
     Raises:
         ValueError: one has the name of a column that every gallery has.
     """
-    if taken := bodies.columns.keys() & {*KNOWN, "vector", "short"}:
+    if taken := bodies.columns.keys() & {*KNOWN, "vector", "code"}:
         raise ValueError(f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name.")
     return {name: float if all(map(_is_number, values)) else str for name, values in bodies.columns.items()}
 

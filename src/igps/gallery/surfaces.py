@@ -56,11 +56,13 @@ Grade = Literal["same file", "same mesh", "same surface", "same at another level
 _KEEP_HANDLES: set[Step] = {"welded", "smoothed", "subdivided"}
 
 
-def distance_if_alike(one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0) -> float:
+def distance_if_alike(
+    one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, most: float = math.inf
+) -> float:
     """`surface_distance`, infinite where the extents of the two tell that they are not the same."""
     if np.abs(np.log(one.extents / other.extents)).max() > _MOST_STRETCHED:
         return math.inf
-    return surface_distance(one, other, enough=enough, hopeless=_HOPELESS)
+    return surface_distance(one, other, enough=enough, hopeless=_HOPELESS, most=most)
 
 
 class Surfaces:
@@ -118,12 +120,13 @@ class Surfaces:
         """That of two, over √area; infinite where they are not the same, or one cannot be read."""
         try:
             one, other = self._last(i), self._last(j)
-            apart, limit = distance_if_alike(one, other, enough=calibration.same.distance), 0.0
+            most, limit = max(calibration.same.distance, self._tolerance), 0.0
+            apart = distance_if_alike(one, other, enough=calibration.same.distance, most=most)
             if apart <= calibration.same.distance:
                 limit = self.limit(i, j, calibration)
                 if apart > limit > 0:
                     # The search has ended at what was near enough: the nearest may be within the limit.
-                    apart = distance_if_alike(one, other, enough=limit)
+                    apart = distance_if_alike(one, other, enough=limit, most=max(limit, self._tolerance))
             if apart <= limit:
                 return apart
             if apart <= self._tolerance:
