@@ -114,6 +114,19 @@ def test_a_polygon_around_a_hole_does_not_fold(tmp_path: Path) -> None:
     assert normals[:, 2].sum() / 2 == pytest.approx(8)
 
 
+@pytest.mark.parametrize("n_corners", [60, 5000])
+def test_a_polygon_that_crosses_itself_or_has_many_corners_is_cut_all_the_same(n_corners: int, tmp_path: Path) -> None:
+    """Into triangles that use every corner, each side of the polygon once."""
+    places = np.random.default_rng(0).normal(size=(n_corners, 2)).tolist()
+    face = " ".join(str(i + 1) for i in range(n_corners))
+    (tmp_path / "scribble.obj").write_text("\n".join(f"v {x!r} {y!r} 0" for x, y in places) + f"\nf {face}\n")
+    faces = read_surface(tmp_path / "scribble.obj").faces
+    assert len(faces) == n_corners - 2
+    sides = {(int(a), int(b)) for face in faces for a, b in zip(face, np.roll(face, -1), strict=True)}
+    assert {(i, (i + 1) % n_corners) for i in range(n_corners)} <= sides
+    assert len(sides) == 3 * len(faces)
+
+
 def test_off_files_are_read_as_trimesh_reads_them(tmp_path: Path) -> None:
     """Plain ones are read without it; these are plain, or have faults and liberties of all kinds."""
     ball = trimesh.creation.icosphere(subdivisions=0)

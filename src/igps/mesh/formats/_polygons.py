@@ -4,6 +4,9 @@ import numpy as np
 
 from igps._arrays import Floats, Integers
 
+# Of more corners no ears are sought, which takes time as their number squared, and more.
+_MOST_CORNERS = 2000
+
 
 def triangles(corners: Integers, n_corners: Integers) -> Integers:
     """Polygons, with their corners laid end to end, cut into triangles from their first corners, (F, 3).
@@ -24,7 +27,10 @@ def triangles(corners: Integers, n_corners: Integers) -> Integers:
 
 
 def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> Integers:
-    """The same, but for polygons that would fold over themselves: of those ears are cut off (Meisters 1975), last."""
+    """The same, but for polygons that would fold over themselves: of those ears are cut off (Meisters 1975), last.
+
+    Of polygons that cross themselves no ear may be left, and the rest is cut from its first corner.
+    """
     if not len(corners) or corners.min() < 0 or corners.max() >= len(vertices):
         return triangles(corners, n_corners)
     starts = np.cumsum(n_corners) - n_corners
@@ -38,6 +44,7 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
         turned = np.einsum("ij,ij->i", doubled, whole[owner]) < -1e-9 * np.einsum("ij,ij->i", whole, whole)[owner]
     folded = np.zeros(len(n_corners), dtype=bool)
     folded[owner[turned]] = True
+    folded &= n_corners <= _MOST_CORNERS
     kept = triangles(corners[~folded[owner]], n_corners[~folded])
     cut = [_without_ears(corners[starts[i] :][: n_corners[i]], vertices, whole[i]) for i in np.flatnonzero(folded)]
     return np.concatenate([kept, *cut])
@@ -46,17 +53,18 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
 def _without_ears(polygon: Integers, vertices: Floats, normal: Floats) -> Integers:
     """Triangles (n − 2, 3) of a polygon (n,) that may have corners turned inwards."""
     left, found, at, tried = polygon.tolist(), [], 0, 0
-    while len(left) > 3:
+    while tried <= len(left) > 3:
         a, b, c = (left[(at + k) % len(left)] for k in (-1, 0, 1))
         three = vertices[[a, b, c]]
         sides = np.roll(three, -1, axis=0) - three
         others = vertices[[k for k in left if k not in (a, b, c)]]
         # On which side of each side the others lie, (n, 3)
         beside = np.cross(sides, others[:, None] - three) @ normal
-        is_ear = np.cross(sides[0], sides[1]) @ normal > 0 and not (beside >= 0).all(axis=1).any()
-        if is_ear or tried > len(left):  # of a polygon that crosses itself any corner goes
+        if np.cross(sides[0], sides[1]) @ normal > 0 and not (beside >= 0).all(axis=1).any():
             found.append((a, b, c))
             del left[at]
-            tried = -1
-        at, tried = (at + (not is_ear)) % len(left), tried + 1
-    return np.array([*found, left], dtype=np.int64)
+            at, tried = at % len(left), 0
+        else:
+            at, tried = (at + 1) % len(left), tried + 1
+    rest = [(left[0], left[k], left[k + 1]) for k in range(1, len(left) - 1)]
+    return np.array([*found, *rest], dtype=np.int64)
