@@ -322,9 +322,6 @@ def broken(path: Path, kind: str) -> None:
         image.header["srow_x"] = image.header["srow_y"]
         with gzip.open(path, "wb") as file:
             file.write(image.header.binaryblock + bytes(4) + labels.tobytes(order="F"))
-    elif kind == "same names":
-        nifti(path, labels)
-        path.with_name("x.csv").write_text("label,name\n3,rib\n7,rib\n")
     elif kind == "image":
         nifti(path, np.arange(40**3).reshape(40, 40, 40).astype(np.int32))
 
@@ -343,7 +340,6 @@ def broken(path: Path, kind: str) -> None:
         ("one slice", "single slice.*whole stack"),
         ("no label", "no voxel has a label"),
         ("singular", "affine.*singular.*Write the file again"),
-        ("same names", "labels 3 and 7 are both named 'rib'.*Rename"),
         ("image", "look like an image"),
     ],
 )
@@ -352,6 +348,23 @@ def test_what_is_no_label_volume_is_refused_in_a_sentence(kind: str, words: str,
     broken(path, kind)
     with pytest.raises(MeshError, match=f"^{re.escape(str(path))}: .*{words}"):
         read_label_volume(path)
+
+
+def test_labels_of_one_name_are_told_apart_by_their_numbers(tmp_path: Path) -> None:
+    labels = two_boxes()
+    labels[0, 0:8, 0:3] = 5
+    nifti(tmp_path / "x.nii", labels)
+    (tmp_path / "x.csv").write_text("label,name\n3,rib\n5,liver\n7,rib\n")
+    volume = read_label_volume(tmp_path / "x.nii")
+    assert [(body.label, body.name) for body in volume.bodies] == [(3, "rib (3)"), (5, "liver"), (7, "rib (7)")]
+    rib = label_surface(volume, "rib (7)")
+    assert rib.volume == pytest.approx((labels == 7).sum() * 3.75, rel=1e-3)
+    assert "another label has the same name" in rib.notes[0]
+    assert label_surface(volume, "liver").notes == ()
+    with pytest.raises(MeshError, match=r"x\.nii: no label 'rib'\. It has 3: rib \(3\), liver, rib \(7\)"):
+        volume.body("rib")
+    with pytest.raises(MeshError, match=r"labels 3 and 5 are both named 'rib \(3\)'.*Rename"):
+        LabelVolume((labels,), AFFINE, names={3: "rib", 7: "rib", 5: "rib (3)"})
 
 
 def test_one_small_label_leaves_the_others() -> None:

@@ -3,6 +3,7 @@
 The world is RAS, x to the patient's right, y to the front and z up, in millimetres. No volume is resampled.
 """
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -52,7 +53,8 @@ class LabelVolume:
         >>> [(body.label, body.name, body.n_voxels) for body in volume.bodies]
         [(1, '1', 2048), (2, 'liver', 2048)]
 
-    A MeshError of no labels, labels that are no whole numbers from 0, names that repeat, or a singular affine.
+    A MeshError of no labels, labels that are no whole numbers from 0, names that numbers do not tell apart, or a
+    singular affine.
     """
 
     layers: tuple[NDArray[Any], ...]  # (X, Y, Z) whole numbers, 0 the background; several where segments overlap
@@ -68,7 +70,7 @@ class LabelVolume:
         checked_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
         if not self.bodies:
             raise MeshError(f"{self.name}: no voxel has a label, all are 0. Check that the right file was exported.")
-        seen: dict[str, int] = {}
+        seen: dict[str, int] = {}  # a name may be what another got for its number
         for body in self.bodies:
             if (other := seen.setdefault(body.name, body.label)) != body.label:
                 both = f"{self.name}: labels {other} and {body.label} are both named {body.name!r}."
@@ -76,7 +78,7 @@ class LabelVolume:
 
     @cached_property
     def bodies(self) -> tuple[LabelBody, ...]:
-        """A body for each label that any voxel has, in ascending order."""
+        """A body for each label that any voxel has, in ascending order; those of one name with their numbers behind."""
         names, found = self.names or {}, []
         for layer, labels in enumerate(self.layers):
             values, counts, compact = _counted(labels, self.name)
@@ -87,7 +89,9 @@ class LabelVolume:
                 if label is not None:
                     at = boxes[(value if compact is labels else index) - 1]
                     found.append(LabelBody(label, names.get(label, str(label)), count, layer, value, at))
-        return tuple(sorted(found, key=lambda body: body.label))
+        given = Counter(body.name for body in found)
+        told = (replace(one, name=f"{one.name} ({one.label})") if given[one.name] > 1 else one for one in found)
+        return tuple(sorted(told, key=lambda body: body.label))
 
     def body(self, part: int | str) -> LabelBody:
         """The body of a label, or of a name; a MeshError with the names that there are, if there is none."""
@@ -132,6 +136,8 @@ def label_surface(volume: LabelVolume, part: int | str, *, how: Mending = "auto"
     mask, affine = _canonical(volume.mask(part), affine)
     vertices, faces, notes = voxel_surface(mask, affine, cavities=cavities == "keep", name=name)
     notes = (*volume.notes, *notes)
+    if (volume.names or {}).get(body.label, body.name) != body.name:
+        notes = (*notes, "another label has the same name: the number was put behind. Give names by a table")
     return mend(vertices, faces, how=how, cavities=cavities, denoise=False, name=name, notes=notes)
 
 
