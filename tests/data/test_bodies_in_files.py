@@ -172,6 +172,24 @@ def test_each_has_the_signature_of_its_own_surface(root: Path, tmp_path: Path, r
         assert reads == [f"{1 + i // 2}.obj" for i in range(4)]  # for the meshes alone
 
 
+def test_a_file_that_hides_what_it_needs_costs_no_other(tmp_path: Path) -> None:
+    """Headers that stop the search for what is read beside them; again when the others are known."""
+    pytest.importorskip("SimpleITK")
+    header = "ObjectType = Image\nNDims = 3\nDimSize = 9 9 9\nElementType = MET_UCHAR\nElementDataFile = .\n"
+    (tmp_path / "dot.mhd").write_text(header)
+    (tmp_path / "deep.gltf").write_text("[" * 200_000)
+    (tmp_path / "list.gltf").write_text('{"buffers": 7}')
+    (tmp_path / "out.gltf").write_text('{"buffers": [{"uri": "../../x.bin"}]}')
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball.export(tmp_path / "ball.off")
+    for _ in range(2):
+        dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
+        failures = dataset.precompute(n_workers=1, progress=False)
+        assert {failure.id for failure in failures} == {"dot.mhd", "deep.gltf", "list.gltf", "out.gltf"}
+        assert all("not readable as" in failure.error for failure in failures)
+        assert dataset.usable(failures)[0].signature.volume == pytest.approx(ball.volume)
+
+
 def test_what_is_read_beside_a_file_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two subjects whose headers are alike, a table of names that is put right, and numbers of a scene beside it."""
     sitk, nibabel = pytest.importorskip("SimpleITK"), pytest.importorskip("nibabel")

@@ -268,6 +268,9 @@ def test_the_tree_joins_what_is_near_and_selects_what_lies_under_a_branch(answer
         groups = groups - {one, other} | {one | other}
         expected.append((one | other, apart[one, other]))
     page.locator("#tree-plot").scroll_into_view_if_needed()
+    stability = clusters_of(distances, n_resamples=50).stability
+    told = f"{np.count_nonzero(np.array(stability) >= 0.75)} of {len(stability)} clusters are stable."
+    assert page.locator("#tree-told").inner_text() == told
     branches = page.locator("#tree-plot .branch").all()[::-1]
     assert len(branches) == len(expected)
     for branch, (members, distance) in zip(branches, expected, strict=True):

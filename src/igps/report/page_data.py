@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.analysis.clusters import clusters_of
+from igps.analysis.clusters import STABLE, clusters_of
 from igps.analysis.map import body_map
 from igps.report.explanations import Painted
 from igps.report.results import Results, System
@@ -115,8 +115,9 @@ def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str],
 
 
 def _map(system: System) -> dict[str, Any] | None:
-    """Where the shapes lie, (N, 2) `points` and the `stress`; the `cluster` of each, the `stability` of these, and the
-    `tree`: of each joining, the lowest first, two branches and their distance; rows come before joinings."""
+    """Where the shapes lie, (N, 2) `points` and the `stress`; the `cluster` of each, the `stability` of these, of which
+    `n_stable` are stable; and the `tree`: of each joining, the lowest first, two branches and their distance; rows come
+    before joinings."""
     distances = system.distances.double().numpy()
     if not _LEAST_MAPPED <= len(distances) <= _MOST_MAPPED or not np.isfinite(distances).all():
         return None
@@ -127,6 +128,7 @@ def _map(system: System) -> dict[str, Any] | None:
         "stress": round(found.stress, 3),
         "cluster": clusters.numbers.tolist(),
         "stability": _numbers(list(clusters.stability)),
+        "n_stable": sum(one >= STABLE for one in clusters.stability),
         "tree": [[int(one), int(other), _significant(height)] for one, other, height, _ in clusters.tree.tolist()],
     }
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from igps.mesh._label_measures import LabelVoxels, VoxelMeasures
 from igps.mesh.formats import archives, brains, clouds, molecules, obj, off, ply, scenes, stl, threemf, volumes, vtk
-from igps.mesh.formats._format import Format, RawBody
+from igps.mesh.formats._format import Format, RawBody, faults
 from igps.mesh.options import LoadOptions
 
 __all__ = [
@@ -35,10 +35,15 @@ def format_of(path: str | Path) -> Format | None:
 
 
 def files_read(path: Path, options: LoadOptions = LoadOptions()) -> list[Path]:
-    """All files on which the bodies of a file depend, as far as they are there: itself first."""
+    """All files on which the bodies of a file depend, as far as they are there: itself first.
+
+    A MeshError of a file that cannot be read far enough to tell.
+    """
     kind = format_of(path)
-    beside = () if kind is None or kind.beside is None or not path.is_file() else kind.beside(path, options)
-    return [path, *(one for one in beside if one.is_file())]
+    if kind is None or kind.beside is None or not path.is_file():
+        return [path]
+    with faults(path, kind):
+        return [path, *(one for one in kind.beside(path, options) if one.is_file())]
 
 
 def is_searched(path: str | Path) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct, pieces
 from igps.mesh.formats._trimesh import Beside, objects
+from igps.mesh.limits import check_memory
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.mesh.surface import signed_volume
@@ -40,11 +41,9 @@ def _buffers(path: Path, options: LoadOptions) -> list[Path]:
     """The files that hold the numbers of a glTF scene."""
     if path.suffix.lower() != ".gltf":
         return []
-    try:
-        names = [one.get("uri", "data:") for one in json.loads(path.read_bytes())["buffers"]]
-        return [Beside(path.parent).place(name) for name in names if not name.startswith("data:")]
-    except (ValueError, LookupError, TypeError, AttributeError):  # reading it says why
-        return []
+    check_memory(path)
+    names = [one.get("uri", "data:") for one in json.loads(path.read_bytes()).get("buffers", [])]
+    return [Beside(path.parent).place(name) for name in names if not name.startswith("data:")]
 
 
 def read_step(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:

@@ -12,7 +12,6 @@ let turntable = null; // made when the first body is opened
 let system = 0;
 let current = null; // the shape in the window
 const MOST_SELECTED = 120; // pictures beside the map
-const STABLE = 0.75; // as `igps.analysis.clusters` has it
 let opener = null; // the picture that opened the window, if it is not on the wall
 
 for (const one of systems) {
@@ -218,12 +217,12 @@ function stabilityOf(cluster) {
 function showMap() {
   if (!bodyMap) return;
   const one = systems[system];
-  const { points, stress, tree: joinings, stability } = one.map ?? { points: [], tree: [] };
+  const { points, stress, tree: joinings, stability, n_stable } = one.map ?? { points: [], tree: [] };
   for (const name of ["map-plot", "tree-plot"]) byId(name).toggleAttribute("hidden", !one.map);
   byId("map-stress").textContent = one.map
     ? `Its stress is ${stress.toFixed(2)}: 0 would tell every distance, above 0.2 much is distorted.`
     : "There is no map of these shapes.";
-  byId("tree-told").textContent = one.map ? `${stability.filter((share) => share >= STABLE).length} of ${stability.length} clusters are stable.` : "";
+  byId("tree-told").textContent = one.map ? `${n_stable} of ${stability.length} clusters are stable.` : "";
   tree.show(one.map ? one.shapes : [], joinings);
   bodyMap.show(points.map(([x, y], row) => ({ shape: one.shapes[row], x, y })));
   colourMap();
