@@ -20,7 +20,8 @@ from igps.data.collation import collate
 from igps.data.requirements import Requirements
 from igps.descriptors import NAMES, descriptor
 from igps.mesh.mesh import Mesh
-from igps.nn.descriptor import EmbeddedDescriptor
+from igps.nn._kernels import pairs
+from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.retrieval import cosine
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 
@@ -118,6 +119,54 @@ def test_padding_changes_no_description(name: str) -> None:
     for row, kind in zip(together, ("rod", "other"), strict=True):
         scale = float(description(name, kind).abs().max())
         torch.testing.assert_close(row[None], description(name, kind), rtol=1e-4, atol=1e-5 * scale)
+
+
+def with_individuals(name: str) -> Descriptor:
+    """A descriptor that keeps size and side, too, where the name ends in "+"."""
+    return descriptor(name.strip("+"), **{"size": "keep", "mirror": "distinct"} if name.endswith("+") else {})
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("name", [*NAMES, "rich+", "pretrained+"])
+def test_tensors_are_made_on_the_device_of_the_bodies(
+    name: str, compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the device "meta" are then those that are made without saying where: they have no numbers to go on with."""
+    if not compiled:  # as on a GPU
+        monkeypatch.setattr(pairs, "_is_compiled", lambda *_: False)
+    found = with_individuals(name)
+    with torch.inference_mode():
+        expected = found(body("rod"))
+        with torch.device("meta"):
+            described = found(body("rod"))
+            distances = found.distances(described, expected)
+    torch.testing.assert_close(described, expected, rtol=0, atol=0)
+    assert not distances.is_meta
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("name", [*NAMES, "rich+", "pretrained+"])
+def test_cuda_describes_as_the_cpu_does(name: str) -> None:
+    found = with_individuals(name)
+    with torch.inference_mode():
+        expected = torch.cat([found(body(kind)) for kind in ("rod", "other")])
+        distances = found.distances(expected, expected)
+        found.cuda()
+        described = torch.cat([found(body(kind).to("cuda")) for kind in ("rod", "other")])
+        found_distances = found.distances(described, described)
+    scale = float(expected.abs().max())
+    torch.testing.assert_close(described.cpu(), expected, rtol=1e-4, atol=1e-5 * scale)
+    torch.testing.assert_close(found_distances.cpu(), distances, rtol=1e-3, atol=1e-4 * float(distances.max()))
+
+
+@pytest.mark.parametrize("name", ["gps", "multiscale", "rich", "rich+"])
+def test_descriptors_of_histograms_are_traced_whole(name: str) -> None:
+    found = with_individuals(name)
+    torch.compiler.reset()
+    with torch.inference_mode():
+        expected = found(body("rod"))
+        traced = torch.compile(found, backend="eager", fullgraph=True)(body("rod"))
+    torch.testing.assert_close(traced, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", NAMES)

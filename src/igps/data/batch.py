@@ -53,19 +53,21 @@ class SampleBatch:
         order is by what the body looks like, and so is the choice: it depends neither on its batch nor on how grid and
         mesh are numbered. Without one, torch's global generator draws them at random.
         """
-        n_kept = min(n_samples, self.mask.shape[1])
-        index = torch.zeros(len(self.mask), n_kept, dtype=torch.long)
-        kept = torch.zeros(len(self.mask), n_kept, dtype=torch.bool)
-        for i, real in enumerate(self.mask.cpu()):
-            present = real.nonzero().flatten()
-            chosen = present[_chosen(len(present), n_samples, seed)]
-            index[i, : len(chosen)] = chosen
-            kept[i, : len(chosen)] = True
-        index, kept = index.to(self.mask.device), kept.to(self.mask.device)
-
         n_shapes, longest = self.mask.shape
+        n_kept = min(n_samples, longest)
+        n_present = self.mask.sum(dim=1, keepdim=True)
+        numbers = torch.arange(n_kept, dtype=torch.float64, device=self.mask.device)
+        kept = numbers < n_present
+        if seed is None:
+            drawn = torch.rand(self.mask.shape, device=self.mask.device).masked_fill(~self.mask, -1)
+            index = drawn.topk(n_kept).indices
+        else:
+            steps = (n_present.double() / n_samples).clamp(min=1) * (numbers + _start(seed))
+            index = torch.searchsorted(self.mask.cumsum(dim=1), steps.long().clamp(max=n_present - 1) + 1)
+        index = index.masked_fill(~kept, 0)
+
         rows = (index + longest * torch.arange(n_shapes, device=index.device)[:, None]).flatten()
-        missing = None if bool(kept.all()) else ~kept
+        missing = None if not torch.compiler.is_compiling() and bool(kept.all()) else ~kept
 
         def take(values: Tensor) -> Tensor:
             taken = values.flatten(0, 1).index_select(0, rows).unflatten(0, (n_shapes, n_kept))
@@ -75,14 +77,11 @@ class SampleBatch:
         return SampleBatch(take(self.points), take(self.eigenfunctions), kept, attributes)
 
 
-def _chosen(n_present: int, n_samples: int, seed: int | None) -> Tensor:
-    if seed is None:
-        return torch.randperm(n_present)[:n_samples]
-    if n_present <= n_samples:
-        return torch.arange(n_present)
-    start = torch.rand(1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    steps = (torch.arange(n_samples) + start) * (n_present / n_samples)
-    return steps.long().clamp_(max=n_present - 1)
+@torch.compiler.assume_constant_result
+def _start(seed: int) -> float:
+    """A number from 0 to 1 that follows from the seed."""
+    generator = torch.Generator("cpu").manual_seed(seed)
+    return torch.rand(1, generator=generator, dtype=torch.float64, device="cpu").item()
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,10 +206,10 @@ class SignatureBatch:
 
     def bodies(self) -> Iterator[Body]:
         """The shapes one by one."""
-        return map(self._body, range(len(self)))
+        return map(self.to("cpu")._body, range(len(self)))
 
     def _body(self, i: int) -> Body:
-        eigenvalues = self.eigenvalues[i][torch.isfinite(self.eigenvalues[i])].cpu().numpy()
+        eigenvalues = self.eigenvalues[i][torch.isfinite(self.eigenvalues[i])].numpy()
         interior, surface = (_samples_of(one, i, len(eigenvalues)) for one in (self.interior, self.surface))
         mesh = None if self.meshes is None else self.meshes[i]
         return Body(eigenvalues, interior, surface, float(self.area[i]), float(self.volume[i]), self.ids[i], mesh)
@@ -256,7 +255,7 @@ def _samples_of(batch: SampleBatch, i: int, n_eigenpairs: int) -> Samples:
     real = batch.mask[i]
 
     def array(values: Tensor) -> NDArray[np.float32]:
-        return values[i, real].cpu().numpy()
+        return values[i, real].numpy()
 
     return Samples(
         array(batch.points).astype(np.float64),

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import Literal
 
 import torch
@@ -141,13 +142,13 @@ def signed_volumes(batch: SignatureBatch) -> Tensor:
     moments = moments / moments.diagonal(dim1=1, dim2=2).sum(dim=1)[:, None, None]
     k = min(16, batch.eigenvalues.shape[1])
     eigenvalues = batch.eigenvalues[:, None, :k] * batch.area[:, None, None]
-    decay = torch.exp(-torch.tensor(_TIMES).to(root)[:, None] * eigenvalues)
+    decay = torch.exp(-root.new_tensor(_TIMES)[:, None] * eigenvalues)
     heat = batch.surface.eigenfunctions[..., :k].to(root).square() @ decay.mT
     heat = heat / (heat * shown).sum(dim=1, keepdim=True)
     weights = torch.cat([outside.norm(dim=2, keepdim=True), heat], dim=2) * shown
     vectors = torch.cat([(inside.norm(dim=2, keepdim=True) * real).mT @ inside, weights.mT @ outside], dim=1)
     vectors = torch.cat([vectors, vectors[:, 1:3] @ moments], dim=1)
-    triples = vectors[:, torch.combinations(torch.arange(_N_VECTORS), 3)]
+    triples = vectors[:, torch.tensor([*combinations(range(_N_VECTORS), 3)], device=vectors.device)]
     lengths = triples.norm(dim=3).prod(dim=2).clamp_min(torch.finfo(triples.dtype).tiny)
     return torch.linalg.det(triples) / lengths.pow(2 / 3)
 

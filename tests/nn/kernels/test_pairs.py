@@ -376,7 +376,8 @@ def test_gradcheck(device: str, layout: list[str]) -> None:
 
     for gradient in torch.autograd.grad(histogram(*leaves).square().sum(), leaves):
         assert (gradient.abs() > 1e-9).any()
-    assert torch.autograd.gradcheck(histogram, leaves)
+    # A GPU adds in any order.
+    assert torch.autograd.gradcheck(histogram, leaves, nondet_tol=1e-12 if device == "cuda" else 0)
 
 
 def test_coincident_points_have_finite_gradients(device: str) -> None:

@@ -96,7 +96,7 @@ class AxialHistogram(SampleHistogram):
             # towards the nearer end of the axis: so a body and its mirror image agree
             away = torch.where(along < 0, -of_direction, of_direction)
             direction = [soft_memberships(away, self.cosine), soft_memberships(outward, self.outward)]
-            counts = counted(joint(place) * own[:, None], joint(direction), torch.tensor(len(points)))
+            counts = counted(joint(place) * own[:, None], joint(direction), own.new_tensor(len(points)))
             found.append(counts.view(self.n_bins))
         return torch.stack(found) / 3
 

@@ -60,7 +60,9 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
 
 def _radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
     """(P, 2) radii of one shape by operations of PyTorch, differentiable."""
-    points, directions = (one.masked_fill(~mask[:, None], 0) for one in (points, directions))
+    # In double precision: the nearest points decide, and of theirs products of matrices leave few digits.
+    dtype = points.dtype
+    points, directions = (one.masked_fill(~mask[:, None], 0).double() for one in (points, directions))
     with full_precision():
         squares = torch.cdist(points, points, compute_mode="use_mm_for_euclid_dist").square()
         # n·(x − y): how deep each point lies below the tangent plane of every other one
@@ -72,7 +74,7 @@ def _radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
         counts = (height > flat) & ~none
         radii = torch.where(counts, squares / torch.where(counts, 2 * height, 1), torch.inf)
         sides.append(radii.topk(_RANK, dim=1, largest=False).values[:, -1])
-    return torch.stack(sides, dim=1)
+    return torch.stack(sides, dim=1).to(dtype)
 
 
 def _array(vectors: Tensor) -> Singles:

@@ -140,8 +140,9 @@ class _Shape:
         self.n_counts = layout.n_classes * (layout.n_classes + 1) // 2, math.prod(self.bins) << len(self.bins)
         n_shares = min(_SHARES, len(blocks)) if math.prod(self.n_counts) <= _MOST_COUNTS else 1
         self.shares = [blocks[k::n_shares] for k in range(n_shares)]
-        self.upstream = _unfolded(torch.empty(0, 0) if upstream is None else upstream.to(self.dtype)).numpy()
-        norms, row = torch.zeros(self.n_values, n_points, dtype=self.dtype), 0
+        none = torch.empty(0, 0, device="cpu")
+        self.upstream = _unfolded(none if upstream is None else upstream.to(self.dtype)).numpy()
+        norms, row = torch.zeros(self.n_values, n_points, dtype=self.dtype, device="cpu"), 0
         for one, centred in zip(self.pairs, self.centred, strict=True):
             if centred is not None:
                 norms[row] = centred.square().sum(dim=1)
@@ -159,7 +160,7 @@ class _Shape:
 
     def counts(self, blocks: Blocks) -> list[Tensor]:
         """(C(C+1)/2, cells·2^K) float64 counts of some blocks, by the cell below and the corner of it."""
-        total, room = torch.zeros(self.n_counts, dtype=torch.float64), self._room(self.n_values)
+        total, room = torch.zeros(self.n_counts, dtype=torch.float64, device="cpu"), self._room(self.n_values)
         for row, column in blocks:
             values = self._part(room, row, column)
             self._fill(values, row, column)
@@ -168,8 +169,8 @@ class _Shape:
 
     def gradients(self, blocks: Blocks) -> list[Tensor]:
         """Derivatives by the weights, by the centres, and by the inputs of each axis."""
-        by_weights = torch.zeros(self.members[1].shape, dtype=torch.float64)
-        by_centres = torch.zeros(self.axes.centres.shape, dtype=torch.float64)
+        by_weights = torch.zeros(self.members[1].shape, dtype=torch.float64, device="cpu")
+        by_centres = torch.zeros(self.axes.centres.shape, dtype=torch.float64, device="cpu")
         found = [[torch.zeros_like(x) for x in one.inputs] for one in self.pairs]
         room, turn_room = self._room(self.n_values), self._room(4 * self.n_oriented)
         for row, column in blocks:
@@ -201,7 +202,7 @@ class _Shape:
         return [by_weights, by_centres, *(gradient for of_axis in found for gradient in of_axis)]
 
     def _room(self, n_matrices: int) -> Tensor:
-        return torch.empty(n_matrices * math.prod(self.block), dtype=self.dtype)
+        return torch.empty(n_matrices * math.prod(self.block), dtype=self.dtype, device="cpu")
 
     def _part(self, room: Tensor, row: int, column: int) -> Tensor:
         """As much of a room as a block takes, (R, I, J)."""

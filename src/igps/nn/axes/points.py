@@ -11,6 +11,7 @@ from torch.nn.functional import one_hot
 
 from igps.data.attribute_sources import ResidueAttribute
 from igps.data.requirements import Requirements, embedding_requirements
+from igps.nn._kernels.located import located
 from igps.nn.axes.centres import OrderedCentres, middles
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import barycentroid_potential
@@ -68,8 +69,7 @@ class PointAxis(Specified, ABC):
         if not self.soft or len(centres) == 1:
             classes = torch.bucketize(values.detach(), _boundaries(centres), right=True).unsqueeze(2)
             return classes, torch.ones_like(classes, dtype=values.dtype)
-        below = torch.bucketize(values.detach().contiguous(), centres.detach()[1:-1], right=True)
-        share = ((values - centres[below]) / centres.diff()[below]).clamp(0, 1)
+        below, share = located(values, centres)
         return torch.stack([below, below + 1], dim=2), torch.stack([1 - share, share], dim=2)
 
 
