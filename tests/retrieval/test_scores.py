@@ -94,6 +94,16 @@ def test_hand_worked_leave_one_out_ranking() -> None:
         assert getattr(scores, name)[0].item() == pytest.approx(value, abs=1e-12), name
 
 
+def test_another_default_device_changes_no_score() -> None:
+    labels, distances = ["a", "a", "a", "a", "b", "b", "b"], line_distances([1, 4, 2, 5, 6, 3], 7)
+    expected, curve = retrieval_scores(distances, labels), precision_recall_curve(distances, labels)
+    with torch.device("meta"):  # whose tensors have no numbers to go on with
+        found = retrieval_scores(distances, labels)
+        assert found.mean() == expected.mean()
+        assert found.per_class() == expected.per_class()
+        assert torch.equal(precision_recall_curve(distances, labels).precision, curve.precision)
+
+
 def test_hand_worked_separate_gallery() -> None:
     # One query of class 1 against 0, 1, 1, 0, 1 ranked as 0 (miss), 2 (hit), 1 (hit), 3, 4 (hit).
     distances = torch.tensor([[0.1, 0.3, 0.2, 0.4, 0.5]])

@@ -30,6 +30,16 @@ def signature(blob: Mesh) -> Signature:
     return compute_signature(blob, CONFIG)
 
 
+def test_another_default_device_changes_nothing(signature: Signature) -> None:
+    mesh = as_mesh(trimesh.creation.icosphere(subdivisions=4))  # eigenpairs by the solver for large meshes
+    expected = compute_signature(mesh, CONFIG)
+    with torch.device("meta"):  # whose tensors have no numbers to go on with
+        found = compute_signature(mesh, CONFIG)
+        batch = collate([signature, found])[np.array([False, True])]
+    np.testing.assert_array_equal(found.interior.eigenfunctions, expected.interior.eigenfunctions)
+    assert torch.equal(batch.eigenvalues, collate([expected]).eigenvalues)
+
+
 def test_shapes_types_and_measures(blob: Mesh, signature: Signature) -> None:
     n_samples = len(signature.interior)
     assert signature.eigenvalues.shape == (40,)

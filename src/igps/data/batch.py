@@ -219,10 +219,10 @@ def chosen_of(index: Several, n: int) -> list[int]:
     """The numbers that a slice, numbers, or a mask choose among n; an IndexError where they do not fit."""
     if isinstance(index, slice):
         return list(range(n))[index]
-    given = index.cpu() if isinstance(index, Tensor) else torch.as_tensor(np.asarray(index))
+    given = index.cpu() if isinstance(index, Tensor) else torch.as_tensor(np.asarray(index), device="cpu")
     if given.dtype == torch.bool and given.shape != (n,):
         raise IndexError(f"mask: expected {n} entries, got an array of shape {tuple(given.shape)}.")
-    found: list[int] = torch.arange(n)[given if given.numel() else given.long()].tolist()
+    found: list[int] = torch.arange(n, device="cpu")[given if given.numel() else given.long()].tolist()
     return found
 
 

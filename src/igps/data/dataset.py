@@ -103,12 +103,13 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """(N,) int64 index of each body's class in `classes`, −1 where unknown."""
         index = {name: i for i, name in enumerate(self.classes)}
         known = None if self.bodies.labels is None else [index[name] for name in self.bodies.labels]
-        return torch.tensor(known or [-1] * len(self), dtype=torch.int64)
+        return torch.tensor(known or [-1] * len(self), dtype=torch.int64, device="cpu")
 
     @property
     def sizes(self) -> Tensor:
         """(N,) int64 interior samples of each body, for `BucketBatchSampler`. Each Signature is looked at for it."""
-        return torch.tensor([len(self._signature(i).interior) for i in range(len(self))], dtype=torch.int64)
+        found = [len(self._signature(i).interior) for i in range(len(self))]
+        return torch.tensor(found, dtype=torch.int64, device="cpu")
 
     def __len__(self) -> int:
         return len(self.bodies)

@@ -67,7 +67,7 @@ class RetrievalScores:
         for query, (label, scored) in enumerate(zip(self.labels, self.scored.tolist(), strict=True)):
             if scored:
                 queries.setdefault(label, []).append(query)
-        return {label: self._mean_over(torch.tensor(members)) for label, members in queries.items()}
+        return {label: self._mean_over(torch.tensor(members, device="cpu")) for label, members in queries.items()}
 
     def _mean_over(self, queries: Tensor) -> dict[str, float]:
         scores = {name: getattr(self, name) for name in SCORE_NAMES}
@@ -112,7 +112,7 @@ def retrieval_scores(distances: Tensor, query_labels: Labels, gallery_labels: La
     """
     relevant, labels = _ranked_relevance(distances, query_labels, gallery_labels)
     length = relevant.shape[1]
-    ranks = torch.arange(1, length + 2, dtype=torch.float64)
+    ranks = torch.arange(1, length + 2, dtype=torch.float64, device="cpu")
     hits = relevant.cumsum(1)
     n_relevant = hits[:, -1]
     scored = n_relevant > 0
@@ -159,14 +159,14 @@ def precision_recall_curve(
     0.05, 0.10, …, 1 of the Princeton Shape Benchmark (Shilane et al. 2004); the 11 levels 0, 0.1, …, 1 are the other
     usual choice. Distances and labels, and errors, as for retrieval_scores.
     """
-    recall = torch.tensor(list(recall_levels), dtype=torch.float64)
+    recall = torch.tensor(list(recall_levels), dtype=torch.float64, device="cpu")
     valid = recall.numel() > 0 and bool(((recall >= 0) & (recall <= 1)).all()) and bool((recall.diff() > 0).all())
     if not valid:
         raise ValueError(f"recall_levels: expected ascending numbers in [0, 1], got {list(recall_levels)}")
     relevant, _ = _ranked_relevance(distances, query_labels, gallery_labels)
     hits = relevant[relevant.any(1)].cumsum(1)
     n_relevant = hits[:, -1:]
-    precision = hits / torch.arange(1, hits.shape[1] + 1, dtype=torch.float64)
+    precision = hits / torch.arange(1, hits.shape[1] + 1, dtype=torch.float64, device="cpu")
     interpolated = precision.flip(1).cummax(1).values.flip(1)
     # A level of 3 · 0.1 of ten is three hits, although it rounds to more than 0.3.
     hits_needed = (recall * n_relevant - 1e-6).ceil()
@@ -188,13 +188,15 @@ def _ranked_relevance(
                 "for a separate gallery"
             )
         gallery = queries
-        others = order != torch.arange(n_queries)[:, None]
+        others = order != torch.arange(n_queries, device="cpu")[:, None]
         order = order[others].view(n_queries, max(0, n_queries - 1))
     else:
         gallery = _label_tuple("gallery_labels", gallery_labels, n_gallery)
     codes: dict[Hashable, int] = {}
-    query_codes = torch.tensor([codes.setdefault(label, len(codes)) for label in queries], dtype=torch.int64)
-    gallery_codes = torch.tensor([codes.setdefault(label, len(codes)) for label in gallery], dtype=torch.int64)
+    query_codes, gallery_codes = (
+        torch.tensor([codes.setdefault(label, len(codes)) for label in labels], dtype=torch.int64, device="cpu")
+        for labels in (queries, gallery)
+    )
     relevant = gallery_codes[order] == query_codes[:, None]
     if not relevant.any():
         raise ValueError(

@@ -34,7 +34,7 @@ class Basis:
         self._basis[0] = torch.from_numpy(first_row)
         if self._single is not None:
             self._single[0] = self._basis[0]
-        self._projected = torch.zeros(capacity + 1, capacity + 1, dtype=torch.float64)
+        self._projected = torch.zeros(capacity + 1, capacity + 1, dtype=torch.float64, device="cpu")
         # rows before stop are filled; those before swept are orthogonal to all before them, those behind it to their
         # neighbours
         self._stop = self._swept = 1
@@ -51,7 +51,7 @@ class Basis:
         size = n_rows * n_columns
         length = size + (size + 1) // 2
         huge = length <= MOST_HUGE_ENTRIES
-        room = torch.from_numpy(np.empty(length)) if huge else torch.empty(length, dtype=torch.float64)
+        room = torch.from_numpy(np.empty(length)) if huge else torch.empty(length, dtype=torch.float64, device="cpu")
         self._basis = room[:size].view(n_rows, n_columns)
         self._single = room[size:].view(torch.float32)[:size].view(n_rows, n_columns)
 

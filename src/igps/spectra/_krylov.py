@@ -71,7 +71,7 @@ class Krylov(Basis):
         # rows previous:current and current:stop of the basis are the last two blocks, the last not yet multiplied
         self._previous = self._current = 1
         self._every = SWEEP_EVERY
-        self._coupling = torch.empty(0, 0, dtype=torch.float64)
+        self._coupling = torch.empty(0, 0, dtype=torch.float64, device="cpu")
         # a random vector is mostly high frequencies: one application leaves what matters
         self._append(self._orthonormal(self._apply(self._random(block_size)), near=1)[0], swept=True)
 
@@ -143,7 +143,7 @@ class Krylov(Basis):
         Entry i of a vector becomes row ``order[i]``.
         """
         coefficients = _coefficients(ritz, index)
-        vectors = torch.empty(self._basis.shape[1], len(index), dtype=torch.float64).numpy()
+        vectors = torch.empty(self._basis.shape[1], len(index), dtype=torch.float64, device="cpu").numpy()
 
         def combine(piece: slice) -> None:
             vectors[order[piece]] = combinations(self._basis[1 : self._stop], coefficients, piece)
@@ -200,7 +200,7 @@ class Krylov(Basis):
             return (overlaps(new, new, piece),)
 
         (squares,) = self._sums(take_out)
-        if float((squares - torch.eye(len(new))).abs().max()) > ROUNDING:
+        if float((squares - torch.eye(len(new), device="cpu")).abs().max()) > ROUNDING:
             self._multiply(_inverse(torch.linalg.cholesky(squares)), new, new)
         self._mark_swept()
         return largest
@@ -266,4 +266,4 @@ def _coefficients(ritz: RitzPairs, index: torch.Tensor) -> torch.Tensor:
 
 def _inverse(factor: torch.Tensor) -> torch.Tensor:
     """Of a lower triangular matrix."""
-    return torch.linalg.solve_triangular(factor, torch.eye(len(factor), dtype=factor.dtype), upper=False)
+    return torch.linalg.solve_triangular(factor, torch.eye(len(factor), dtype=factor.dtype, device="cpu"), upper=False)

@@ -154,8 +154,13 @@ class Factors:
         """The solutions (V, b) for right-hand sides (V, b), float64, both best stored by columns."""
         tree, structure = self.tree, self.tree.structure
         n_vertices, b = right_hand_sides.shape
-        right, solution = right_hand_sides.T.contiguous().numpy(), torch.empty(b, n_vertices, dtype=torch.float64)
-        x, carried = (torch.empty(n * b, dtype=torch.float64).numpy() for n in (n_vertices, tree.n_carried))
+        right, solution = (
+            right_hand_sides.T.contiguous().numpy(),
+            torch.empty(b, n_vertices, dtype=torch.float64, device="cpu"),
+        )
+        x, carried = (
+            torch.empty(n * b, dtype=torch.float64, device="cpu").numpy() for n in (n_vertices, tree.n_carried)
+        )
         largest = int((np.diff(tree.first) + np.diff(tree.start)).max())
 
         def forward(nodes: tuple[int, int]) -> None:
@@ -239,7 +244,7 @@ def _invert(pivot: torch.Tensor) -> tuple[torch.Tensor, int]:
     factor, order, failed = torch.linalg.ldl_factor_ex(pivot)
     if failed:
         raise SingularMatrixError("a pivot block of the shifted matrix is singular: use a slightly different shift")
-    inverse = torch.linalg.ldl_solve(factor, order, torch.eye(len(pivot), dtype=pivot.dtype))
+    inverse = torch.linalg.ldl_solve(factor, order, torch.eye(len(pivot), dtype=pivot.dtype, device="cpu"))
     # Bunch & Kaufman's pivots: a 1×1 one counts by its sign, a 2×2 one (marked by a negative index) has one eigenvalue
     # of either sign
     n_negative = ((order > 0) & (factor.diagonal() < 0)).sum() + (order < 0).sum() // 2
