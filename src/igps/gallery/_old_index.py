@@ -19,8 +19,7 @@ _ROWS_AT_ONCE = 1024
 def convert(path: Path) -> None:
     """Make a gallery of an index beside its files, which are not needed any more; none of its rows tells its size.
 
-    Raises:
-        ValueError: it is damaged.
+    A ValueError where it is damaged.
     """
     with alone(path):
         if not exists(path):  # another process may have been quicker
