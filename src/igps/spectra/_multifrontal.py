@@ -66,16 +66,10 @@ class Tree:
     n_carried: int  # rows that wait at the same time, at most
 
     def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> Factors:
-        """The factors of ``matrix − shift · I``; their bits do not depend on the team.
+        """The factors of ``matrix − shift · I``, of which both triangles are read; a team changes none of their bits.
 
-        Args:
-            matrix: (V, V) symmetric, with the stored entries of the one that was analysed; both triangles are read.
-            shift: any number that is not an eigenvalue.
-            team: threads that work side by side.
-
-        Raises:
-            ValueError: the stored entries of the matrix are others.
-            SingularMatrixError: a pivot block is singular.
+        A ValueError if the matrix stores other entries than the one that was analysed, a SingularMatrixError if a pivot
+        block is singular, as at an eigenvalue.
         """
         blocks = np.empty(self.block_start[-1])
         return Factors(self, blocks, self._eliminate(matrix, shift, team, blocks))
