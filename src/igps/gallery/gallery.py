@@ -49,7 +49,7 @@ class Gallery:
     """Described bodies, opened for queries, which need neither their files nor their Signatures.
 
     Args:
-        path: its folder. One that `igps index` wrote becomes a gallery, once.
+        path: its folder.
         descriptor: the one that it was built with. It may be left out if the gallery knows it by its name.
         version: an earlier one of its `versions`; the last if None.
 
