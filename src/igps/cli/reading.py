@@ -92,8 +92,8 @@ def signatures(
 ) -> tuple[SignatureDataset, list[Failure]]:
     """The bodies whose signatures are in the cache, after computing what was missing; and those that failed.
 
-    They satisfy the descriptors' requirements. The other parameters, and those of `chosen_dataset`, are options of every
-    command that reads bodies, see `MEANINGS`. A ValueError where no body could be used.
+    They satisfy the descriptors' requirements; a ValueError where no body could be used. The other parameters, and
+    those of `chosen_dataset`, are options of every command that reads bodies, see `MEANINGS`.
     """
     needs = reduce(or_, (one.requirements for one in descriptors), Requirements()) if descriptors else None
     dataset = chosen_dataset(source, needs, **reading)

@@ -38,7 +38,7 @@ from scipy import sparse
 from igps._arrays import Floats
 from igps._threads import ALONE, Team
 from igps.spectra import _fronts as loops
-from igps.spectra._checks import canonical, check_entries
+from igps.spectra._checks import checked_entries
 from igps.spectra._ordering import LEAF_SIZE, checked_graph, nested_dissection
 from igps.spectra._tree import Structure, side_by_side, stacked_places, tree_structure
 
@@ -81,21 +81,17 @@ class Tree:
     def arranged(self, matrix: sparse.csr_array) -> tuple[Tree, sparse.csr_array, np.ndarray]:
         """The structure for unknowns in the order of elimination, such a matrix, and which each was before (V,)."""
         order = self.structure.order
-        matrix = self._known(matrix)[order][:, order]
+        matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)[order][:, order]
         matrix.sort_indices()
         indptr, indices = (array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices))
         same = np.arange(len(order))
         structure = self.structure._replace(indptr=indptr, indices=indices, order=same, number=same)
         return replace(self, structure=structure), matrix, order
 
-    def _known(self, matrix: sparse.csr_array) -> sparse.csr_array:
-        matrix = canonical(matrix)
-        check_entries(matrix, self.structure.indptr, self.structure.indices)
-        return matrix
-
     def _eliminate(self, matrix: sparse.csr_array, shift: float, team: Team, blocks: np.ndarray | None) -> int:
         """Write the blocks, if they are to be kept; the number of negative eigenvalues."""
-        values, updates = self._known(matrix).data.astype(np.float64, copy=False), np.empty(self.n_updates)
+        matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)
+        values, updates = matrix.data.astype(np.float64, copy=False), np.empty(self.n_updates)
 
         def eliminate(nodes: tuple[int, int]) -> int:
             return self._eliminate_range(nodes, values, float(shift), updates, blocks, team)
