@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-import zipfile
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -28,7 +27,7 @@ import pyarrow as pa
 
 from igps.gallery import _table
 from igps.gallery._table import BodyTable
-from igps.gallery.about import check_alike, open_table
+from igps.gallery.about import check_alike, is_gallery, open_table
 from igps.retrieval import chi_square, cosine, search
 from igps.retrieval.vectors import VectorMap
 
@@ -315,35 +314,12 @@ def test_several_processes_read_while_one_adds(tmp_path: Path) -> None:
     assert [numbers(opened.search(one[None], cosine, top=3)) for one in rows[::150]] == before != after
 
 
-def test_an_index_of_an_earlier_version_becomes_a_gallery(tmp_path: Path) -> None:
-    """Two that 0.2.0 wrote: of 12 short descriptions, two of which were replaced; and of four in half precision."""
-    with zipfile.ZipFile(Path(__file__).parent / "old_indices.zip") as file:
-        file.extractall(tmp_path)
-
-    def values(n: int, width: int, seed: int) -> torch.Tensor:
-        return torch.from_numpy(np.random.default_rng(seed).random((n, width), dtype=np.float32))
-
-    short, long = open_table(tmp_path / "short.igps"), open_table(tmp_path / "long.igps")
-    assert (short.about, len(short), short.head["searched_by"]) == (ABOUT, 12, "chi_square")
-    expected = torch.cat([values(2, 8, 1), values(12, 8, 0)[2:]])
-    for i in range(12):
-        (row,), distances, description = short.search(expected[i : i + 1], chi_square, top=1)
-        assert torch.equal(description[0], expected[i])
-        assert (row["id"], row["name"], row["class"]) == (f"/meshes/{i}.off", f"{i}.off", "odd" if i % 2 else None)
-        assert (row["checksum"], row["volume"], float(distances)) == ("b" if i < 2 else "a", None, 0)
-    (some,) = long.batches()
-    torch.testing.assert_close(long.decoded(some)[0], values(4, 1030, 2).reshape(4, 2, 515) * 1e-6, rtol=2**-11, atol=0)
-    short.add(values(1, 8, 5), [told(0)], {})
-    assert len(open_table(tmp_path / "short.igps")) == 13
-
-
-@pytest.mark.parametrize("name", ["manifest.json", "descriptions.raw", "entries.sqlite"])
-def test_an_old_index_that_cannot_be_read_says_what_to_do(tmp_path: Path, name: str) -> None:
-    with zipfile.ZipFile(Path(__file__).parent / "old_indices.zip") as file:
-        file.extractall(tmp_path)
-    next((tmp_path / "short.igps").rglob(name)).write_text("{}")
-    with pytest.raises(ValueError, match=r"short\.igps: expected an index of an earlier version.*Build a gallery"):
-        open_table(tmp_path / "short.igps")
+def test_an_index_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
+    """Its signatures are of version 4: with these nothing is compared."""
+    (tmp_path / "manifest.json").write_text('{"format": "igps-index-1"}')
+    assert is_gallery(tmp_path)
+    with pytest.raises(ValueError, match=r"an index of version 0\.2\.0, of other signatures\. Build a gallery"):
+        open_table(tmp_path)
 
 
 _WRITER = """

@@ -66,7 +66,7 @@ def backward_error(matrix: np.ndarray, solution: np.ndarray, right: np.ndarray, 
 def eliminations(factors: Factors) -> list[np.ndarray]:
     """E of every node that has one."""
     tree, found = factors.tree, []
-    for node, n_own in enumerate(np.diff(tree.first)):
+    for node, n_own in enumerate(np.diff(tree.structure.first)):
         block = factors.blocks[tree.block_start[node] : tree.block_start[node + 1]]
         found.append(block.reshape(n_own, -1)[:, n_own:] if n_own else block)
     return [elimination for elimination in found if elimination.size]
@@ -180,7 +180,7 @@ def test_coinciding_places_are_allowed() -> None:
 def test_a_separator_keeps_blocks_small() -> None:
     """On an n × n grid the root needs about n unknowns; a cut through the wrong place would need many more."""
     matrix, places = grid_matrix(40)
-    assert np.diff(analyse(matrix, places).first)[-1] <= 1.5 * 40
+    assert np.diff(analyse(matrix, places).structure.first)[-1] <= 1.5 * 40
 
 
 def test_one_dissection_serves_other_values() -> None:

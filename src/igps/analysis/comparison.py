@@ -69,7 +69,6 @@ def compare(
 
     Args:
         dataset: N meshes with classes, their signatures with all that the descriptors need.
-        descriptors: in the order of the results.
         n_workers: processes that describe; all cores if None.
         strict: raise at the first mesh that cannot be described instead of listing it.
 
@@ -117,10 +116,7 @@ def check_descriptors(descriptors: Sequence[Descriptor], dataset: SignatureDatas
 
 
 def _described(job: tuple[Descriptor, SignatureDataset]) -> _Description:
-    """The description of the one mesh of a dataset, and the seconds of processor time that it took.
-
-    Timed from the cached signature on, with the reading of a mesh that is needed.
-    """
+    """The description of the one mesh of a dataset, and the seconds of processor time that it took."""
     descriptor, dataset = job
     with one_thread(), torch.inference_mode():
         batch = dataset.batch([0])

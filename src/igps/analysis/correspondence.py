@@ -24,10 +24,7 @@ def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Values:
     Samples of the surface correspond where heat flows alike (Sun, Ovsjanikov and Guibas 2009) over large times, which
     does not depend on the pose. A sample is unlike by as many standard deviations as its heat kernel of small times is
     away from those of the ten that correspond to it; and by how far the nearest are by all times. Both are averaged
-    over the surface around and standardised; the result is the exponential of their sum.
-
-    Args:
-        body, other: a body each.
+    over the surface around and standardised; the result is the exponential of their sum. Each batch is of one body.
     """
     coarse, fine = zip(*(_heat_kernels(one) for one in (body, other)), strict=True)
     scale = coarse[1].std(axis=0) + 1e-9

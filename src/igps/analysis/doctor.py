@@ -52,14 +52,7 @@ def examine(
     limits: Limits | None = None,
     progress: bool = True,
 ) -> list[Finding]:
-    """Read and mend every body as for its signature, and say what was found.
-
-    Args:
-        files: to be examined.
-        reading: how they are read; the default if None.
-        config: of the signatures; the default if None.
-        limits: time and memory of one file.
-    """
+    """Read and mend every body as for its signature, and say what was found; limits are of one file."""
     jobs = by_file(files, range(len(files)))
     one = partial(_examine, reading or LoadOptions(), config or SignatureConfig())
     outcomes = run(one, [[files[i] for i in job] for job in jobs], n_workers=n_workers, limits=limits)

@@ -28,20 +28,14 @@ Shares = Mapping[SampleKind, NDArray[np.float64]]
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A distance, shared out. Shares may be negative: what makes the bodies alike.
+    """A distance, shared out. Shares may be negative: what makes the bodies alike."""
 
-    Args:
-        distance: by the descriptor.
-        parts: of each histogram, by what it counts, its share; they sum to the distance.
-        samples: of the one and the other body, of each kind of samples (P,) their shares; all together sum to the
-            distance.
-        places: the same distance shared out among the samples of the surfaces by where the bodies are unlike, see
-            `igps.analysis.correspondence`; none is negative. None of two groups.
-    """
-
-    distance: float
-    parts: Mapping[str, float]
+    distance: float  # by the descriptor
+    parts: Mapping[str, float]  # of each histogram, by what it counts, its share; they sum to the distance
+    # Of the one and the other body, of each kind of samples (P,) their shares; all together sum to the distance
     samples: tuple[Shares, Shares]
+    # The same distance shared out among the samples of the surfaces by where the bodies are unlike, see
+    # `igps.analysis.correspondence`; none is negative. None of two groups
     places: tuple[Shares, Shares] | None = None
 
     def summary(self, most: int = 3) -> str:
@@ -69,7 +63,6 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
 
     Args:
         descriptor: of histograms, such as interior or rich, alone or under a head, such as pretrained.
-        one, other: a body each.
 
     Raises:
         ValueError: a descriptor of another kind, or not one body each.
@@ -100,9 +93,7 @@ def _placed(body: SignatureBatch, other: SignatureBatch, samples: Shares, distan
 def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Tensor, float]:
     """What a unit of each cell's contents counts, positive in the one and negative in the other body, and the distance.
 
-    Args:
-        descriptor: see `explain`, in double precision.
-        one, other: (cells,) histograms.
+    The descriptor is in double precision, see `explain`; the histograms are (cells,).
     """
     roots = torch.stack([one, other]).double().sqrt()
     middle, half = roots.mean(dim=0), (roots[0] - roots[1]) / 2
@@ -134,10 +125,7 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
 def on_surface(shares: Shares, samples: Mapping[SampleKind, NDArray[np.float64]], points: NDArray[np.float64]) -> Any:
     """(V,) what the body has of the difference about each point: 1 where it is as everywhere, if the sum were 1.
 
-    Args:
-        shares: of the samples of each kind, (P,).
-        samples: their places, (P, 3).
-        points: (V, 3), such as vertices.
+    Of the samples of each kind, shares (P,) and places (P, 3); and points (V, 3), such as vertices.
     """
     found = np.zeros(len(points))
     for kind, values in shares.items():
@@ -243,10 +231,7 @@ def explain_groups(
         descriptor: see `explain`.
         one, other: (N, ...) descriptions of its histograms (for a head, those that the head is given).
         batches: two bodies to be painted, one of each group.
-        test: see `significant_cells`.
-
-    Returns:
-        the explanation, and the (cells,) that are held.
+        test: options of `significant_cells`, whose result comes behind the explanation.
     """
     descriptor = copy.deepcopy(descriptor).double().eval()
     rows = [group.double().flatten(1) for group in (one, other)]

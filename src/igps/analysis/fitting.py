@@ -91,7 +91,6 @@ def fit(
         prior: whether the metric that the descriptor has counts beside the new head.
         failures: a list to which bodies that cannot be described are added; None to raise at the first.
         n_workers: threads that describe; all cores if None.
-        progress: show a bar.
 
     Raises:
         ValueError: no labels, too few of them, or a descriptor without histograms.
@@ -162,13 +161,7 @@ def classify(
 ) -> Classification:
     """The classes of the bodies of a dataset by a model that `fit` made.
 
-    Args:
-        dataset: bodies, labelled or not.
-        model: a file, or the model.
-        failures, n_workers, progress: see `fit`.
-
-    Raises:
-        ValueError: the model has no classifier.
+    The model is one, or a file of it; a ValueError where it has no classifier. For the other arguments see `fit`.
     """
     found = descriptor_of(model)
     found = found.descriptor if isinstance(found, IndividualDescriptor) else found

@@ -45,7 +45,6 @@ def body_map(distances: Values, layout: Layout = "mds", *, seed: int = 0) -> Bod
 
     Args:
         distances: (N, N).
-        layout: "mds" or "umap".
         seed: of UMAP.
 
     Raises:
@@ -67,22 +66,16 @@ def body_map(distances: Values, layout: Layout = "mds", *, seed: int = 0) -> Bod
 
 
 def _classical(distances: Values) -> Values:
-    from scipy.sparse.linalg import LinearOperator, eigsh
+    from scipy.linalg import eigh
+    from scipy.sparse.linalg import eigsh
 
     squares, n = distances**2, len(distances)
     means = squares.mean(axis=0)
-
-    def product(vector: Values) -> Values:
-        vector = vector.ravel()
-        total = vector.sum()
-        rows: Values = squares @ vector - means * total - (means @ vector - means.mean() * total)
-        return -rows / 2
-
+    products = (means[:, None] + means - means.mean() - squares) / 2
     if n < 8:
-        values, axes = np.linalg.eigh(np.stack([product(one) for one in np.eye(n)]))
-        values, axes = values[-2:], axes[:, -2:]
+        values, axes = eigh(products, subset_by_index=(n - 2, n - 1))
     else:
-        values, axes = eigsh(LinearOperator((n, n), product, dtype=float), 2, which="LA", v0=np.sin(np.arange(n) + 1.0))
+        values, axes = eigsh(products, 2, which="LA", v0=np.sin(np.arange(n) + 1.0))
     found: Values = axes * np.sqrt(np.maximum(values, 0))
     return found
 

@@ -60,23 +60,14 @@ _SAYS = {
 
 @dataclass(frozen=True)
 class Outlier:
-    """How unlike its class a body is.
+    """How unlike its class a body is."""
 
-    Args:
-        body: its number.
-        label: its class.
-        score: the root of the sum of squares of those `scores` that are positive.
-        scores: of each measure, how many robust standard deviations it is from the rest of its class.
-        lies_among: the class whose members are nearer than its own; None where its own are.
-        reason: in words.
-    """
-
-    body: int
-    label: str
-    score: float
-    scores: Mapping[str, float]
-    lies_among: str | None
-    reason: str
+    body: int  # its number
+    label: str  # its class
+    score: float  # the root of the sum of squares of those `scores` that are positive
+    scores: Mapping[str, float]  # of each measure, how many robust standard deviations it is from the rest of its class
+    lies_among: str | None  # the class whose members are nearer than its own; None where its own are
+    reason: str  # in words
 
     @property
     def is_outlier(self) -> bool:
@@ -145,10 +136,6 @@ def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> d
     meshes: "handles", and "flat", the largest share of the surface that lies in one plane. Of labels: "stray",
     "cavity", "hole" and "gap", roots of shares of their voxels, and "cut", see `igps.analysis.segmentation`; and
     "overlap", (N, N), the share of each that lies in each body of another class in the same grid and folder.
-
-    Args:
-        dataset: N bodies.
-        n_workers: processes; all cores if None.
     """
     found = np.full((len(dataset), len(_MEASURED)), np.nan)
     places = list[Place | None]([None] * len(dataset))
@@ -206,10 +193,8 @@ def _of_body(pipeline: SignaturePipeline, body: BodyRef, raw: RawBody) -> tuple[
     found["stray"], found["cavity"], found["hole"] = stray_root(mask), cavity_root(mask), hole_root(mask)
     found["gap"] = gap_root(mask, sides)
     found["cut"] = cut_end(mask, np.stack([low == 0, low + mask.shape == grid], axis=1))
-    place = Place(
-        (body.path.parent, grid, voxels.affine.tobytes()), low, mask.shape, int(mask.sum()), np.packbits(mask)
-    )
-    return list(found.values()), place
+    where = body.path.parent, grid, voxels.affine.tobytes()
+    return list(found.values()), Place(where, low, mask.shape, int(mask.sum()), np.packbits(mask))
 
 
 def _nearness(distances: Values, codes: NDArray[np.int64]) -> tuple[Values, Values, NDArray[np.int64]]:

@@ -51,11 +51,7 @@ def gap_root(mask: Mask, sides: Values) -> float:
     """The root of the voxels that closing adds, over those of the body: its tunnels, notches and clefts.
 
     Closing (Matheron 1975) keeps outside what a ball outside of the body reaches. Its radius is four fifths of that of
-    the largest ball inside.
-
-    Args:
-        mask: (X, Y, Z).
-        sides: (3,) of a voxel, length.
+    the largest ball inside. A voxel has sides (3,), length.
     """
     while mask.size > _MOST_VOXELS:
         mask = np.pad(mask, [(0, n % 2) for n in mask.shape])
@@ -72,11 +68,7 @@ def cut_end(mask: Mask, at_border: Mask) -> float:
     """How flat an end of a body is along an axis of the grid, as if slices were cut off; 0 if all are at the border.
 
     The root of the voxels of its last slice beyond that of two fifths of those of the two slices before it, which is
-    what ends that are round have.
-
-    Args:
-        mask: (X, Y, Z), no larger than the body.
-        at_border: (3, 2) which ends the border of the volume cuts.
+    what ends that are round have. The mask is no larger than the body; (3, 2) ends are at the border of the volume.
     """
     flattest = 0.0
     for axis, end in np.argwhere(~at_border):

@@ -92,14 +92,8 @@ def signatures(
 ) -> tuple[SignatureDataset, list[Failure]]:
     """The bodies whose signatures are in the cache, after computing what was missing; and those that failed.
 
-    The parameters, and those of `chosen_dataset`, are options of every command that reads bodies, see `MEANINGS`.
-
-    Args:
-        source: a folder, files, or bodies.
-        descriptors: whose requirements the signatures satisfy.
-
-    Raises:
-        ValueError: no body could be used, or `paper` beside other parameters of the signatures.
+    They satisfy the descriptors' requirements; a ValueError where no body could be used. The other parameters, and
+    those of `chosen_dataset`, are options of every command that reads bodies, see `MEANINGS`.
     """
     needs = reduce(or_, (one.requirements for one in descriptors), Requirements()) if descriptors else None
     dataset = chosen_dataset(source, needs, **reading)
@@ -123,9 +117,7 @@ def described(
 ) -> Described:
     """The bodies whose signatures are in the cache, and their descriptions; see `signatures`.
 
-    Args:
-        source: a folder, files, or bodies.
-        descriptor: a name, to which size and mirror are added; or a descriptor as it is.
+    Size and mirror are added to a descriptor's name; a descriptor itself stays as it is.
     """
     if isinstance(descriptor, str):
         descriptor = with_side(descriptor, mirror)
@@ -191,8 +183,6 @@ def chosen_dataset(
     """The dataset that the options tell; nothing is computed.
 
     Args:
-        source: a folder, files, or bodies.
-        needs: what the signatures satisfy, if that is known.
         signature: parameters of the signatures.
         classes: what the class of a body is: folder (or labels.csv), body (its name in its file), or file.
 

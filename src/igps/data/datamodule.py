@@ -46,17 +46,15 @@ class SignatureDataModule(LightningDataModule):
 
     Args:
         root: a folder that tells classes, see `find_bodies`.
-        protocol: "seen" splits each class, "unseen" splits the classes.
+        protocol: see `SplitProtocol`.
         n_train: shapes of each class ("seen") or classes ("unseen") in training and validation together; below 1 a
             share.
         n_validation: how many of those validate; below 1 a share.
         n_test: classes to test ("unseen" only); all others if None.
-        split_seed: of the split.
         classes_per_batch, shapes_per_class: P and K of a training batch, in each process.
         n_samples_in_memory: interior and surface samples of each training shape, a fixed random subset, that are kept
             in memory from step to step; None reads whole signatures from the cache at each step.
-        config: of the signatures.
-        reading: how mesh files are read.
+        config, reading: see `SignatureDataset`.
         cache_dir: of the signatures; the user's cache directory if None.
         n_workers: processes that compute missing signatures; all cores if None.
         n_loading_workers: processes that read signatures for the batches; none if 0.

@@ -125,9 +125,7 @@ def find_bodies(
     `Bodies.columns`; beside them, `label` may be missing where the folder tells no classes.
 
     Args:
-        root: the folder.
         options: how files are read, which says what bodies there are in one.
-        classes: what the class of a body is, see `ClassRule`.
         attributes: what bodies bring along; the files of these are no bodies.
         labelled: whether it must tell classes.
 

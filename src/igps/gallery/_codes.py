@@ -145,16 +145,11 @@ def _estimate(
     signs: Words, square: Singles, scale: Singles, ends: Integers, planes: Words, step: Singles, to_centre: Singles,
     far: Singles,
 ) -> None:  # fmt: skip
-    """Squared distances of a query to the vectors of codes, into `far` (N,).
+    """Squared distances of a query to the vectors of codes, into `far` (N,), which is infinite before.
 
-    Args:
-        signs: (4, N) words.
-        square, scale: (N,) as in `CODE`.
-        ends: (C + 1,) where those of each centre begin, and end.
-        planes: (C, 4, 4) words of each bit of the query's difference from each centre.
-        step: (C,) of these numbers.
-        to_centre: (C,) squared distances of the query.
-        far: infinite numbers.
+    Of the codes, signs (4, N) in words, square and scale (N,) as in `CODE`, and ends (C + 1,) where those of each
+    centre begin; of the query's difference from each centre, planes (C, 4, 4) of the words of each bit, step (C,) that
+    their numbers stand for, and to_centre (C,), its square.
     """
     for centre in range(len(ends) - 1):
         for start in range(ends[centre], ends[centre + 1], _ROWS):

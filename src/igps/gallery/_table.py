@@ -188,7 +188,7 @@ def write(
     at least one row; the first few thousand should be like the others. Further columns are those beside `KNOWN`.
     """
     there = {one.name for one in path.iterdir()} if path.is_dir() else set()
-    if strange := {one for one in there if not one.startswith((_BODIES, _MAP, "lock", "manifest", "part-", "staged-"))}:
+    if strange := {one for one in there if not one.startswith((_BODIES, _MAP, "lock"))}:
         raise ValueError(f"{path}: expected a gallery or a new folder, got one with {min(strange)}. Name another.")
     batches = (batch for batch in batches if len(batch[1]))
     if (first := next(batches, None)) is None:

@@ -21,7 +21,7 @@ KNOWN: dict[str, type] = {"id": str, "name": str, "class": str, "file": str, "pa
 """What every row tells beside its description, and of which type."""
 
 MANIFEST = "manifest.json"
-"""What an index of an earlier version has."""
+"""What an index of 0.2.0 has."""
 
 Row = Mapping[str, Any]
 Batch = tuple[Tensor, Sequence[Row]]
@@ -72,7 +72,7 @@ def in_words(sentence: str) -> Iterator[None]:
 
 
 def is_gallery(path: str | Path) -> bool:
-    """Whether a folder is a gallery, or an index of an earlier version."""
+    """Whether a folder is a gallery, or an index of 0.2.0, which is refused in words."""
     return any((Path(path) / name).exists() for name in ("bodies.lance", MANIFEST))
 
 
@@ -84,9 +84,7 @@ def tables() -> Any:
 
 
 def open_table(path: str | Path, version: int | None = None) -> Any:
-    """The table of a gallery, or of an index of an earlier version, which becomes a gallery."""
+    """The table of a gallery; a ValueError of an index of 0.2.0, with whose Signatures none of now are compared."""
     if not tables().exists(Path(path)) and (Path(path) / MANIFEST).exists():
-        from igps.gallery._old_index import convert
-
-        convert(Path(path))
+        raise ValueError(f"{path}: an index of version 0.2.0, of other signatures. Build a gallery in a new folder.")
     return tables().BodyTable(path, version)

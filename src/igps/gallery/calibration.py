@@ -28,7 +28,6 @@ LEVELS = (0.0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, *(i / 10 for i in range(1,
           0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 1.0)  # fmt: skip
 """Shares of pairs whose greatest distance is kept."""
 
-
 FINEST = 1e-5
 """A smaller coarseness counts as this, of √area: 2,000 samples may miss what little is not flat."""
 
@@ -37,21 +36,13 @@ _DEPENDS_ON = ("algorithm_version", "resolution", "min_samples", "n_surface_samp
 
 @dataclass(frozen=True)
 class Threshold:
-    """A distance up to which two files are called the same, and how often that was wrong and right.
-
-    Args:
-        distance: the threshold.
-        n_other: pairs that are not the same, on which it was counted.
-        n_false: those of them that it takes for the same.
-        n_same: pairs that are.
-        n_found: those of them that it finds.
-    """
+    """A distance up to which two files are called the same, and how often that was wrong and right."""
 
     distance: float
-    n_other: int
-    n_false: int
-    n_same: int
-    n_found: int
+    n_other: int  # pairs that are not the same, on which it was counted
+    n_false: int  # those of them that it takes for the same
+    n_same: int  # pairs that are
+    n_found: int  # those of them that it finds
 
     @property
     def false_rate(self) -> float:
@@ -61,32 +52,20 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Distances between generated bodies, by a descriptor and by their surfaces laid onto each other.
+    """Distances between generated bodies, by a descriptor and by their surfaces laid onto each other."""
 
-    Args:
-        descriptor: its name.
-        model: its `fingerprint`.
-        signatures: version of the Signatures, and those of their parameters that distances depend on.
-        made_of: what was measured, in words.
-        distances: of each of `KINDS` the quantiles at `LEVELS` of the descriptor's distance.
-        n_pairs: of each of `KINDS`, how many pairs.
-        near: the descriptor's distance beyond which no pair is looked at: twice the largest between copies.
-        same: of `surface_distance`: up to it two files may show the same body in the same shape.
-        detail: of the same over the larger of the two `coarseness`, which leaves open what a surface's level of detail
-            has lost: up to it they do.
-        pose: of the descriptor's distance: up to it they show poses of one body.
-    """
-
-    descriptor: str
-    model: str
-    signatures: Mapping[str, int]
-    made_of: str
-    distances: Mapping[str, Sequence[float]]
-    n_pairs: Mapping[str, int]
-    near: float
-    same: Threshold
+    descriptor: str  # its name
+    model: str  # its `fingerprint`
+    signatures: Mapping[str, int]  # version of the Signatures, and those of their parameters that distances depend on
+    made_of: str  # what was measured, in words
+    distances: Mapping[str, Sequence[float]]  # of each of `KINDS` the quantiles at `LEVELS`, by the descriptor
+    n_pairs: Mapping[str, int]  # of each of `KINDS`, how many pairs
+    near: float  # the descriptor's distance beyond which no pair is looked at: twice the largest between copies
+    same: Threshold  # of `surface_distance`: up to it two files may show the same body in the same shape
+    # Of the same over the larger of the two `coarseness`, which leaves open what a surface's level of detail has lost:
+    # up to it they do
     detail: Threshold
-    pose: Threshold
+    pose: Threshold  # of the descriptor's distance: up to it they show poses of one body
 
     def share_closer(self, kind: str, distance: float) -> float:
         """Which share of the pairs of a kind is closer than a distance, interpolated between the quantiles."""
@@ -108,19 +87,12 @@ class Calibration:
     def limit(self, coarseness: float) -> float:
         """The `surface_distance` up to which two files show the same body in the same shape.
 
-        Args:
-            coarseness: the larger of the two, see `igps.gallery.duplicates.Surfaces.coarseness`.
+        It depends on the larger of the two `igps.gallery.surfaces.Surfaces.coarseness`.
         """
         return min(self.same.distance, self.detail.distance * max(coarseness, FINEST))
 
     def check(self, descriptor: str | Descriptor, module: Descriptor, config: SignatureConfig) -> None:
-        """Raise a ValueError unless this is the calibration of a descriptor and of Signatures.
-
-        Args:
-            descriptor: as it was asked for.
-            module: the descriptor itself.
-            config: of the Signatures.
-        """
+        """Raise a ValueError unless it is of a descriptor, as it was asked for and itself, and of such Signatures."""
         name = name_of(descriptor)
         if name != self.descriptor:
             raise ValueError(f"descriptor: expected {self.descriptor}, whose distances are calibrated, got {name}.")
@@ -143,12 +115,7 @@ class Calibration:
 
     @classmethod
     def load(cls, path: str | Path = CALIBRATION) -> Self:
-        """What `save` wrote.
-
-        Raises:
-            FileNotFoundError: no such file.
-            ValueError: it is no calibration.
-        """
+        """What `save` wrote; a FileNotFoundError of no file, a ValueError of what is no calibration."""
         try:
             found: dict[str, Any] = json.loads(Path(path).read_text())
             one = cls(**found | {name: Threshold(**found[name]) for name in ("same", "detail", "pose")})

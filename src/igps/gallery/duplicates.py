@@ -41,49 +41,31 @@ _Pairs = dict[tuple[int, int], float]
 
 @dataclass(frozen=True)
 class Duplicates:
-    """Groups of files that show the same body.
+    """Groups of files that show the same body."""
 
-    Args:
-        groups: names of at least two files each, in order; each is the same as some other of its group, by preference
-            the finest.
-        paths: where the files of the groups are, by name.
-        pairs: those that make the groups, and how far apart: their surfaces over √area, or their descriptions where
-            poses are asked for.
-        grades: of these pairs, see `Grade`; none where poses are asked for.
-        largest: of these pairs, how far the farthest sample of one surface is from the other: over √area, as a length,
-            and its unit if that is known.
-        nearly: pairs that are not the same, but no farther apart than was tolerated, and how far, over √area.
-        n_files: among how many they were looked for.
-        failures: files that could not be compared.
-    """
-
+    # Names of at least two files each, in order; each is the same as some other of its group, by preference the finest
     groups: tuple[tuple[str, ...], ...]
-    paths: dict[str, Path]
+    paths: dict[str, Path]  # of the files of the groups, by name
+    # Those that make the groups, and how far apart: their surfaces over √area, or for poses their descriptions
     pairs: dict[tuple[str, str], float]
-    grades: dict[tuple[str, str], Grade]
+    grades: dict[tuple[str, str], Grade]  # of these pairs; none where poses are asked for
+    # Of these pairs, how far the farthest sample of one surface is from the other: over √area, as a length, and its
+    # unit if that is known
     largest: dict[tuple[str, str], tuple[float, float, str | None]]
-    nearly: dict[tuple[str, str], float]
-    n_files: int
-    failures: tuple[Failure, ...]
+    nearly: dict[tuple[str, str], float]  # those that are not the same, but as near as was tolerated, over √area
+    n_files: int  # among which they were looked for
+    failures: tuple[Failure, ...]  # files that could not be compared
 
 
 @dataclass(frozen=True)
 class BodyDistance:
-    """How far two bodies are from each other, and what that means.
+    """How far two bodies are from each other, and what that means."""
 
-    Args:
-        distance: by the descriptor.
-        surfaces: of their surfaces laid onto each other, root mean square over √area.
-        limit: up to which `surfaces` is that of the same shape, at their levels of detail; 0 if one has more handles.
-        meaning: of the distance, in words.
-        same: whether they are the same body in the same shape.
-    """
-
-    distance: float
-    surfaces: float
-    limit: float
-    meaning: str
-    same: bool
+    distance: float  # by the descriptor
+    surfaces: float  # of their surfaces laid onto each other, root mean square over √area
+    limit: float  # up to which they are of one shape, at their levels of detail; 0 if one has more handles
+    meaning: str  # of the distance, in words
+    same: bool  # whether they are the same body in the same shape
 
 
 def duplicates(
@@ -112,7 +94,6 @@ def duplicates(
         cache_dir: of Signatures, for a gallery; the user's cache directory if None.
         calibration: of the descriptor; the one that is shipped if None.
         n_workers: threads; all cores if None.
-        progress: show bars.
 
     Raises:
         ValueError: the calibration is of another descriptor.
@@ -239,13 +220,7 @@ def body_distance(
     calibration: Calibration | None = None,
     progress: bool = False,
 ) -> BodyDistance:
-    """How far the two meshes of a dataset are from each other, and what that means.
-
-    Args:
-        dataset: of two files.
-        descriptor: a calibrated one.
-        calibration: of the descriptor; the one that is shipped if None.
-        progress: show a bar.
+    """How far the two meshes of a dataset are from each other, and what that means; arguments as of `duplicates`.
 
     Raises:
         ValueError: not two files, or the calibration is of another descriptor.

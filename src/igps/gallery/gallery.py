@@ -35,20 +35,13 @@ CANDIDATES = 640
 
 @dataclass(frozen=True)
 class Match:
-    """A body that a query found.
+    """A body that a query found."""
 
-    Args:
-        name: in its collection.
-        label: its class, if it is known.
-        path: its file when it was described, which may have been moved since.
-        distance: from the query, by the descriptor's own distance; or re-ranked, without unit.
-        row: all that the gallery tells of it, by column.
-    """
-
-    name: str
-    label: str | None
-    path: Path
-    distance: float
+    name: str  # in its collection
+    label: str | None  # its class, if it is known
+    path: Path  # its file when it was described, which may have been moved since
+    distance: float  # from the query, by the descriptor's own distance; or re-ranked, without unit
+    # All that the gallery tells of it, by column
     row: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
 
@@ -56,7 +49,7 @@ class Gallery:
     """Described bodies, opened for queries, which need neither their files nor their Signatures.
 
     Args:
-        path: its folder. One that `igps index` wrote becomes a gallery, once.
+        path: its folder.
         descriptor: the one that it was built with. It may be left out if the gallery knows it by its name.
         version: an earlier one of its `versions`; the last if None.
 
@@ -175,12 +168,9 @@ class Gallery:
         Signatures that are not cached are computed on the way; `dataset.precompute()` does that on all cores.
 
         Args:
-            path: its folder.
-            dataset: of the bodies.
             descriptor: a name, which the gallery keeps, or a descriptor, which then is given whenever it is opened.
             n_workers: threads or processes that describe; all cores if None.
             strict: raise at the first body that cannot be described.
-            progress: show a bar.
         """
         chosen, failures = descriptor_of(descriptor), list[Failure]()
         # In any order, as short vectors are fitted to the first
@@ -193,15 +183,10 @@ class Gallery:
     def add(
         self, dataset: SignatureDataset, *, n_workers: int | None = None, strict: bool = False, progress: bool = False
     ) -> list[Failure]:
-        """Add the bodies of a dataset; returns those that failed.
+        """Add the bodies of a dataset; returns those that failed. Arguments as of `build`.
 
-        Bodies that it has already are passed over, and replaced where their content has changed.
-
-        Args:
-            dataset, n_workers, strict, progress: see `build`.
-
-        Raises:
-            ValueError: the gallery is of other Signatures.
+        Bodies that it has already are passed over, and replaced where their content has changed. A ValueError where the
+        gallery is of other Signatures.
         """
         wanted = about_of(dataset.config, dataset.reading, self.descriptor)
         check_alike(self.path, self.about, {name: wanted[name] for name in ("signature", "reading")})
@@ -222,10 +207,8 @@ class Gallery:
     ) -> Gallery:
         """A gallery of the bodies of others, which stay as they are, added to that at `path`, if there is one.
 
-        Raises:
-            ValueError: they are of different descriptors or Signatures, or none is given.
+        A ValueError where they are of different descriptors or Signatures, or none is given.
         """
-
         opened = [open_table(other) for other in others]
         if not opened:
             raise ValueError("others: expected at least one gallery, got none.")

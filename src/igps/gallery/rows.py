@@ -54,8 +54,7 @@ def described_rows(
 def further_columns(bodies: Bodies) -> dict[str, type]:
     """Further columns of the table of labels, and of which type: numbers where all values are.
 
-    Raises:
-        ValueError: one has the name of a column that every gallery has.
+    A ValueError of one that has the name of a column that every gallery has.
     """
     if taken := bodies.columns.keys() & {*KNOWN, "vector", "code"}:
         raise ValueError(f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name.")

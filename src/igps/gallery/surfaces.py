@@ -89,17 +89,11 @@ class Surfaces:
         self._dataset = dataset
         self._last = lru_cache(_SURFACES)(self.samples)
         self._last_triangles = lru_cache(_TRIANGLES)(self._triangles)
-        self._frame = lru_cache(None)(self._origin_and_area)
         self._numbered = lru_cache(_TRIANGLES)(self._as_numbered)
         self._known = lru_cache(None)(self._coarseness_and_handles)
 
     def samples(self, i: int) -> SurfaceSamples:
-        """Those of one.
-
-        Raises:
-            MeshError: the mesh cannot be used; so does their `surface`.
-            ValueError: the Signatures have no directions of the surface.
-        """
+        """Those of one; a MeshError if it cannot be used, as of their `surface`; a ValueError without directions."""
         signature = self._signature(i)
         found = SurfaceSamples.of(signature.surface.points, signature.surface.attributes[_NORMALS], signature.area)
         return replace(found, surface=partial(self._last_triangles, i))
@@ -108,11 +102,7 @@ class Surfaces:
         """How far one is from itself with each vertex in the middle of its neighbours, over √area.
 
         That is what its level of detail leaves open: how far chords cut round parts off, and other triangles sharp
-        edges. On thin triangles, near neighbours count, see `mean_of_neighbours`.
-
-        Raises:
-            MeshError: the mesh cannot be used.
-            ImportError: libigl is not installed.
+        edges. On thin triangles, near neighbours count, see `mean_of_neighbours`. A MeshError if it cannot be used.
         """
         return self._known(i)[0]
 
@@ -138,10 +128,7 @@ class Surfaces:
     def grade(self, i: int, j: int) -> tuple[Grade, float]:
         """What two have in common that are the same at their level of detail; how far the farthest sample is off.
 
-        The latter over √area, and 0 for the same file or mesh.
-
-        Raises:
-            MeshError: one cannot be read.
+        The latter over √area, and 0 for the same file or mesh. A MeshError if one cannot be read.
         """
         one, other = self._dataset.bodies[i], self._dataset.bodies[j]
         with contextlib.suppress(OSError):
@@ -170,11 +157,7 @@ class Surfaces:
         return calibration.limit(max(coarseness, of_other))
 
     def profiles(self, n_workers: int | None = None, progress: bool = False) -> tuple[Tensor, list[Failure]]:
-        """Those (M, 64) of all that can be read, in order, and the failures of the others.
-
-        Raises:
-            MeshError: none can be read.
-        """
+        """Those (M, 64) of all that can be read, in order, and the failures of the others; a MeshError of none."""
 
         def profile(i: int) -> NDArray[np.float64] | None:
             with contextlib.suppress(MeshError):  # which is among the failures
@@ -218,12 +201,8 @@ class Surfaces:
 
     def _placed(self, i: int, mesh: Mesh) -> NDArray[np.float64]:
         """The vertices of one about the origin and in the unit of its samples."""
-        origin, area = self._frame(i)
-        return (mesh.vertices - origin) / math.sqrt(area)
-
-    def _origin_and_area(self, i: int) -> tuple[NDArray[np.float64], float]:
         signature = self._signature(i)
-        return signature.surface.points.mean(axis=0), signature.area
+        return (mesh.vertices - signature.surface.points.mean(axis=0)) / math.sqrt(signature.area)
 
     def _mesh(self, i: int) -> Mesh:
         with self._kept_failure(i):

@@ -27,7 +27,6 @@ def sync(
     Files of the same size and time of change as before are not read.
 
     Args:
-        gallery: what is brought up to the folder.
         dataset: of all bodies below the folder; Signatures that are missing are computed.
         root: the folder. Rows of files elsewhere stay.
         n_workers, strict, progress: see `Gallery.build`.

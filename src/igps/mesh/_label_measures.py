@@ -19,23 +19,17 @@ _SMALL = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class LabelVoxels:
-    """A label in its grid.
+    """A label in its grid."""
 
-    Args:
-        mask: (X, Y, Z) where it is, in the smallest box that holds it.
-        low: (3,) index of the first voxel of the box.
-        grid: voxels of the whole volume along its axes.
-        affine: (4, 4) from indices of the volume to the world.
-    """
-
-    mask: Booleans
-    low: Integers
-    grid: tuple[int, ...]
-    affine: Floats
+    mask: Booleans  # (X, Y, Z) where it is, in the smallest box that holds it
+    low: Integers  # (3,) index of the first voxel of the box
+    grid: tuple[int, ...]  # voxels of the whole volume along its axes
+    affine: Floats  # (4, 4) from indices of the volume to the world
 
     def measures(self) -> VoxelMeasures:
         """Their number, pieces and thickness."""
-        return measured(self.mask)
+        n_pieces = ndimage.label(self.mask, np.ones((3, 3, 3)))[1]
+        return VoxelMeasures(int(np.count_nonzero(self.mask)), int(n_pieces), thinnest_part(self.mask))
 
 
 @dataclass(frozen=True)
@@ -45,12 +39,6 @@ class VoxelMeasures:
     n_voxels: int
     n_pieces: int
     thinnest: int
-
-
-def measured(mask: Booleans) -> VoxelMeasures:
-    """The measures of a mask (X, Y, Z)."""
-    n_pieces = ndimage.label(mask, np.ones((3, 3, 3)))[1]
-    return VoxelMeasures(int(np.count_nonzero(mask)), int(n_pieces), thinnest_part(mask))
 
 
 def thinnest_part(mask: Booleans) -> int:

@@ -139,14 +139,7 @@ def connected(vertices: Floats, faces: Integers) -> list[Surface]:
 
 def largest(vertices: Floats, faces: Integers) -> Surface:
     """The connected component of the largest volume."""
-    count, label = components(faces, len(vertices))
-    if count > 1:
-        part = label[faces[:, 0]]
-        centred = vertices - vertices.mean(axis=0)
-        six_volumes = np.einsum("ij,ij->i", centred[faces[:, 0]], area_vectors(centred, faces))
-        volume = np.abs(np.bincount(part, weights=six_volumes, minlength=count))
-        faces = faces[part == np.argmax(volume)]
-    return compact(vertices, faces)
+    return max(connected(*compact(vertices, faces)), key=lambda surface: abs(signed_volume(*surface)))
 
 
 def stacked(surfaces: Sequence[Surface]) -> Surface:

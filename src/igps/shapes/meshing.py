@@ -53,6 +53,8 @@ def roughen(vertices: Array, faces: Faces, amplitude: float, wavelength: float, 
 
 def defect(vertices: Array, faces: Faces, genus: int, n_vertices: int, min_angle: float = _MIN_ANGLE) -> str | None:
     """What keeps a mesh out of the benchmark, in words, or None; ``min_angle`` in degrees."""
+    import igl
+
     count = len(vertices)
     if abs(count / n_vertices - 1.0) > _VERTEX_TOLERANCE:
         return f"{count} vertices"
@@ -64,8 +66,8 @@ def defect(vertices: Array, faces: Faces, genus: int, n_vertices: int, min_angle
         return f"genus {body.genus} in place of {genus}"
     if body.notes:
         return "inside out"
-    angle = _smallest_angle(vertices, faces)
-    if angle < min_angle:
+    angle = float(np.degrees(igl.internal_angles(vertices, faces).min()))
+    if not angle >= min_angle:  # it is NaN where corners lie in one place or in a row
         return f"a triangle with an angle of {angle:.2g} degrees"
     return None
 
@@ -128,14 +130,3 @@ def _relax(body: Sequence[Placed], vertices: Array, faces: Faces, spacing: float
         vertices = vertices + 0.7 * step
         vertices -= normals * np.clip(_distance(body, vertices), -0.5 * spacing, 0.5 * spacing)[:, None]
     return vertices
-
-
-def _smallest_angle(vertices: Array, faces: Faces) -> float:
-    """The smallest corner angle in degrees."""
-    corners = vertices[faces]
-    smallest = np.inf
-    for i in range(3):
-        a, b = corners[:, (i + 1) % 3] - corners[:, i], corners[:, (i + 2) % 3] - corners[:, i]
-        angles = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))
-        smallest = min(smallest, float(np.degrees(angles.min())))
-    return smallest

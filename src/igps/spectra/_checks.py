@@ -17,10 +17,12 @@ def canonical(matrix: sparse.csr_array) -> sparse.csr_array:
     return matrix
 
 
-def check_entries(matrix: sparse.csr_array, indptr: np.ndarray, indices: np.ndarray) -> None:
-    """Whether a matrix stores the entries of the one whose structure is known."""
+def checked_entries(matrix: sparse.csr_array, indptr: np.ndarray, indices: np.ndarray) -> sparse.csr_array:
+    """The canonical matrix, which must store the entries of the one whose structure is known."""
+    matrix = canonical(matrix)
     if not (np.array_equal(matrix.indptr, indptr) and np.array_equal(matrix.indices, indices)):
         raise ValueError("matrix must store the same entries as the one that was dissected: dissect it anew")
+    return matrix
 
 
 def checked_mass(mass: np.ndarray | sparse.sparray | sparse.spmatrix) -> np.ndarray:

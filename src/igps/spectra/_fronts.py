@@ -7,20 +7,7 @@ import numpy as np
 from igps._compiled import compiled
 from igps.spectra._pivots import AT_ONCE, invert_front
 from igps.spectra._products import COLUMNS, ONE, ROWS, ZERO, product
-
-
-class Structure(NamedTuple):
-    """What is known of a matrix before its values: `Nodes`, and the entries of the csr matrix."""
-
-    indptr: np.ndarray
-    indices: np.ndarray
-    order: np.ndarray
-    number: np.ndarray
-    first: np.ndarray
-    children: np.ndarray
-    start: np.ndarray
-    boundary: np.ndarray
-    parent_row: np.ndarray
+from igps.spectra._tree import Structure
 
 
 class Room(NamedTuple):

@@ -38,9 +38,9 @@ from scipy import sparse
 from igps._arrays import Floats
 from igps._threads import ALONE, Team
 from igps.spectra import _fronts as loops
-from igps.spectra._checks import canonical, check_entries
+from igps.spectra._checks import checked_entries
 from igps.spectra._ordering import LEAF_SIZE, checked_graph, nested_dissection
-from igps.spectra._tree import Nodes, side_by_side, stacked_places, tree_nodes
+from igps.spectra._tree import Structure, side_by_side, stacked_places, tree_structure
 
 # Own unknowns of a node above which its dense algebra is PyTorch's, for which a team can work
 LARGE = 127
@@ -53,11 +53,10 @@ class SingularMatrixError(ValueError):
 
 
 @dataclass(frozen=True)
-class Tree(Nodes):
+class Tree:
     """Elimination order and fronts for one sparsity pattern; serves any number of values and shifts."""
 
-    indptr: np.ndarray  # (V + 1,) int32, of the csr matrix
-    indices: np.ndarray  # (E,) int32
+    structure: Structure
     block_start: np.ndarray  # (N + 1,) where each node's block [D E] starts among all blocks
     update_start: np.ndarray  # (N,) where its complement starts among those that wait to be added
     n_updates: int  # entries of all complements that wait at the same time, at most
@@ -66,22 +65,11 @@ class Tree(Nodes):
     carried_start: np.ndarray  # (N,) where the rows that a node adds to its boundary start among those that wait
     n_carried: int  # rows that wait at the same time, at most
 
-    @property
-    def structure(self) -> loops.Structure:
-        """As the compiled loops take it."""
-        return loops.Structure(**{name: getattr(self, name) for name in loops.Structure._fields})
-
     def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> Factors:
-        """The factors of ``matrix − shift · I``; their bits do not depend on the team.
+        """The factors of ``matrix − shift · I``, of which both triangles are read; a team changes none of their bits.
 
-        Args:
-            matrix: (V, V) symmetric, with the stored entries of the one that was analysed; both triangles are read.
-            shift: any number that is not an eigenvalue.
-            team: threads that work side by side.
-
-        Raises:
-            ValueError: the stored entries of the matrix are others.
-            SingularMatrixError: a pivot block is singular.
+        A ValueError if the matrix stores other entries than the one that was analysed, a SingularMatrixError if a pivot
+        block is singular, as at an eigenvalue.
         """
         blocks = np.empty(self.block_start[-1])
         return Factors(self, blocks, self._eliminate(matrix, shift, team, blocks))
@@ -92,18 +80,17 @@ class Tree(Nodes):
 
     def arranged(self, matrix: sparse.csr_array) -> tuple[Tree, sparse.csr_array, np.ndarray]:
         """The structure for unknowns in the order of elimination, such a matrix, and which each was before (V,)."""
-        matrix = canonical(matrix)
-        check_entries(matrix, self.indptr, self.indices)
-        matrix = matrix[self.order][:, self.order]
+        order = self.structure.order
+        matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)[order][:, order]
         matrix.sort_indices()
         indptr, indices = (array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices))
-        same = np.arange(len(self.order))
-        return replace(self, indptr=indptr, indices=indices, order=same, number=same), matrix, self.order
+        same = np.arange(len(order))
+        structure = self.structure._replace(indptr=indptr, indices=indices, order=same, number=same)
+        return replace(self, structure=structure), matrix, order
 
     def _eliminate(self, matrix: sparse.csr_array, shift: float, team: Team, blocks: np.ndarray | None) -> int:
         """Write the blocks, if they are to be kept; the number of negative eigenvalues."""
-        matrix = canonical(matrix)
-        check_entries(matrix, self.indptr, self.indices)
+        matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)
         values, updates = matrix.data.astype(np.float64, copy=False), np.empty(self.n_updates)
 
         def eliminate(nodes: tuple[int, int]) -> int:
@@ -115,8 +102,8 @@ class Tree(Nodes):
         self, nodes: tuple[int, int], values: Floats, shift: float, updates: Floats, blocks: Floats | None, team: Team
     ) -> int:
         """Write the blocks of a range of nodes, and what they leave to nodes behind it; their negative pivots."""
-        begin, end = nodes
-        n_own, n_boundary = np.diff(self.first[begin : end + 1]), np.diff(self.start[begin : end + 1])
+        (begin, end), structure = nodes, self.structure
+        n_own, n_boundary = np.diff(structure.first[begin : end + 1]), np.diff(structure.start[begin : end + 1])
         front = np.empty(int((n_own + n_boundary).max()) ** 2)
         block_start = self.block_start
         if blocks is None:
@@ -124,8 +111,8 @@ class Tree(Nodes):
         padded = min(LARGE, int(n_own.max())) + loops.AT_ONCE
         squares = [np.empty(padded**2) for _ in range(3)]
         strips = [np.empty(loops.AT_ONCE * (padded + loops.AT_ONCE)) for _ in range(2)]
-        room = loops.Room(np.empty(len(self.order), dtype=np.int64), front, *squares, *strips)
-        problem = self.structure, values, shift, updates, self.update_start, blocks, block_start, room
+        room = loops.Room(np.empty(len(structure.order), dtype=np.int64), front, *squares, *strips)
+        problem = structure, values, shift, updates, self.update_start, blocks, block_start, room
         n_negative, node = 0, begin
         while True:
             n_more, node = loops.eliminate((node, end), LARGE, *problem)
@@ -154,14 +141,10 @@ class Factors:
         """The solutions (V, b) for right-hand sides (V, b), float64, both best stored by columns."""
         tree, structure = self.tree, self.tree.structure
         n_vertices, b = right_hand_sides.shape
-        right, solution = (
-            right_hand_sides.T.contiguous().numpy(),
-            torch.empty(b, n_vertices, dtype=torch.float64, device="cpu"),
-        )
-        x, carried = (
-            torch.empty(n * b, dtype=torch.float64, device="cpu").numpy() for n in (n_vertices, tree.n_carried)
-        )
-        largest = int((np.diff(tree.first) + np.diff(tree.start)).max())
+        right = right_hand_sides.T.contiguous().numpy()
+        solution = torch.empty(b, n_vertices, dtype=torch.float64, device="cpu")
+        x, carried = (np.empty(n * b) for n in (n_vertices, tree.n_carried))
+        largest = int((np.diff(structure.first) + np.diff(structure.start)).max())
 
         def forward(nodes: tuple[int, int]) -> None:
             places = x, carried, tree.carried_start
@@ -194,17 +177,15 @@ def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, 
     matrix, coordinates = checked_graph(matrix, coordinates)
     node, n_levels = nested_dissection(matrix, coordinates, leaf_size)
     indptr, indices = (array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices))
-    nodes = tree_nodes(node, n_levels, indptr, indices)
-    n_own, n_boundary = np.diff(nodes.first), np.diff(nodes.start)
+    structure = tree_structure(node, n_levels, indptr, indices)
+    n_own, n_boundary = np.diff(structure.first), np.diff(structure.start)
     subtrees = side_by_side(n_levels, len(node))
     inside = {number for begin, end in subtrees for number in range(begin, end)}
     above = [(number, number + 1) for number in range(len(n_own)) if number not in inside]
-    update_start, n_updates = stacked_places(nodes.children, n_boundary**2, [*subtrees, *above])
-    carried_start, n_carried = stacked_places(nodes.children, n_boundary, [*subtrees, *above])
+    update_start, n_updates = stacked_places(structure.children, n_boundary**2, [*subtrees, *above])
+    carried_start, n_carried = stacked_places(structure.children, n_boundary, [*subtrees, *above])
     return Tree(
-        **vars(nodes),
-        indptr=indptr,
-        indices=indices,
+        structure=structure,
         block_start=np.append(0, np.cumsum(n_own * (n_own + n_boundary))),
         update_start=update_start,
         n_updates=n_updates,

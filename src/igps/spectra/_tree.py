@@ -3,7 +3,7 @@
 Nodes and unknowns are numbered depth first, each node behind its children: in the order of their elimination.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,10 +14,11 @@ from igps._compiled import compiled
 SUBTREE, MOST_SUBTREES = 2**13, 3
 
 
-@dataclass(frozen=True)
-class Nodes:
-    """The nodes of the tree, N in number, and their vertices."""
+class Structure(NamedTuple):
+    """What is known of a matrix before its values: its pattern, and the nodes of the tree, N in number."""
 
+    indptr: np.ndarray  # (V + 1,) int32, of the csr matrix
+    indices: np.ndarray  # (E,) int32
     order: np.ndarray  # (V,) the vertex of each number
     number: np.ndarray  # (V,) the number of each vertex
     first: np.ndarray  # (N + 1,) where each node's own numbers start
@@ -27,8 +28,8 @@ class Nodes:
     parent_row: np.ndarray  # the row of each vertex of a boundary in the front of the node's parent
 
 
-def tree_nodes(node: np.ndarray, n_levels: int, indptr: np.ndarray, indices: np.ndarray) -> Nodes:
-    """The nodes of a full binary tree for vertices (V,) assigned to the places of a heap."""
+def tree_structure(node: np.ndarray, n_levels: int, indptr: np.ndarray, indices: np.ndarray) -> Structure:
+    """Of a full binary tree for vertices (V,) assigned to the places of a heap."""
     n_nodes = 2**n_levels - 1
     post = np.full(n_nodes, n_nodes - 1)  # the number of each place in the heap
     children, parent = np.full((n_nodes, 2), -1), np.full(n_nodes, -1)
@@ -47,7 +48,8 @@ def tree_nodes(node: np.ndarray, n_levels: int, indptr: np.ndarray, indices: np.
     start, boundary = _boundaries(first, children, order, number, indptr, indices)
     owner = np.repeat(np.arange(n_nodes), np.diff(start))
     boundary = np.sort(owner * len(node) + boundary) - owner * len(node)
-    return Nodes(order, number, first, children, start, boundary, _parent_rows(first, parent, start, boundary))
+    rows = _parent_rows(first, parent, start, boundary)
+    return Structure(indptr, indices, order, number, first, children, start, boundary, rows)
 
 
 @compiled()
