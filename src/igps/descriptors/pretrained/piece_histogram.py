@@ -83,24 +83,24 @@ class PieceHistogram(SampleHistogram):
         if not torch.isfinite(points).all():
             raise ValueError("PieceHistogram: expected finite places, got NaN or infinity.")
         counts = [max(1, round(share * len(heights))) for share in self.levels]
-        tree = merge_tree(heights, neighbours, counts)
-        found = torch.stack([self._of_level(points, pieces, weights) for pieces in tree.pieces])
-        return found / sum(counts)
-
-    def _of_level(self, points: Tensor, pieces: Tensor, weights: Tensor) -> Tensor:
-        """(S, T) numbers of samples by the size and the length of their pieces."""
+        pieces = merge_tree(heights, neighbours, counts).pieces
         left = pieces >= 0
-        _, piece, counts = pieces[left].unique(return_inverse=True, return_counts=True)
-        points, counts = points[left], counts.to(points.dtype)
+        # Pieces of all levels at once, those of each level side by side
+        numbers = pieces + len(heights) * torch.arange(len(pieces), device=pieces.device)[:, None]
+        found, piece, n_points = numbers[left].unique(return_inverse=True, return_counts=True)
+        points, weights = points.expand(*left.shape, 3)[left], weights.expand_as(left)[left].to(points.dtype)
 
-        def means(values: Tensor) -> Tensor:
-            return values.new_zeros(len(counts), values.shape[1]).index_add(0, piece, values) / counts[:, None]
+        def sums(values: Tensor) -> Tensor:
+            return values.new_zeros(len(found), *values.shape[1:]).index_add(0, piece, values)
 
-        places = points - means(points)[piece]
-        covariance = means((places[:, :, None] * places[:, None, :]).flatten(1)).view(-1, 3, 3)
-        spread = torch.linalg.eigvalsh(covariance)[:, -1]
-        sizes, spread = counts / len(pieces), torch.where(counts < _FEWEST, 0, spread)
-        lengths = (12 * spread / sizes).clamp_min(torch.finfo(points.dtype).tiny).log2() / 2
-        of_sizes, of_lengths = soft_memberships(sizes.log2(), self.sizes), soft_memberships(lengths, self.lengths)
-        weighed = torch.zeros_like(counts).index_add(0, piece, weights[left].to(counts.dtype))
-        return (of_sizes * weighed[:, None]).T @ of_lengths
+        places = points - (sums(points) / n_points[:, None])[piece]
+        covariance = sums((places[:, :, None] * places[:, None, :]).flatten(1)) / n_points[:, None]
+        spread = torch.linalg.eigvalsh(covariance.view(-1, 3, 3))[:, -1]
+        sizes = n_points.to(points.dtype) / len(heights)
+        lengths = 12 * torch.where(n_points < _FEWEST, 0, spread) / sizes
+        lengths = lengths.clamp_min(torch.finfo(points.dtype).tiny).log2() / 2
+        of_sizes = soft_memberships(sizes.log2(), self.sizes) * sums(weights)[:, None]
+        of_lengths = soft_memberships(lengths, self.lengths)
+        n_pieces = torch.bincount(found // len(heights), minlength=len(pieces)).tolist()
+        of_levels = zip(of_sizes.split(n_pieces), of_lengths.split(n_pieces), strict=True)
+        return torch.stack([one.T @ other for one, other in of_levels]) / sum(counts)
