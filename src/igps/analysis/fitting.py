@@ -120,7 +120,8 @@ def fit(
     def chosen(x: Tensor, y: Tensor) -> HeadName:
         if head != "auto":
             return head
-        held_out = [out for out in _held_out(y, goal, _N_INNER_FOLDS) if _has_pair(y[out])]
+        of_each = _held_out(y, goal, _N_INNER_FOLDS)
+        held_out = [out for out in of_each if _has_pair(y[out]) and _has_pair(y[~out])]
 
         def tier(name: HeadName) -> float:
             return fmean(_retrieved(fitted(name, x[~out], y[~out], False), x[out], y[out])["ft"] for out in held_out)
@@ -229,6 +230,8 @@ def _scores(
     for number, out in enumerate(_held_out(labels, goal, _N_FOLDS)):
         x, y = histograms[~out], labels[~out]
         name = chosen(x, y)
+        if name == "whitened" and not _has_pair(y):  # nothing to fit it to
+            continue
         head = fitted(name, x, y)
         if _has_pair(labels[out]):
             scores = _retrieved(head, histograms[out], labels[out])
@@ -237,11 +240,12 @@ def _scores(
             said.append(head.probabilities(histograms[out]))
             truth.append(torch.searchsorted(head.classes, labels[out]))
             left_out = torch.isin(labels, classes[number::_N_FOLDS])
-            if bool((out & left_out).any()) and len(labels[~out & ~left_out].unique()) > 1:
+            new, old = out & left_out, out & ~left_out
+            if bool(new.any() and old.any()) and len(labels[~out & ~left_out].unique()) > 1:
                 less = fitted(name, histograms[~out & ~left_out], labels[~out & ~left_out], False)
                 assert isinstance(less, ClassifierHead)
-                known.append(less.strangeness(histograms[out & ~left_out]))
-                strange.append(less.strangeness(histograms[out & left_out]))
+                known.append(less.strangeness(histograms[old]))
+                strange.append(less.strangeness(histograms[new]))
     means = {one: fmean(scores[one] for scores in found) for one in (found[0] if found else ())}
     if said:
         probabilities, right = torch.cat(said), torch.cat(truth)
