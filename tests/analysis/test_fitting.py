@@ -48,9 +48,21 @@ def test_a_classifier_is_fitted_saved_and_asked(dataset: igps.SignatureDataset, 
         assert found.names == test.bodies.names
         expected = KernelHead().fit(histograms(train), train.labels).predict(histograms(test))
         assert found.probabilities.argmax(dim=1).tolist() == expected.tolist()
-    card = igps.load(tmp_path / "mine.safetensors").card
+    loaded = igps.load(tmp_path / "mine.safetensors")
+    assert loaded.scale == model.scale == pytest.approx(model.card["scale"])
+    card = loaded.card
     assert card["classes"] == dict.fromkeys(sorted(HEIGHTS), 3)
     assert (card["head"], card["goal"], card["prior"]) == ("classifier", "known", False)
+
+
+def test_a_classifier_without_names_tells_numbers(dataset: igps.SignatureDataset) -> None:
+    for names, told in (((), ("0", "1", "2", "3")), (("a", "b", "c", "d"), ("a", "b", "c", "d"))):
+        head = ClassifierHead(names=names).fit(histograms(dataset), dataset.labels)
+        model = EmbeddedDescriptor(small_interior(), head)  # type: ignore[arg-type]
+        assert classify(dataset, model).classes == told
+    head.names = ("a",)
+    with pytest.raises(ValueError, match="expected names of 4 classes, got 1"):
+        classify(dataset, model)
 
 
 def test_held_out_scores_are_of_what_was_held_out(dataset: igps.SignatureDataset) -> None:

@@ -139,6 +139,7 @@ def fit(
     if individual is not None:
         kept = {"size": individual.keeps_size, "side": individual.twists is not None}
         model = IndividualDescriptor(model, scale=scale, **kept).eval()
+    model.scale = scale
     model.card = {
         "scale": scale,
         "descriptor": descriptor if isinstance(descriptor, str) else descriptor.name,
@@ -176,10 +177,13 @@ def classify(
     head = found.head if isinstance(found, EmbeddedDescriptor) else None
     if not isinstance(found, EmbeddedDescriptor) or not isinstance(head, ClassifierHead):
         raise ValueError(f"model: expected one with a classifier, got {found.name}. Fit one with head='classifier'.")
+    names = head.names or tuple(map(str, head.classes.tolist()))
+    if len(names) != len(head.classes):
+        raise ValueError(f"model: expected names of {len(head.classes)} classes, got {len(names)}. Fit it again.")
     histograms, dataset = _histograms(dataset, found.descriptor, failures, n_workers, progress)
     strangeness = head.strangeness(histograms)
     return Classification(
-        dataset.bodies.names, head.names, head.probabilities(histograms), strangeness, strangeness > head.strange_from
+        dataset.bodies.names, names, head.probabilities(histograms), strangeness, strangeness > head.strange_from
     )
 
 
