@@ -1,6 +1,7 @@
 """Where two bodies differ: their distance, shared out among the parts of the description and the samples of each."""
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -247,7 +248,17 @@ def explain_groups(
 
     Returns:
         the explanation, and the (cells,) that are held.
+
+    Raises:
+        ValueError: too few bodies for a test.
     """
+    level, (n, m) = test.get("level", 0.05), (len(one), len(other))
+    ways = math.comb(n + m, n) // (1 + (n == m))  # of equal groups two are the same difference
+    if ways * level <= 1:
+        raise ValueError(
+            f"one, other: {n} and {m} bodies can be arranged in {ways} ways alone, too few to tell anything from "
+            f"chance at a level of {level}. Add bodies, or explain one of each."
+        )
     descriptor = copy.deepcopy(descriptor).double().eval()
     rows = [group.double().flatten(1) for group in (one, other)]
     kept = significant_cells(rows[0].sqrt(), rows[1].sqrt(), **test)
