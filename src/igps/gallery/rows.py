@@ -58,8 +58,12 @@ def further_columns(bodies: Bodies) -> dict[str, type]:
     """Further columns of the table of labels, and of which type: numbers where all values are.
 
     Raises:
-        ValueError: one has the name of a column that every gallery has.
+        ValueError: one has the name of a column that every gallery has, or one that no gallery takes.
     """
+    if dotted := [name for name in bodies.columns if "." in name]:
+        raise ValueError(
+            f"{LABELS_FILE}: a gallery takes no dot in the name of a column, got {dotted[0]!r}. Rename it."
+        )
     if taken := bodies.columns.keys() & {*KNOWN, "vector", "code"}:
         raise ValueError(f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name.")
     return {name: float if all(map(_is_number, values)) else str for name, values in bodies.columns.items()}
