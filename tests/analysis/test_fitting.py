@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,9 +48,21 @@ def test_a_classifier_is_fitted_saved_and_asked(dataset: igps.SignatureDataset, 
         assert found.names == test.bodies.names
         expected = KernelHead().fit(histograms(train), train.labels).predict(histograms(test))
         assert found.probabilities.argmax(dim=1).tolist() == expected.tolist()
-    card = igps.load(tmp_path / "mine.safetensors").card
+    loaded = igps.load(tmp_path / "mine.safetensors")
+    assert loaded.scale == model.scale == pytest.approx(model.card["scale"])
+    card = loaded.card
     assert card["classes"] == dict.fromkeys(sorted(HEIGHTS), 3)
     assert (card["head"], card["goal"], card["prior"]) == ("classifier", "known", False)
+
+
+def test_a_classifier_without_names_tells_numbers(dataset: igps.SignatureDataset) -> None:
+    for names, told in (((), ("0", "1", "2", "3")), (("a", "b", "c", "d"), ("a", "b", "c", "d"))):
+        head = ClassifierHead(names=names).fit(histograms(dataset), dataset.labels)
+        model = EmbeddedDescriptor(small_interior(), head)  # type: ignore[arg-type]
+        assert classify(dataset, model).classes == told
+    head.names = ("a",)
+    with pytest.raises(ValueError, match="expected names of 4 classes, got 1"):
+        classify(dataset, model)
 
 
 def test_held_out_scores_are_of_what_was_held_out(dataset: igps.SignatureDataset) -> None:
@@ -106,6 +119,18 @@ def test_too_little_to_fit_to_is_said(dataset: igps.SignatureDataset) -> None:
         igps.fit(dataset, small_interior(), head="best")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="descriptions: expected histograms"):
         igps.fit(dataset, Below(), head="whitened")
+
+
+@pytest.mark.parametrize("sizes", [(5, 5, 5), (5, 5, 5, 1), (5, 1, 1), (3, 1), (2, 2)])
+def test_no_sizes_of_classes_are_too_uneven(dataset: igps.SignatureDataset, sizes: tuple[int, ...]) -> None:
+    """A fold may leave no two bodies of a class, or hold none of the classes out that a classifier knows."""
+    labels = [name for name, n in zip(HEIGHTS, sizes, strict=False) for _ in range(n)]
+    bodies = replace(dataset.bodies.subset(range(len(labels))), labels=tuple(labels))
+    again = igps.SignatureDataset(bodies, dataset.config, dataset.pipeline.cache_dir)
+    for head in ("auto", "classifier", "whitened"):
+        model = igps.fit(again, small_interior(), head=head)  # type: ignore[arg-type]
+        assert sorted(model.card["classes"].values()) == sorted(sizes)
+        assert "unknown_auc" not in model.card["held_out_scores"] or sum(n > 1 for n in sizes) > 1
 
 
 class Below(igps.Descriptor):

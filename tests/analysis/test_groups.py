@@ -47,6 +47,28 @@ def test_without_a_difference_one_test_in_twenty_rejects(is_confounded: bool, n_
     assert ((rejected >= 0.03) & (rejected <= 0.07)).all(), rejected
 
 
+def test_the_unit_of_a_covariate_does_not_matter() -> None:
+    """Down to one in which all values lie below rounding of numbers about 1; a constant explains nothing."""
+    random = np.random.default_rng(3)
+    age = random.normal(size=24) + 7
+    vectors = random.normal(size=(24, 3)) + np.outer(age, [2, 1, 0])
+    usual = quick(vectors, covariates=age[:, None])
+    for other in (1e-15 * age, 1e15 * age):
+        found = quick(vectors, covariates=np.stack([other, np.full(24, 1e15 / 3)], axis=1))
+        assert found.permanova_f == pytest.approx(usual.permanova_f)
+        assert found.permanova_p == usual.permanova_p
+
+
+def test_numbers_that_are_none_are_refused() -> None:
+    vectors = np.random.default_rng(0).normal(size=(24, 3))
+    with pytest.raises(ValueError, match="n_permutations: expected at least 1, got -3"):
+        quick(vectors, n_permutations=-3)
+    with pytest.raises(ValueError, match="covariates: expected finite numbers"):
+        quick(vectors, covariates=np.full((24, 1), np.nan))
+    with pytest.raises(ValueError, match="vectors: expected finite numbers"):
+        quick(np.where(np.arange(24)[:, None] == 2, np.inf, vectors))
+
+
 def test_power_grows_with_the_difference() -> None:
     random = np.random.default_rng(2)
     powers = []

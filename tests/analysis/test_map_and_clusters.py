@@ -98,6 +98,12 @@ def test_clusters_that_were_put_in_are_found_and_stable(joining: str) -> None:
         assert np.allclose(points[middle], own[cdist(own, own).sum(axis=1).argmin()])
 
 
+def test_bodies_that_are_alike_are_one_cluster() -> None:
+    for apart in (0.0, 1.0):  # all of them, or each from each other by the same
+        found = clusters_of(apart * (np.ones((6, 6)) - np.eye(6)))
+        assert found.numbers.tolist() == [0] * 6
+
+
 def test_clusters_of_one_cloud_are_told_unstable() -> None:
     random, found = np.random.default_rng(3), []
     for _ in range(5):

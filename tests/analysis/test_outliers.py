@@ -32,6 +32,11 @@ def test_what_is_usual_is_no_outlier() -> None:
     assert {one.lies_among for one in found} == {None}
 
 
+def test_a_body_alone_in_its_class_is_told_not_to_be_judged() -> None:
+    found = outliers(squared_distances(usual()) ** 0.5, ["alone", *LABELS[1:]])
+    assert [one.label for one in found if one.reason == "alone in its class, its shape is not judged"] == ["alone"]
+
+
 def test_a_body_of_another_shape_comes_first() -> None:
     vectors = usual()
     vectors[3, 0] += 14

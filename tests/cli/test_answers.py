@@ -16,6 +16,7 @@ from igps.analysis.map import body_map
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.nn.description import describe
+from igps.report.answers import write_answer
 from igps.retrieval import chi_square
 from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, small_interior, write_egg
@@ -161,6 +162,25 @@ def test_the_map_has_the_distances_of_the_descriptor_and_its_colours(
     assert rows[0][colour] == first[colour]
     assert imread(tmp_path / "map.png").std() > 0.02
     assert (tmp_path / "map.svg").read_text().startswith("<?xml")
+
+
+def test_a_column_called_as_the_coordinates_leaves_them_alone(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = table(root / "labels.csv")
+    (tmp_path / "labels.csv").write_text("file,x\n" + "".join(f"{root / row['file']},7\n" for row in rows))
+    igps(monkeypatch, root, "figure", "map", tmp_path, *OWN, "--colour", "x", "--out", tmp_path)
+    found = table(tmp_path / "map.csv")
+    assert {row["x of labels.csv"] for row in found} == {"7.0"}
+    assert len({row["x"] for row in found}) == len(rows)
+
+
+def test_what_is_not_known_is_null_in_the_file(tmp_path: Path) -> None:
+    write_answer(tmp_path, "rows", [{"body": "é", "stability": float("nan")}])
+    assert json.loads((tmp_path / "rows.json").read_text(), parse_constant=pytest.fail) == [
+        {"body": "é", "stability": None}
+    ]
+    assert table(tmp_path / "rows.csv")[0]["body"] == "é"
 
 
 def test_a_colour_that_is_no_column_is_refused(

@@ -252,6 +252,8 @@ def test_some_items_are_a_dataset(dataset: SignatureDataset, index: slice | list
 def test_an_item_is_asked_for_by_number_or_name(dataset: SignatureDataset) -> None:
     assert [dataset[i].id for i in (-1, np.int64(2), "ball/2.off")] == ["egg/2.off", "egg/1.off", "ball/2.off"]
     assert [item.id for item in dataset] == list(dataset.bodies.names)
+    for number in (torch.tensor(2), np.array(2)):
+        assert dataset[number].id == "egg/1.off"  # type: ignore[call-overload]
     with pytest.raises(IndexError):
         dataset[4]
     with pytest.raises(IndexError, match="mask: expected 4 entries, got an array of shape"):

@@ -325,3 +325,35 @@ def test_commands_that_change_a_gallery(
     assert "values: expected numbers" in wrong
     wrong = error_of(monkeypatch, capsys, "gallery", "update", gallery, "--where", "area > 0", "--to", "colour=red")
     assert "colour: expected one of the columns name, class" in wrong
+
+
+def test_sync_notices_a_table_of_names_that_was_edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With its two names swapped the rows have the same names, and the bodies of each other."""
+    nibabel = pytest.importorskip("nibabel")
+    labels = np.zeros((24, 16, 16), np.uint8)
+    labels[2:8, 3:12, 3:12], labels[11:22, 5:9, 5:9] = 1, 2
+    (tmp_path / "scans").mkdir()
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "scans" / "scan.nii.gz")
+    table = tmp_path / "names.json"
+    table.write_text('{"1": "block", "2": "bar"}')
+    monkeypatch.setattr(rows, "_YOUNG", 0)
+
+    def now() -> SignatureDataset:
+        reading = LoadOptions(bodies="labels", names=str(table))
+        return SignatureDataset(tmp_path / "scans", CONFIG, tmp_path / "cache", reading=reading)
+
+    gallery, _ = Gallery.build(tmp_path / "g.igps", now(), small_interior(), n_workers=1)
+    before = {row["part"]: row["volume"] for row in gallery.rows("part", "volume")}
+    assert sync(gallery, now(), tmp_path / "scans", n_workers=1) == (0, 0, [])
+    table.write_text('{"1": "bar", "2": "block"}')
+    assert sync(gallery, now(), tmp_path / "scans", n_workers=1) == (2, 0, [])
+    after = {row["part"]: row["volume"] for row in gallery.rows("part", "volume")}
+    assert after == {"block": before["bar"], "bar": before["block"]}
+
+
+def test_a_column_with_a_dot_is_told_before_anything_is_described(root: Path, tmp_path: Path) -> None:
+    (root / "labels.csv").write_text("file,label,scan.age\nball/0.off,ball,3\n")
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
+    with pytest.raises(ValueError, match=r"labels.csv: a gallery takes no dot .* got 'scan.age'"):
+        Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    assert not (tmp_path / "g.igps").exists()

@@ -254,6 +254,89 @@ def test_an_array_that_promises_too_much_is_not_unpacked(tmp_path: Path) -> None
         load_mesh(tmp_path / "a.gii")
 
 
+def bracket() -> tuple[np.ndarray, list[list[int]]]:
+    """A prism over a C of area 10 and perimeter 22: octagons whose first corner sees not all others, and squares."""
+    outline = np.array([[4, 0], [4, 1], [1, 1], [1, 3], [4, 3], [4, 4], [0, 4], [0, 0]], float)
+    vertices = np.concatenate([np.c_[outline, np.zeros(8)], np.c_[outline, np.ones(8)]])
+    sides = [[i, (i + 1) % 8, 8 + (i + 1) % 8, 8 + i] for i in range(8)]
+    return vertices, [[*range(7, -1, -1)], [*range(8, 16)], *sides]
+
+
+def text_of(rows: list[list[int]], counted: bool = True) -> str:
+    return "".join(f"{len(row)} " * counted + " ".join(map(str, row)) + "\n" for row in rows)
+
+
+def ply_of(vertices: np.ndarray, faces: list[list[int]], order: str = "") -> bytes:
+    """A PLY file with a colour before and behind the corners of each face; as text without an order."""
+    kind = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    head = f"ply\nformat {kind} 1.0\ncomment made here\nelement vertex {len(vertices)}\n"
+    head += "property float x\nproperty float y\nproperty float z\nproperty uchar red\n"
+    head += f"element face {len(faces)}\nproperty short group\nproperty list uchar int vertex_indices\n"
+    head += "property uchar red\nend_header\n"
+    if not order:
+        rows = "".join(" ".join(map(str, row)) + " 9\n" for row in vertices.tolist())
+        return (head + rows + "".join(f"5 {len(row)} {' '.join(map(str, row))} 9\n" for row in faces)).encode()
+    body = b"".join(np.array(row, f"{order}f4").tobytes() + b"\x09" for row in vertices)
+    for row in faces:
+        body += (
+            np.array(5, f"{order}i2").tobytes() + bytes([len(row)]) + np.array(row, f"{order}i4").tobytes() + b"\x09"
+        )
+    return head.encode() + body
+
+
+def polygon_files() -> dict[str, bytes]:
+    vertices, faces = bracket()
+    places = "".join(" ".join(map(str, row)) + "\n" for row in vertices.tolist())
+    size, offsets = sum(len(row) + 1 for row in faces), " ".join(map(str, np.cumsum([len(row) for row in faces])))
+    arrays = (
+        f'<Points><DataArray type="Float64" NumberOfComponents="3" format="ascii">{places}</DataArray></Points><Polys>'
+        f'<DataArray type="Int64" Name="connectivity" format="ascii">{text_of(faces, False)}</DataArray>'
+        f'<DataArray type="Int64" Name="offsets" format="ascii">{offsets}</DataArray></Polys>'
+    )
+    vtk = f"# vtk DataFile Version 3.0\nmade\nASCII\nDATASET POLYDATA\nPOINTS 16 float\n{places}POLYGONS 10 {size}\n"
+    coloured = "".join(f"{row} 0.5 0.5 0.5 # grey\n" for row in text_of(faces).splitlines())
+    return {
+        "plain.off": f"OFF\n16 10 0\n{places}{text_of(faces)}".encode(),
+        "coloured.off": f"OFF\n# made here\n\n16 10\n{places}{coloured}".encode(),
+        "text.ply": ply_of(vertices, faces),
+        "little.ply": ply_of(vertices, faces, "<"),
+        "big.ply": ply_of(vertices, faces, ">"),
+        "made.vtk": (vtk + text_of(faces)).encode(),
+        "made.vtp": f'<VTKFile type="PolyData"><PolyData><Piece>{arrays}</Piece></PolyData></VTKFile>'.encode(),
+    }
+
+
+@pytest.mark.parametrize("name", polygon_files())
+def test_concave_polygons_of_any_format_do_not_fold(name: str, tmp_path: Path) -> None:
+    content = polygon_files()[name]
+    (tmp_path / name).write_bytes(content)
+    mesh = load_mesh(tmp_path / name, LoadOptions(mend="never"))
+    np.testing.assert_array_equal(mesh.vertices, bracket()[0])
+    assert mesh.volume == pytest.approx(10)
+    assert mesh.area == pytest.approx(2 * 10 + 22)
+    (tmp_path / name).write_bytes(content[: len(content) - len(content) // 8])
+    with pytest.raises(MeshError, match=name):
+        load_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize("n_corners", [3, 4])
+def test_triangles_and_squares_are_what_trimesh_makes_of_them(n_corners: int, tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    quads = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+    cube = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
+    vertices, faces = (
+        (cube, quads) if n_corners == 4 else (ball.vertices.astype("f4").astype(float), ball.faces.tolist())
+    )
+    places = "".join(" ".join(map(repr, row)) + "\n" for row in vertices.tolist())
+    (tmp_path / "one.off").write_text(f"OFF\n{len(vertices)} {len(faces)} 0\n{places}{text_of(faces)}")
+    for order in ("", "<", ">"):
+        (tmp_path / f"one{'t<>'.find(order or 't')}.ply").write_bytes(ply_of(vertices, faces, order))
+    for path in tmp_path.iterdir():
+        found, expected = load_mesh(path), trimesh.load(path, process=False)
+        np.testing.assert_array_equal(found.vertices, expected.vertices)
+        np.testing.assert_array_equal(found.faces, expected.faces)
+
+
 def test_files_are_known_by_the_longest_suffix_and_maps_on_surfaces_are_none() -> None:
     assert format_of("a.tar.gz").name == "an archive"  # type: ignore[union-attr]
     assert format_of("A.OFF").name == "OFF"  # type: ignore[union-attr]

@@ -290,3 +290,59 @@ def test_a_gzipped_file_that_is_cut_short_is_named(tmp_path: Path) -> None:
 def test_unknown_bodies_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="bodies: expected one of chains, models, assembly"):
         read_molecule(written(tmp_path, residue(1)), "residues")  # type: ignore[arg-type]
+
+
+def test_b_factors_that_a_file_lacks_are_unknown(tmp_path: Path) -> None:
+    whole = residue(1)
+    cut = "".join(f"{row[:54]}\n" for row in whole.splitlines())
+    blank = "".join(f"{row[:60]}      {row[66:]}\n" for row in whole.splitlines())
+    columns = [
+        "group_PDB",
+        "type_symbol",
+        "label_atom_id",
+        "label_alt_id",
+        "label_comp_id",
+        "label_asym_id",
+        "label_seq_id",
+    ]
+    columns += ["id", "Cartn_x", "Cartn_y", "Cartn_z"]
+    row = "ATOM C CA . ALA A 1 1 0.0 0.0 0.0"
+    loop = "data_made\nloop_\n" + "".join(f"_atom_site.{name}\n" for name in columns)
+    pairs = "data_made\n" + "".join(
+        f"_atom_site.{name} {value}\n" for name, value in zip(columns, row.split(), strict=True)
+    )
+    known = loop + "_atom_site.B_iso_or_equiv\n" + row
+    texts = {"cut.pdb": cut, "blank.pdb": blank, "loop.cif": f"{loop}{row}\n", "pairs.cif": pairs}
+    texts["asked.cif"] = f"{known} ?\n"
+    for name, text in texts.items():
+        (molecule,) = read_molecule(written(tmp_path, text, name))
+        assert np.isnan(molecule.b_factors).all(), name
+    assert read_molecule(written(tmp_path, f"{known} 7\n", "known.cif"))[0].b_factors.tolist() == [7]
+    with pytest.raises(MeshError, match="no label_alt_id"):
+        read_molecule(written(tmp_path, pairs.replace("_atom_site.label_alt_id .\n", ""), "lacking.cif"))
+
+
+def test_names_of_atoms_in_the_wrong_column_are_no_metals(tmp_path: Path) -> None:
+    names = ["N", "CA", "C", "O", "CB", "CD", "NE", "HG"]
+    atoms = [(name, float(i), 0.0) for i, name in enumerate(names)]
+    rows = [f"{row[:12]}{row[12:16].strip():<4}{row[16:66]}" for row in residue(1, "GLN", atoms).splitlines()]
+    (molecule,) = read_molecule(written(tmp_path, "\n".join(rows)))
+    np.testing.assert_allclose(molecule.radii, [1.55, 1.7, 1.7, 1.52, 1.7, 1.7, 1.55], atol=1e-6)  # Bondi 1964
+    # And calcium, which some write as an atom of the polymer, is no residue.
+    ion = line(9, "CA", 5.0, 5.0, 5.0, residue="CA", place="  99 ", element="CA")
+    (molecule,) = read_molecule(written(tmp_path, residue(1) + ion))
+    assert molecule.residue_names == ("ALA",)
+    assert molecule.notes == ("1 ligands were left out",)
+
+
+def test_no_line_is_lost_to_marks_of_text_or_to_frames(tmp_path: Path) -> None:
+    text = residue(1) + residue(2)
+    (usual,) = read_molecule(written(tmp_path, text))
+    for number, other in enumerate((f"\ufeff{text}", text.replace("\n", "\r"), text.replace("\n", "\r\n"))):
+        path = tmp_path / f"{number}.pdb"
+        path.write_bytes(other.encode())
+        np.testing.assert_array_equal(read_molecule(path)[0].positions, usual.positions)
+    frames = f"CRYST1\n{text}END\n{residue(1)}END\n"
+    found = read_molecule(written(tmp_path, frames), "models")
+    assert [len(molecule.radii) for molecule in found] == [10, 5]
+    assert len(read_molecule(written(tmp_path, f"{text}TER\nEND\n"), "models")) == 1

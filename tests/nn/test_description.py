@@ -85,6 +85,11 @@ def test_describe_is_the_descriptor_of_each_batch(dataset: SignatureDataset, bat
     assert failures == []
 
 
+def test_a_name_in_place_of_a_descriptor_is_told(dataset: SignatureDataset) -> None:
+    with pytest.raises(TypeError, match=r"got 'rich'. Give igps.descriptor\('rich'\)"):
+        describe(dataset, "rich")  # type: ignore[arg-type]
+
+
 def test_meshes_come_to_descriptors_that_need_them(dataset: SignatureDataset) -> None:
     expected = [[dataset.mesh(i).area, dataset[i].signature.area] for i in range(4)]
     np.testing.assert_allclose(describe(dataset, Area(), n_workers=1), expected, rtol=1e-6)

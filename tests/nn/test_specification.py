@@ -154,6 +154,24 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
         igps.descriptor(tmp_path / "gone.safetensors")
 
 
+def test_a_name_that_no_file_may_have_is_not_saved(tmp_path: Path) -> None:
+    spaced = HistogramDescriptor(PairHistogram(["interior_distance"]), name="two words")
+    with pytest.raises(ValueError, match="name: expected letters, digits and _, got 'two words'"):
+        spaced.save(tmp_path / "mine.safetensors")
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("card", ["5", "null", "[1]", '"scale"', "[" * 9000 + "]" * 9000])
+def test_a_card_that_is_no_table_is_refused(card: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.safetensors"
+    learnable().save(path, {"scale": "1:100"})
+    assert igps.load(path).scale is None  # a word of one's own, and no distance
+    words = {"format": "igps-descriptor-1", "specification": json.dumps(specification(learnable())), "card": card}
+    save_file(load_file(path), path, metadata=words)
+    with pytest.raises(ValueError, match=r"mine\.safetensors: expected a descriptor"):
+        igps.load(path)
+
+
 def test_numbers_of_a_description_are_known() -> None:
     batch = two_bodies()
     assert learnable().n_features == learnable()(batch).shape[1]

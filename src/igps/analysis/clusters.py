@@ -38,7 +38,8 @@ def clusters_of(
 
     Args:
         distances: (N, N).
-        n_clusters: how many; if None, as many of 2 to 30 as have the largest mean silhouette (Rousseeuw 1987).
+        n_clusters: how many; if None, as many of 2 to 30 as have the largest mean silhouette (Rousseeuw 1987),
+            or one where none is above zero.
         joining: two clusters are as far apart as their bodies are in mean, at most, or at least.
         n_resamples: random halves of the bodies, for the stability (Hennig 2007).
         seed: of these.
@@ -55,7 +56,8 @@ def clusters_of(
     if n_clusters is None:
         cuts = {k: _cut(tree, k) for k in range(2, min(_MOST_CLUSTERS, n - 1) + 1)}
         scores = {k: silhouette_score(found, cut, metric="precomputed") for k, cut in cuts.items() if cut.max()}
-        n_clusters = max(scores, key=lambda k: scores[k]) if scores else 1
+        # One where no cut keeps together what is nearer than the rest, such as of bodies that are all alike
+        n_clusters = max((k for k, one in scores.items() if one > 0), key=lambda k: scores[k], default=1)
     if not 1 <= n_clusters <= n:
         raise ValueError(f"n_clusters: expected 1 to {n}, got {n_clusters}.")
     numbers = _cut(tree, n_clusters)

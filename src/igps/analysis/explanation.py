@@ -1,6 +1,7 @@
 """Where two bodies differ: their distance, shared out among the parts of the description and the samples of each."""
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -232,7 +233,17 @@ def explain_groups(
         one, other: (N, ...) descriptions of its histograms (for a head, those that the head is given).
         batches: two bodies to be painted, one of each group.
         test: options of `significant_cells`, whose result comes behind the explanation.
+
+    Raises:
+        ValueError: too few bodies for a test.
     """
+    level, (n, m) = test.get("level", 0.05), (len(one), len(other))
+    ways = math.comb(n + m, n) // (1 + (n == m))  # of equal groups two are the same difference
+    if ways * level <= 1:
+        raise ValueError(
+            f"one, other: {n} and {m} bodies can be arranged in {ways} ways alone, too few to tell anything from "
+            f"chance at a level of {level}. Add bodies, or explain one of each."
+        )
     descriptor = copy.deepcopy(descriptor).double().eval()
     rows = [group.double().flatten(1) for group in (one, other)]
     kept = significant_cells(rows[0].sqrt(), rows[1].sqrt(), **test)

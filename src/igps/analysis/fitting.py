@@ -119,7 +119,8 @@ def fit(
     def chosen(x: Tensor, y: Tensor) -> HeadName:
         if head != "auto":
             return head
-        held_out = [out for out in _held_out(y, goal, _N_INNER_FOLDS) if _has_pair(y[out])]
+        of_each = _held_out(y, goal, _N_INNER_FOLDS)
+        held_out = [out for out in of_each if _has_pair(y[out]) and _has_pair(y[~out])]
 
         def tier(name: HeadName) -> float:
             return fmean(_retrieved(fitted(name, x[~out], y[~out], False), x[out], y[out])["ft"] for out in held_out)
@@ -137,6 +138,7 @@ def fit(
     if individual is not None:
         kept = {"size": individual.keeps_size, "side": individual.twists is not None}
         model = IndividualDescriptor(model, scale=scale, **kept).eval()
+    model.scale = scale
     model.card = {
         "scale": scale,
         "descriptor": descriptor if isinstance(descriptor, str) else descriptor.name,
@@ -168,10 +170,13 @@ def classify(
     head = found.head if isinstance(found, EmbeddedDescriptor) else None
     if not isinstance(found, EmbeddedDescriptor) or not isinstance(head, ClassifierHead):
         raise ValueError(f"model: expected one with a classifier, got {found.name}. Fit one with head='classifier'.")
+    names = head.names or tuple(map(str, head.classes.tolist()))
+    if len(names) != len(head.classes):
+        raise ValueError(f"model: expected names of {len(head.classes)} classes, got {len(names)}. Fit it again.")
     histograms, dataset = _histograms(dataset, found.descriptor, failures, n_workers, progress)
     strangeness = head.strangeness(histograms)
     return Classification(
-        dataset.bodies.names, head.names, head.probabilities(histograms), strangeness, strangeness > head.strange_from
+        dataset.bodies.names, names, head.probabilities(histograms), strangeness, strangeness > head.strange_from
     )
 
 
@@ -222,6 +227,8 @@ def _scores(
     for number, out in enumerate(_held_out(labels, goal, _N_FOLDS)):
         x, y = histograms[~out], labels[~out]
         name = chosen(x, y)
+        if name == "whitened" and not _has_pair(y):  # nothing to fit it to
+            continue
         head = fitted(name, x, y)
         if _has_pair(labels[out]):
             scores = _retrieved(head, histograms[out], labels[out])
@@ -230,11 +237,12 @@ def _scores(
             said.append(head.probabilities(histograms[out]))
             truth.append(torch.searchsorted(head.classes, labels[out]))
             left_out = torch.isin(labels, classes[number::_N_FOLDS])
-            if bool((out & left_out).any()) and len(labels[~out & ~left_out].unique()) > 1:
+            new, old = out & left_out, out & ~left_out
+            if bool(new.any() and old.any()) and len(labels[~out & ~left_out].unique()) > 1:
                 less = fitted(name, histograms[~out & ~left_out], labels[~out & ~left_out], False)
                 assert isinstance(less, ClassifierHead)
-                known.append(less.strangeness(histograms[out & ~left_out]))
-                strange.append(less.strangeness(histograms[out & left_out]))
+                known.append(less.strangeness(histograms[old]))
+                strange.append(less.strangeness(histograms[new]))
     means = {one: fmean(scores[one] for scores in found) for one in (found[0] if found else ())}
     if said:
         probabilities, right = torch.cat(said), torch.cat(truth)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from igps._parameters import check_at_least
 from igps.nn.descriptor import Descriptor
 
 FEWEST = 5
@@ -96,20 +97,25 @@ def group_test(
         seed: of both, and of the folds.
 
     Raises:
-        ValueError: shapes that do not match.
+        ValueError: shapes that do not match, or numbers that are not finite.
     """
+    check_at_least(1, n_permutations=n_permutations)
     n = len(vectors)
     codes_of = [np.unique(np.asarray(one), return_inverse=True)[1] for one in (groups, strata or ["all"] * n)]
     known = np.ones((n, 0)) if covariates is None else np.asarray(covariates, dtype=float).reshape(len(covariates), -1)
     for name, found in (("groups", len(groups)), ("strata", len(codes_of[1])), ("covariates", len(known))):
         if found != n:
             raise ValueError(f"{name}: expected one for each of {n} bodies, got {found}.")
+    for name, numbers in (("vectors", vectors), ("covariates", known)):
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"{name}: expected finite numbers. Leave out bodies that have none.")
     group, stratum = codes_of
     untested = GroupTest(body, dict(sorted(Counter(groups).items())))
     if why := _senseless(untested.sizes, group, stratum):
         return replace(untested, refused=why)
     # What is known of the bodies, and what the groups add to that, both orthonormal
     means = _orthonormal(_indicators(stratum), _ROUNDING)
+    known = known / np.maximum(np.abs(known).max(axis=0, initial=0), np.finfo(float).tiny)  # whatever the unit
     known = _orthonormal(known - known.mean(axis=0), _ROUNDING)
     # Of covariates alone: no permutation within strata changes the means of these
     along = _orthonormal(known - means @ (means.T @ known), _ROUNDING)

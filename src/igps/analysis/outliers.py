@@ -122,7 +122,8 @@ def outliers(
                     value=value, usual=centre, square=value**2, common=centre**2, ratio=ratio, notes=text
                 )
             )
-        reason = "; ".join(told) if score > LIMIT else "nothing unusual"
+        alone = "alone in its class, its shape is not judged" if np.isnan(own[i]) else "nothing unusual"
+        reason = "; ".join(told) if score > LIMIT else alone
         if among is not None:
             reason += f"; labelled {label}, lies among {among}"
         found.append(Outlier(i, label, score, of_body, among, reason))

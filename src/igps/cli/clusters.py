@@ -12,6 +12,7 @@ from igps.analysis.comparison import pair_distances
 from igps.analysis.map import Layout, body_map
 from igps.cli.reading import Folder, described, print_failures
 from igps.data.dataset import SignatureDataset
+from igps.data.sources import LABELS_FILE
 from igps.report.answers import clusters_figure, map_figure, write_answer
 
 
@@ -95,8 +96,9 @@ def map_bodies(
             values = bodies.numbers(colour)
         except ValueError:  # words
             values = list(bodies.column(colour))
+    column = colour if colour not in ("body", "x", "y") else f"{colour} of {LABELS_FILE}"
     rows = [
-        {"body": name, "x": x, "y": y, "class": label, colour: value}
+        {"body": name, "x": x, "y": y, "class": label, column: value}
         for name, (x, y), label, value in zip(bodies.names, found.points.tolist(), label_of, values, strict=True)
     ]
     print(f"{len(rows)} bodies; stress {found.stress:.2f}: 0 tells every distance, above 0.2 the map distorts much")

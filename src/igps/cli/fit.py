@@ -98,6 +98,7 @@ def _card(model: Descriptor, path: Path) -> str:
     """A page on a fitted model."""
     card = model.card
     scores = "\n".join(f"| {_TITLES[name]} | {100 * value:.1f} |" for name, value in card["held_out_scores"].items())
+    scores = scores or "| none: no class is large enough to hold bodies out | |"
     classes = ", ".join(f"{name} ({n})" for name, n in card["classes"].items())
     what = {"known": "bodies of its classes", "new": "bodies of classes that it was not fitted to"}[card["goal"]]
     return f"""# {path.name}

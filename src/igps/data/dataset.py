@@ -1,6 +1,7 @@
 """A torch Dataset of Signatures, computed on first touch and cached."""
 
 import copy
+import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -125,6 +126,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """An item by number or name; the dataset of some of the bodies by slice, numbers, names, or mask."""
         if isinstance(index, str):
             index = self.bodies.number(index)
+        elif isinstance(index, Tensor | np.ndarray) and index.ndim == 0:  # as permutations give them one by one
+            index = operator.index(index)
         if isinstance(index, int | np.integer):
             return self._item(range(len(self))[index])
         if not isinstance(index, slice | Tensor):

@@ -1,6 +1,7 @@
 """Descriptors by name."""
 
 import importlib
+import math
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +24,7 @@ from igps.descriptors.spectral_gw import SpectralGromovWasserstein
 from igps.descriptors.volume_shape_dna import VolumeShapeDNA
 from igps.descriptors.with_attributes import WithAttributes
 from igps.descriptors.written import written
-from igps.nn.descriptor import Descriptor
+from igps.nn.descriptor import NAME, Descriptor
 from igps.nn.specification import IN_FOLDER, load_module
 
 _MAKERS: Mapping[str, Callable[[], Descriptor]] = {
@@ -46,7 +47,6 @@ NAMES: tuple[str, ...] = tuple(_MAKERS)
 """The names of the library's descriptors of any body."""
 
 _MARK = re.compile(r"\+(?:size|side)(?=\+|$)")
-_NAME = re.compile(r"\w{1,100}(\+\w{1,40}(=[\d.e-]{1,10})?){0,9}")
 _WITH = re.compile(r"\+(\w+)(?:=([\d.]+))?")
 _WRITTEN = (".yaml", ".yml")
 
@@ -84,11 +84,12 @@ def load(path: str | Path) -> Descriptor:
     module, card = load_module(path)
     if not isinstance(module, Descriptor):
         raise ValueError(f"{path}: expected a descriptor, got {type(module).__name__}.")
-    if not _NAME.fullmatch(module.name):  # files are called after it
+    if not NAME.fullmatch(module.name):
         raise ValueError(f"{path}: expected a descriptor's name of letters, digits and _, got {module.name[:80]!r}.")
     module.card = card
-    if "scale" in card:
-        module.scale = card["scale"]
+    scale = card.get("scale")  # a card of one's own may say anything by this word
+    if isinstance(scale, int | float) and 0 < scale < math.inf:
+        module.scale = scale
     return module
 
 

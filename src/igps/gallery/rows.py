@@ -19,6 +19,7 @@ from igps.data.sources import LABELS_FILE, Bodies
 from igps.gallery.about import KNOWN, Batch
 from igps.mesh.formats import files_read
 from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import Signature
@@ -38,7 +39,9 @@ def described_rows(
     with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
         for start in range(0, len(dataset), _AT_ONCE):
             numbers = range(start, min(start + _AT_ONCE, len(dataset)))
-            told = dict(zip(numbers, told_of(bodies.subset(numbers), kinds), strict=True))  # before files are read
+            told = dict(
+                zip(numbers, told_of(bodies.subset(numbers), kinds, dataset.reading), strict=True)
+            )  # before files are read
             keys = {i: key_of(dataset, i) for i in numbers}
             new = [i for i in numbers if not keys[i] or known.get(told[i]["id"]) != keys[i]]
             failed: list[Failure] = []
@@ -54,19 +57,23 @@ def described_rows(
 def further_columns(bodies: Bodies) -> dict[str, type]:
     """Further columns of the table of labels, and of which type: numbers where all values are.
 
-    A ValueError of one that has the name of a column that every gallery has.
+    A ValueError of one that has the name of a column that every gallery has, or one that no gallery takes.
     """
+    if dotted := [name for name in bodies.columns if "." in name]:
+        raise ValueError(
+            f"{LABELS_FILE}: a gallery takes no dot in the name of a column, got {dotted[0]!r}. Rename it."
+        )
     if taken := bodies.columns.keys() & {*KNOWN, "vector", "code"}:
         raise ValueError(f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name.")
     return {name: float if all(map(_is_number, values)) else str for name, values in bodies.columns.items()}
 
 
-def told_of(bodies: Bodies, kinds: Mapping[str, type]) -> list[dict[str, Any]]:
-    """What is known of bodies without reading their files."""
+def told_of(bodies: Bodies, kinds: Mapping[str, type], reading: LoadOptions) -> list[dict[str, Any]]:
+    """What is known of bodies without reading their files, which are read by the options."""
     folders = {folder: os.path.realpath(folder) for folder in {os.path.dirname(path) for path in bodies.paths}}
     files = [os.path.join(folders[os.path.dirname(path)], os.path.basename(path)) for path in bodies.paths]
     labels = bodies.labels or [None] * len(bodies)
-    stamps = {file: _stamp(Path(file)) for file in set(files)}
+    stamps = {file: _stamp(Path(file), reading) for file in set(files)}
     told: list[dict[str, Any]] = []
     for file, part, name, label in zip(files, bodies.parts, bodies.names, labels, strict=True):
         id_ = file if part is None else f"{file}#{part}"
@@ -77,10 +84,10 @@ def told_of(bodies: Bodies, kinds: Mapping[str, type]) -> list[dict[str, Any]]:
     return told
 
 
-def _stamp(file: Path) -> dict[str, int]:
-    """Size and time of the last change; −1 where the file may change again within the grain of its clock."""
+def _stamp(file: Path, reading: LoadOptions) -> dict[str, int]:
+    """Size and time of the last change of all that is read; −1 where it may change again within a clock's grain."""
     try:
-        n_bytes, *times = stamp_of(*files_read(file))
+        n_bytes, *times = stamp_of(*files_read(file, reading))
     except (OSError, MeshError):  # describing it will say why
         return {"bytes": -1, "modified": -1}
     changed = max(times)

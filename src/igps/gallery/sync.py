@@ -35,7 +35,7 @@ def sync(
         How many bodies were described, how many removed, and those that failed, of which the old row stays.
     """
     kinds = further_columns(dataset.bodies)
-    now = told_of(dataset.bodies, kinds)
+    now = told_of(dataset.bodies, kinds, dataset.reading)
     asked = [name for name in ("checksum", *now[0]) if name in gallery.columns]
     known = {one["id"]: one for one in gallery.rows(*asked)}
     new: list[int] = []

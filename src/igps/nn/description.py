@@ -71,6 +71,9 @@ def describe(
     """
     if isinstance(descriptor, Descriptor):
         descriptor.requirements.check_config(dataset.config)
+    if not isinstance(descriptor, nn.Module):
+        given = f"igps.descriptor({descriptor!r})" if isinstance(descriptor, str) else "a Descriptor"
+        raise TypeError(f"descriptor: expected a module, got {descriptor!r}. Give {given}.")
     if not len(dataset):
         raise ValueError("dataset: expected at least one mesh to describe, got none.")
     kept = None if cache_tag is None else _Kept(dataset, cache_tag)

@@ -1,6 +1,7 @@
 """What a descriptor is: how bodies are described, what that needs, and how two descriptions are compared."""
 
 import contextlib
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import reduce
@@ -27,6 +28,9 @@ from igps.nn.specification import Specified, save_module
 from igps.retrieval import chi_square
 from igps.retrieval.vectors import MOST_NUMBERS, SearchDistance
 from igps.signature.signature import SignatureConfig, compute_signature
+
+NAME = re.compile(r"\w{1,100}(\+\w{1,40}(=[\d.e-]{1,10})?){0,9}")
+"""What the name of a descriptor in a file is: files are called after it."""
 
 
 class Descriptor(Specified, ABC):
@@ -97,8 +101,10 @@ class Descriptor(Specified, ABC):
             card: what a reader should know of it, for JSON; its own if None.
 
         Raises:
-            ValueError: it is made of other modules than the library's.
+            ValueError: it is made of other modules than the library's, or its name is not of letters, digits and _.
         """
+        if not NAME.fullmatch(self.name):
+            raise ValueError(f"name: expected letters, digits and _, got {self.name!r}. Make it with another.")
         save_module(self, path, dict(self.card if card is None else card))
 
     @abstractmethod

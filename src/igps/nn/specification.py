@@ -154,6 +154,8 @@ def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
         if not all(bool(torch.isfinite(one).all()) for one in module.state_dict().values()):
             raise ValueError("a parameter is not finite")
         card = json.loads(words["card"])
+        if not isinstance(card, dict):
+            raise ValueError("its card is no table")
     except _UNREADABLE as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"{path}: expected a descriptor in the format {_FORMAT} ({reason}). Save it again.") from error

@@ -18,6 +18,7 @@ from igps.analysis.map import BodyMap
 from igps.analysis.outliers import Outlier
 from igps.mesh.mesh import Mesh
 from igps.report.drawing import PALETTE, draw_body, new_figure, paint, seen_from_the_front
+from igps.report.page_data import finite
 from igps.retrieval import PrecisionRecallCurve
 
 if TYPE_CHECKING:
@@ -31,8 +32,8 @@ _FOUND, _OTHER = PALETTE[0], "#777777"
 def write_answer(out: Path, name: str, rows: Sequence[Mapping[str, Any]], figure: Figure | None = None) -> None:
     """Write NAME.csv, a line a row, NAME.json with the same, and the picture, if any, as NAME.svg and NAME.png."""
     out.mkdir(parents=True, exist_ok=True)
-    (out / f"{name}.json").write_text(json.dumps(list(rows), indent=2) + "\n")
-    with (out / f"{name}.csv").open("w", newline="") as file:
+    (out / f"{name}.json").write_text(json.dumps(finite(list(rows)), indent=2) + "\n")
+    with (out / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else [])
         writer.writeheader()
         writer.writerows(rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import re
 import zlib
@@ -20,6 +21,9 @@ SUFFIXES = frozenset({".pdb", ".ent", ".cif", ".mmcif", ".pqr"})
 # Twice the largest structures of the Protein Data Bank.
 _MOST_BYTES = 2**31
 _ATOM_LINE = re.compile(rb"^(?:ATOM  |HETATM)[^\r\n]*", re.MULTILINE)
+# Without any of these gemmi reads no atoms.
+_COLUMNS = ("id", "type_symbol", "label_asym_id", "label_alt_id", "Cartn_x", "Cartn_y", "Cartn_z")
+_END_LINE = re.compile(rb"^END[ \t]*$", re.MULTILINE)
 _NUMBER_OF_RESIDUE = re.compile(r"(-?\d+)([A-Za-z]?)")
 
 
@@ -36,9 +40,13 @@ def read_structure(path: Path) -> gemmi.Structure:
     gemmi = gemmi_module()
     try:
         if suffix(path) in (".pdb", ".ent"):
-            return gemmi.read_pdb_string(_ATOM_LINE.sub(_with_numbers, text))
+            return gemmi.read_pdb_string(_as_models(_ATOM_LINE.sub(_with_numbers, text)))
         blocks = gemmi.cif.read_string(text.decode("utf-8", "replace"))
-        return gemmi.make_structure_from_block(next((b for b in blocks if b.find_values("_atom_site.id")), blocks[0]))
+        block = next((b for b in blocks if b.find_values("_atom_site.id")), blocks[0])
+        if missing := [name for name in _COLUMNS if not block.find_values(f"_atom_site.{name}")]:
+            raise ValueError(f"_atom_site has no {', '.join(missing)}")
+        _mark_unknown(block)
+        return gemmi.make_structure_from_block(block)
     except (RuntimeError, ValueError, IndexError) as error:
         fault = f"{path}: not readable as a structure, or cut short ({' '.join(str(error).split())})."
         raise MeshError(f"{fault} Download or export it again.") from error
@@ -85,19 +93,37 @@ def _text(path: Path) -> bytes:
         raise MeshError(f"{path}: more than {_MOST_BYTES:,} bytes of text, which no structure has. Check the file.")
     if not text.strip():
         raise MeshError(f"{path}: the file is empty. Export it again.")
-    return text
+    return text.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
 
 
 def _with_numbers(line: re.Match[bytes]) -> bytes:
-    """A line of a PDB file, with NaN where a coordinate is no number: gemmi would read a zero there."""
+    """A line of a PDB file, with NaN where a coordinate or B-factor is no number: gemmi would read a 0 or 20 there."""
     whole = line.group()
-    for start in (30, 38, 46):
+    for start, end in ((30, 38), (38, 46), (46, 54), (60, 66)):
         try:
-            float(whole[start : start + 8])
+            float(whole[start:end])
         except ValueError:
-            if len(whole) >= start + 8:
-                whole = whole[:start] + b"     nan" + whole[start + 8 :]
+            if len(whole) >= 54:
+                whole = whole[:start].ljust(start) + b"nan".rjust(end - start) + whole[end:]
     return whole
+
+
+def _as_models(text: bytes) -> bytes:
+    """What END parts, as frames of simulations are, becomes models: gemmi would read the first alone."""
+    frames = [frame for frame in _END_LINE.split(text) if _ATOM_LINE.search(frame)]
+    return b"ENDMDL\n".join(frames) if len(frames) > 1 else text
+
+
+def _mark_unknown(block: gemmi.cif.Block) -> None:
+    """NaN where a B-factor is not known: gemmi would read 20."""
+    column = block.find_values("_atom_site.B_iso_or_equiv")
+    if not column and (loop := block.find_values("_atom_site.id").get_loop()):
+        loop.add_columns(["_atom_site.B_iso_or_equiv"], "nan")
+    elif not column:  # of a single atom
+        block.set_pair("_atom_site.B_iso_or_equiv", "nan")
+    for row, value in enumerate(column):
+        if value in ("?", "."):
+            column[row] = "nan"
 
 
 def _pqr(text: bytes, path: Path) -> gemmi.Structure:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from igps._arrays import Integers
-from igps.mesh.formats._polygons import triangles
+from igps._arrays import Floats, Integers
+from igps.mesh.formats._polygons import flat_triangles, triangles
 
 TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, TETRAHEDRON = 5, 6, 7, 8, 9, 10
 # Sides of volumes, seen from outside, as VTK orders their corners: of tetrahedra, voxels, hexahedra, wedges, pyramids.
@@ -18,7 +18,7 @@ _SIDES: dict[int, tuple[tuple[int, ...], ...]] = {
 _WITHOUT_AREA = (0, 1, 2, 3, 4)
 
 
-def surface(corners: Integers, n_corners: Integers, kinds: Integers) -> Integers:
+def surface(corners: Integers, n_corners: Integers, kinds: Integers, vertices: Floats) -> Integers:
     """Triangles (F, 3) of cells, whose corners are laid end to end; a ValueError for curved ones and the like."""
     unknown = set(np.unique(kinds).tolist()) - {*_WITHOUT_AREA, TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, *_SIDES}
     if unknown:
@@ -26,7 +26,7 @@ def surface(corners: Integers, n_corners: Integers, kinds: Integers) -> Integers
             f"cells of the kind {min(unknown)}; only flat polygons and volumes with straight edges are read"
         )
     flat = np.isin(kinds, (TRIANGLE, POLYGON, QUAD))
-    found = [triangles(corners[np.repeat(flat, n_corners)], n_corners[flat])]
+    found = [flat_triangles(corners[np.repeat(flat, n_corners)], n_corners[flat], vertices)]
     starts = np.cumsum(n_corners) - n_corners
     for kind, n in ((PIXEL, 4), *((kind, int(max(map(max, of_kind))) + 1) for kind, of_kind in _SIDES.items())):
         if (n_corners[kinds == kind] != n).any():

@@ -29,6 +29,8 @@ MoleculeBodies = Literal["chains", "models", "assembly"]
 
 # Elements that the first letter of an atom's name gives where the file does not.
 _ELEMENTS = frozenset("HCNOSP")
+# All that residues are made of whose names are standard, with the selenium of a methionine; and deuterium.
+_OF_STANDARD = frozenset({*_ELEMENTS, "D", "Se"})
 # Radius of an atom whose element is not known, carbon's.
 _UNKNOWN_RADIUS = 1.7
 
@@ -56,7 +58,7 @@ class Molecule:
     residue_of: Integers  # (A,) the residue of each ball, from 0
     residue_names: tuple[str, ...]  # three letters; a modified amino acid has the name of the one that it was
     residue_positions: Floats  # (R, 3) of the Cα atoms, or else the mean of a residue's atoms, Å
-    b_factors: Floats  # (R,) means of the residue's atoms: B-factors, Å², or a model's pLDDT; NaN of a PQR file
+    b_factors: Floats  # (R,) means of the residue's atoms: B-factors, Å², or a model's pLDDT; NaN if the file has none
     notes: tuple[str, ...] = ()  # what was done to the structure, in words
 
     def __repr__(self) -> str:
@@ -174,8 +176,8 @@ class _Builder:
         name = _standard(residue.name, kind)
         named = {atom.name for atom in atoms}
         is_known = name != residue.name or (kind.is_amino_acid() or kind.is_nucleic_acid())
-        # An ion whose name is not known is an atom by itself, which is no polymer.
-        is_alone = len(atoms) == 1 and not named & {"CA", "P"}
+        # An ion whose name is not known is an atom by itself, which is no polymer; calcium is called as Cα is.
+        is_alone = len(atoms) == 1 and (not named & {"CA", "P"} or atoms[0].element.name == "Ca")
         in_polymer = is_known or {"N", "CA", "C"} <= named or (residue.het_flag == "A" and not is_alone)
         if not atoms or not (in_polymer or self.ligands):
             self._count["ligand"] += bool(atoms)
@@ -242,7 +244,12 @@ class _Builder:
     def _atoms(self, residue: gemmi.Residue) -> list[gemmi.Atom]:
         """Those that have a position, one of each that has alternatives."""
         chosen: dict[Any, Any] = {}
+        gemmi = gemmi_module()
+        is_standard = residue.name in STANDARD or gemmi.find_tabulated_residue(residue.name).is_standard()
         for number, atom in enumerate(residue):
+            # Where names begin in the wrong column, gemmi takes Cα for calcium
+            if is_standard and atom.element.name not in _OF_STANDARD:
+                atom.element = gemmi.Element("X")
             if not self.hydrogens and (atom.is_hydrogen() or (not atom.element.atomic_number and _letter(atom) == "H")):
                 continue
             if not np.isfinite(atom.pos.tolist()).all():

@@ -7,6 +7,7 @@ import numpy as np
 
 from igps._arrays import Surface
 from igps.mesh.formats._format import Format, RawBody
+from igps.mesh.formats._polygons import flat_triangles
 from igps.mesh.formats._trimesh import objects
 from igps.mesh.options import LoadOptions
 
@@ -15,8 +16,8 @@ _WHOLE_NUMBERS = re.compile(r"\s*\d[\d\s]*", re.ASCII)
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The surface of an OFF file."""
-    plain = _plain(path)
-    return objects(path, options) if plain is None else [RawBody(*plain)]
+    found = _plain(path) or _polygons(path)
+    return objects(path, options) if found is None else [RawBody(*found)]
 
 
 def _plain(path: Path) -> Surface | None:
@@ -39,6 +40,34 @@ def _plain(path: Path) -> Surface | None:
     if vertices.shape != (n_vertices, 3) or faces.shape != (n_faces, 4) or (faces[:, 0] != 3).any():
         return None
     return (vertices, np.ascontiguousarray(faces[:, 1:])) if faces[:, 1:].max() < n_vertices else None
+
+
+def _polygons(path: Path) -> Surface | None:
+    """The surface of polygons, behind which colours may stand; None of triangles alone, and of what is broken.
+
+    Trimesh folds concave ones, and cannot read those of more than four corners.
+    """
+    try:
+        lines = [
+            line
+            for line in (line.partition("#")[0].strip() for line in path.read_text(encoding="utf-8").splitlines())
+            if line
+        ]
+        n_vertices, n_faces = map(int, lines[1].split()[:2])
+        rows = [line.split() for line in lines[2 + n_vertices : 2 + n_vertices + n_faces]]
+        n_corners = np.array([int(row[0]) for row in rows], dtype=np.int64)
+        if lines[0] != "OFF" or len(rows) < n_faces or min(n_vertices, n_faces) < 1 or not (n_corners > 3).any():
+            return None
+        corners = np.array(
+            [int(word) for n, row in zip(n_corners.tolist(), rows, strict=True) for word in row[1 : n + 1]],
+            dtype=np.int64,
+        )
+        vertices = np.loadtxt(lines[2 : 2 + n_vertices], np.float64, comments=None, usecols=(0, 1, 2), ndmin=2)
+    except (ValueError, IndexError):
+        return None
+    if len(corners) != n_corners.sum() or (n_corners < 3).any():
+        return None
+    return vertices, flat_triangles(corners, n_corners, vertices)
 
 
 FORMAT = Format("OFF", (".off",), read)

@@ -257,7 +257,7 @@ def _body(vertices: Floats, cells: list[Cells], part: str | None = None) -> RawB
     for corners, n_corners, kinds in cells:
         if len(kinds) != len(n_corners) or (n_corners < 0).any() or n_corners.sum() != len(corners):
             raise ValueError("numbers of cells and corners do not agree")
-        faces.append(_vtk_cells.surface(corners, n_corners, kinds))
+        faces.append(_vtk_cells.surface(corners, n_corners, kinds, vertices))
     return RawBody(vertices, np.concatenate(faces), part)
 
 
