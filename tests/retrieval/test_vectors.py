@@ -1,0 +1,52 @@
+"""Short vectors against the distances that they stand for, and against scikit-learn's features and components."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from scipy.stats import spearmanr
+from sklearn.decomposition import PCA
+from sklearn.kernel_approximation import AdditiveChi2Sampler
+
+from igps.retrieval import vectors as module
+from igps.retrieval.vectors import VectorMap
+
+
+def histograms(n: int, n_cells: int) -> np.ndarray:
+    """Histograms of sum 1, in families of twenty."""
+    generator = np.random.default_rng(0)
+    families = generator.gamma(0.5, size=(n // 20 + 1, n_cells)).repeat(20, axis=0)[:n]
+    found = families * generator.gamma(20, size=families.shape)
+    return (found / found.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def test_features_order_as_chi_square_does() -> None:
+    """By a fifth to a third less, the more the closer, and in nearly the same order."""
+    rows = histograms(120, 500)
+    vectors = VectorMap.fit(rows, "chi_square")(rows)
+    assert vectors.shape[1] <= 256
+    a, b = rows[:, None].astype(float), rows[None].astype(float)
+    expected = ((a - b) ** 2 / np.maximum(a + b, 1e-300)).sum(axis=2) / 2
+    apart = ~np.eye(120, dtype=bool)
+    found = cdist(vectors, vectors)[apart] ** 2 / 2
+    ratio = found / expected[apart]
+    assert ratio.min() > 0.63
+    assert ratio.max() < 0.9
+    assert spearmanr(found, expected[apart])[0] > 0.995
+
+
+def test_rows_are_taken_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_ROWS_AT_ONCE", 8)
+    rows = histograms(30, 40)
+    features = AdditiveChi2Sampler(sample_steps=2).fit_transform(rows)
+    expected = PCA(30, svd_solver="full").fit(features).transform(features)
+    found = VectorMap.fit(rows, "chi_square")(rows)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_short_unit_vectors_stay_as_they_are() -> None:
+    rows = histograms(30, 40)
+    kept = VectorMap.fit(rows, "cosine")
+    assert not kept.changes
+    np.testing.assert_array_equal(kept(rows), rows)
