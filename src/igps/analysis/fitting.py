@@ -163,7 +163,13 @@ def classify(
 ) -> Classification:
     """The classes of the bodies of a dataset by a model that `fit` made.
 
-    The model is one, or a file of it; a ValueError where it has no classifier. For the other arguments see `fit`.
+    Args:
+        dataset: bodies, labelled or not.
+        model: a file, or the model.
+        failures, n_workers, progress: see `fit`.
+
+    Raises:
+        ValueError: the model has no classifier.
     """
     found = descriptor_of(model)
     found = found.descriptor if isinstance(found, IndividualDescriptor) else found

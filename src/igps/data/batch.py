@@ -115,17 +115,28 @@ class SignatureBatch:
         >>> batch = collate([compute_signature(body, SignatureConfig(n_eigenpairs=20)) for body in bodies])
         >>> len(batch), [body.area for body in batch.bodies()] == batch.area.tolist()
         (2, True)
+
+    Args:
+        eigenvalues: (N, K) float64, 1/length²; infinite where padded, so that every spectral weight is zero there.
+        interior: interior samples.
+        surface: surface samples.
+        area: (N,) float64, length².
+        volume: (N,) float64, length³.
+        labels: (N,) int64, −1 where unknown.
+        ids: N names.
+        meshes: the N surfaces, for descriptors that need more than the Signatures; None if they were not asked for.
+        units: the N units of length, None where one is not known; None if none is.
     """
 
-    eigenvalues: Tensor  # (N, K) float64, 1/length²; infinite where padded, so that spectral weights are zero there
+    eigenvalues: Tensor
     interior: SampleBatch
     surface: SampleBatch
-    area: Tensor  # (N,) float64, length²
-    volume: Tensor  # (N,) float64, length³
-    labels: Tensor  # (N,) int64, −1 where unknown
-    ids: tuple[str, ...]  # N names
-    meshes: tuple[Mesh, ...] | None = None  # N, for descriptors that need the surface; None if they were not asked for
-    units: tuple[str | None, ...] | None = None  # of length, None where one is not known; None if none is
+    area: Tensor
+    volume: Tensor
+    labels: Tensor
+    ids: tuple[str, ...]
+    meshes: tuple[Mesh, ...] | None = None
+    units: tuple[str | None, ...] | None = None
 
     def __len__(self) -> int:
         return len(self.ids)

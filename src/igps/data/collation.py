@@ -30,8 +30,12 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
         >>> tuple(batch.eigenvalues.shape), (batch.volume[1] / batch.volume[0]).item()
         ((2, 20), 2.0)
 
-    Meshes are the surfaces of the items, for descriptors that need them. A ValueError of no items, of samples with
-    different attributes, or if there is not one mesh for each.
+    Args:
+        items: N Signatures, with or without labels.
+        meshes: their surfaces, for descriptors that need them.
+
+    Raises:
+        ValueError: no items, samples that carry different attributes, or not one mesh for each.
     """
     if not items:
         raise ValueError("items: expected at least one signature, got none.")

@@ -240,8 +240,11 @@ class SignatureDataset(Dataset[LabelledSignature]):
     ) -> Self:
         """The Signatures of a file that `to_file` wrote; it is read by memory map, and runs no code.
 
-        Descriptions are kept in `cache_dir`. For `descriptor` see `SignatureDataset`. A FileNotFoundError of no file, a
-        ValueError of another, or of one that has less than the descriptor requires.
+        Descriptions are kept in `cache_dir`. For `descriptor` see `SignatureDataset`.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: it is no such file, or has less than the descriptor requires.
         """
         file = CollectionFile(path)
         about = file.about

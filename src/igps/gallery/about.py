@@ -84,7 +84,7 @@ def tables() -> Any:
 
 
 def open_table(path: str | Path, version: int | None = None) -> Any:
-    """The table of a gallery; a ValueError of an index of 0.2.0, with whose Signatures none of now are compared."""
+    """The table of a gallery; a ValueError for an index of 0.2.0, whose Signatures are others."""
     if not tables().exists(Path(path)) and (Path(path) / MANIFEST).exists():
         raise ValueError(f"{path}: an index of version 0.2.0, of other signatures. Build a gallery in a new folder.")
     return tables().BodyTable(path, version)

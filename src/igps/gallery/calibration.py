@@ -92,7 +92,7 @@ class Calibration:
         return min(self.same.distance, self.detail.distance * max(coarseness, FINEST))
 
     def check(self, descriptor: str | Descriptor, module: Descriptor, config: SignatureConfig) -> None:
-        """Raise a ValueError unless it is of a descriptor, as it was asked for and itself, and of such Signatures."""
+        """Raise a ValueError unless it belongs to a descriptor (its name, and the module) and to such Signatures."""
         name = name_of(descriptor)
         if name != self.descriptor:
             raise ValueError(f"descriptor: expected {self.descriptor}, whose distances are calibrated, got {name}.")
@@ -115,7 +115,7 @@ class Calibration:
 
     @classmethod
     def load(cls, path: str | Path = CALIBRATION) -> Self:
-        """What `save` wrote; a FileNotFoundError of no file, a ValueError of what is no calibration."""
+        """What `save` wrote; a ValueError if it is no calibration."""
         try:
             found: dict[str, Any] = json.loads(Path(path).read_text())
             one = cls(**found | {name: Threshold(**found[name]) for name in ("same", "detail", "pose")})

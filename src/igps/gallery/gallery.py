@@ -185,8 +185,10 @@ class Gallery:
     ) -> list[Failure]:
         """Add the bodies of a dataset; returns those that failed. Arguments as of `build`.
 
-        Bodies that it has already are passed over, and replaced where their content has changed. A ValueError where the
-        gallery is of other Signatures.
+        Bodies that it has already are passed over, and replaced where their content has changed.
+
+        Raises:
+            ValueError: the gallery is of other Signatures.
         """
         wanted = about_of(dataset.config, dataset.reading, self.descriptor)
         check_alike(self.path, self.about, {name: wanted[name] for name in ("signature", "reading")})
@@ -207,7 +209,8 @@ class Gallery:
     ) -> Gallery:
         """A gallery of the bodies of others, which stay as they are, added to that at `path`, if there is one.
 
-        A ValueError where they are of different descriptors or Signatures, or none is given.
+        Raises:
+            ValueError: they are of different descriptors or Signatures, or none is given.
         """
         opened = [open_table(other) for other in others]
         if not opened:

@@ -57,7 +57,8 @@ def described_rows(
 def further_columns(bodies: Bodies) -> dict[str, type]:
     """Further columns of the table of labels, and of which type: numbers where all values are.
 
-    A ValueError of one that has the name of a column that every gallery has, or one that no gallery takes.
+    Raises:
+        ValueError: one has the name of a column that every gallery has, or a name with a dot.
     """
     if dotted := [name for name in bodies.columns if "." in name]:
         raise ValueError(

@@ -93,7 +93,7 @@ class Surfaces:
         self._known = lru_cache(None)(self._coarseness_and_handles)
 
     def samples(self, i: int) -> SurfaceSamples:
-        """Those of one; a MeshError if it cannot be used, as of their `surface`; a ValueError without directions."""
+        """Those of one body; a MeshError if it cannot be used, a ValueError if its samples have no directions."""
         signature = self._signature(i)
         found = SurfaceSamples.of(signature.surface.points, signature.surface.attributes[_NORMALS], signature.area)
         return replace(found, surface=partial(self._last_triangles, i))
@@ -157,7 +157,7 @@ class Surfaces:
         return calibration.limit(max(coarseness, of_other))
 
     def profiles(self, n_workers: int | None = None, progress: bool = False) -> tuple[Tensor, list[Failure]]:
-        """Those (M, 64) of all that can be read, in order, and the failures of the others; a MeshError of none."""
+        """Those (M, 64) of all that can be read, in order, and the failures of the others; a MeshError if none can."""
 
         def profile(i: int) -> NDArray[np.float64] | None:
             with contextlib.suppress(MeshError):  # which is among the failures

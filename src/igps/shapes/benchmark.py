@@ -140,7 +140,9 @@ class ArticulatedShapes:
 
         Each file appears whole or not at all, so an interrupted run is resumed by the same call and several processes
         may write at once. ``root/shapes.json`` records the generator's settings; classes and shapes may be added later.
-        A ValueError if ``root`` holds shapes of another seed, resolution or version.
+
+        Raises:
+            ValueError: ``root`` holds shapes of another seed, resolution or version.
         """
         folder = shapes_folder(
             root, generator="ArticulatedShapes", version=_VERSION, seed=self.seed, n_vertices=self.n_vertices

@@ -51,12 +51,19 @@ DENSE_VERTICES, DENSE_VERTICES_PER_EIGENPAIR = 1000, 4
 
 @dataclass(frozen=True)
 class Spectrum:
-    """The low end of the spectrum of `L φ = λ M φ`, a shape's Laplace–Beltrami spectrum; the constant is left out."""
+    """The low end of the spectrum of `L φ = λ M φ`, a shape's Laplace–Beltrami spectrum; the constant is left out.
 
-    eigenvalues: np.ndarray  # (K,) float64, ascending, 1/length²
-    eigenfunctions: np.ndarray  # (V, K) float64, M-orthonormal, 1/length
-    mass: np.ndarray  # (V,) float64, the vertex areas, length²
-    residual: float  # the largest ‖L φ − λ M φ‖ / λ of the pairs, in the norm of M⁻¹, as measured
+    Attributes:
+        eigenvalues: (K,) float64, ascending, 1/length².
+        eigenfunctions: (V, K) float64, M-orthonormal, 1/length.
+        mass: (V,) float64, the vertex areas, length².
+        residual: the largest ‖L φ − λ M φ‖ / λ of the pairs, in the norm of M⁻¹, as measured.
+    """
+
+    eigenvalues: np.ndarray
+    eigenfunctions: np.ndarray
+    mass: np.ndarray
+    residual: float
 
 
 @one_thread()
