@@ -62,7 +62,8 @@ class SampleBatch:
             drawn = torch.rand(self.mask.shape, device=self.mask.device).masked_fill(~self.mask, -1)
             index = drawn.topk(n_kept).indices
         else:
-            steps = (n_present.double() / n_samples).clamp(min=1) * (numbers + _start(seed))
+            start = _START_OF_ZERO if seed == 0 else _start(seed)
+            steps = (n_present.double() / n_samples).clamp(min=1) * (numbers + start)
             index = torch.searchsorted(self.mask.cumsum(dim=1), steps.long().clamp(max=n_present - 1) + 1)
         index = index.masked_fill(~kept, 0)
 
@@ -77,11 +78,14 @@ class SampleBatch:
         return SampleBatch(take(self.points), take(self.eigenfunctions), kept, attributes)
 
 
-@torch.compiler.assume_constant_result
 def _start(seed: int) -> float:
     """A number from 0 to 1 that follows from the seed."""
     generator = torch.Generator("cpu").manual_seed(seed)
     return torch.rand(1, generator=generator, dtype=torch.float64, device="cpu").item()
+
+
+# Of the seed that all descriptors take: `torch.compile` cannot trace a generator.
+_START_OF_ZERO = _start(0)
 
 
 @dataclass(frozen=True, eq=False)
