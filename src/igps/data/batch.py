@@ -51,7 +51,7 @@ class SampleBatch:
 
         A seed takes them at equal steps along the order they come in, from a start that it draws. In a Signature that
         order is by what the body looks like, and so is the choice: it depends neither on its batch nor on how grid and
-        mesh are numbered. Without one, torch's global generator draws them at random.
+        mesh are numbered. Without one, the global generator of their device draws them at random.
         """
         n_shapes, longest = self.mask.shape
         n_kept = min(n_samples, longest)

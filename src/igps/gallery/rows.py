@@ -39,9 +39,9 @@ def described_rows(
     with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
         for start in range(0, len(dataset), _AT_ONCE):
             numbers = range(start, min(start + _AT_ONCE, len(dataset)))
-            told = dict(
-                zip(numbers, told_of(bodies.subset(numbers), kinds, dataset.reading), strict=True)
-            )  # before files are read
+            # Before files are read: one that changes meanwhile is described again next time
+            of_each = told_of(bodies.subset(numbers), kinds, dataset.reading)
+            told = dict(zip(numbers, of_each, strict=True))
             keys = {i: key_of(dataset, i) for i in numbers}
             new = [i for i in numbers if not keys[i] or known.get(told[i]["id"]) != keys[i]]
             failed: list[Failure] = []

@@ -59,6 +59,17 @@ def test_radii_are_those_of_the_definition(ball_radii: Radii) -> None:
         np.testing.assert_allclose(found[:, column], by_definition(points, directions, side), rtol=1e-6)
 
 
+def test_near_points_keep_their_digits_in_single_precision(ball_radii: Radii) -> None:
+    """Of a lens beside the origin, whose two sides are near each other."""
+    generator, axes = torch.Generator().manual_seed(0), torch.tensor([0.3, 0.3, 0.02])
+    ball = normalize(torch.randn(400, 3, generator=generator), dim=1)
+    points, directions = ball * axes + 0.4, normalize(ball / axes, dim=1)
+    found = ball_radii(points, directions)
+    for side, column in ((1, 0), (-1, 1)):
+        expected = by_definition(points, directions, side)
+        np.testing.assert_allclose(found[:, column], expected, rtol=1e-4)
+
+
 def test_a_ball_has_its_own_radius_inside_and_none_outside(ball_radii: Radii) -> None:
     points = normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(1)), dim=1)
     radii = ball_radii(0.3 * points, points)

@@ -48,11 +48,8 @@ def _polygons(path: Path) -> Surface | None:
     Trimesh folds concave ones, and cannot read those of more than four corners.
     """
     try:
-        lines = [
-            line
-            for line in (line.partition("#")[0].strip() for line in path.read_text(encoding="utf-8").splitlines())
-            if line
-        ]
+        text = path.read_text(encoding="utf-8")
+        lines = [kept for line in text.splitlines() if (kept := line.partition("#")[0].strip())]
         n_vertices, n_faces = map(int, lines[1].split()[:2])
         rows = [line.split() for line in lines[2 + n_vertices : 2 + n_vertices + n_faces]]
         n_corners = np.array([int(row[0]) for row in rows], dtype=np.int64)
