@@ -33,7 +33,7 @@ def test_estimates_are_right_on_average(width: int) -> None:
     rest = vectors @ coder.turn.T - coder.centres[own["centre"]]
     errors = []
     for query in families(1, 20, 1.0, width, seed=1):
-        found = codes._distances(query)[codes._place]
+        found = codes._distances(query, len(vectors))[codes._place]
         away = coder.turn @ query - coder.centres[own["centre"]]
         lengths = np.linalg.norm(rest, axis=1) * np.linalg.norm(away, axis=1)
         # A vector that is a centre is known exactly.
@@ -53,6 +53,16 @@ def test_families_larger_than_what_is_asked_for_are_told_apart() -> None:
         nearest = np.argsort(np.square(vectors - query).sum(axis=1))[:10]
         found.append(np.isin(nearest, codes.nearest(query, 100)).mean())
     assert np.mean(found) > 0.98
+
+
+def test_codes_of_far_centres_are_passed_over() -> None:
+    """Three quarters of them, and none of the nearest is lost."""
+    vectors = families(40, 500, 0.2)
+    codes = kept(vectors)
+    for query in vectors[::900]:
+        assert 0.7 < np.isinf(codes._distances(query, 1000)).mean() <= 0.75
+        nearest = np.argsort(np.square(vectors - query).sum(axis=1))[:10]
+        assert set(nearest.tolist()) <= set(codes.nearest(query, 200).tolist())
 
 
 def test_rows_are_found_among_those_named_whatever_their_order() -> None:
@@ -85,4 +95,4 @@ def test_the_lowest_are_those_of_sorting() -> None:
 def test_vectors_that_are_all_alike_are_found() -> None:
     codes = kept(np.ones((500, 16), np.float32))
     assert len(codes.nearest(np.ones(16, np.float32), 12)) == 12
-    assert np.isfinite(codes._distances(np.zeros(16, np.float32))).all()
+    assert np.isfinite(codes._distances(np.zeros(16, np.float32), 500)).all()

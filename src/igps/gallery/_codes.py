@@ -8,11 +8,14 @@ products are counts of bits.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.cluster import KMeans
+from sklearn.exceptions import ConvergenceWarning
 
 from igps._arrays import Integers, Singles
 from igps._compiled import SUMS, compiled
@@ -21,6 +24,8 @@ from igps.retrieval.vectors import SearchDistance, VectorMap
 Words = NDArray[np.uint64]
 
 _BITS, _QUERY_BITS, _CENTRES, _ROWS = 256, 4, 1024, 1024
+# Codes that are looked at, at least, for each that is found
+_LOOKED_AT = 64
 # Rounds by which centres move to the middle of those that are nearest to them
 _ROUNDS = 5
 _TINY = np.finfo(np.float32).tiny
@@ -44,13 +49,10 @@ class Coder:
         generator = np.random.default_rng(0)
         turn = np.linalg.qr(generator.standard_normal((_BITS, vectors.shape[1])))[0].astype(np.float32)
         turned = vectors @ turn.T
-        centres = turned[generator.choice(len(turned), min(_CENTRES, len(turned)), replace=False)]
-        for _ in range(_ROUNDS):
-            nearest = _nearest(turned, centres)
-            count = np.bincount(nearest, minlength=len(centres))[:, None]
-            sums = np.zeros_like(centres)
-            np.add.at(sums, nearest, turned)
-            centres = np.where(count > 0, sums / np.maximum(count, 1), centres).astype(np.float32)
+        n_centres = min(_CENTRES, len(turned))
+        with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):  # fewer where vectors are alike
+            found = KMeans(n_centres, init="random", n_init=1, max_iter=_ROUNDS, random_state=0).fit(turned)
+        centres = found.cluster_centers_.astype(np.float32)
         return cls(short, turn, centres)
 
     def arrays(self) -> dict[str, Any]:
@@ -92,25 +94,33 @@ class Codes:
         self._ends = np.searchsorted(centre.take(chosen), np.arange(len(coder.centres) + 1))
 
     def nearest(self, description: Singles, n: int, among: Words | None = None) -> Words:
-        """Rows of the n that seem nearest to a description (F,), or all if they are fewer, in any order."""
+        """Rows of the n that seem nearest to a description (F,), or all if they are fewer, ascending."""
         at = None if among is None else np.sort(self._place[np.searchsorted(self._rows, among)])
-        lowest = _lowest(self._distances(description, at), n)
-        return self._rows[self._order[lowest if at is None else at[lowest]]]
+        lowest = _lowest(self._distances(description, _LOOKED_AT * n, at), n)
+        return np.sort(self._rows[self._order[lowest if at is None else at[lowest]]])
 
-    def _distances(self, description: Singles, at: Integers | None = None) -> Singles:
-        """Squared, from a description (F,), as they are estimated of the codes at some places, ascending, or of all."""
+    def _distances(self, description: Singles, n: int, at: Integers | None = None) -> Singles:
+        """Squared, from a description (F,), as they are estimated of the codes at some places, ascending, or of all.
+
+        Infinite for those of the farther centres: the nearer have n, or a quarter of all, if there are more.
+        """
+        signs, square, scale, ends = self._signs, self._square, self._scale, self._ends
+        if at is not None:
+            signs, square, scale = (one.take(at, axis=-1) for one in (signs, square, scale))
+            ends = np.searchsorted(at, ends)
         rest = self._coder.short(description[None]) @ self._coder.turn.T - self._coder.centres
+        to_centre = np.square(rest).sum(axis=1)
+        by_distance = np.argsort(to_centre)
+        n_seen = np.cumsum(np.diff(ends)[by_distance])
+        near = np.sort(by_distance[: 1 + np.searchsorted(n_seen, max(n, len(square) // 4))])
+        rest = rest[near]
         # A number of the query is `step` times (u - 7.5), u of four bits
         middle = np.float32((2**_QUERY_BITS - 1) / 2)
         step = np.maximum(np.abs(rest).max(axis=1), _TINY) / middle
         u = np.clip(np.rint(rest / step[:, None] + middle), 0, 2 * middle).astype(np.uint8)[:, None]
         planes = np.packbits(u >> np.arange(_QUERY_BITS, dtype=np.uint8)[:, None] & 1, axis=2).view(np.uint64)
-        signs, square, scale, ends = self._signs, self._square, self._scale, self._ends
-        if at is not None:
-            signs, square, scale = (one.take(at, axis=-1) for one in (signs, square, scale))
-            ends = np.searchsorted(at, ends)
         far = np.full(len(square), np.inf, np.float32)
-        _estimate(signs, square, scale, ends, planes, step, np.square(rest).sum(axis=1), far)
+        _estimate(signs, square, scale, ends[near], ends[near + 1], planes, step, to_centre[near], far)
         return far
 
 
@@ -142,18 +152,18 @@ def _n_bits(word: np.uint64) -> np.uint64:
 
 @compiled(fastmath=SUMS)
 def _estimate(
-    signs: Words, square: Singles, scale: Singles, ends: Integers, planes: Words, step: Singles, to_centre: Singles,
-    far: Singles,
+    signs: Words, square: Singles, scale: Singles, starts: Integers, ends: Integers, planes: Words, step: Singles,
+    to_centre: Singles, far: Singles,
 ) -> None:  # fmt: skip
     """Squared distances of a query to the vectors of codes, into `far` (N,), which is infinite before.
 
-    Of the codes, signs (4, N) in words, square and scale (N,) as in `CODE`, and ends (C + 1,) where those of each
-    centre begin; of the query's difference from each centre, planes (C, 4, 4) of the words of each bit, step (C,) that
-    their numbers stand for, and to_centre (C,), its square.
+    Of the codes, signs (4, N) in words, square and scale (N,) as in `CODE`, and where those of some centres start and
+    end (C,); of the query's difference from each, planes (C, 4, 4) of the words of each bit, step (C,) that their
+    numbers stand for, and to_centre (C,), its square.
     """
-    for centre in range(len(ends) - 1):
-        for start in range(ends[centre], ends[centre + 1], _ROWS):
-            some = slice(start, min(start + _ROWS, ends[centre + 1]))
+    for centre in range(len(ends)):
+        for start in range(starts[centre], ends[centre], _ROWS):
+            some = slice(start, min(start + _ROWS, ends[centre]))
             n_different = np.zeros(some.stop - start, np.uint64)
             for word in range(len(signs)):
                 one, two, four, eight = planes[centre, :, word]

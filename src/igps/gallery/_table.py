@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from igps._threads import one_thread
 from igps.gallery._codes import CODE, Coder, Codes
 from igps.gallery.about import KNOWN, Batch, Row, in_words
 from igps.retrieval.distances import Distance
@@ -91,6 +92,7 @@ class BodyTable:
         values = torch.from_numpy(np.array(rows["vector"].combine_chunks().flatten())).float().reshape(len(rows), -1)
         return torch.ldexp(values[:, :-1], values[:, -1:]).reshape(-1, *self.shape)
 
+    @one_thread()
     def search(
         self, query: Tensor, distance: Distance, *, top: int, candidates: int = 512, exact: bool = False,
         where: str | None = None,
