@@ -36,7 +36,7 @@ from igps.signature.signature import Signature
 _SURFACES, _TRIANGLES = 512, 64
 _NORMALS: AttributeName = "surface_direction"
 # Copies differ by up to 0.045 in the logarithms of their extents; what differs by more is not laid onto each other.
-_MOST_STRETCHED = 0.15
+_MOST_STRETCHED = 0.1
 # A tenth of this is much between copies.
 _HOPELESS = 0.03
 MOST_TOLERATED = 0.02
@@ -157,7 +157,7 @@ class Surfaces:
         return calibration.limit(max(coarseness, of_other))
 
     def profiles(self, n_workers: int | None = None, progress: bool = False) -> tuple[Tensor, list[Failure]]:
-        """Those (M, 64) of all that can be read, in order, and the failures of the others; a MeshError if none can."""
+        """Those (M, 3, 64) of all that can be read, in order, and failures of the others; a MeshError if none can."""
 
         def profile(i: int) -> NDArray[np.float64] | None:
             with contextlib.suppress(MeshError):  # which is among the failures
