@@ -73,7 +73,7 @@ class SurfaceSamples:
 
     @property
     def profile(self) -> Array:
-        """(3, 64) quantiles of distances between samples, and of half of those of samples and tangent planes to the mean.
+        """(3, 64) quantiles of distances between samples, and of half of those from the middle to samples and tangents.
 
         The root mean square difference of two surfaces' distances between samples is at most twice that of their
         offsets, but for what the sampling adds, and however the surfaces are laid: distances between corresponding
