@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from igps.analysis.clusters import clusters_of
 from igps.analysis.groups import group_test, vectors_of
 from igps.analysis.map import body_map
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.nn.description import describe
-from igps.report.answers import write_answer
+from igps.report.answers import clusters_figure, map_figure, write_answer
 from igps.retrieval import chi_square
 from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, small_interior, write_egg
@@ -181,6 +182,20 @@ def test_what_is_not_known_is_null_in_the_file(tmp_path: Path) -> None:
         {"body": "é", "stability": None}
     ]
     assert table(tmp_path / "rows.csv")[0]["body"] == "é"
+
+
+def test_names_are_drawn_as_they_are_and_not_as_formulas(tmp_path: Path) -> None:
+    names = ["cost_$a_{$.off", "_under", "$x$"]
+    distances = np.array([[0.0, 1, 3], [1, 0, 2], [3, 2, 0]])
+    figures = {
+        "clusters": clusters_figure(clusters_of(distances, 2), names),
+        "map": map_figure(body_map(distances), names, "$a_{$"),
+    }
+    for name, figure in figures.items():
+        write_answer(tmp_path, name, [{"body": "a"}], figure)
+        assert imread(tmp_path / f"{name}.png").std() > 0.02
+        drawn = (tmp_path / f"{name}.svg").read_text()
+        assert all(f"<!-- {one}" in drawn for one in names)
 
 
 def test_a_colour_that_is_no_column_is_refused(
