@@ -93,6 +93,14 @@ def write_collection(path: Path, about: About, signature: Callable[[int], Signat
                 file.write(tensors[name].data)
 
 
+def is_collection(path: Path) -> bool:
+    """Whether a file is one that `write_collection` wrote, by its beginning."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return _FORMAT.encode() in file.read(100)
+
+
 class CollectionFile:
     """The Signatures of a file that `write_collection` wrote, read by memory map and checked at each reading.
 

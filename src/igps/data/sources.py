@@ -135,7 +135,7 @@ def find_bodies(
     """
     root, options = Path(root), options or LoadOptions()
     if not root.is_dir():
-        raise FileNotFoundError(f"{root}: no such folder.")
+        raise FileNotFoundError(f"{root}: {'a file; a folder expected' if root.exists() else 'no such folder'}.")
     table = (root / LABELS_FILE).is_file()
     bodies = (_from_labels_file(root, options) if table else _from_folder(root, options, attributes)).classed(classes)
     if labelled and bodies.labels is None:
