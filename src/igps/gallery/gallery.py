@@ -247,6 +247,8 @@ class Gallery:
         kinds = {name: kind for name, kind in self.columns.items() if name not in ours}
         if wrong := values.keys() - kinds.keys():
             raise ValueError(f"{min(wrong)}: expected one of the columns {', '.join(kinds)}.")
+        if empty := [name for name in ("name", "file") if values.get(name, name) is None]:
+            raise ValueError(f"{empty[0]}: expected a value, got none; every body has one, by which it is told.")
         with in_words("values: expected numbers in columns of numbers"):
             typed = {name: None if value is None else kinds[name](value) for name, value in values.items()}
         with self.table.changing(where) as table:
