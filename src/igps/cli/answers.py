@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from igps._parameters import check_at_least
 from igps.analysis.explanation import KINDS, Explanation, explain_groups, on_surface
 from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, vectors_of, with_discovery_rates
@@ -100,6 +101,7 @@ def outliers(
         top: how many to list.
         out: folder for outliers.csv and outliers.json with all, and pictures of the first as outliers.svg and .png.
     """
+    check_at_least(0, top=top)
     bodies = described(Folder(root, labelled=True, needs_meshes=True), descriptor, **reading)
     dataset = bodies.dataset
     distances = squared_distances(vectors_of(bodies.descriptor, bodies.descriptions)) ** 0.5
