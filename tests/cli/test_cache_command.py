@@ -44,9 +44,10 @@ def test_the_file_stands_for_the_folder(
     if labelled:
         call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache)
         assert json.loads(capsys.readouterr().out) == expected
-        with pytest.raises(SystemExit, match="1"):
-            call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache, "--mend", "never")
-        assert "expected no options of reading beside a file of signatures" in capsys.readouterr().err
+        for option in (["--mend", "never"], ["--attribute", "ct={file}.nii"]):
+            with pytest.raises(SystemExit, match="1"):
+                call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache, *option)
+            assert "expected no options of reading beside a file of signatures" in capsys.readouterr().err
     else:
         with pytest.raises(SystemExit, match="1"):
             call(monkeypatch, "retrieve", out, "--descriptor", INTERIOR, *cache)

@@ -147,6 +147,9 @@ def test_what_cannot_be_described_is_told(root: Path, tmp_path: Path) -> None:
     assert [failure.id for failure in failures] == ["egg/1.off"]
     assert "too much" in failures[0].error
     assert len(gallery) == 5
+    alone = dataset[["egg/1.off"]]
+    with pytest.raises(ValueError, match=r"none of 1 bodies could be described; the first: .*1\.off: .*too much"):
+        Gallery.build(tmp_path / "none.igps", alone, "own_descriptors:picky", n_workers=1)
 
 
 def test_a_checksum_tells_descriptors_apart() -> None:

@@ -197,7 +197,7 @@ def chosen_dataset(
         raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
     config, reading = SignatureConfig.paper() if paper else signature, LoadOptions(**options)
     if isinstance(source, Folder) and source.root.is_file():
-        if config != SignatureConfig() or reading != LoadOptions() or classes is not None:
+        if config != SignatureConfig() or reading != LoadOptions() or classes is not None or attribute:
             raise ValueError(f"{source.root}: expected no options of reading beside a file of signatures.")
         if source.needs_meshes:
             raise ValueError(f"{source.root}: holds signatures and no meshes, which are needed. Give their folder.")

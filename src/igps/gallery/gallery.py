@@ -177,7 +177,13 @@ class Gallery:
         mixed = dataset.subset(np.random.default_rng(0).permutation(len(dataset)).tolist())
         batches = described_rows(mixed, chosen, {}, failures, n_workers, strict, progress)
         about = about_of(dataset.config, dataset.reading, descriptor)
-        tables().write(Path(path), about, chosen.searched_by, batches, further_columns(dataset.bodies))
+        try:
+            tables().write(Path(path), about, chosen.searched_by, batches, further_columns(dataset.bodies))
+        except ValueError as error:
+            if len(failures) < len(dataset):
+                raise
+            told = f"none of {len(failures)} bodies could be described; the first: {failures[0].error}"
+            raise ValueError(f"{path}: {told}") from error
         return cls(path, descriptor), failures
 
     def add(
