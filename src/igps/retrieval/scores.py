@@ -184,6 +184,8 @@ def _ranked_relevance(
     order = rank(distances if isinstance(distances, Tensor) else torch.as_tensor(distances, device="cpu")).cpu()
     n_queries, n_gallery = order.shape
     queries = _label_tuple("query_labels", query_labels, n_queries)
+    if n_queries and set(queries) == {-1}:
+        raise ValueError("query_labels: expected labels, all are −1, as of a dataset whose bodies have no classes")
     if gallery_labels is None:
         if n_queries != n_gallery:
             raise ValueError(
