@@ -80,10 +80,33 @@ def test_pipeline_classifies(paths: list[Path], features: VolumetricFeatures) ->
 def test_other_input_is_refused(features: VolumetricFeatures) -> None:
     with pytest.raises(TypeError, match="X: expected paths of mesh files, or meshes, got int"):
         features.transform([1, 2])
+    with pytest.raises(TypeError, match=r"expected a list of paths .*, got 'a\.off' alone"):
+        features.transform("a.off")
+    with pytest.raises(ValueError, match=r"expected one column of paths or meshes, got an array of shape \(1, 2\)"):
+        features.transform(np.array([["a.off", "b.off"]]))  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="got nothing"):
         features.fit([])
     with pytest.raises(ValueError, match="descriptor: expected one of interior"):
         VolumetricFeatures("unknown").fit(["a.off"])  # type: ignore[arg-type]
+
+
+def test_a_column_of_a_table_is_a_list(paths: list[Path], features: VolumetricFeatures) -> None:
+    """As ColumnTransformer hands it over; its one column was taken for a file."""
+    pandas = pytest.importorskip("pandas")
+    expected = features.transform(paths[:2])
+    table = pandas.DataFrame({"file": list(map(str, paths[:2]))})
+    for given in (table, table["file"], table.to_numpy()):
+        np.testing.assert_array_equal(features.transform(given), expected)
+
+
+def test_a_file_of_several_bodies_is_no_row(tmp_path: Path) -> None:
+    nibabel = pytest.importorskip("nibabel")
+    labels = np.zeros((12, 12, 12), np.uint8)
+    labels[1:6, 1:11, 1:11], labels[7:11, 1:11, 1:11] = 1, 2
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "a.nii.gz")
+    features = VolumetricFeatures("interior", cache_dir=tmp_path, n_workers=1)
+    with pytest.raises(ValueError, match=r"got several, such as .*a\.nii\.gz#1\. Name each as FILE#PART"):
+        features.transform([tmp_path / "a.nii.gz"])
 
 
 def test_a_name_is_a_descriptor_with_its_needs(paths: list[Path], tmp_path: Path) -> None:

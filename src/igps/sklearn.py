@@ -101,6 +101,9 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
             features = torch.cat(parts)
         else:
             dataset = SignatureDataset(shapes, self.config, self.cache_dir, descriptor=chosen, reading=self.reading)
+            if len(dataset) != len(shapes):
+                more = next(name for name in dataset.bodies.names if name not in set(map(str, shapes)))
+                raise ValueError(f"X: expected files of one body, got several, such as {more}. Name each as FILE#PART.")
             dataset.precompute(n_workers=self.n_workers, strict=True, progress=False)
             tag = cache_tag(chosen)
             features = describe(dataset, chosen, cache_tag=tag, n_workers=self.n_workers)
@@ -122,7 +125,14 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
 
 
 def _checked(shapes: Sequence[str | Path | Mesh]) -> list[Any]:
-    found = list(np.asarray(shapes, dtype=object).ravel()) if isinstance(shapes, np.ndarray) else list(shapes)
+    if isinstance(shapes, str | Path):
+        raise TypeError(f"X: expected a list of paths of mesh files, or of meshes, got {str(shapes)!r} alone.")
+    found = list(shapes)
+    if isinstance(shapes, np.ndarray) or hasattr(shapes, "to_numpy"):  # a table would tell its columns
+        table = np.asarray(shapes, dtype=object)
+        if table.shape[1:] not in ((), (1,)):
+            raise ValueError(f"X: expected one column of paths or meshes, got an array of shape {table.shape}.")
+        found = list(table.ravel())
     kinds = {
         Mesh if isinstance(shape, Mesh) else Path if isinstance(shape, str | Path) else type(shape) for shape in found
     }

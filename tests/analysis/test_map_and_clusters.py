@@ -83,6 +83,8 @@ def test_words_and_numbers_that_are_none_are_refused() -> None:
         clusters_of(np.ones((4, 4)), joining="ward")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="1 to 4, got 9"):
         clusters_of(np.ones((4, 4)), 9)
+    with pytest.raises(ValueError, match="n_resamples: expected at least 0, got -1"):
+        clusters_of(np.ones((4, 4)), n_resamples=-1)
 
 
 @pytest.mark.parametrize("joining", ["average", "complete", "single"])

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from igps.analysis.clusters import clusters_of
 from igps.analysis.groups import group_test, vectors_of
 from igps.analysis.map import body_map
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.nn.description import describe
-from igps.report.answers import write_answer
+from igps.report.answers import clusters_figure, map_figure, write_answer
 from igps.retrieval import chi_square
 from igps.signature.signature import SignatureConfig
 from own_descriptors import SMALL, small_interior, write_egg
@@ -183,9 +184,55 @@ def test_what_is_not_known_is_null_in_the_file(tmp_path: Path) -> None:
     assert table(tmp_path / "rows.csv")[0]["body"] == "é"
 
 
-def test_a_colour_that_is_no_column_is_refused(
-    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_names_are_drawn_as_they_are_and_not_as_formulas(tmp_path: Path) -> None:
+    names = ["cost_$a_{$.off", "_under", "$x$"]
+    distances = np.array([[0.0, 1, 3], [1, 0, 2], [3, 2, 0]])
+    figures = {
+        "clusters": clusters_figure(clusters_of(distances, 2), names),
+        "map": map_figure(body_map(distances), names, "$a_{$"),
+    }
+    for name, figure in figures.items():
+        write_answer(tmp_path, name, [{"body": "a"}], figure)
+        assert imread(tmp_path / f"{name}.png").std() > 0.02
+        drawn = (tmp_path / f"{name}.svg").read_text()
+        assert all(f"<!-- {one}" in drawn for one in names)
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (
+            ["figure", "map", "--colour", "weight"],
+            "weight: no such column of labels.csv; further columns: scanner, age",
+        ),
+        (["groups", "--group", "weight"], "weight: no such column of labels.csv; further columns: scanner, age"),
+        (["groups", "--strata", "weight"], "weight: no such column of labels.csv"),
+        (["groups", "--covariate", "age", "scanner"], "scanner: expected numbers, got 'x' of short0.off"),
+    ],
+)
+def test_what_labels_do_not_tell_is_refused_before_anything_is_computed(
+    command: list[str], message: str, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    cache = ["--cache_dir", tmp_path / "cache"]
+    where = next(i for i, word in enumerate(command) if word.startswith("--"))
+    words = ["igps", *command[:where], root, *command[where:], *OWN, *cache, *SMALL]
+    monkeypatch.setattr(sys, "argv", list(map(str, words)))
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, root, "figure", "map", root, *OWN, "--colour", "weight")
-    assert "weight: no such column of labels.csv; further columns: scanner, age" in capsys.readouterr().err
+        main()
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "cache").exists()
+
+
+def test_three_classes_are_refused_before_anything_is_computed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for label in "abc":
+        write_egg(tmp_path / "eggs" / label / "0.off", 1.0, subdivisions=2)
+    monkeypatch.setattr(
+        sys, "argv", ["igps", "explain", str(tmp_path / "eggs"), "--cache_dir", str(tmp_path / "cache")]
+    )
+    with pytest.raises(SystemExit, match="1"):
+        main()
+    assert "expected a folder of two classes, got 3" in capsys.readouterr().err
+    assert not (tmp_path / "cache").exists()

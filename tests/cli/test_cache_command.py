@@ -44,10 +44,42 @@ def test_the_file_stands_for_the_folder(
     if labelled:
         call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache)
         assert json.loads(capsys.readouterr().out) == expected
-        with pytest.raises(SystemExit, match="1"):
-            call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache, "--mend", "never")
-        assert "expected no options of reading beside a file of signatures" in capsys.readouterr().err
+        for option in (["--mend", "never"], ["--attribute", "ct={file}.nii"]):
+            with pytest.raises(SystemExit, match="1"):
+                call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache, *option)
+            assert "expected no options of reading beside a file of signatures" in capsys.readouterr().err
     else:
         with pytest.raises(SystemExit, match="1"):
             call(monkeypatch, "retrieve", out, "--descriptor", INTERIOR, *cache)
         assert "expected signatures with classes" in capsys.readouterr().err
+
+
+def test_lists_of_files_may_be_one_file_of_signatures_and_what_needs_meshes_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for label, height in (("flat", 0.5), ("long", 2.0)):
+        for i in range(2):
+            write_egg(tmp_path / "eggs" / label / f"{i}.off", height * (1 + 0.05 * i), subdivisions=2)
+    cache, out = ["--cache_dir", tmp_path / "cache"], tmp_path / "signatures.igps"
+    rich, model, small = ["--descriptor", "rich"], tmp_path / "mine.safetensors", SMALL[2:]
+    call(monkeypatch, "cache", "export", tmp_path / "eggs", "--out", out, "--descriptors", "rich", *cache, *small)
+    call(monkeypatch, "extract", tmp_path / "eggs", *rich, "--out", tmp_path / "folder.csv", *cache, *small)
+    call(monkeypatch, "fit", out, *rich, "--head", "classifier", "--out", model, *cache)
+    capsys.readouterr()
+    call(monkeypatch, "classify", tmp_path / "eggs", "--model", model, *cache, *small, "--json")
+    expected = json.loads(capsys.readouterr().out)
+    shutil.rmtree(tmp_path / "eggs")
+    call(monkeypatch, "extract", out, *rich, "--out", tmp_path / "file.csv", *cache)
+    assert (tmp_path / "file.csv").read_text() == (tmp_path / "folder.csv").read_text()
+    capsys.readouterr()
+    call(monkeypatch, "classify", out, "--model", model, *cache, "--json")
+    assert json.loads(capsys.readouterr().out) == expected
+    for command, message in (
+        (["outliers", out, *rich, *cache], "holds signatures and no meshes"),
+        (["explain", out, *rich, *cache], "holds signatures and no meshes"),
+        (["duplicates", out, *cache], "holds signatures and no meshes"),
+        (["doctor", out], "a file; a folder expected"),
+    ):
+        with pytest.raises(SystemExit, match="1"):
+            call(monkeypatch, *command)
+        assert message in capsys.readouterr().err

@@ -293,6 +293,8 @@ def test_query_lists_the_nearest(
             f"expected one of {', '.join(NAMES)}, molecular, or .*, got 'best'",
         ),
         (["retrieve", "ROOT"], "n_eigenpairs: this descriptor needs signatures of at least 64, got 20"),
+        (["retrieve", "ROOT", "--signature.max_vertices", "0"], "max_vertices: expected more than .*, got 0"),
+        (["outliers", "ROOT", "--top", "-1"], "top: expected at least 0, got -1"),
         (["query", "ROOT/egg/1.off", "--gallery", "ROOT", "--top", "0"], "top"),
         (["query", "nowhere.off", "--gallery", "ROOT", "--descriptor", "d2"], "no such file|cannot be read"),
         (

@@ -81,6 +81,24 @@ def test_a_wide_table_has_a_row_for_each_file(
             assert wide[f"{part}.{column}"].tolist() == rows[column].tolist()
 
 
+@pytest.mark.parametrize("options", [[], ["--wide"]])
+def test_columns_that_are_called_as_ours_are_kept_beside_them(
+    options: list[str], root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "labels.csv").write_text(
+        f"file,volume,unit,v0,age\n{root / '1.nii.gz'},7,left,x,40\n{root / '2.nii.gz'},8,right,y,50\n"
+    )
+    extract(monkeypatch, tmp_path, tmp_path / "features.csv", *options)
+    table = pd.read_csv(tmp_path / "features.csv")
+    n_rows, ours = (1, "liver.volume") if options else (2, "volume")
+    assert table["volume of labels.csv"].tolist() == [7] * n_rows + [8] * n_rows
+    assert table["unit of labels.csv"].tolist() == ["left"] * n_rows + ["right"] * n_rows
+    assert table["v0 of labels.csv"].tolist() == ["x"] * n_rows + ["y"] * n_rows
+    assert table["age"].tolist() == [40] * n_rows + [50] * n_rows
+    assert (table[ours] > 100).all()
+    assert table["unit"].tolist() == ["mm"] * len(table)
+
+
 def test_a_body_that_a_file_lacks_has_no_values(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("1.nii.gz", "2.nii.gz", "1.csv", "2.csv"):
         (tmp_path / name).write_bytes((root / name).read_bytes())

@@ -112,6 +112,35 @@ def test_axes_of_a_map_in_another_order_are_put_right(body: BodyRef) -> None:
     np.testing.assert_allclose(attribute_source("a.map")(body, INSIDE), linear(INSIDE), atol=1e-4)
 
 
+@pytest.mark.parametrize("told", ["origin", "start", "both"])
+def test_the_place_of_a_map_may_be_said_twice(told: str, body: BodyRef) -> None:
+    """The origin alone counts then, as in Chimera, EMAN and IMP; the sum of both lies twice as far away."""
+    mrcfile = pytest.importorskip("mrcfile")
+    index = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1)
+    start = np.array([-10, -12, -8])
+    with mrcfile.new(body.path.with_name("a.mrc")) as file:
+        file.set_data(np.ascontiguousarray(linear((index + start) * 0.5).astype(np.float32).T))
+        file.voxel_size = 0.5
+        if told != "start":
+            file.header.origin = tuple(0.5 * start)
+        if told != "origin":
+            file.header.nxstart, file.header.nystart, file.header.nzstart = start
+    np.testing.assert_allclose(attribute_source("a.mrc")(body, INSIDE), linear(INSIDE), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("values", "size", "message"),
+    [(np.ones((9, 9, 9), np.float32), 0, "voxels of .*0"), (np.ones((9, 9, 9), np.complex64), 0.5, "complex numbers")],
+)
+def test_a_map_of_no_use_is_refused(values: np.ndarray, size: float, message: str, body: BodyRef) -> None:
+    mrcfile = pytest.importorskip("mrcfile")
+    with mrcfile.new(body.path.with_name("a.mrc")) as file:
+        file.set_data(values)
+        file.voxel_size = size
+    with pytest.raises(MeshError, match=rf"a\.mrc: a map of {message}"):
+        attribute_source("a.mrc")(body, INSIDE)
+
+
 def write_ply(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
     rows = "\n".join(" ".join(map(repr, map(float, row))) for row in np.column_stack([mesh.vertices, values]))
     faces = "\n".join("3 " + " ".join(map(str, face)) for face in mesh.faces)
@@ -271,6 +300,23 @@ def test_patterns_name_the_file_and_lead_out_of_no_folder(tmp_path: Path) -> Non
             file(pattern)
     with pytest.raises(MeshError, match=r"none\.nii does not exist. Check the pattern 'none.nii'"):
         file("none.nii")
+
+
+def test_a_body_that_is_a_link_has_the_attribute_of_its_own_name(tmp_path: Path) -> None:
+    """As git-annex keeps files: all in one store, under other names; and folders that are links."""
+    write_body(tmp_path / "root" / "store" / "KEY.off", 1, 1)
+    for name in ("cat", "dog"):
+        (tmp_path / "root" / name).mkdir()
+        (tmp_path / "root" / name / "1.off").symlink_to("../store/KEY.off")
+        (tmp_path / "root" / "ct" / name).mkdir(parents=True)
+        (tmp_path / "root" / "ct" / name / "1.off.nii").write_text("")
+    (tmp_path / "link").symlink_to(tmp_path / "root")
+    (tmp_path / "root" / "cow").symlink_to(tmp_path / "root" / "dog")
+    (tmp_path / "root" / "ct" / "cow").symlink_to(tmp_path / "root" / "ct" / "dog")
+    for root, path in (("root", "root/cat"), ("link", "root/dog"), ("root", "link/dog"), ("root", "root/cow")):
+        source = ImageAttribute("ct/{file}.nii", tmp_path / root)
+        found = source.file(BodyRef(tmp_path / path / "1.off"))[0]
+        assert found.relative_to(tmp_path / root).as_posix() == f"ct/{path[-3:]}/1.off.nii"
 
 
 @pytest.mark.parametrize(("suffix", "content"), [("dx", b"delta"), ("thickness", b"\xff\xff\xff" + bytes(12))])

@@ -172,6 +172,23 @@ def test_what_is_no_collection_is_refused(written: tuple[SignatureDataset, Path]
         SignatureDataset.from_file(tmp_path / "gone.igps")
 
 
+def test_labels_may_be_numbers_and_each_body_is_there_once(tmp_path: Path) -> None:
+    """What is written can be read: it was not, where labels were numbers, or a file was given twice."""
+    paths = [tmp_path / f"{i}.off" for i in range(3)]
+    for i, path in enumerate(paths):
+        write_body(path, 1.0, 1.5 + 0.1 * i)
+    dataset = SignatureDataset(paths, CONFIG, tmp_path / "cache", labels=np.array([10, 2, 10]))  # type: ignore[arg-type]
+    assert dataset.labels.tolist() == [1, 0, 1]
+    dataset.to_file(tmp_path / "signatures.igps")
+    found = SignatureDataset.from_file(tmp_path / "signatures.igps")
+    assert found.classes == ("2", "10")
+    assert found.labels.tolist() == [1, 0, 1]
+    twice = SignatureDataset([*paths, paths[0]], CONFIG, tmp_path / "cache")
+    with pytest.raises(ValueError, match=r"twice\.igps: .*0\.off is there twice"):
+        twice.to_file(tmp_path / "twice.igps")
+    assert not (tmp_path / "twice.igps").exists()
+
+
 def test_a_failed_export_leaves_what_was_there(tmp_path: Path) -> None:
     write_body(tmp_path / "meshes" / "1.off", 1.1, 1.5)
     (tmp_path / "meshes" / "2.off").write_text("nothing")

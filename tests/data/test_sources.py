@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from igps.data.sources import bodies_of, file_and_part, find_bodies, given_bodies
@@ -74,6 +77,51 @@ def test_a_part_is_told_from_a_folder_with_its_mark(tmp_path: Path) -> None:
     assert file_and_part(folder / "a.obj#liver#2") == (folder / "a.obj", "liver#2")
     assert file_and_part(folder / "b#2.obj#liver") == (folder / "b#2.obj", "liver")
     assert file_and_part(folder / "b#2.obj") == (folder / "b#2.obj", None)
+
+
+def test_what_is_left_out_of_a_folder_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    touch(tmp_path, "cat/1.off", "dog/2.off", "alone.off")
+    (tmp_path / "cat" / "lost.off").symlink_to(tmp_path / "not there.off")  # as of a file that was not fetched
+    (tmp_path / "elsewhere").mkdir()
+    touch(tmp_path / "elsewhere", "5.off")
+    (tmp_path / "linked").symlink_to(tmp_path / "elsewhere")
+    os.mkfifo(tmp_path / "cat" / "pipe.off")
+    Path(os.fsdecode(os.fsencode(tmp_path / "cat") + b"/m\xfcll.off")).write_text("")
+    scan = os.scandir
+
+    def refused(path: str) -> Any:
+        if Path(path).name == "dog":
+            raise PermissionError(13, "Permission denied", path)
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", refused)
+    files = find_bodies(tmp_path)
+    assert files.names == ("cat/1.off", "cat/lost.off", "elsewhere/5.off", "linked/5.off")
+    assert files.labels == ("cat", "cat", "elsewhere", "linked")
+    assert "dog: left out with all that is in it" in caplog.text
+    assert r"m\xfcll.off': left out, its name is not UTF-8" in caplog.text
+    assert "1 files beside the folders of classes are left out, such as alone.off" in caplog.text
+    assert len(caplog.records) == 3
+
+
+def test_names_that_are_no_words_are_refused(tmp_path: Path) -> None:
+    name = Path(os.fsdecode(os.fsencode(tmp_path) + b"/m\xfcll"))
+    touch(name, "1.off")
+    with pytest.raises(ValueError, match=r"m\\xfcll': a name in UTF-8 expected"):
+        find_bodies(name)
+    with pytest.raises(ValueError, match=r"paths: expected names in UTF-8, got b'.*m\\xfcll/1.off'"):
+        given_bodies([name / "1.off"])
+
+
+def test_labels_may_be_an_array_and_are_of_files_alone(tmp_path: Path) -> None:
+    touch(tmp_path, "cat/1.off", "dog/2.off")
+    paths = [tmp_path / "cat" / "1.off", tmp_path / "dog" / "2.off"]
+    assert bodies_of(paths, np.array(["x", "y"])).labels == ("x", "y")  # type: ignore[arg-type]
+    for given in (tmp_path, find_bodies(tmp_path)):
+        with pytest.raises(ValueError, match="labels: expected None beside a folder or bodies"):
+            bodies_of(given, ["x", "y"])
 
 
 def test_nothing_there(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -146,6 +147,9 @@ def test_what_cannot_be_described_is_told(root: Path, tmp_path: Path) -> None:
     assert [failure.id for failure in failures] == ["egg/1.off"]
     assert "too much" in failures[0].error
     assert len(gallery) == 5
+    alone = dataset[["egg/1.off"]]
+    with pytest.raises(ValueError, match=r"none of 1 bodies could be described; the first: .*1\.off: .*too much"):
+        Gallery.build(tmp_path / "none.igps", alone, "own_descriptors:picky", n_workers=1)
 
 
 def test_a_checksum_tells_descriptors_apart() -> None:
@@ -283,6 +287,31 @@ def test_sync_finds_what_is_new_changed_and_gone(root: Path, tmp_path: Path, mon
     assert {one.label for one in built.nearest(described)[0]} == {"round"}
 
 
+def test_sync_keeps_what_lies_in_a_folder_that_may_not_be_read(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = tmp_path / "cache"
+    dataset = SignatureDataset(root, CONFIG, cache)
+    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    scan, access = os.scandir, os.access
+
+    def refused(path: str) -> Any:
+        if Path(path).name == "egg":
+            raise PermissionError(13, "Permission denied", str(path))
+        return scan(path)
+
+    (root / "ball" / "0.off").unlink()
+    with monkeypatch.context() as context:  # whoever runs tests may read everything
+        context.setattr(os, "scandir", refused)
+        context.setattr(os, "access", lambda path, how: Path(path).name != "egg" and access(path, how))
+        seen = SignatureDataset(root, CONFIG, cache)
+    assert len(seen) == len(dataset) - 4
+    with monkeypatch.context() as context:
+        context.setattr(os, "access", lambda path, how: Path(path).name != "egg" and access(path, how))
+        assert sync(gallery, seen, root, n_workers=1) == (0, 1, [])
+    assert {row["name"] for row in gallery.rows("name")} == {*dataset.bodies.names} - {"ball/0.off"}
+
+
 def test_it_opens_where_it_was_moved_to(dataset: SignatureDataset, tmp_path: Path) -> None:
     gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     described = describe(dataset, small_interior())
@@ -325,6 +354,9 @@ def test_commands_that_change_a_gallery(
     assert "values: expected numbers" in wrong
     wrong = error_of(monkeypatch, capsys, "gallery", "update", gallery, "--where", "area > 0", "--to", "colour=red")
     assert "colour: expected one of the columns name, class" in wrong
+    for column in ("name", "file"):
+        wrong = error_of(monkeypatch, capsys, "gallery", "update", gallery, "--where", "area > 0", "--to", f"{column}=")
+        assert f"{column}: expected a value, got none" in wrong
 
 
 def test_sync_notices_a_table_of_names_that_was_edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

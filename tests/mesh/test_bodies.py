@@ -148,6 +148,9 @@ def test_several_bodies_and_unknown_parts_are_told_with_the_names_there_are(tmp_
         load_mesh(path, OBJECTS)
     with pytest.raises(MeshError, match=r"has no body 'lid'; there are: 'part', 'part \(2\)'"):
         load_mesh(path, OBJECTS, part="lid")
+    trimesh.creation.box().export(tmp_path / "box.off")
+    with pytest.raises(MeshError, match=r"box\.off: is one body, and has none called 'lid'\. Leave that name out\."):
+        load_mesh(tmp_path / "box.off", part="lid")
     with pytest.raises(ValueError, match="bodies: expected one of whole, labels"):
         LoadOptions(bodies="organs")  # type: ignore[arg-type]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import nibabel
@@ -94,6 +95,11 @@ def test_more_notes_and_a_unit_leave_the_surface_as_it_is(blob: Mesh) -> None:
     assert (told.unit, told.annotated().unit, blob.unit) == ("mm", "mm", None)
     assert told.vertices is blob.vertices
     assert told.area == blob.area
+
+
+def test_a_trimesh_that_was_read_is_called_by_its_file(tmp_path: Path) -> None:
+    trimesh.creation.box((1, 2, 3)).export(tmp_path / "box.off")
+    assert Mesh.of(trimesh.load(tmp_path / "box.off")).name == "box.off"
 
 
 def test_a_trimesh_becomes_a_mesh_and_a_mesh_stays_itself() -> None:

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from igps.data.attribute_sources import _molecule
 from igps.mesh.formats.molecules import is_structure, read_molecule
+from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import MeshError
 from igps.mesh.molecular_surface import molecular_surface
 from igps.mesh.residues import VOLUMES
@@ -89,6 +91,25 @@ def test_pdb_and_mmcif_and_their_gzipped_files_are_one_molecule(tmp_path: Path) 
         np.testing.assert_array_equal(other.radii, one.radii)
         np.testing.assert_array_equal(other.charges, one.charges)
         assert other.residue_names == one.residue_names
+
+
+def test_each_block_of_mmcif_with_atoms_gives_its_bodies(tmp_path: Path) -> None:
+    """As PyMOL writes several objects into one file; the first alone was read. Blocks of ligands have no atoms."""
+    import gemmi
+
+    blocks = []
+    for name, n_residues in (("one", 1), ("chainless", 2)):
+        structure = gemmi.read_pdb_string("".join(residue(i) for i in range(1, n_residues + 1)) + "END\n")
+        structure.name = name
+        structure.setup_entities()
+        blocks.append(structure.make_mmcif_document().as_string())
+    path = written(tmp_path, "data_comp_LIG\n_chem_comp.id LIG\n" + "".join(blocks), "made.cif")
+    found = read_molecule(path)
+    assert [one.name for one in found] == [f"{path}#one chain A", f"{path}#chainless chain A"]
+    assert [len(one.radii) for one in found] == [5, 10]
+    assert [one.name for one in read_molecule(path, "models")] == [f"{path}#one", f"{path}#chainless"]
+    for part, n_residues in (("chainless chain A", 2), ("chainless", 2), ("one", 1)):
+        assert len(_molecule(BodyRef(path, part)).residue_names) == n_residues
 
 
 def test_a_pqr_file_has_its_own_charges_and_radii(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -51,6 +52,19 @@ def test_a_folder_to_share_has_the_model_and_its_card(tmp_path: Path, monkeypatc
     Path("empty").mkdir()
     with pytest.raises(FileNotFoundError, match=r"empty/model\.safetensors: no such file"):
         igps.load("empty")
+
+
+def test_the_umask_says_who_may_read_a_model_and_the_system_why_none_is_written(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        igps.descriptor("interior").save(tmp_path / "mine.safetensors")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "mine.safetensors").stat().st_mode & 0o777 == 0o640
+    (tmp_path / "folder.safetensors").mkdir()
+    with pytest.raises(OSError, match=r"folder\.safetensors"):
+        igps.descriptor("interior").save(tmp_path / "folder.safetensors")
+    assert sorted(os.listdir(tmp_path)) == ["folder.safetensors", "mine.safetensors"]
 
 
 @pytest.mark.parametrize("name", [*NAMES, "molecular"])

@@ -226,6 +226,7 @@ def test_inputs_are_left_as_they_were(distance: Distance) -> None:
     [
         (torch.ones(2, 3), torch.ones(2, 4), "gallery: expected descriptors of the shape"),
         (torch.ones(3), torch.ones(2, 3), "queries: expected shape"),
+        (torch.ones(2, 3), np.ones((2, 3)), "gallery: expected a tensor, got ndarray"),
         (torch.ones(2, 3), torch.ones(2, 0), "gallery: expected shape"),
         (torch.ones(2, 3, dtype=torch.int64), torch.ones(2, 3), "queries: expected a real floating dtype"),
         (torch.ones(2, 3), torch.tensor([[1.0, float("nan"), 1.0]]), "gallery: expected finite entries"),

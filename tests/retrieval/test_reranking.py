@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -206,6 +207,7 @@ def test_few_shapes_and_equal_ones() -> None:
 @pytest.mark.parametrize(
     ("distances", "numbers", "message"),
     [
+        (np.zeros((3, 3)), {}, "distances: expected a tensor, got ndarray"),
         (torch.zeros(2, 3), {}, r"expected those of a collection to itself, \(N, N\), got \(2, 3\)"),
         (-torch.ones(2, 2), {}, "finite numbers ≥ 0"),
         (torch.full((2, 2), math.nan), {}, "finite numbers ≥ 0"),

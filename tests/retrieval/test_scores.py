@@ -94,6 +94,13 @@ def test_hand_worked_leave_one_out_ranking() -> None:
         assert getattr(scores, name)[0].item() == pytest.approx(value, abs=1e-12), name
 
 
+def test_distances_may_be_an_array_as_a_file_gives_them() -> None:
+    labels, distances = ["a", "a", "a", "a", "b", "b", "b"], line_distances([1, 4, 2, 5, 6, 3], 7)
+    assert retrieval_scores(distances.numpy(), labels).mean() == retrieval_scores(distances, labels).mean()
+    curves = [precision_recall_curve(given, labels).precision for given in (distances.numpy(), distances)]
+    assert torch.equal(*curves)
+
+
 def test_another_default_device_changes_no_score() -> None:
     labels, distances = ["a", "a", "a", "a", "b", "b", "b"], line_distances([1, 4, 2, 5, 6, 3], 7)
     expected, curve = retrieval_scores(distances, labels), precision_recall_curve(distances, labels)
@@ -236,6 +243,7 @@ def test_per_class_means_are_those_of_the_members() -> None:
         (torch.ones(2, 2), torch.zeros(2, 1, dtype=torch.int64), None, "query_labels: expected shape"),
         (torch.ones(2, 2), torch.zeros(2), None, "query_labels: expected an integer tensor"),
         (torch.ones(2, 2), [torch.tensor(0), torch.tensor(0)], None, "query_labels: expected an integer tensor"),
+        (torch.ones(2, 2), torch.tensor([-1, -1]), None, "query_labels: .* all are −1, as of a dataset whose bodies"),
         (torch.ones(2, 2), "aa", None, "query_labels: expected an integer tensor"),
         (torch.ones(2, 2), ["a", "b"], None, "nothing to score"),
         (torch.ones(1, 2), ["1"], [1, 1], "nothing to score"),

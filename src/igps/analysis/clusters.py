@@ -6,6 +6,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from igps._parameters import check_at_least
 from igps.analysis.map import Values, checked_distances
 
 Joining = Literal["average", "complete", "single"]
@@ -51,6 +52,7 @@ def clusters_of(
 
     if joining not in get_args(Joining):
         raise ValueError(f"joining: expected one of {', '.join(get_args(Joining))}, got {joining!r}.")
+    check_at_least(0, n_resamples=n_resamples)
     found, n = checked_distances(distances), len(distances)
     tree = _tree(found, joining)
     if n_clusters is None:

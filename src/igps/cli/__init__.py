@@ -79,16 +79,16 @@ def main(commands: Commands | None = None, program: str = "igps") -> None:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     commands = COMMANDS if commands is None else commands
     parser = command_parser(commands, program)
-    parsed = parser.instantiate(parser.parse_args())
-    command, options = _chosen(parsed, commands)
-    as_json = options.pop(JSON, False)
-    if parsed.subcommand == "figure" and options.get("out", ...) is None:
-        options["out"] = Path("figures")
-    if taken_in := "".join(f"+{word}" for word in options.pop("with", None) or ()):
-        name = "descriptors" if "descriptors" in options else "descriptor"
-        given = options[name] or "pretrained"
-        options[name] = given + taken_in if isinstance(given, str) else [one + taken_in for one in given]
     try:
+        parsed = parser.instantiate(parser.parse_args())
+        command, options = _chosen(parsed, commands)
+        as_json = options.pop(JSON, False)
+        if parsed.subcommand == "figure" and options.get("out", ...) is None:
+            options["out"] = Path("figures")
+        if taken_in := "".join(f"+{word}" for word in options.pop("with", None) or ()):
+            name = "descriptors" if "descriptors" in options else "descriptor"
+            given = options[name] or "pretrained"
+            options[name] = given + taken_in if isinstance(given, str) else [one + taken_in for one in given]
         # With --json, what a reader is told goes where progress goes
         with one_thread(), contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
             found = command(**options)

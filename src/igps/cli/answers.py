@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from igps._parameters import check_at_least
 from igps.analysis.explanation import KINDS, Explanation, explain_groups, on_surface
 from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, vectors_of, with_discovery_rates
 from igps.analysis.outliers import measures_of
 from igps.analysis.outliers import outliers as find_outliers
-from igps.cli.reading import Folder, described, print_failures
+from igps.cli.reading import Folder, described, files_or_folder, print_failures
 from igps.data.dataset import SignatureDataset
+from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import EmbeddedDescriptor
@@ -48,14 +50,19 @@ def groups(
         n_permutations: random ones.
         seed: of what is random.
     """
-    found = described(Folder(root, labelled=group is None), descriptor, size="ignore", **reading)
+
+    def columns(bodies: Bodies) -> tuple[Any, Any, Any]:
+        labels = np.array(bodies.labels if group is None else bodies.column(group))
+        of_strata = None if strata is None else np.array(bodies.column(strata))
+        return labels, of_strata, np.array([bodies.numbers(name) for name in covariate]).T if covariate else None
+
+    folder = Folder(root, labelled=group is None, check=columns)
+    found = described(folder, descriptor, size="ignore", **reading)
     bodies = found.dataset.bodies
+    labels, of_strata, of_covariates = columns(bodies)
     vectors = {"": vectors_of(found.descriptor, found.descriptions)}
     if size:
         vectors[", size"] = np.log([[one.volume] for one in found.dataset.signatures()])
-    labels = np.array(bodies.labels if group is None else bodies.column(group))
-    of_strata = None if strata is None else np.array(bodies.column(strata))
-    of_covariates = np.array([bodies.numbers(name) for name in covariate]).T if covariate else None
     members: dict[str, list[int]] = {}
     for i, part in enumerate(bodies.parts):
         members.setdefault(part or "all", []).append(i)
@@ -94,7 +101,8 @@ def outliers(
         top: how many to list.
         out: folder for outliers.csv and outliers.json with all, and pictures of the first as outliers.svg and .png.
     """
-    bodies = described(Folder(root, labelled=True), descriptor, **reading)
+    check_at_least(0, top=top)
+    bodies = described(Folder(root, labelled=True, needs_meshes=True), descriptor, **reading)
     dataset = bodies.dataset
     distances = squared_distances(vectors_of(bodies.descriptor, bodies.descriptions)) ** 0.5
     measures = measures_of(dataset, n_workers=reading.get("n_workers"))
@@ -104,7 +112,7 @@ def outliers(
          **{f"score_{name}": round(value, 3) for name, value in one.scores.items()}}
         for one in found
     ]  # fmt: skip
-    width = max(len(row["body"]) for row in rows[:top])
+    width = max((len(row["body"]) for row in rows[:top]), default=4)
     print(f"{'score':>7}  {'body':<{width}}  class: why")
     for row in rows[:top]:
         print(f"{row['score']:>7.1f}  {row['body']:<{width}}  {row['class']}: {row['reason']}")
@@ -131,13 +139,14 @@ def explain(
             bodies painted from two sides as explain.svg and explain.png.
     """
     module = descriptor_of(descriptor)
-    if len(meshes) == 1 and meshes[0].is_dir():
+    source = files_or_folder(meshes)
+    if isinstance(source, Folder):
         inner = module.descriptor if isinstance(module, EmbeddedDescriptor) else module
-        bodies = described(Folder(meshes[0], labelled=True), inner, **reading)
+        folder = Folder(source.root, labelled=True, needs_meshes=True, check=_check_two_classes)
+        bodies = described(folder, inner, **reading)
+        _check_two_classes(bodies.dataset.bodies)  # those that are left
         dataset, descriptions, labels = bodies.dataset, bodies.descriptions, np.array(bodies.dataset.bodies.labels)
         classes = sorted(set(labels))
-        if len(classes) != 2:
-            raise ValueError(f"meshes: expected a folder of two classes, got {len(classes)}.")
         members = [np.flatnonzero(labels == name) for name in classes]
         squares = squared_distances(descriptions.flatten(1).double().sqrt().numpy())
         chosen = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]  # the medoids
@@ -160,6 +169,11 @@ def explain(
         write_answer(out, "explain", parts, explanation_figure(painted))
         print(f"written to {out}")
     return {"bodies": names, "distance": found.distance, "shares": parts}
+
+
+def _check_two_classes(bodies: Bodies) -> None:
+    if (n := len(set(bodies.labels or ()))) != 2:
+        raise ValueError(f"meshes: expected a folder of two classes, got {n}.")
 
 
 def _painted(dataset: SignatureDataset, i: int, found: Explanation, place: int) -> tuple[Mesh, Any]:

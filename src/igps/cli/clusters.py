@@ -12,7 +12,7 @@ from igps.analysis.comparison import pair_distances
 from igps.analysis.map import Layout, body_map
 from igps.cli.reading import Folder, described, print_failures
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import LABELS_FILE
+from igps.data.sources import LABELS_FILE, Bodies
 from igps.report.answers import clusters_figure, map_figure, write_answer
 
 
@@ -40,7 +40,7 @@ def clusters(
         seed: of these.
         out: folder for clusters.csv and clusters.json, and the tree as clusters.svg and clusters.png.
     """
-    dataset, distances, label_of = _compared(root, descriptor, **reading)
+    dataset, distances, label_of = _compared(Folder(root), descriptor, **reading)
     found = clusters_of(distances, n_clusters, joining=joining, n_resamples=n_resamples, seed=seed)
     names, told = dataset.bodies.names, list[dict[str, Any]]()
     print(f"{'cluster':>7}{'bodies':>8}{'stability':>11}  in the middle")
@@ -82,7 +82,17 @@ def map_bodies(
         seed: of umap, and of clusters.
         out: folder for map.csv, map.json, map.svg and map.png.
     """
-    dataset, distances, label_of = _compared(root, descriptor, **reading)
+
+    def told_of(bodies: Bodies) -> list[str] | list[float]:
+        """What labels.csv says; nothing where the colour is something else."""
+        if colour in ("class", "cluster", "volume"):
+            return []
+        try:
+            return bodies.numbers(colour)
+        except ValueError:  # words
+            return list(bodies.column(colour))
+
+    dataset, distances, label_of = _compared(Folder(root, check=told_of), descriptor, **reading)
     found, bodies = body_map(distances, layout, seed=seed), dataset.bodies
     values: list[str] | list[float]
     if colour == "class":
@@ -92,10 +102,7 @@ def map_bodies(
     elif colour == "volume":
         values = [one.volume for one in dataset.signatures()]
     else:
-        try:
-            values = bodies.numbers(colour)
-        except ValueError:  # words
-            values = list(bodies.column(colour))
+        values = told_of(bodies)
     column = colour if colour not in ("body", "x", "y") else f"{colour} of {LABELS_FILE}"
     rows = [
         {"body": name, "x": x, "y": y, "class": label, column: value}
@@ -108,9 +115,11 @@ def map_bodies(
     return rows
 
 
-def _compared(root: Path, descriptor: str, **reading: Any) -> tuple[SignatureDataset, NDArray[np.float64], list[str]]:
+def _compared(
+    folder: Folder, descriptor: str, **reading: Any
+) -> tuple[SignatureDataset, NDArray[np.float64], list[str]]:
     """The bodies, their distances, and the class of each, "" where that is not known."""
-    found = described(Folder(root), descriptor, **reading)
+    found = described(folder, descriptor, **reading)
     print_failures(found.failures, len(found.dataset))
     distances = pair_distances(found.descriptor, found.descriptions, progress=True).double().numpy()
     return found.dataset, distances, list(found.dataset.bodies.labels or [""] * len(found.dataset))

@@ -44,7 +44,7 @@ def duplicates(
         source = Gallery(root)
         as_described(source, reading)
     else:
-        source, unread = signatures(Folder(root), [descriptor_of(DESCRIPTOR)], **reading)
+        source, unread = signatures(Folder(root, needs_meshes=True), [descriptor_of(DESCRIPTOR)], **reading)
     kept = {name: reading.get(name) for name in ("cache_dir", "n_workers")}
     found = find_duplicates(source, DESCRIPTOR, poses=poses, size=size, tolerance=tolerance, progress=True, **kept)
     _print_groups(found, poses)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from igps.data.dataset import SignatureDataset
+from igps.data.sources import LABELS_FILE
 
 SUFFIXES = (".csv", ".parquet")
 Table = Mapping[str, Sequence[Any]]
@@ -23,16 +24,18 @@ def feature_table(dataset: SignatureDataset, features: np.ndarray) -> tuple[Tabl
 
     Returns:
         `file`, `part`, `name`, `label`, further columns of the table of labels, and the `unit` of length; and `volume`,
-        `area`, and the description as `v0`, `v1` and so on.
+        `area`, and the description as `v0`, `v1` and so on. A further column of one of these names is
+        `NAME of labels.csv`.
     """
     bodies = dataset.bodies
     units, volumes, areas = zip(*((one.unit, one.volume, one.area) for one in dataset.signatures()), strict=True)
     files = [name.removesuffix(f"#{part}") for name, part in zip(bodies.names, bodies.parts, strict=True)]
     own = {"file": files, "part": bodies.parts, "name": bodies.names, "label": bodies.labels or [None] * len(bodies)}
     vectors = features.reshape(len(features), -1)
-    known = {**bodies.columns, **own, "unit": units}
-    known = {name: known[name] for name in dict.fromkeys([*own, *bodies.columns, "unit"])}
-    return known, {"volume": volumes, "area": areas, **{f"v{i}": list(column) for i, column in enumerate(vectors.T)}}
+    measured = {"volume": volumes, "area": areas, **{f"v{i}": list(column) for i, column in enumerate(vectors.T)}}
+    taken = {*own, "unit", *measured}
+    further = {f"{name} of {LABELS_FILE}" * (name in taken) or name: bodies.columns[name] for name in bodies.columns}
+    return {**own, **further, "unit": units}, measured
 
 
 def wide_table(known: Table, measured: Table) -> Table:

@@ -62,9 +62,11 @@ def precompute(
 
 
 def cache_export(root: Path, out: Path, descriptors: list[str] | None = None, **reading: Any) -> None:
-    """Write the signatures of a folder to one file, which every command takes in place of the folder.
+    """Write the signatures of a folder to one file, which commands take in place of the folder.
 
-    The file is read by memory map, runs no code, and holds no path: meshes that cannot be used are left out.
+    The file is read by memory map, runs no code, and holds no path: meshes that cannot be used are left out. Commands
+    that need the meshes themselves do not take it: doctor, duplicates,
+    explain and outliers.
 
     Args:
         out: the file, such as signatures.igps.

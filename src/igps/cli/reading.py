@@ -2,7 +2,7 @@
 
 import csv
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import or_
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from igps._parallel import Limits
 from igps.data.attribute_sources import attribute_sources
+from igps.data.collection import is_collection
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, ClassRule, find_bodies
@@ -60,6 +61,8 @@ class Folder:
 
     root: Path
     labelled: bool = False  # whether it must tell classes
+    needs_meshes: bool = False  # whether signatures alone do not do
+    check: Callable[[Bodies], object] | None = None  # raises what is wrong with its bodies before any is computed
 
 
 @dataclass(frozen=True)
@@ -134,8 +137,9 @@ def described(
 
 
 def files_or_folder(meshes: Sequence[Path]) -> Folder | Sequence[Path]:
-    """What a list of words names: files, or one folder."""
-    return Folder(meshes[0]) if len(meshes) == 1 and meshes[0].is_dir() else meshes
+    """What a list of words names: files, or one folder or file of signatures."""
+    is_one = len(meshes) == 1 and (meshes[0].is_dir() or is_collection(meshes[0]))
+    return Folder(meshes[0]) if is_one else meshes
 
 
 def limits_of(seconds: float | None, gigabytes: float | None) -> Limits:
@@ -193,16 +197,23 @@ def chosen_dataset(
         raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
     config, reading = SignatureConfig.paper() if paper else signature, LoadOptions(**options)
     if isinstance(source, Folder) and source.root.is_file():
-        if config != SignatureConfig() or reading != LoadOptions() or classes is not None:
+        if config != SignatureConfig() or reading != LoadOptions() or classes is not None or attribute:
             raise ValueError(f"{source.root}: expected no options of reading beside a file of signatures.")
+        if source.needs_meshes:
+            raise ValueError(f"{source.root}: holds signatures and no meshes, which are needed. Give their folder.")
         dataset = SignatureDataset.from_file(source.root, descriptor=needs, cache_dir=cache_dir)
         if source.labelled and dataset.bodies.labels is None:
             raise ValueError(f"{source.root}: expected signatures with classes. Export those of a labelled folder.")
+        if source.check is not None:
+            source.check(dataset.bodies)
         return dataset
     attributes = attribute_sources(attribute or (), source.root if isinstance(source, Folder) else None)
     if isinstance(source, Folder):
         how: dict[str, Any] = {"classes": classes or "folder", "attributes": attributes.values()}
-        source = find_bodies(source.root, reading, labelled=source.labelled, **how)
+        bodies = find_bodies(source.root, reading, labelled=source.labelled, **how)
+        if source.check is not None:
+            source.check(bodies)
+        source = bodies
     return SignatureDataset(
         source, config, cache_dir, descriptor=needs, classes=classes, reading=reading, attributes=attributes
     )

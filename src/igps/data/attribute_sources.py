@@ -70,7 +70,8 @@ class ResidueAttribute:
 def _molecule(body: BodyRef) -> Molecule:
     """That whose surface the body is."""
     part, changed = body.part or "", os.stat(body.path).st_mtime_ns
-    how: MoleculeBodies = "chains" if "chain" in part else "assembly" if "assembly" in part else "models"
+    words = part.split()  # before them may stand the name of one of several structures
+    how: MoleculeBodies = "chains" if "chain" in words else "assembly" if "assembly" in words else "models"
     found = molecules_by_part(body.path, changed, how)
     if part in found:
         return found[part]
@@ -100,7 +101,7 @@ class FileAttribute(ABC):
         """The kind of source, the array's name, and the content of the file; a MeshError where there is none."""
         file, name = self.file(body)
         files = files_read(file)
-        return f"{type(self).__name__} 1 {name} {_checksum(*files, stamp=stamp_of(*files))}"
+        return f"{type(self).__name__} 2 {name} {_checksum(*files, stamp=stamp_of(*files))}"
 
     def __call__(self, body: BodyRef, points: Values) -> Values:
         """(P,) or (P, C) at points (P, 3); a MeshError where the file is of no use, or knows too few of them."""
@@ -135,10 +136,11 @@ class FileAttribute(ABC):
         """The file of a body, and the name of the array in it, which may be ""; a MeshError where there is none."""
         pattern, _, name = self.path.partition("#")
         root = body.path.parent if self.root is None else self.root
-        try:
-            below = body.path.resolve().relative_to(root.resolve()).as_posix()
-        except ValueError:
-            below = body.path.name
+        # As the path says; where folders are called otherwise there, as they are. A file may be a link to anywhere
+        ways = ((Path(os.path.abspath(body.path)), Path(os.path.abspath(root))),
+                (body.path.parent.resolve() / body.path.name, root.resolve()))  # fmt: skip
+        below = next((one.relative_to(base).as_posix() for one, base in ways if one.is_relative_to(base)), None)
+        below = below or body.path.name
         if Path(pattern).is_absolute():
             root = Path(pattern.partition("{")[0]).parent if "{" in pattern else Path(pattern).parent
         words = {"{stem}": body.path.name.partition(".")[0], "{file}": below, "{part}": body.part or ""}

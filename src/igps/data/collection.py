@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
@@ -35,8 +36,9 @@ class About:
     def written(self) -> str:
         """All of it as JSON; of the paths, what their names tell."""
         bodies = {name: value for name, value in vars(self.bodies).items() if name != "paths"}
-        parameters = {"reading": asdict(self.reading), "config": asdict(self.config)}
-        return json.dumps({**bodies, "classes": self.classes, "keys": self.keys, **parameters})
+        labels = None if self.bodies.labels is None else list(map(str, self.bodies.labels))  # numbers may be given
+        words = {"labels": labels, "classes": list(map(str, self.classes)), "keys": self.keys}
+        return json.dumps({**bodies, **words, "reading": asdict(self.reading), "config": asdict(self.config)})
 
     @staticmethod
     def read(text: str) -> About:
@@ -66,6 +68,9 @@ def write_collection(path: Path, about: About, signature: Callable[[int], Signat
     A file that is there is replaced. Each Signature is asked for by its number, several times, and not kept.
     """
     n = len(about.bodies)
+    if len(set(about.bodies.names)) < n:
+        twice = next(name for name, count in Counter(about.bodies.names).items() if count > 1)
+        raise ValueError(f"{path}: {twice} is there twice; names that differ expected. Give each body once.")
     arrays: list[dict[str, tuple[str, tuple[int, ...], int]]] = []
     told = []
     for i in range(n):
@@ -91,6 +96,14 @@ def write_collection(path: Path, about: About, signature: Callable[[int], Signat
             tensors, _ = encode(signature(i))
             for _, name in group:
                 file.write(tensors[name].data)
+
+
+def is_collection(path: Path) -> bool:
+    """Whether a file is one that `write_collection` wrote, by its beginning."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return _FORMAT.encode() in file.read(100)
 
 
 class CollectionFile:

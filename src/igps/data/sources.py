@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import logging
 import math
+import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,6 +17,8 @@ from igps.mesh.formats import is_searched, searched_suffixes
 from igps.mesh.loading import BodyRef, list_bodies
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
+
+logger = logging.getLogger(__name__)
 
 LABELS_FILE = "labels.csv"
 
@@ -134,8 +138,10 @@ def find_bodies(
         ValueError: `labels.csv` cannot be understood, or no classes are told where they must be.
     """
     root, options = Path(root), options or LoadOptions()
+    if not _is_told(root):
+        raise ValueError(f"{os.fsencode(root)!r}: a name in UTF-8 expected. Rename the folder.")
     if not root.is_dir():
-        raise FileNotFoundError(f"{root}: no such folder.")
+        raise FileNotFoundError(f"{root}: {'a file; a folder expected' if root.exists() else 'no such folder'}.")
     table = (root / LABELS_FILE).is_file()
     bodies = (_from_labels_file(root, options) if table else _from_folder(root, options, attributes)).classed(classes)
     if labelled and bodies.labels is None:
@@ -144,12 +150,16 @@ def find_bodies(
 
 
 def _from_folder(root: Path, options: LoadOptions, attributes: Iterable[AttributeSource]) -> Bodies:
-    files = _files_in(root)
+    linked = [path for path in root.iterdir() if path.is_symlink() and path.is_dir() and not path.name.startswith(".")]
+    files = sorted(path for folder in (root, *linked) for path in _files_in(folder))
     beside = {file for one in attributes if isinstance(one, FromFiles) for file in one.files(files)}
-    folders = sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
-    rows: list[tuple[Path, str | None]]
-    rows = [(path, folder.name) for folder in folders for path in _files_in(folder) if path not in beside]
-    rows = rows or [(path, None) for path in files if path not in beside]
+    alone = [path for path in files if path.parent == root and path not in beside]
+    nested = [path for path in files if path.parent != root and path not in beside]
+    if alone and nested:
+        told = f"{len(alone)} files beside the folders of classes are left out, such as {alone[0].name}"
+        logger.warning("%s: %s. Put them into a folder, or list all in a %s.", root, told, LABELS_FILE)
+    rows: list[tuple[Path, str | None]] = [(path, path.relative_to(root).parts[0]) for path in nested]
+    rows = rows or [(path, None) for path in alone]
     if not rows:
         raise FileNotFoundError(
             f"{root}: no mesh found. Expected a folder per class, or mesh files with a {LABELS_FILE} (file,label), "
@@ -168,9 +178,11 @@ def given_bodies(
     files = [file_and_part(Path(path)) for path in paths]
     if not files:
         raise ValueError("paths: expected at least one mesh file, got none.")
+    if unknown := [file for file, _ in files if not _is_told(file)]:
+        raise ValueError(f"paths: expected names in UTF-8, got {os.fsencode(unknown[0])!r}. Rename the file.")
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
-    classes: Sequence[str | None] = labels or [None] * len(files)
+    classes: Sequence[str | None] = [None] * len(files) if labels is None else list(labels)
     rows = [(file, str(file), label, part) for (file, part), label in zip(files, classes, strict=True)]
     return _expanded(rows, options or LoadOptions())
 
@@ -182,6 +194,8 @@ def bodies_of(
     attributes: Iterable[AttributeSource] = (),
 ) -> Bodies:
     """`find_bodies` of a folder, `given_bodies` of files, and bodies as they are; a FileNotFoundError of neither."""
+    if labels is not None and (isinstance(given, Bodies) or (isinstance(given, str | Path) and Path(given).is_dir())):
+        raise ValueError(f"labels: expected None beside a folder or bodies, which tell theirs, got {len(labels)}.")
     if isinstance(given, Bodies):
         return given
     if isinstance(given, str | Path) and not file_and_part(Path(given))[0].exists():
@@ -263,5 +277,24 @@ def _expanded(
 
 
 def _files_in(folder: Path) -> list[Path]:
-    found = (path for path in folder.rglob("*") if is_searched(path) and path.is_file())
-    return sorted(path for path in found if not any(name.startswith(".") for name in path.relative_to(folder).parts))
+    """Files that may be bodies, but for hidden ones; of links those too that lead nowhere, which reading them says."""
+
+    def untold(error: OSError) -> None:
+        logger.warning(
+            "%s: left out with all that is in it (%s). Ask for the right to read it.", error.filename, error.strerror
+        )
+
+    found = []
+    for place, folders, names in os.walk(folder, onerror=untold):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for path in (Path(place, name) for name in names if not name.startswith(".") and is_searched(name)):
+            if not _is_told(path):
+                logger.warning("%s: left out, its name is not UTF-8. Rename it.", os.fsencode(path))
+            elif os.path.isfile(path) or not os.path.exists(path):  # of a pipe reading might wait for ever
+                found.append(path)
+    return found
+
+
+def _is_told(path: Path) -> bool:
+    """Whether the name of a file can be printed and written: those of other systems may be bytes without meaning."""
+    return not any("\udc80" <= letter <= "\udcff" for letter in os.path.abspath(path))

@@ -177,7 +177,13 @@ class Gallery:
         mixed = dataset.subset(np.random.default_rng(0).permutation(len(dataset)).tolist())
         batches = described_rows(mixed, chosen, {}, failures, n_workers, strict, progress)
         about = about_of(dataset.config, dataset.reading, descriptor)
-        tables().write(Path(path), about, chosen.searched_by, batches, further_columns(dataset.bodies))
+        try:
+            tables().write(Path(path), about, chosen.searched_by, batches, further_columns(dataset.bodies))
+        except ValueError as error:
+            if len(failures) < len(dataset):
+                raise
+            told = f"none of {len(failures)} bodies could be described; the first: {failures[0].error}"
+            raise ValueError(f"{path}: {told}") from error
         return cls(path, descriptor), failures
 
     def add(
@@ -247,6 +253,8 @@ class Gallery:
         kinds = {name: kind for name, kind in self.columns.items() if name not in ours}
         if wrong := values.keys() - kinds.keys():
             raise ValueError(f"{min(wrong)}: expected one of the columns {', '.join(kinds)}.")
+        if empty := [name for name in ("name", "file") if values.get(name, name) is None]:
+            raise ValueError(f"{empty[0]}: expected a value, got none; every body has one, by which it is told.")
         with in_words("values: expected numbers in columns of numbers"):
             typed = {name: None if value is None else kinds[name](value) for name, value in values.items()}
         with self.table.changing(where) as table:

@@ -32,7 +32,8 @@ def sync(
         n_workers, strict, progress: see `Gallery.build`.
 
     Returns:
-        How many bodies were described, how many removed, and those that failed, of which the old row stays.
+        How many bodies were described, how many removed, and those that failed, of which the old row stays; as does
+        that of a file in a folder that may not be read.
     """
     kinds = further_columns(dataset.bodies)
     now = told_of(dataset.bodies, kinds, dataset.reading)
@@ -59,9 +60,19 @@ def sync(
         failures += gallery.add(chosen.usable(failures), n_workers=n_workers, strict=strict, progress=progress)
     here = f"{Path(root).resolve()}{os.sep}"
     gone = [name for name in known.keys() - {row["id"] for row in now} if name.startswith(here)]
+    gone = [name for name in gone if not _is_out_of_reach(known[name]["file"])]
     for where in _where_id(gone):
         gallery.remove(where)
     return len(new) - len(failures), len(gone), failures
+
+
+def _is_out_of_reach(file: str) -> bool:
+    """Whether a file may be there that is not seen, as in a folder that this user may not read."""
+    try:
+        os.lstat(file)
+    except OSError as error:
+        return isinstance(error, PermissionError)
+    return not os.access(os.path.dirname(file), os.R_OK)
 
 
 def _where_id(ids: Sequence[str]) -> Iterator[str]:

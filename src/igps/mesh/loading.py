@@ -119,6 +119,8 @@ def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part
     shown = ", ".join(repr(name) for name in names[:8]) + (", ..." if len(names) > 8 else "")
     if part is None:
         raise MeshError(f"{path}: holds {len(names)} bodies: {shown}. Name one as part=, or read all by load_bodies.")
+    if names == [None]:
+        raise MeshError(f"{path}: is one body, and has none called {part!r}. Leave that name out.")
     raise MeshError(f"{path}: has no body {part!r}; there are: {shown}. Choose one of them.")
 
 

@@ -1,5 +1,6 @@
 """Surfaces of other libraries, in memory, recognised by their attributes: none of the libraries is imported."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,10 @@ from igps.mesh.formats._polygons import flat_triangles
 
 def raw_of(thing: Any) -> tuple[str, RawBody]:
     """Name and surface of a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage, unchecked; or a TypeError."""
-    metadata = getattr(thing, "metadata", None)
-    name = str((metadata.get("file_name") if isinstance(metadata, dict) else None) or "mesh")
+    metadata, source = getattr(thing, "metadata", None), getattr(thing, "source", None)
+    known = metadata.get("file_name") if isinstance(metadata, dict) else None
+    path = getattr(source, "file_path", None)  # where trimesh keeps that of a file that it read
+    name = str(known or (Path(path).name if path else "mesh"))
     if hasattr(thing, "get_arrays_from_intent"):
         points, faces = (thing.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE"))
         if not points or not faces:

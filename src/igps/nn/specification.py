@@ -11,8 +11,10 @@ from typing import Any, Self
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import nn
+
+from igps.data.cache import whole_file
 
 _FORMAT = "igps-descriptor-1"
 # Of a folder that is shared as a whole, beside its card
@@ -132,7 +134,8 @@ def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) ->
     words = {"format": _FORMAT, "specification": json.dumps(specification(module)), "card": json.dumps(card)}
     state = {name: value.detach().cpu().clone().contiguous() for name, value in module.state_dict().items()}
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    save_file(state, path, metadata=words)
+    with whole_file(Path(path)) as file:
+        file.write(save(state, metadata=words))
 
 
 def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:

@@ -17,7 +17,7 @@ from igps.analysis.groups import GroupTest
 from igps.analysis.map import BodyMap
 from igps.analysis.outliers import Outlier
 from igps.mesh.mesh import Mesh
-from igps.report.drawing import PALETTE, draw_body, new_figure, paint, seen_from_the_front
+from igps.report.drawing import PALETTE, draw_body, new_figure, paint, save_figure, seen_from_the_front
 from igps.report.page_data import finite
 from igps.retrieval import PrecisionRecallCurve
 
@@ -38,8 +38,8 @@ def write_answer(out: Path, name: str, rows: Sequence[Mapping[str, Any]], figure
         writer.writeheader()
         writer.writerows(rows)
     if figure is not None:
-        figure.savefig(out / f"{name}.svg")
-        figure.savefig(out / f"{name}.png", dpi=150)
+        save_figure(figure, out / f"{name}.svg")
+        save_figure(figure, out / f"{name}.png", dpi=150)
 
 
 def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:
@@ -96,13 +96,13 @@ def map_figure(found: BodyMap, values: Sequence[str] | Sequence[float], title: s
     axes = figure.add_subplot()
     x, y = found.points.T
     if isinstance(values[0], str):
-        names = sorted(set(map(str, values)))
+        names, drawn = sorted(set(map(str, values))), []
         for number, name in enumerate(names):
             own = [value == name for value in values]
             mark, colour = _MARKS[number // len(PALETTE) % len(_MARKS)], PALETTE[number % len(PALETTE)]
-            axes.scatter(x[own], y[own], s=20, label=name, linewidths=0.8, marker=mark, color=colour)
-        if any(names):
-            figure.legend(loc="outside right upper", title=title, fontsize=7, ncols=1 + len(names) // 30)
+            drawn.append(axes.scatter(x[own], y[own], s=20, label=name, linewidths=0.8, marker=mark, color=colour))
+        if any(names):  # by hand: Matplotlib leaves out what begins with an underscore
+            figure.legend(drawn, names, loc="outside right upper", title=title, fontsize=7, ncols=1 + len(names) // 30)
     else:
         figure.colorbar(axes.scatter(x, y, s=20, c=values, cmap="viridis"), label=title)
     axes.set(aspect="equal", xticks=[], yticks=[], xlabel=f"stress {found.stress:.2f}")
@@ -142,7 +142,7 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> N
     axes.grid(color="#DDDDDD", linewidth=0.6)
     figure.legend(loc="outside right upper", frameon=False, title="system")
     out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=130)
+    save_figure(figure, out, dpi=130)
 
 
 # Of precision and recall, in the second and third round of colours

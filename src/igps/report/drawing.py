@@ -71,6 +71,15 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
+def save_figure(figure: Figure, path: Path, dpi: float | None = None) -> None:
+    """Save a figure by the suffix of the path; a $ in the name of a body begins no formula."""
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
+    figure.savefig(path, dpi=dpi or "figure")
+
+
 def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progress: bool = False) -> None:
     """Save a PNG file with a row per class: its first mesh as the query, then the `top` meshes ranked nearest to it.
 
@@ -103,7 +112,7 @@ def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progre
         fontsize=9,
     )
     out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=110)
+    save_figure(figure, out, dpi=110)
 
 
 def draw_body(axis: Axes, mesh: Mesh) -> None:

@@ -203,9 +203,16 @@ def _unit(name: str, rows: Tensor) -> Tensor:
     return scaled / torch.linalg.vector_norm(scaled, dim=1, keepdim=True)
 
 
+def check_tensor(name: str, given: Any) -> None:
+    """Raise a ValueError of anything but a tensor, such as a NumPy array."""
+    if not isinstance(given, Tensor):
+        raise ValueError(f"{name}: expected a tensor, got {type(given).__name__}; make one by torch.as_tensor")
+
+
 def _as_rows(queries: Tensor, gallery: Tensor, *, non_negative: bool) -> tuple[Tensor, Tensor]:
     """Both arguments checked, as (Q, cells) and (G, cells) of one dtype of at least 32 bits."""
     for name, tensor in (("queries", queries), ("gallery", gallery)):
+        check_tensor(name, tensor)
         if tensor.ndim < 2 or tensor.shape[1:].numel() == 0:
             raise ValueError(
                 f"{name}: expected shape (N, ...) with at least one entry a descriptor, got {tuple(tensor.shape)}; "

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from igps.retrieval.distances import Distance, chi_square
+from igps.retrieval.distances import Distance, check_tensor, chi_square
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +55,7 @@ def search(
 
 def check_distances(distances: Tensor) -> None:
     """Raise ValueError unless distances is a real (Q, G) matrix without NaN and negative entries; infinity may be."""
+    check_tensor("distances", distances)
     if distances.ndim != 2 or distances.is_complex() or distances.dtype == torch.bool:
         raise ValueError(
             f"distances: expected a real matrix (Q, G), got shape {tuple(distances.shape)} of {distances.dtype}; "

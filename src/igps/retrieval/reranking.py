@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from igps.retrieval.distances import Distance
+from igps.retrieval.distances import Distance, check_tensor
 from igps.retrieval.graph_reranking import MOST_WHOLE, rerank_graph
 from igps.retrieval.ranking import SearchResult, rank
 
@@ -60,6 +60,7 @@ def rerank(
     Raises:
         ValueError: distances that are no such matrix, or numbers out of range.
     """
+    check_tensor("distances", distances)
     if distances.ndim != 2 or distances.shape[0] != distances.shape[1]:
         raise ValueError(f"distances: expected those of a collection to itself, (N, N), got {tuple(distances.shape)}.")
     if not bool((distances >= 0).all() and torch.isfinite(distances).all()):

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from igps.retrieval.ranking import rank
@@ -83,7 +84,9 @@ class PrecisionRecallCurve:
     n_queries: int  # in the mean
 
 
-def retrieval_scores(distances: Tensor, query_labels: Labels, gallery_labels: Labels | None = None) -> RetrievalScores:
+def retrieval_scores(
+    distances: Tensor | NDArray[Any], query_labels: Labels, gallery_labels: Labels | None = None
+) -> RetrievalScores:
     """NN, FT, ST, E-measure, DCG, ADR and mAP of every query (see RetrievalScores).
 
     Without gallery labels the queries are the gallery: every shape queries all others (leave-one-out), itself removed
@@ -102,7 +105,7 @@ def retrieval_scores(distances: Tensor, query_labels: Labels, gallery_labels: La
         0.6666666666666666
 
     Args:
-        distances: (Q, G), ≥ 0, smaller is closer; infinity is allowed.
+        distances: (Q, G), ≥ 0, smaller is closer, a tensor or a NumPy array; infinity is allowed.
         query_labels: Q class labels.
         gallery_labels: G class labels of a separate gallery; None for leave-one-out.
 
@@ -147,7 +150,7 @@ def retrieval_scores(distances: Tensor, query_labels: Labels, gallery_labels: La
 
 
 def precision_recall_curve(
-    distances: Tensor,
+    distances: Tensor | NDArray[Any],
     query_labels: Labels,
     gallery_labels: Labels | None = None,
     *,
@@ -175,12 +178,14 @@ def precision_recall_curve(
 
 
 def _ranked_relevance(
-    distances: Tensor, query_labels: Labels, gallery_labels: Labels | None
+    distances: Tensor | NDArray[Any], query_labels: Labels, gallery_labels: Labels | None
 ) -> tuple[Tensor, tuple[Hashable, ...]]:
     """rel(k) of every query as float64 (Q, G), or (Q, Q−1) without the query itself, on the CPU; the query labels."""
-    order = rank(distances).cpu()
+    order = rank(distances if isinstance(distances, Tensor) else torch.as_tensor(distances, device="cpu")).cpu()
     n_queries, n_gallery = order.shape
     queries = _label_tuple("query_labels", query_labels, n_queries)
+    if n_queries and set(queries) == {-1}:
+        raise ValueError("query_labels: expected labels, all are −1, as of a dataset whose bodies have no classes")
     if gallery_labels is None:
         if n_queries != n_gallery:
             raise ValueError(

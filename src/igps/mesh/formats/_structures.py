@@ -6,10 +6,11 @@ import codecs
 import gzip
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from igps.mesh.formats._format import distinct
 from igps.mesh.mesh import MeshError
 
 if TYPE_CHECKING:
@@ -32,31 +33,38 @@ def suffix(path: Path) -> str:
     return Path(path.name.lower().removesuffix(".gz")).suffix
 
 
-def read_structure(path: Path) -> gemmi.Structure:
-    """What the file holds; of a PQR file the charges of atoms are their occupancies, and the radii their B-factors."""
+def read_structures(path: Path) -> dict[str, gemmi.Structure]:
+    """What the file holds, by its name in the file: one, called "", but for mmCIF with atoms in several blocks of data.
+
+    Of a PQR file the charges of atoms are their occupancies, and the radii their B-factors.
+    """
     text = _text(path)
     if suffix(path) == ".pqr":
-        return _pqr(text, path)
+        return {"": _pqr(text, path)}
     gemmi = gemmi_module()
     try:
         if suffix(path) in (".pdb", ".ent"):
-            return gemmi.read_pdb_string(_as_models(_ATOM_LINE.sub(_with_numbers, text)))
-        blocks = gemmi.cif.read_string(text.decode("utf-8", "replace"))
-        block = next((b for b in blocks if b.find_values("_atom_site.id")), blocks[0])
-        if missing := [name for name in _COLUMNS if not block.find_values(f"_atom_site.{name}")]:
-            raise ValueError(f"_atom_site has no {', '.join(missing)}")
-        _mark_unknown(block)
-        return gemmi.make_structure_from_block(block)
+            return {"": gemmi.read_pdb_string(_as_models(_ATOM_LINE.sub(_with_numbers, text)))}
+        document = gemmi.cif.read_string(text.decode("utf-8", "replace"))
+        blocks = [block for block in document if block.find_values("_atom_site.id")] or [document[0]]
+        for block in blocks:
+            if missing := [name for name in _COLUMNS if not block.find_values(f"_atom_site.{name}")]:
+                raise ValueError(f"_atom_site has no {', '.join(missing)}")
+            _mark_unknown(block)
+        names = distinct(block.name for block in blocks) if len(blocks) > 1 else [""]
+        return {name: gemmi.make_structure_from_block(block) for name, block in zip(names, blocks, strict=True)}
     except (RuntimeError, ValueError, IndexError) as error:
         fault = f"{path}: not readable as a structure, or cut short ({' '.join(str(error).split())})."
         raise MeshError(f"{fault} Download or export it again.") from error
 
 
-def parts_of(structure: gemmi.Structure, bodies: str, path: Path) -> Iterator[tuple[str, list[gemmi.Chain], list[str]]]:
+def parts_of(
+    structures: Mapping[str, gemmi.Structure], bodies: str, path: Path
+) -> Iterator[tuple[str, list[gemmi.Chain], list[str]]]:
     """The name of each body, its chains, and notes."""
     gemmi = gemmi_module()
-    for model in structure:
-        of = f"model {model.num} " if len(structure) > 1 else ""
+    for name, structure, model in ((name, one, model) for name, one in structures.items() for model in one):
+        of = f"{name} " * bool(name) + f"model {model.num} " * (len(structure) > 1)
         if bodies == "chains":
             # A chain may come in several pieces.
             for label in dict.fromkeys(chain.name for chain in model):

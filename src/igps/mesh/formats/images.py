@@ -73,7 +73,11 @@ def _map(path: Path) -> tuple[NDArray[Any], Floats]:
         # Which of x, y and z columns, rows and sections run along; values (sections, rows, columns).
         along = [int(header[name]) for name in ("mapc", "mapr", "maps")]
         sides = np.array(file.voxel_size.item(), dtype=float)
+        if not (sides > 0).all() or values.dtype.kind == "c":
+            what = "complex numbers" if values.dtype.kind == "c" else f"voxels of {sides} Å"
+            raise MeshError(f"{path}: a map of {what}; real numbers in voxels of known size expected. Write it anew.")
         starts = np.array([int(header[name]) for name in ("nxstart", "nystart", "nzstart")])[np.argsort(along)]
-        affine = np.eye(4)
-        affine[:3, :3], affine[:3, 3] = np.diag(sides), np.array(header.origin.item()) + starts * sides
+        # Of files that have both, most programs take the origin alone: it is the same place said twice
+        origin, affine = np.array(header.origin.item(), dtype=float), np.eye(4)
+        affine[:3, :3], affine[:3, 3] = np.diag(sides), origin if origin.any() else starts * sides
         return np.array(values.transpose(np.argsort(along[::-1]))), affine

@@ -15,7 +15,7 @@ import numpy as np
 
 from igps._arrays import Floats, Integers
 from igps.mesh.formats._format import Format, RawBody, made_later
-from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structure, suffix
+from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structures, suffix
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.mesh.residues import BACKBONE, CHARGED_ATOMS, PHOSPHATES, STANDARD, WATER, residue_ball, side_chain_ball
@@ -75,11 +75,12 @@ def read_molecule(
 ) -> list[Molecule]:
     """Read the bodies of a structure file: PDB, mmCIF or PQR, gzipped or not.
 
-    Each model of an ensemble gives bodies of its own. Water is left out. Of alternative locations that of the highest
-    occupancy is taken, the first of equals. Radii are van der Waals radii of the elements (Bondi 1964), and charges
-    those of residues at pH 7, without the ends of chains. A PQR file has its own of both, and keeps its hydrogens.
-    Where all atoms of a side chain are missing, a ball of its volume touches Cα on the side of Cβ; a residue of Cα
-    alone is a ball of its whole volume (Zamyatnin 1972). So backbones and traces are bodies, too.
+    Each model of an ensemble, and each block of data of mmCIF that has atoms, gives bodies of its own. Water is left
+    out. Of alternative locations that of the highest occupancy is taken, the first of equals. Radii are van der Waals
+    radii of the elements (Bondi 1964), and charges those of residues at pH 7, without the ends of chains. A PQR file
+    has its own of both, and keeps its hydrogens. Where all atoms of a side chain are missing, a ball of its volume
+    touches Cα on the side of Cβ; a residue of Cα alone is a ball of its whole volume (Zamyatnin 1972). So backbones and
+    traces are bodies, too.
 
     Example:
         >>> import tempfile
@@ -104,8 +105,7 @@ def read_molecule(
     path = Path(path)
     if bodies not in get_args(MoleculeBodies):
         raise ValueError(f"bodies: expected one of {', '.join(get_args(MoleculeBodies))}, got {bodies!r}.")
-    structure = read_structure(path)
-    parts = list(parts_of(structure, bodies, path))
+    parts = list(parts_of(read_structures(path), bodies, path))
     found, left_out = _molecules(parts, ligands, hydrogens, suffix(path) == ".pqr")
     if not found and not ligands:
         found, left_out = _molecules(parts, True, hydrogens, suffix(path) == ".pqr")

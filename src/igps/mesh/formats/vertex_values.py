@@ -73,7 +73,7 @@ def _ply(path: Path) -> dict[str, NDArray[np.generic]]:
 def _freesurfer(path: Path) -> NDArray[np.generic]:
     content = path.read_bytes()
     if not content.startswith(_MAGIC) or len(content) < 15:
-        raise ValueError("not a file of values of FreeSurfer")
+        raise ValueError("neither of the suffix of a format that is read, nor a file of values of FreeSurfer")
     n, _, n_each = (int(x) for x in np.frombuffer(content, ">i4", 3, 3))
     if n < 1 or n_each != 1 or len(content) < 15 + 4 * n:
         raise ValueError(f"{n} vertices of {n_each} values announced, {len(content) - 15} of {4 * n} bytes there")
