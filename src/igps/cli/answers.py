@@ -1,6 +1,6 @@
 """`igps groups`, `igps outliers` and `igps explain`."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, vectors_of, with_discovery_rates
 from igps.analysis.outliers import measures_of
 from igps.analysis.outliers import outliers as find_outliers
-from igps.cli.reading import Folder, described, print_failures
+from igps.cli.reading import Folder, described, files_or_folder, print_failures
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
 from igps.mesh.mesh import Mesh
@@ -131,9 +131,10 @@ def explain(
             bodies painted from two sides as explain.svg and explain.png.
     """
     module = descriptor_of(descriptor)
-    if len(meshes) == 1 and meshes[0].is_dir():
+    source = files_or_folder(meshes)
+    if isinstance(source, Folder):
         inner = module.descriptor if isinstance(module, EmbeddedDescriptor) else module
-        bodies = described(Folder(meshes[0], labelled=True), inner, **reading)
+        bodies = described(replace(source, labelled=True), inner, **reading)
         dataset, descriptions, labels = bodies.dataset, bodies.descriptions, np.array(bodies.dataset.bodies.labels)
         classes = sorted(set(labels))
         if len(classes) != 2:
@@ -145,7 +146,7 @@ def explain(
         found, kept = explain_groups(module, descriptions[members[0]], descriptions[members[1]], batches, level=level)
         print(f"{int(kept.sum())} of {len(kept)} cells differ by more than chance; painted: the middle of each group")
     else:
-        dataset, chosen = described(meshes, module, **{**reading, "strict": True}).dataset, [0, 1]
+        dataset, chosen = described(source, module, **{**reading, "strict": True}).dataset, [0, 1]
         if len(dataset) != 2:
             raise ValueError(f"meshes: expected two bodies, got {len(dataset)}. Name two files, or FILE#PART.")
         found = explain_pair(module, *(dataset.batch([i]) for i in chosen))

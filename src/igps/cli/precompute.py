@@ -62,12 +62,13 @@ def precompute(
 
 
 def cache_export(root: Path, out: Path, descriptors: list[str] | None = None, **reading: Any) -> None:
-    """Write the signatures of a folder to one file, which every command takes in place of the folder.
+    """Write the signatures of a folder to one file, which commands take in place of the folder.
 
-    The file is read by memory map, runs no code, and holds no path: meshes that cannot be used are left out.
+    The file is read by memory map, runs no code, and holds no path: meshes that cannot be used are left out. Commands
+    that look at the meshes themselves, such as doctor, duplicates and explain, need the folder.
 
     Args:
-        out: the file, such as signatures.igps.
+        out: the file, its name ending in .igps.
         descriptors: whose needs the signatures shall satisfy; pretrained if not given.
     """
     chosen = [descriptor_of(name) for name in descriptors or ["pretrained"]]

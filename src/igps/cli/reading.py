@@ -39,6 +39,9 @@ LISTS = {
 }
 """Options of several words, of the same commands."""
 
+EXPORTED = ".igps"
+"""Ending of the name of a file that `igps cache export` writes."""
+
 MEANINGS = {
     **FLAGS,
     "root": "folder of meshes, with or without classes",
@@ -134,8 +137,9 @@ def described(
 
 
 def files_or_folder(meshes: Sequence[Path]) -> Folder | Sequence[Path]:
-    """What a list of words names: files, or one folder."""
-    return Folder(meshes[0]) if len(meshes) == 1 and meshes[0].is_dir() else meshes
+    """What a list of words names: files, or one folder, or a file of signatures in place of one."""
+    is_folder = len(meshes) == 1 and (meshes[0].is_dir() or meshes[0].suffix == EXPORTED)
+    return Folder(meshes[0]) if is_folder else meshes
 
 
 def limits_of(seconds: float | None, gigabytes: float | None) -> Limits:

@@ -88,7 +88,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         sources, self._functions = split_attributes(given)
         self.bodies = bodies_of(root_or_paths, labels, reading, sources.values()).classed(classes or "folder")
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
-        if pre_transform is not None and pre_transform.cache_tag and self._functions:
+        if pre_transform is not None and self._functions:
             raise ValueError("pre_transform: expected attributes with a cache_tag beside it, got a function of points.")
         directory = Path(cache_dir or default_cache_dir())
         self.config, self.reading = config.resolved(), reading
