@@ -183,6 +183,7 @@ def equal(one: SignatureBatch, other: SignatureBatch) -> bool:
     [
         (slice(1, None), [1, 2]),
         (slice(None, None, 2), [0, 2]),
+        (slice(None, None, -1), [2, 1, 0]),
         ([2, 0], [2, 0]),
         ([-1], [2]),
         (torch.tensor([1, 1]), [1, 1]),
@@ -203,7 +204,8 @@ def test_some_shapes_of_a_batch_are_the_batch_of_them(
 
 def test_one_shape_of_a_batch_is_a_body(signatures: list[Signature]) -> None:
     batch = collate(signatures)
-    assert [batch[i].id for i in (0, -1, np.int64(1))] == ["body 0", "body 2", "body 1"]
+    numbers = (0, -1, np.int64(1), torch.tensor(2), np.array(0))
+    assert [batch[i].id for i in numbers] == ["body 0", "body 2", "body 1", "body 2", "body 0"]  # type: ignore[index]
     np.testing.assert_array_equal(batch[2].eigenvalues, signatures[2].eigenvalues)
     assert [body.id for body in batch] == list(batch.ids)
     with pytest.raises(IndexError):
