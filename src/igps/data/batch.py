@@ -160,8 +160,9 @@ class SignatureBatch:
             number = range(len(self))[index]
             return self[number : number + 1].to("cpu")._body(0)
         chosen = chosen_of(index, len(self))
-        forward = isinstance(index, slice) and (index.step or 1) > 0  # a view; tensors take no other slices
-        rows = index if forward else torch.tensor(chosen, dtype=torch.int64, device=self.labels.device)
+        rows: slice | Tensor = torch.tensor(chosen, dtype=torch.int64, device=self.labels.device)
+        if isinstance(index, slice) and (index.step or 1) > 0:  # views; tensors take no slices backwards
+            rows = index
         return replace(
             self.map(lambda values: values[rows]),
             ids=tuple(self.ids[i] for i in chosen),
