@@ -146,9 +146,7 @@ class SignatureBatch:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def __iter__(self) -> Iterator[Body]:
-        return self.bodies()
-
+    # No __iter__, by which Lightning would look for the size of a batch in its bodies: numbers iterate too.
     @overload
     def __getitem__(self, index: int) -> Body: ...
     @overload

@@ -215,6 +215,8 @@ def _label_tuple(name: str, labels: Labels, n_expected: int) -> tuple[Hashable, 
         raise ValueError(
             f"{name}: expected an integer tensor (N,) or a sequence of integers or strings, got {labels!r}"
         )
+    if -1 in labels:
+        raise ValueError(f"{name}: expected the class of each, got −1, which is unknown. Leave those out.")
     if len(labels) != n_expected:
         raise ValueError(
             f"{name}: expected {n_expected} labels, one for each of the distances' entries, got {len(labels)}"
