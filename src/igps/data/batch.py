@@ -168,6 +168,11 @@ class SignatureBatch:
             units=None if self.units is None else tuple(self.units[i] for i in chosen),
         )
 
+    @property
+    def device(self) -> torch.device:
+        """Where its tensors are."""
+        return self.area.device
+
     def map(self, function: Callable[[Tensor], Tensor]) -> SignatureBatch:
         """The batch of what a function makes of each of its tensors."""
         return replace(
