@@ -39,7 +39,11 @@ def test_pytorch_geometric_batches_samples_with_their_eigenfunctions(dataset: ig
     from torch_geometric.loader import DataLoader as GeometricLoader
     from torch_geometric.nn import global_add_pool
 
+    changed = to_pyg(dataset[0].signature)
+    for values in changed.to_dict().values():  # as transforms of theirs do in place
+        values.zero_()
     bodies = [to_pyg(item.signature, "surface", item.label) for item in dataset]
+    assert bodies[0].eigenfunctions.any()
     batch = next(iter(GeometricLoader(bodies, batch_size=8)))
     assert (batch.pos.shape, batch.eigenfunctions.shape) == ((640, 3), (640, 20))
     assert batch.eigenvalues.shape == (8, 20)

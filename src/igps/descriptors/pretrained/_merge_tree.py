@@ -19,6 +19,7 @@ class MergeTree(NamedTuple):
     pieces: Tensor  # (L, P) of each point the peak of the piece of the superlevel set it belongs to; −1 where below
 
 
+@torch.compiler.disable  # its loops are compiled already
 def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = ()) -> MergeTree:
     """The merge tree of finite values (P,) on points; two are neighbours if either names the other in (P, k).
 
