@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -31,6 +31,7 @@ from scipy import sparse
 
 import igps
 from igps._threads import n_cores
+from igps.data.transforms import FewerSamples
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.winding import winding_number
@@ -407,6 +408,33 @@ def learned_step(data: Path | None) -> Figure:
     return Figure(ours, "s", before, "version 0.2.0", before / ours, "40 shapes, 400 samples of each")
 
 
+def together(data: Path | None) -> dict[str, Figure]:
+    """32 bodies described at once, one thread, over one after the other; seconds of the processor."""
+    torch.set_num_threads(1)
+    needs = igps.descriptor("interior").requirements | igps.descriptor("pretrained").requirements
+    with tempfile.TemporaryDirectory() as folder:
+        igps.ArticulatedShapes(n_classes=8, n_per_class=4, n_vertices=1500).write(f"{folder}/meshes")
+        dataset = igps.SignatureDataset(f"{folder}/meshes", cache_dir=f"{folder}/cache", descriptor=needs).to_memory()
+    figures = {}
+    for n_samples, which in ((400, "400"), (None, "all")):
+        bodies = dataset.to_memory(FewerSamples(n_interior=n_samples, n_surface=n_samples, seed=0))
+        batch, alone = bodies.batch(range(len(bodies))), [bodies.batch([i]) for i in range(len(bodies))]
+        for name in ("interior", "pretrained"):
+            descriptor = igps.descriptor(name)
+
+            def seconds(batches: Sequence[igps.SignatureBatch], descriptor: igps.Descriptor = descriptor) -> float:
+                start = time.process_time()
+                with torch.no_grad():
+                    for one in batches:
+                        descriptor(one)
+                return time.process_time() - start
+
+            ours, before = timed_by(lambda: seconds([batch]), lambda: seconds(alone), 5)  # noqa: B023
+            note = f"32 generated bodies, {which} samples"
+            figures[f"together_{name}_{which}"] = Figure(ours, "s", before, "one by one", before / ours, note)
+    return figures
+
+
 @contextlib.contextmanager
 def two_versions(script: str, path: Path, commit: str) -> Iterator[Callable[[str], tuple[float, float]]]:
     """A script beside this one, run by now's igps and by that of a commit on one thread: gives seconds for a line.
@@ -635,6 +663,7 @@ FIGURES: dict[str, Callable[[Path | None], Figure | dict[str, Figure]]] = {
     "signature_1500": signature_1500,
     "learned_step": learned_step,
     "epoch": epoch,
+    "together": together,
     "descriptor_15k": descriptor_15k,
     "mesh_10k": mesh_10k,
     "mesh_250k": mesh_250k,

@@ -7,6 +7,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from igps.cli import main
@@ -48,6 +49,12 @@ def test_the_file_stands_for_the_folder(
             with pytest.raises(SystemExit, match="1"):
                 call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache, *option)
             assert "expected no options of reading beside a file of signatures" in capsys.readouterr().err
+        call(monkeypatch, "extract", out, "--out", tmp_path / "rows.npz", "--descriptor", INTERIOR, *cache)
+        names = np.load(tmp_path / "rows.npz")["names"].tolist()
+        assert names == ["flat/0.off", "flat/1.off", "long/0.off", "long/1.off"]
+        with pytest.raises(SystemExit, match="1"):
+            call(monkeypatch, "explain", out, "--level", 0.5, "--descriptor", INTERIOR, *cache)
+        assert "holds signatures and no meshes" in capsys.readouterr().err
     else:
         with pytest.raises(SystemExit, match="1"):
             call(monkeypatch, "retrieve", out, "--descriptor", INTERIOR, *cache)

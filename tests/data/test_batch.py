@@ -183,6 +183,7 @@ def equal(one: SignatureBatch, other: SignatureBatch) -> bool:
     [
         (slice(1, None), [1, 2]),
         (slice(None, None, 2), [0, 2]),
+        (slice(None, None, -1), [2, 1, 0]),
         ([2, 0], [2, 0]),
         ([-1], [2]),
         (torch.tensor([1, 1]), [1, 1]),
@@ -203,13 +204,22 @@ def test_some_shapes_of_a_batch_are_the_batch_of_them(
 
 def test_one_shape_of_a_batch_is_a_body(signatures: list[Signature]) -> None:
     batch = collate(signatures)
-    assert [batch[i].id for i in (0, -1, np.int64(1))] == ["body 0", "body 2", "body 1"]
+    numbers = (0, -1, np.int64(1), torch.tensor(2), np.array(0))
+    assert [batch[i].id for i in numbers] == ["body 0", "body 2", "body 1", "body 2", "body 0"]  # type: ignore[index]
     np.testing.assert_array_equal(batch[2].eigenvalues, signatures[2].eigenvalues)
-    assert [body.id for body in batch] == list(batch.ids)
+    assert [body.id for body in batch] == list(batch.ids)  # type: ignore[attr-defined]
     with pytest.raises(IndexError):
         batch[3]
     with pytest.raises(IndexError, match="mask: expected 3 entries"):
         batch[[True, False]]
+
+
+@pytest.mark.filterwarnings("ignore:Trying to infer the `batch_size`")
+def test_lightning_finds_the_size_of_a_batch(signatures: list[Signature]) -> None:
+    """For `self.log` in a LightningModule of one's own."""
+    from pytorch_lightning.utilities.data import extract_batch_size
+
+    assert extract_batch_size(collate(signatures)) == len(signatures)
 
 
 def test_batches_are_joined_and_cut_again(signatures: list[Signature]) -> None:

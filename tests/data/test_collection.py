@@ -14,6 +14,7 @@ from bodies_on_disk import write_body
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
+from igps.data.cache import checksum
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.data.requirements import Requirements
@@ -122,6 +123,15 @@ def test_a_damaged_signature_is_named_and_costs_no_other(
             assert damaged[i].id == name
 
 
+@pytest.mark.parametrize("word", [b"egg/2.off", b"ball"])
+def test_a_damaged_name_is_noticed(written: tuple[SignatureDataset, Path], tmp_path: Path, word: bytes) -> None:
+    content = bytearray(written[1].read_bytes())
+    content[content.index(word) + 1] ^= 1
+    (tmp_path / "damaged.igps").write_bytes(content)
+    with pytest.raises(ValueError, match=r"damaged\.igps: expected a collection .*Export it again"):
+        SignatureDataset.from_file(tmp_path / "damaged.igps")
+
+
 def told(path: Path, target: Path, **changes: object) -> Path:
     """The same file that tells something else of itself."""
     with safe_open(path, framework="np") as file:
@@ -130,6 +140,7 @@ def told(path: Path, target: Path, **changes: object) -> Path:
     about.update({name: value for name, value in changes.items() if name != "format"})
     metadata["about"] = json.dumps(about)
     metadata["format"] = str(changes.get("format", metadata["format"]))
+    metadata["checksum"] = checksum({}, {"about": metadata["about"]})
     save_file(load_file(path), target, metadata=metadata)
     return target
 

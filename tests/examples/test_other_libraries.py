@@ -39,7 +39,11 @@ def test_pytorch_geometric_batches_samples_with_their_eigenfunctions(dataset: ig
     from torch_geometric.loader import DataLoader as GeometricLoader
     from torch_geometric.nn import global_add_pool
 
+    changed = to_pyg(dataset[0].signature)
+    for values in changed.to_dict().values():  # as transforms of theirs do in place
+        values.zero_()
     bodies = [to_pyg(item.signature, "surface", item.label) for item in dataset]
+    assert bodies[0].eigenfunctions.any()
     batch = next(iter(GeometricLoader(bodies, batch_size=8)))
     assert (batch.pos.shape, batch.eigenfunctions.shape) == ((640, 3), (640, 20))
     assert batch.eigenvalues.shape == (8, 20)
@@ -132,6 +136,7 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
     from pytorch_metric_learning.miners import BatchHardMiner
     from pytorch_metric_learning.samplers import MPerClassSampler
     from pytorch_metric_learning.testers import GlobalEmbeddingSpaceTester
+    from pytorch_metric_learning.trainers import MetricLossOnly
     from pytorch_metric_learning.utils.accuracy_calculator import AccuracyCalculator
     from pytorch_metric_learning.utils.inference import CustomKNN
 
@@ -164,18 +169,19 @@ def test_heads_and_descriptors_are_distances_of_pytorch_metric_learning_and_back
     ours = igps.retrieval_scores(plain.distances(cells, cells), dataset.labels).mean()["nn"]
     assert found == pytest.approx(ours)
 
-    class Tester(GlobalEmbeddingSpaceTester):  # type: ignore[misc]
-        """A batch goes into a descriptor whole, and has its labels with it."""
-
-        def get_embeddings_for_eval(self, trunk_model: nn.Module, embedder_model: nn.Module, batch: Any) -> Tensor:
-            return embedder_model(trunk_model(batch).flatten(1))
-
-    tester = Tester(
-        batch_size=3, dataloader_num_workers=0, accuracy_calculator=calculator, normalize_embeddings=False,
-        data_and_label_getter=lambda batch: (batch, batch.labels),
-    )  # fmt: skip
-    tested = tester.test({"eggs": dataset}, 0, plain, collate_fn=igps.collate)["eggs"]
+    how: dict[str, Any] = {"dataloader_num_workers": 0, "data_and_label_getter": lambda batch: (batch, batch.labels)}
+    trunk = nn.Sequential(plain, nn.Flatten())
+    tester = GlobalEmbeddingSpaceTester(batch_size=3, accuracy_calculator=calculator, normalize_embeddings=False, **how)
+    tested = tester.test({"eggs": dataset}, 0, trunk, collate_fn=igps.collate)["eggs"]
     assert tested["precision_at_1_level0"] == pytest.approx(ours)
+
+    layer = nn.Linear(plain.n_features, 4)
+    before, models = layer.weight.detach().clone(), {"trunk": trunk, "embedder": layer}
+    optimizers = {"embedder_optimizer": torch.optim.Adam(layer.parameters(), lr=0.01)}
+    MetricLossOnly(
+        models, optimizers, 8, {"metric_loss": TripletMarginLoss()}, dataset=dataset, collate_fn=igps.collate, **how
+    ).train()
+    assert not torch.equal(layer.weight, before)
 
     theirs = LpDistance(normalize_embeddings=False)  # and back: any of theirs is a distance here
     scores = igps.retrieval_scores(theirs(cells, cells), dataset.labels).mean()

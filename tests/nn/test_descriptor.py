@@ -265,6 +265,12 @@ def test_a_descriptor_of_bodies_sees_each_without_padding(batch: SignatureBatch)
     torch.testing.assert_close(described, expected)
 
 
+@pytest.mark.parametrize("make", [*MAKERS, Extent])
+def test_a_batch_without_shapes_is_refused(batch: SignatureBatch, make: Callable[[], Descriptor]) -> None:
+    with pytest.raises(ValueError, match="batch: expected at least one shape, got none"):
+        make()(batch[batch.labels == 7])
+
+
 def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch: SignatureBatch) -> None:
     below = HistogramDescriptor([small(5, 2), small(3, 1)], name="two", invariant_to=("motion", "scale"))
     descriptor = EmbeddedDescriptor(below, WhitenedHead().centre(below(batch)), source="nobody")

@@ -298,6 +298,15 @@ def test_any_module_describes(items: list[LabelledSignature], tmp_path: Path) ->
     assert (model.descriptor.cells != 0).any()
 
 
+def test_bodies_of_unknown_classes_are_refused(items: list[LabelledSignature], tmp_path: Path) -> None:
+    """As −1 all would be of one class, and every score the best."""
+    unknown = [replace(item, label=-1) for item in items]
+    with pytest.raises(ValueError, match="labels: expected the class of each body, got −1"):
+        trainer(1, tmp_path).fit(learner(), loader([*items[:-1], unknown[-1]]))
+    with pytest.raises(ValueError, match="query_labels: expected the class of each, got −1"):
+        trainer(1, tmp_path).test(learner(), loader(unknown), verbose=False)
+
+
 def test_several_training_loaders_are_refused(items: list[LabelledSignature], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="train_dataloaders: expected one DataLoader, got list"):
         trainer(1, tmp_path).fit(learner(), [loader(items), loader(items)])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 import igps.nn.functional as functional
-from batches import two_bodies
+from batches import alone, two_bodies
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.nn.axes import (
     Attribute,
@@ -149,6 +149,26 @@ def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differenc
                 moved.append(float(loss()))
             leaf.view(-1)[entry] += 1e-6
         assert float(gradient.view(-1)[entry]) == pytest.approx((moved[0] - moved[1]) / 2e-6, rel=1e-3)
+
+
+def test_padding_leaves_second_derivatives_as_they_are(module: DescriptionPart) -> None:
+    """Of a body whose samples and eigenvalues are padded, and of the same body alone."""
+    if any(isinstance(one, EmbeddedPairCosines) for one in module.modules()):
+        pytest.skip("first derivatives only: between points of many coordinates PyTorch has no others")
+    batch, module = doubled(two_bodies()), module.double()
+    upstream = torch.randn(module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    found = []
+    for one, row in ((batch, 1), (alone(batch, 1), 0)):
+        leaves = (one.eigenvalues.clone().requires_grad_(), one.area.clone().requires_grad_())
+        cells = module(replace(one, eigenvalues=leaves[0], area=leaves[1]))[row] * upstream
+        gradients = torch.autograd.grad(cells.sum(), leaves, create_graph=True, allow_unused=True)
+        total = sum((g.square().sum() for g in gradients if g is not None), torch.zeros(()).double())
+        second = torch.autograd.grad(total, leaves, allow_unused=True) if total.requires_grad else (None, None)
+        found.append([None if values is None else values[row].flatten()[:7] for values in second])
+    for padded, plain in zip(*found, strict=True):
+        assert (padded is None) == (plain is None)
+        if padded is not None and plain is not None:
+            torch.testing.assert_close(padded, plain, rtol=1e-9, atol=1e-12)
 
 
 def test_a_state_is_read_back_to_the_last_key(module: DescriptionPart) -> None:

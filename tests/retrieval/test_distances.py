@@ -177,6 +177,16 @@ def test_weights_of_fewer_dimensions_than_the_cells_pass_gradcheck() -> None:
     assert torch.autograd.gradcheck(lambda w: chi_square(queries, gallery, w), (weights,))
 
 
+def test_chi_square_has_second_derivatives_and_none_at_empty_cells() -> None:
+    queries, gallery = histograms(3, (6,), seed=27, filled=2), histograms(4, (6,), seed=28, filled=2)
+    weights = torch.tensor([1.0, 2.0, 0.5, 1.0, 3.0, 1.0], dtype=torch.float64)
+    leaves = [one.requires_grad_() for one in (queries, gallery, weights)]
+    assert torch.autograd.gradgradcheck(chi_square, leaves)
+    empty = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
+    [first] = torch.autograd.grad(chi_square(empty, torch.zeros(1, 2).double()).sum(), empty, create_graph=True)
+    assert torch.autograd.grad(first.sum(), empty)[0].tolist() == [[0, 0]]
+
+
 @pytest.mark.parametrize("distance", ALL)
 def test_gradients_are_finite_at_empty_cells_and_at_distance_zero(distance: Distance) -> None:
     shapes = histograms(6, (3, 8), seed=16, filled=0.3).requires_grad_()

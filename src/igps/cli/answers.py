@@ -154,7 +154,7 @@ def explain(
         found, kept = explain_groups(module, descriptions[members[0]], descriptions[members[1]], batches, level=level)
         print(f"{int(kept.sum())} of {len(kept)} cells differ by more than chance; painted: the middle of each group")
     else:
-        dataset, chosen = described(meshes, module, **{**reading, "strict": True}).dataset, [0, 1]
+        dataset, chosen = described(source, module, **{**reading, "strict": True}).dataset, [0, 1]
         if len(dataset) != 2:
             raise ValueError(f"meshes: expected two bodies, got {len(dataset)}. Name two files, or FILE#PART.")
         found = explain_pair(module, *(dataset.batch([i]) for i in chosen))

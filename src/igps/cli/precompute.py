@@ -65,11 +65,10 @@ def cache_export(root: Path, out: Path, descriptors: list[str] | None = None, **
     """Write the signatures of a folder to one file, which commands take in place of the folder.
 
     The file is read by memory map, runs no code, and holds no path: meshes that cannot be used are left out. Commands
-    that need the meshes themselves do not take it: doctor, duplicates,
-    explain and outliers.
+    that look at the meshes themselves need the folder: doctor, duplicates, explain and outliers.
 
     Args:
-        out: the file, such as signatures.igps.
+        out: the file, its name ending in .igps.
         descriptors: whose needs the signatures shall satisfy; pretrained if not given.
     """
     chosen = [descriptor_of(name) for name in descriptors or ["pretrained"]]

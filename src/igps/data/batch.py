@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, overload
@@ -145,25 +146,32 @@ class SignatureBatch:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def __iter__(self) -> Iterator[Body]:
-        return self.bodies()
-
+    # No __iter__, by which Lightning would look for the size of a batch in its bodies: numbers iterate too.
     @overload
     def __getitem__(self, index: int) -> Body: ...
     @overload
     def __getitem__(self, index: Several) -> SignatureBatch: ...
     def __getitem__(self, index: int | Several) -> Body | SignatureBatch:
         """One shape as a `Body` by its number; some as a batch by a slice, numbers, or a mask."""
+        index = number_of(index)
         if isinstance(index, int | np.integer):
-            return self._body(range(len(self))[index])
+            number = range(len(self))[index]
+            return self[number : number + 1].to("cpu")._body(0)
         chosen = chosen_of(index, len(self))
-        rows = index if isinstance(index, slice) else torch.tensor(chosen, dtype=torch.int64, device=self.labels.device)
+        rows: slice | Tensor = torch.tensor(chosen, dtype=torch.int64, device=self.labels.device)
+        if isinstance(index, slice) and (index.step or 1) > 0:  # views; tensors take no slices backwards
+            rows = index
         return replace(
             self.map(lambda values: values[rows]),
             ids=tuple(self.ids[i] for i in chosen),
             meshes=None if self.meshes is None else tuple(self.meshes[i] for i in chosen),
             units=None if self.units is None else tuple(self.units[i] for i in chosen),
         )
+
+    @property
+    def device(self) -> torch.device:
+        """Where its tensors are."""
+        return self.area.device
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SignatureBatch:
         """The batch of what a function makes of each of its tensors."""
@@ -217,6 +225,11 @@ class SignatureBatch:
         interior, surface = (_samples_of(one, i, len(eigenvalues)) for one in (self.interior, self.surface))
         mesh = None if self.meshes is None else self.meshes[i]
         return Body(eigenvalues, interior, surface, float(self.area[i]), float(self.volume[i]), self.ids[i], mesh)
+
+
+def number_of(index: Any) -> Any:
+    """The number in an array without dimensions, as permutations give them one by one; any other index as it is."""
+    return operator.index(index) if isinstance(index, Tensor | np.ndarray) and index.ndim == 0 else index
 
 
 def chosen_of(index: Several, n: int) -> list[int]:

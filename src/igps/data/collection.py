@@ -86,6 +86,7 @@ def write_collection(path: Path, about: About, signature: Callable[[int], Signat
         header[f"{i}.{name}"] = {"dtype": _KINDS[kind], "shape": shape, "data_offsets": (end, end + n_bytes)}
         end += n_bytes
     words = {"format": _FORMAT, "about": about.written(), "signatures": json.dumps(told)}
+    words["checksum"] = checksum({}, {"about": words["about"]})
     text = json.dumps({"__metadata__": words, **header}, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     if len(text) > _MOST_HEADER:
@@ -122,6 +123,7 @@ class CollectionFile:
             metadata = self._file.metadata() or {}
             if metadata.get("format") != _FORMAT:
                 raise ValueError(f"its format is {metadata.get('format')!r}")
+            check_checksum({}, {"about": metadata["about"], "checksum": metadata["checksum"]})
             self.about = About.read(metadata["about"])
             self._told: list[dict[str, str]] = json.loads(metadata["signatures"])
             if len(self._told) != len(self.about.bodies):

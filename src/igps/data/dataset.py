@@ -1,7 +1,6 @@
 """A torch Dataset of Signatures, computed on first touch and cached."""
 
 import copy
-import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -15,7 +14,7 @@ from torch.utils.data import Dataset
 
 from igps._parallel import Failed, Limits
 from igps.data.attributes import ROOMS, AttributeSource, PointFunction, split_attributes, with_attribute
-from igps.data.batch import LabelledSignature, Several, SignatureBatch, chosen_of
+from igps.data.batch import LabelledSignature, Several, SignatureBatch, chosen_of, number_of
 from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.collation import collate
 from igps.data.collection import About, CollectionFile, write_collection
@@ -88,7 +87,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         sources, self._functions = split_attributes(given)
         self.bodies = bodies_of(root_or_paths, labels, reading, sources.values()).classed(classes or "folder")
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
-        if pre_transform is not None and pre_transform.cache_tag and self._functions:
+        if pre_transform is not None and self._functions:
             raise ValueError("pre_transform: expected attributes with a cache_tag beside it, got a function of points.")
         directory = Path(cache_dir or default_cache_dir())
         self.config, self.reading = config.resolved(), reading
@@ -126,8 +125,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         """An item by number or name; the dataset of some of the bodies by slice, numbers, names, or mask."""
         if isinstance(index, str):
             index = self.bodies.number(index)
-        elif isinstance(index, Tensor | np.ndarray) and index.ndim == 0:  # as permutations give them one by one
-            index = operator.index(index)
+        index = number_of(index)
         if isinstance(index, int | np.integer):
             return self._item(range(len(self))[index])
         if not isinstance(index, slice | Tensor):

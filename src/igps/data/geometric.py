@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 def to_pyg(signature: Signature, samples: Literal["interior", "surface"] = "surface", label: int = -1) -> Data:
     """The samples of a body as `torch_geometric.data.Data`: P nodes without edges, which its loaders batch.
 
+    They are copies, which transforms may change in place.
+
     Returns:
         `pos` (P, 3); `eigenfunctions` (P, K); `mass` (P,), the share of the surface's area, or of the volume, of each
         sample; the attributes of the samples under their names; `eigenvalues` (1, K), `area` and `volume` (1,), which
@@ -30,12 +32,12 @@ def to_pyg(signature: Signature, samples: Literal["interior", "surface"] = "surf
     found = getattr(signature, samples)
     measure = signature.area if samples == "surface" else signature.volume
     return Data(
-        pos=torch.from_numpy(found.points).float(),
-        eigenfunctions=torch.from_numpy(found.eigenfunctions),
+        pos=torch.tensor(found.points, dtype=torch.float32),
+        eigenfunctions=torch.tensor(found.eigenfunctions),
         mass=torch.full((len(found),), measure / len(found)),
         eigenvalues=torch.from_numpy(signature.eigenvalues).float()[None],
         area=torch.tensor([signature.area]),
         volume=torch.tensor([signature.volume]),
         y=torch.tensor([label]),
-        **{name: torch.from_numpy(values) for name, values in found.attributes.items()},
+        **{name: torch.tensor(values) for name, values in found.attributes.items()},
     )

@@ -80,6 +80,13 @@ class SignaturePipeline:
     attributes: Mapping[str, AttributeSource] = field(default_factory=dict)  # added to the samples, by name
     pre_transform: PreTransform | None = None  # done to the Signature with its attributes before it is kept
 
+    def __post_init__(self) -> None:
+        if self.pre_transform is not None and not getattr(self.pre_transform, "cache_tag", None):
+            raise ValueError(
+                f"pre_transform: expected a cache_tag, its name in the cache, got {self.pre_transform!r} without one. "
+                "Derive it from igps.data.transforms.Transform, or give it as transform=, which is not cached."
+            )
+
     def mesh(self, body: BodyRef) -> Mesh:
         """The checked mesh of a body; a MeshError where it cannot be used."""
         return load_mesh(body.path, self.reading, part=body.part, least_vertices=self.config.n_vertices_read)
@@ -151,7 +158,8 @@ class SignaturePipeline:
 
     def key(self, body: BodyRef) -> str:
         """A Signature's name in the cache, by all that it depends on; a MeshError where the file cannot be read."""
-        return self._key(body, BodyFile.of(body.path, self.reading), self.config, False)
+        key = self._key(body, BodyFile.of(body.path, self.reading), self.config, False)
+        return key if self.pre_transform is None else self._changed_key(body, key)
 
     def _hit(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> CacheHit:
         return self._lookup(body, file) or self._made(body, file, mesh)[0]

@@ -142,5 +142,5 @@ def nearest_neighbours(points: Tensor, n_nearest: int = N_NEIGHBOURS) -> Tensor:
         raise ValueError("samples: expected at least one of each body, got none.")
     with full_precision():
         squares = torch.cdist(points.detach(), points.detach(), compute_mode="use_mm_for_euclid_dist")
-    squares.fill_diagonal_(torch.inf)
+    squares.diagonal().fill_(torch.inf)
     return smallest(squares, min(n_nearest, len(points) - 1))[1]

@@ -115,7 +115,7 @@ class Descriptor(Specified, ABC):
         """(N, ...) descriptions of N shapes; a ValueError if the batch lacks what the descriptor needs."""
         self.requirements.check(batch)
         # On other devices nothing is gained, and what is traced runs later.
-        alone = batch.area.device.type == "cpu" and not torch.compiler.is_compiling()
+        alone = batch.device.type == "cpu" and not torch.compiler.is_compiling()
         with one_thread() if alone else contextlib.nullcontext():
             return self.describe(batch)
 
@@ -157,7 +157,7 @@ class BodyDescriptor(Descriptor):
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, ...) descriptions, on the device of the batch."""
         descriptions = [np.asarray(self.describe_body(body), dtype=np.float32) for body in batch.bodies()]
-        return torch.from_numpy(np.stack(descriptions)).to(batch.area.device)
+        return torch.from_numpy(np.stack(descriptions)).to(batch.device)
 
 
 class HistogramDescriptor(Descriptor):

@@ -73,7 +73,11 @@ def interior_distance(p: Tensor, q: Tensor) -> Tensor:
 
 def barycentroid_potential(embedding: Tensor) -> Tensor:
     """(..., P) the potential U, the norm of embeddings (..., P, K) (Rustamov 2010); least at the barycentroid."""
-    return torch.linalg.vector_norm(embedding, dim=-1)
+    if not embedding.requires_grad:
+        return torch.linalg.vector_norm(embedding, dim=-1)
+    nothing = ~embedding.detach().any(dim=-1)  # padding, where a norm has a first derivative of 0 and no second one
+    norms = torch.linalg.vector_norm(embedding.masked_fill(nothing.unsqueeze(-1), 1), dim=-1)
+    return norms.masked_fill(nothing, 0)
 
 
 class SpectralEmbedding(Specified):

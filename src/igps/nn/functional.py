@@ -1,7 +1,7 @@
 """The mathematics of the modules as functions of tensors, without parameters or state."""
 
 from igps.nn._kernels.balls import ball_radii
-from igps.nn._kernels.pair_values import euclidean_distances, oriented_pairs, point_pair_features
+from igps.nn._kernels.pair_values import euclidean_distances, oriented_pairs, pair_twists, point_pair_features
 from igps.nn.axes.points import soft_memberships
 from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding, spectral_weights
 from igps.nn.histograms.pairs import joint_histogram, pair_histogram
@@ -16,6 +16,7 @@ __all__ = [
     "joint_histogram",
     "oriented_pairs",
     "pair_histogram",
+    "pair_twists",
     "point_pair_features",
     "soft_memberships",
     "spectral_embedding",

@@ -160,9 +160,9 @@ class RetrievalLearner(LightningModule):
     @one_thread()
     def training_step(self, batch: SignatureBatch, batch_index: int) -> Tensor:
         """Loss of one P×K batch."""
-        embeddings = self._head(self(batch))
-        chosen = () if self.miner is None else (self.miner(embeddings, batch.labels),)
-        loss: Tensor = self.loss(embeddings, batch.labels, *chosen)
+        embeddings, labels = self._head(self(batch)), _known_labels(batch)
+        chosen = () if self.miner is None else (self.miner(embeddings, labels),)
+        loss: Tensor = self.loss(embeddings, labels, *chosen)
         self.log("train_loss", loss, batch_size=len(batch), prog_bar=True)
         return loss
 
@@ -232,9 +232,19 @@ class RetrievalLearner(LightningModule):
         if not isinstance(loader, DataLoader):
             raise ValueError(f"train_dataloaders: expected one DataLoader, got {type(loader).__name__}.")
         in_order = DataLoader(loader.dataset, batch_size=16, collate_fn=loader.collate_fn)
-        parts = [(self(batch.to(self.device)), batch.labels) for batch in in_order]
+        parts = [(self(batch.to(self.device)), _known_labels(batch)) for batch in in_order]
         descriptions, labels = zip(*parts, strict=True)
         return torch.cat(descriptions), torch.cat(labels)
+
+
+def _known_labels(batch: SignatureBatch) -> Tensor:
+    """(N,) labels of a batch; a ValueError where a class is not known, as −1 would be a class like any other."""
+    if bool((batch.labels < 0).any()):
+        raise ValueError(
+            "labels: expected the class of each body, got −1, an unknown one. Give folders of classes, a labels.csv, "
+            "or SignatureDataset(labels=...)."
+        )
+    return batch.labels
 
 
 def _class_paths(configuration: Any) -> Iterator[str]:

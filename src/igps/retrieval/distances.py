@@ -1,10 +1,10 @@
 """Distances between every query and every gallery descriptor: tensors (Q, ...) and (G, ...) in, (Q, G) out.
 
 Smaller is closer, identical descriptors are at exactly zero, and a distance matrix of a set with itself is exactly
-symmetric. All dimensions after the first are cells, or entries of one vector. All functions are differentiable, run on
-the device of their inputs, and compute half precision in float32. All raise a ValueError for shapes, dtypes or devices
-that do not fit, for NaN or infinite entries, and those of histograms for negative ones; to check that waits for the
-device once per argument.
+symmetric. All dimensions after the first are cells, or entries of one vector. All functions are differentiable, χ² any
+number of times and the others once; they run on the device of their inputs, and compute half precision in float32. All
+raise a ValueError for shapes, dtypes or devices that do not fit, for NaN or infinite entries, and those of histograms
+for negative ones; to check that waits for the device once per argument.
 """
 
 import math
@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
-from torch.autograd.function import once_differentiable
 
 from igps._threads import Team
 from igps.retrieval import distance_loops
@@ -38,8 +37,8 @@ def chi_square(queries: Tensor, gallery: Tensor, weights: Tensor | None = None) 
 
     With the ½ (and w = 1) the distance of two histograms that each sum to 1 lies in [0, 1], and is 1 where they have no
     cell in common. A cell empty in both adds nothing, and the gradients of such a cell are set to zero, where the
-    function has no derivative. Memory beyond inputs, result and gradients stays below 256 MiB, backward included.
-    First derivatives only. Source: Rustamov 2010 (comparison of histograms by χ²).
+    function has no derivative. Memory beyond inputs, result and gradients stays below 256 MiB, but derivatives of
+    gradients hold all triples of query, gallery and cell. Source: Rustamov 2010 (comparison of histograms by χ²).
 
     Example:
         >>> import torch
@@ -103,9 +102,12 @@ class _ChiSquare(torch.autograd.Function):
         return distances.mul_(0.5)
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         a, b, w = ctx.saved_tensors
+        if torch.is_grad_enabled():  # derivatives of the gradient are asked for
+            leaves = [one for one, is_needed in zip((a, b, w), ctx.needs_input_grad, strict=True) if is_needed]
+            found = iter(torch.autograd.grad(_all_at_once(a, b, w), leaves, grad, create_graph=True))
+            return tuple(next(found) if is_needed else None for is_needed in ctx.needs_input_grad)
         grad_a, grad_b = torch.zeros_like(a), torch.zeros_like(b)
         grad_w = torch.zeros_like(w) if ctx.needs_input_grad[2] else None
         for q, g, c in _tiles(a, b):
@@ -121,6 +123,15 @@ class _ChiSquare(torch.autograd.Function):
         if w is not None:
             grad_a, grad_b = grad_a * w, grad_b * w
         return grad_a, grad_b, None if grad_w is None else grad_w / 2
+
+
+def _all_at_once(a: Tensor, b: Tensor, w: Tensor | None) -> Tensor:
+    """χ² in operations of PyTorch, which hold all (Q, G, cells) and have derivatives of any order."""
+    total = a[:, None] + b
+    filled = total > 0
+    difference = torch.where(filled, a[:, None] - b, 0)
+    terms = difference.square() / torch.where(filled, total, 1)
+    return (terms if w is None else terms * w).sum(dim=-1) / 2
 
 
 def _is_for_loops(tensor: Tensor) -> bool:

@@ -184,8 +184,6 @@ def _ranked_relevance(
     order = rank(distances if isinstance(distances, Tensor) else torch.as_tensor(distances, device="cpu")).cpu()
     n_queries, n_gallery = order.shape
     queries = _label_tuple("query_labels", query_labels, n_queries)
-    if n_queries and set(queries) == {-1}:
-        raise ValueError("query_labels: expected labels, all are −1, as of a dataset whose bodies have no classes")
     if gallery_labels is None:
         if n_queries != n_gallery:
             raise ValueError(
@@ -220,6 +218,8 @@ def _label_tuple(name: str, labels: Labels, n_expected: int) -> tuple[Hashable, 
         raise ValueError(
             f"{name}: expected an integer tensor (N,) or a sequence of integers or strings, got {labels!r}"
         )
+    if -1 in labels:
+        raise ValueError(f"{name}: expected the class of each, got −1, which is unknown. Leave those out.")
     if len(labels) != n_expected:
         raise ValueError(
             f"{name}: expected {n_expected} labels, one for each of the distances' entries, got {len(labels)}"

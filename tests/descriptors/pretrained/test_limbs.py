@@ -201,3 +201,10 @@ def test_gradients_are_those_of_differences() -> None:
     assert torch.autograd.gradcheck(branches, embedding.requires_grad_())
     embedding.requires_grad_(False)
     assert torch.autograd.gradcheck(pieces, points.requires_grad_())
+
+
+@BOTH
+def test_a_program_is_compiled_around_them(make: Maker) -> None:
+    batch, module = two_bodies(), make(embedding=EMBEDDING)
+    torch.compiler.reset()
+    torch.testing.assert_close(torch.compile(module, backend="aot_eager")(batch), module(batch), rtol=0, atol=1e-6)

@@ -364,7 +364,7 @@ def test_gradients_equal_those_of_the_dense_definition(
         torch.testing.assert_close(by_hand, by_torch, rtol=1e-9, atol=1e-13)
 
 
-@pytest.mark.parametrize("layout", [["many"], ["few", "own"], ["few", "cosines"]])
+@pytest.mark.parametrize("layout", [["many"], ["few", "own"], ["few", "cosines"], ["twists"]])
 def test_gradcheck(device: str, layout: list[str]) -> None:
     given = some(7, n_classes=2, seed=1)
     names = ["memberships", *dict.fromkeys({"many": "coordinates", "own": "heights"}.get(k, "points") for k in layout)]
@@ -377,7 +377,19 @@ def test_gradcheck(device: str, layout: list[str]) -> None:
     for gradient in torch.autograd.grad(histogram(*leaves).square().sum(), leaves):
         assert (gradient.abs() > 1e-9).any()
     # A GPU adds in any order.
-    assert torch.autograd.gradcheck(histogram, leaves, nondet_tol=1e-12 if device == "cuda" else 0)
+    some_order = 1e-12 if device == "cuda" else 0
+    assert torch.autograd.gradcheck(histogram, leaves, nondet_tol=some_order)
+    assert torch.autograd.gradgradcheck(histogram, leaves, nondet_tol=some_order)
+
+
+@pytest.mark.parametrize("layout", [["many"], ["few", "own"], ["few", "cosines"], ["twists"]])
+def test_gradients_taken_under_autocast_keep_their_digits(layout: list[str]) -> None:
+    given = {name: value.float().requires_grad_() for name, value in some(30).items()}
+    leaves = [given["coordinates" if layout == ["many"] else "points"]]
+    [expected] = torch.autograd.grad(counted(layout, given).square().sum(), leaves)
+    with torch.autocast("cpu", torch.bfloat16):
+        [found] = torch.autograd.grad(counted(layout, given).square().sum(), leaves)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6 * float(expected.abs().max()))
 
 
 def test_coincident_points_have_finite_gradients(device: str) -> None:

@@ -30,6 +30,12 @@ def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = ()) -
     """
     if not torch.isfinite(values).all():
         raise ValueError("values: expected finite numbers, got NaN or infinity.")
+    if torch.compiler.is_compiling():  # the loops are compiled already; as a decorator this would import the compiler
+        return torch.compiler.disable(_merge_tree)(values, neighbours, counts)
+    return _merge_tree(values, neighbours, counts)
+
+
+def _merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int]) -> MergeTree:
     order = torch.argsort(values.detach(), descending=True, stable=True).cpu().numpy()
     ends = np.empty((len(values), 2), np.int64)
     pieces = np.full((len(counts), len(values)), -1, np.int64)

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn.utils.rnn import pad_sequence
 
 from igps._arrays import Booleans, Floats
 from igps._threads import ALONE, Team
+from igps.nn._kernels.count_by_torch import count_by_torch
 from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES, Axes, Numbers, Places
 from igps.nn._kernels.pair_loops import count_block, gradient_block
 from igps.nn._kernels.pair_values import PairValues, centres_of, cosine_factors, with_tensors
@@ -55,9 +55,15 @@ class CompiledCount(torch.autograd.Function):
         return torch.stack(_of_shapes(counts, len(weights)))
 
     @staticmethod
-    @once_differentiable
+    @torch.autocast("cpu", enabled=False)
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         weights, *tensors = ctx.saved_tensors
+        if torch.is_grad_enabled():  # derivatives of the gradient are asked for, which loops do not have
+            layout, which = ctx.layout, ctx.needs_input_grad[1:]
+            counts = count_by_torch(layout.classes, layout.n_classes, layout.pairs, layout.mask, weights, *tensors)
+            leaves = [one for one, is_needed in zip((weights, *tensors), which, strict=True) if is_needed]
+            given = iter(torch.autograd.grad(counts, leaves, upstream, create_graph=True, allow_unused=True))
+            return None, *(next(given) if is_needed else None for is_needed in which)
         gradients = [torch.zeros_like(tensor) for tensor in (weights, *tensors)]
 
         def derivatives(number: int, team: Team) -> tuple[Tensor, list[Tensor]]:

@@ -114,8 +114,7 @@ def _distances(rows: Inputs, columns: Inputs) -> Tensor:
 def _cosines(rows: Inputs, columns: Inputs) -> Tensor:
     factors = zip(cosine_factors(*rows), cosine_factors(*columns), strict=True)
     here, there, among = (left @ right.mT for (left, _), (_, right) in factors)
-    length = torch.cdist(rows[0], columns[0], compute_mode="donot_use_mm_for_euclid_dist")
-    inverse = torch.where(length > 0, 1 / torch.where(length > 0, length, 1), 0)
+    inverse = _inverse_distances(rows[0], columns[0])
     here, there = (here * inverse).clamp(-1, 1), (there * inverse).clamp(-1, 1)
     return torch.stack([torch.maximum(here, there), torch.minimum(here, there), among], dim=-3)
 
@@ -125,9 +124,17 @@ def _twists(rows: Inputs, columns: Inputs) -> Tensor:
     (p, m), (q, n) = (rows[0] - centre, rows[1]), (columns[0] - centre, columns[1])
     # (m × n)·(q − p) = m·(n × q) − (p × m)·n: products of matrices
     triple = m @ torch.linalg.cross(n, q).mT - torch.linalg.cross(p, m) @ n.mT
-    squares = (p.unsqueeze(-2) - q.unsqueeze(-3)).square().sum(dim=-1)
-    inverse = torch.where(squares > 0, torch.where(squares > 0, squares, 1).rsqrt(), 0)
-    return (triple * inverse).clamp(-1, 1).unsqueeze(-3)
+    return (triple * _inverse_distances(p, q)).clamp(-1, 1).unsqueeze(-3)
+
+
+def _inverse_distances(x: Tensor, y: Tensor) -> Tensor:
+    """(N, I, J) one over the distances of points (N, I, D) and (N, J, D), 0 where they coincide."""
+    if x.shape[-1] > 3:  # one difference after the other would be slow; PyTorch has first derivatives of this alone
+        squares = torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist").square()
+    else:
+        both = zip(x.unbind(-1), y.unbind(-1), strict=True)
+        squares = sum(((a.unsqueeze(-1) - b.unsqueeze(-2)).square() for a, b in both), x.new_zeros(()))
+    return torch.where(squares > 0, torch.where(squares > 0, squares, 1).rsqrt(), 0)
 
 
 def centres_of(pairs: Sequence[PairValues]) -> list[Tensor]:

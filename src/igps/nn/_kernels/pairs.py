@@ -1,8 +1,8 @@
 """One count of pairs of points, into a product of classes and bins, with two back ends.
 
 `count_pairs` is what every histogram of pairs comes down to. On the CPU it runs in compiled loops, with a gradient of
-their own (`count_by_loops`); on other devices, and where PyTorch traces it for `torch.compile` or `torch.export`, in
-operations of PyTorch (`count_by_torch`). Both count in double precision, hold no matrix of
+their own (`count_by_loops`); on other devices, where PyTorch traces it for `torch.compile` or `torch.export`, and for
+derivatives of gradients, in operations of PyTorch (`count_by_torch`). Both count in double precision, hold no matrix of
 all pairs, and have gradients by all that the values are computed from, by the weights and by the centres.
 """
 
