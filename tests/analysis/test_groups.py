@@ -132,6 +132,18 @@ def test_the_interval_covers_the_effect() -> None:
     assert 0.88 < np.mean(covered) < 0.99
 
 
+@pytest.mark.filterwarnings("error")
+def test_small_groups_have_an_interval() -> None:
+    """In two of five runs all six of a group are drawn as one body at least once, which has no scatter."""
+    random = np.random.default_rng(6)
+    vectors = random.normal(size=(12, 3)) + np.repeat([0, 1], 6)[:, None]
+    for seed in range(8):
+        found = quick(vectors, ["a"] * 6 + ["b"] * 6, seed, n_bootstraps=2000)
+        assert found.effect_low is not None
+        assert found.effect_high is not None
+        assert found.effect_low < found.effect_high < 1
+
+
 def test_a_probability_is_that_of_all_arrangements() -> None:
     """Ten numbers in two groups of five: 252 arrangements, counted one by one."""
     from itertools import combinations

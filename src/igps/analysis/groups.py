@@ -152,7 +152,10 @@ def group_test(
     unexplained = np.maximum(1 - overlap / added.shape[1], _ROUNDING)
     sizes = np.bincount(group)
     weights = [random.multinomial(k, np.full(k, 1 / k), n_bootstraps) for k in sizes]
-    low, high = np.quantile(_effects(squares, group, weights), (0.025, 0.975)) if n_bootstraps else (None, None)
+    # Of a small group all may be drawn as one body, whose scatter nobody knows
+    with np.errstate(invalid="ignore"):
+        effects = _effects(squares, group, weights)
+    low, high = np.nanquantile(effects, (0.025, 0.975)) if n_bootstraps else (None, None)
     return replace(
         untested,
         permanova_f=float(pseudo_f[0]),
