@@ -138,7 +138,7 @@ def find_bodies(
         ValueError: `labels.csv` cannot be understood, or no classes are told where they must be.
     """
     root, options = Path(root), options or LoadOptions()
-    if not _is_told(root):
+    if not _is_told(root.absolute()):
         raise ValueError(f"{os.fsencode(root)!r}: a name in UTF-8 expected. Rename the folder.")
     if not root.is_dir():
         raise FileNotFoundError(f"{root}: {'a file; a folder expected' if root.exists() else 'no such folder'}.")
@@ -178,7 +178,7 @@ def given_bodies(
     files = [file_and_part(Path(path)) for path in paths]
     if not files:
         raise ValueError("paths: expected at least one mesh file, got none.")
-    if unknown := [file for file, _ in files if not _is_told(file)]:
+    if unknown := [file for file, _ in files if not _is_told(file.absolute())]:
         raise ValueError(f"paths: expected names in UTF-8, got {os.fsencode(unknown[0])!r}. Rename the file.")
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
@@ -297,4 +297,4 @@ def _files_in(folder: Path) -> list[Path]:
 
 def _is_told(path: Path) -> bool:
     """Whether the name of a file can be printed and written: those of other systems may be bytes without meaning."""
-    return not any("\udc80" <= letter <= "\udcff" for letter in os.path.abspath(path))
+    return str(path).encode(errors="ignore").decode() == str(path)
