@@ -226,4 +226,4 @@ def test_the_profile_of_a_ball_is_its_closed_form() -> None:
     radius, shares = 1 / np.sqrt(4 * np.pi), (np.arange(64) + 0.5) / 64
     np.testing.assert_allclose(profile[0], 2 * radius * np.sqrt(shares), atol=5e-3)
     np.testing.assert_allclose(profile[1], radius / 2, rtol=1e-3)
-    np.testing.assert_allclose(profile[2], radius / 2, rtol=1e-3)
+    np.testing.assert_allclose(profile[2], radius / 3, rtol=1e-3)

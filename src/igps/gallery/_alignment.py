@@ -31,6 +31,8 @@ _N_ROTATIONS = 300
 _N_PROFILE = 1000
 _N_SCORED, _N_FITTED = 60, 250
 _N_TRIED, _COARSE_STEPS, _FINE_STEPS, _LAST_STEPS = 12, 6, 4, 10
+# Placings that samples tell no better from each other than by this factor are laid onto the surface
+_ALIKE = 1.5
 # After the fine steps, what is farther than the hopeless distance over this is hopeless. With 0.03 for that, copies of
 # generated bodies are within 0.0033 then, well below 0.02; those of thin wires come near it.
 _FINER = 1.5
@@ -73,16 +75,16 @@ class SurfaceSamples:
 
     @property
     def profile(self) -> Array:
-        """(3, 64) quantiles of distances between samples, and of half of those from the middle to samples and tangents.
+        """(3, 64) quantiles of distances between samples, of half of those to the middle, of a third to tangent planes.
 
         The root mean square difference of two surfaces' distances between samples is at most twice that of their
         offsets, but for what the sampling adds, and however the surfaces are laid: distances between corresponding
         points differ by no more than both moved. Relief that goes in and out, which `surface_distance` averages away,
-        hardly moves a quantile either. The middle moves with the sampling, and tangent planes turn with relief, so that
-        these count half.
+        hardly moves a quantile either. The middle moves with the sampling, and the planes' distances from it also with
+        relief, which turns them: so these count less.
         """
-        from_middle = np.linalg.norm(self.points, axis=1), np.einsum("ni,ni->n", self.points, self.normals)
-        lengths = pdist(_subset(self, _N_PROFILE).points), *(some / 2 for some in from_middle)
+        planes = np.einsum("ni,ni->n", self.points, self.normals)
+        lengths = pdist(_subset(self, _N_PROFILE).points), np.linalg.norm(self.points, axis=1) / 2, planes / 3
         return np.stack([np.quantile(some, (np.arange(64) + 0.5) / 64) for some in lengths])
 
     @property
@@ -144,7 +146,9 @@ def surface_distance(
         if far <= hopeless:
             # Of a spring's turns samples tell no more than how far apart they lie: the surface itself decides
             finest = other if other.surface is None else other.surface()
-            fine = [_fitted(samples, finest, placing, _FINE_STEPS) for _, placing in coarse]
+            fine = [
+                _fitted(samples, finest, placing, _FINE_STEPS) for apart, placing in coarse if apart <= _ALIKE * far
+            ]
             far, placing = min(fine, key=itemgetter(0))
             if far <= hopeless / _FINER:
                 far = _apart(one, other, placing, patch, most)
