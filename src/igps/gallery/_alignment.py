@@ -34,7 +34,7 @@ _N_TRIED, _COARSE_STEPS, _FINE_STEPS, _LAST_STEPS = 12, 6, 4, 10
 # Placings that samples tell no better from each other than by this factor are laid onto the surface
 _ALIKE = 1.5
 # After the fine steps, what is farther than the hopeless distance over this is hopeless. With 0.03 for that, 99 % of
-# copies of generated bodies are within 0.0036 then, well below 0.02; the others are found from other starts.
+# copies of generated bodies are within 0.006 then, well below 0.02; the others are found from other starts.
 _FINER = 1.5
 # Neighbouring samples whose offsets are averaged.
 _PATCH = 10
