@@ -135,7 +135,7 @@ def test_the_interval_covers_the_effect() -> None:
 
 
 def test_matched_pairs_tell_nothing_where_there_is_nothing() -> None:
-    """Strata of two leave what mirrors itself: one of a pair must not tell the other, nor halve what chance explains."""
+    """Strata of two leave what mirrors itself: one of a pair must not tell the other, nor chance count half."""
     random = np.random.default_rng(10)
     pairs, found = [str(i) for i in range(12)] * 2, []
     for draw in range(40):

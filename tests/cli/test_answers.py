@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from matplotlib.image import imread
 
 from igps.analysis.clusters import clusters_of
@@ -122,6 +123,28 @@ def test_explain_writes_shares_that_add_up(
         assert sum(shares) == pytest.approx(float(part["share"]), rel=1e-6)
         assert f"short0.off and {root}/long3.off: {float(part['share']):.4g}" in printed
     assert imread(tmp_path / "explain.png").std() > 0.02
+
+
+@pytest.mark.parametrize("is_group", [False, True])
+def test_explain_heeds_size_and_side(
+    is_group: bool, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Bodies that are twice as large as others of their form differ in size; the side of symmetric ones is rounding."""
+    folder = root.parent / f"sized{is_group}"
+    for label, factor in (("small", 1.0), ("large", 2.0)):
+        for i in range(8):
+            egg = trimesh.creation.icosphere(subdivisions=2)
+            egg.vertices *= np.array([1, 1, 1.2 + i / 50]) * factor
+            (folder / label).mkdir(parents=True, exist_ok=True)
+            egg.export(folder / label / f"{i}.off")
+    what = [folder] if is_group else [folder / "small" / "0.off", folder / "large" / "0.off"]
+    own = ["--descriptor", "own_descriptors:small_gps"]
+    igps(monkeypatch, root, "explain", *what, *own, "--size", "keep", "--mirror", "distinct", "--json")
+    found = json.loads(capsys.readouterr().out)
+    shares = {row["histogram"]: row["share"] for row in found["shares"]}
+    assert list(shares)[-2:] == ["side", "size"]
+    assert shares["size"] > 0.5 * found["distance"]
+    assert shares["size"] + shares["side"] == pytest.approx(found["distance"], rel=1e-3)
 
 
 @pytest.mark.parametrize("words", [["clusters"], ["figure", "clusters"]])

@@ -8,7 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from igps._parameters import check_at_least
-from igps.analysis.explanation import KINDS, Explanation, explain_groups, on_surface
+from igps.analysis.explanation import KINDS, Explanation, contents_of, explain_groups, on_surface
 from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, vectors_of, with_discovery_rates
 from igps.analysis.outliers import measures_of
@@ -17,8 +17,9 @@ from igps.cli.reading import Folder, described, files_or_folder, print_failures
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
+from igps.descriptors.fingerprint import cache_tag
 from igps.mesh.mesh import Mesh
-from igps.nn.descriptor import EmbeddedDescriptor
+from igps.nn.description import describe
 from igps.report.answers import explanation_figure, groups_figure, outliers_figure, write_answer
 from igps.report.tables import groups_table
 
@@ -138,14 +139,15 @@ def explain(
         out: folder for explain.csv, the shares of the histograms; explain_samples.csv, those of the samples; and both
             bodies painted from two sides as explain.svg and explain.png.
     """
-    module = descriptor_of(descriptor)
     source = files_or_folder(meshes)
+    contents_of(descriptor_of(descriptor))  # refuses others before anything is computed
     if isinstance(source, Folder):
-        inner = module.descriptor if isinstance(module, EmbeddedDescriptor) else module
         folder = Folder(source.root, labelled=True, needs_meshes=True, check=_check_two_classes)
-        bodies = described(folder, inner, **reading)
+        bodies = described(folder, descriptor, **reading)
         _check_two_classes(bodies.dataset.bodies)  # those that are left
-        dataset, descriptions, labels = bodies.dataset, bodies.descriptions, np.array(bodies.dataset.bodies.labels)
+        dataset, module, labels = bodies.dataset, bodies.descriptor, np.array(bodies.dataset.bodies.labels)
+        inner, n_workers = contents_of(module), reading.get("n_workers")
+        descriptions = describe(dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True)
         classes = sorted(set(labels))
         members = [np.flatnonzero(labels == name) for name in classes]
         squares = squared_distances(descriptions.flatten(1).double().sqrt().numpy())
@@ -154,12 +156,13 @@ def explain(
         found, kept = explain_groups(module, descriptions[members[0]], descriptions[members[1]], batches, level=level)
         print(f"{int(kept.sum())} of {len(kept)} cells differ by more than chance; painted: the middle of each group")
     else:
-        dataset, chosen = described(source, module, **{**reading, "strict": True}).dataset, [0, 1]
+        bodies, chosen = described(source, descriptor, **{**reading, "strict": True}), [0, 1]
+        dataset, module = bodies.dataset, bodies.descriptor
         if len(dataset) != 2:
             raise ValueError(f"meshes: expected two bodies, got {len(dataset)}. Name two files, or FILE#PART.")
         found = explain_pair(module, *(dataset.batch([i]) for i in chosen))
     names = [dataset.bodies.names[i] for i in chosen]
-    print(f"{' and '.join(names)}: {found.distance:.4g} by {descriptor}: {found.summary()}")
+    print(f"{' and '.join(names)}: {found.distance:.4g} by {module.name}: {found.summary()}")
     painted = [_painted(dataset, i, found, place) for place, i in enumerate(chosen)]
     for name, (_, values) in zip(names, painted, strict=True):
         print(f"{name}: half of what is its own lies on {_half(values):.0%} of its surface")
