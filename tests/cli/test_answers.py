@@ -81,6 +81,29 @@ def test_groups_prints_and_writes_the_tests(
     assert (tmp_path / "groups.svg").read_text().startswith("<?xml")
 
 
+def test_a_covariate_may_be_words_but_no_mistyped_number(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = table(root / "labels.csv")
+    lines = [
+        f"{root / row['file']},{row['label']},{'fmm'[i % 3]},{'5o' if i == 4 else i}" for i, row in enumerate(rows)
+    ]
+    (tmp_path / "labels.csv").write_text("\n".join(["file,label,sex,dose", *lines]))
+    words = ["groups", tmp_path, *OWN, "--n_permutations", "199"]
+    igps(monkeypatch, root, *words, "--covariate", "sex", "--json")
+    (found,) = json.loads(capsys.readouterr().out)
+    vectors = vectors_of(
+        small_interior(), describe(SignatureDataset(root, CONFIG, root.parent / "cache"), small_interior())
+    )
+    is_f = np.arange(13)[:, None] % 3 == 0
+    expected = group_test(vectors, [row["label"] for row in rows], covariates=is_f.astype(float), n_permutations=199)
+    assert found["permanova_f"] == pytest.approx(expected.permanova_f)
+    assert found["permanova_p"] == expected.permanova_p
+    with pytest.raises(SystemExit, match="1"):
+        igps(monkeypatch, root, *words, "--covariate", "dose")
+    assert "dose: expected numbers, got '5o'" in capsys.readouterr().err
+
+
 def test_groups_refuses_three_of_a_group(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -230,7 +253,7 @@ def test_names_are_drawn_as_they_are_and_not_as_formulas(tmp_path: Path) -> None
         ),
         (["groups", "--group", "weight"], "weight: no such column of labels.csv; further columns: scanner, age"),
         (["groups", "--strata", "weight"], "weight: no such column of labels.csv"),
-        (["groups", "--covariate", "age", "scanner"], "scanner: expected numbers, got 'x' of short0.off"),
+        (["groups", "--covariate", "age", "weight"], "weight: no such column of labels.csv"),
     ],
 )
 def test_what_labels_do_not_tell_is_refused_before_anything_is_computed(

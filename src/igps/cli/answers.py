@@ -1,5 +1,6 @@
 """`igps groups`, `igps outliers` and `igps explain`."""
 
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,7 @@ def groups(
         root: folder with one subfolder per group, or with files and a labels.csv (columns file,label and more).
         group: a column of labels.csv that tells the groups; the class if not given.
         strata: a column within whose values bodies are permuted, such as scanner.
-        covariate: columns of numbers that are regressed out first, such as age.
+        covariate: columns that are regressed out first: numbers, such as age, or words, such as sex.
         size: test the size, too, the logarithm of the volume, in lines of its own
         out: folder for groups.csv, groups.json, and the effects as groups.svg and groups.png.
         n_permutations: random ones.
@@ -55,7 +56,7 @@ def groups(
     def columns(bodies: Bodies) -> tuple[Any, Any, Any]:
         labels = np.array(bodies.labels if group is None else bodies.column(group))
         of_strata = None if strata is None else np.array(bodies.column(strata))
-        return labels, of_strata, np.array([bodies.numbers(name) for name in covariate]).T if covariate else None
+        return labels, of_strata, np.hstack([_numbers(bodies, name) for name in covariate]) if covariate else None
 
     folder = Folder(root, labelled=group is None, check=columns)
     found = described(folder, descriptor, size="ignore", **reading)
@@ -85,6 +86,14 @@ def groups(
         write_answer(out, "groups", rows, groups_figure(tests))
         print(f"written to {out}")
     return [asdict(one) for one in tests]
+
+
+def _numbers(bodies: Bodies, name: str) -> Any:
+    """(N, k) the numbers of a column; of one of words alone, which of them each body has."""
+    words = bodies.column(name)
+    if any(re.match(r"[-+.\d]|nan|inf", word, re.IGNORECASE) for word in words):
+        return np.array(bodies.numbers(name))[:, None]
+    return np.array([[word == one for one in sorted(set(words))] for word in words], dtype=float)
 
 
 def outliers(
