@@ -126,6 +126,9 @@ def test_outliers_lists_the_short_egg_among_the_long_first(
     assert rows[0]["body"] == "long6.off"
     assert "lies among short" in rows[0]["reason"]
     assert "long6.off" in printed.splitlines()[1]
+    svg = (tmp_path / "outliers.svg").read_text()
+    assert f"<!-- {float(rows[0]['score']):.1f}  long6.off -->" in svg
+    assert str(root) not in svg
     assert [float(row["score"]) for row in rows] == sorted((float(row["score"]) for row in rows), reverse=True)
     assert imread(tmp_path / "outliers.png").std() > 0.02
 
@@ -242,6 +245,18 @@ def test_names_are_drawn_as_they_are_and_not_as_formulas(tmp_path: Path) -> None
         assert imread(tmp_path / f"{name}.png").std() > 0.02
         drawn = (tmp_path / f"{name}.svg").read_text()
         assert all(f"<!-- {one}" in drawn for one in names)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_picture_is_the_same_each_time_and_has_room_for_long_names(tmp_path: Path) -> None:
+    distances = np.array([[0.0, 1, 3], [1, 0, 2], [3, 2, 0]])
+    for folder in ("one", "other"):
+        figure = clusters_figure(clusters_of(distances, 2), ["a", "b", "sub-01/" + "x" * 200 + ".off"])
+        write_answer(tmp_path / folder, "clusters", [{"body": "a"}], figure)
+        assert figure.axes[0].get_window_extent().width > 0.4 * figure.bbox.width
+    one, other = ((tmp_path / folder / "clusters.svg").read_bytes() for folder in ("one", "other"))
+    assert one == other
+    assert "<!-- sub-01/xxx" in one.decode()
 
 
 @pytest.mark.parametrize(

@@ -123,10 +123,8 @@ def outliers(
                 )
             )
         alone = "alone in its class, its shape is not judged" if np.isnan(own[i]) else "nothing unusual"
-        reason = "; ".join(told) if score > LIMIT else alone
-        if among is not None:
-            reason += f"; labelled {label}, lies among {among}"
-        found.append(Outlier(i, label, score, of_body, among, reason))
+        said = [*(told if score > LIMIT else ()), *([] if among is None else [f"labelled {label}, lies among {among}"])]
+        found.append(Outlier(i, label, score, of_body, among, "; ".join(said) or alone))
     return sorted(found, key=lambda one: -one.score)
 
 

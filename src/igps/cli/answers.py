@@ -129,7 +129,7 @@ def outliers(
     print(f"{sum(one.is_outlier for one in found)} of {len(rows)} bodies have a score above what chance explains")
     print_failures(bodies.failures, len(dataset))
     if out is not None:
-        pictured = [(one, dataset.mesh(one.body)) for one in found[: min(top, 12)]]
+        pictured = [(one, dataset.bodies.names[one.body], dataset.mesh(one.body)) for one in found[: min(top, 12)]]
         write_answer(out, "outliers", rows, outliers_figure(pictured))
         print(f"written to {out}")
     return rows
@@ -173,7 +173,7 @@ def explain(
     names = [dataset.bodies.names[i] for i in chosen]
     print(f"{' and '.join(names)}: {found.distance:.4g} by {module.name}: {found.summary()}")
     painted = [_painted(dataset, i, found, place) for place, i in enumerate(chosen)]
-    for name, (_, values) in zip(names, painted, strict=True):
+    for name, _, values in painted:
         print(f"{name}: half of what is its own lies on {_half(values):.0%} of its surface")
     parts = [{"histogram": name, "share": share} for name, share in found.parts.items()]
     if out is not None:
@@ -188,12 +188,12 @@ def _check_two_classes(bodies: Bodies) -> None:
         raise ValueError(f"meshes: expected a folder of two classes, got {n}.")
 
 
-def _painted(dataset: SignatureDataset, i: int, found: Explanation, place: int) -> tuple[Mesh, Any]:
-    """A body, and what each of its faces has of the difference."""
+def _painted(dataset: SignatureDataset, i: int, found: Explanation, place: int) -> tuple[str, Mesh, Any]:
+    """A body's name and mesh, and what each of its faces has of the difference."""
     mesh, signature = dataset.mesh(i), dataset[i].signature
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     samples = {kind: getattr(signature, kind).points for kind in KINDS}
-    return mesh, on_surface((found.places or found.samples)[place], samples, centres)
+    return dataset.bodies.names[i], mesh, on_surface((found.places or found.samples)[place], samples, centres)
 
 
 def _half(values: Any) -> float:
