@@ -217,6 +217,7 @@ def _shared(
 _AXES = {
     "InteriorDistance": "interior distances", "EuclideanDistance": "distances in space", "PairCosines": "directions",
     "EmbeddedPairCosines": "directions to the surface", "BallRadius": "thickness", "Attribute": "attributes",
+    "Shares": "kinds of residues",
     "AxialHistogram": "place along the axes", "BranchHistogram": "lengths of limbs",
     "PieceHistogram": "sizes of pieces", "SpectrumShares": "spectrum",
 }  # fmt: skip
