@@ -221,7 +221,7 @@ def _deviations(values: Values, codes: NDArray[np.int64], name: str) -> tuple[Va
 
     Usual is what the others of the class have; of a class of one, other classes. Where less is as odd as more, a body
     of a class of two or three is as far away as from both, whatever is less: other classes tell which of the two is
-    odd. All is over what a twentieth of the bodies exceed, where that is more than by chance.
+    odd. All is over what a twentieth of the other bodies exceed, where that is more than by chance.
     """
     n, least, known = len(values), _LEAST[name], np.isfinite(values)
     members = [np.setdiff1d(np.flatnonzero(known & (codes == codes[i])), i) for i in range(n)]
@@ -242,8 +242,12 @@ def _deviations(values: Values, codes: NDArray[np.int64], name: str) -> tuple[Va
                 usual[i] = usual[i] if len(own) else np.median(others)
         if opinions:
             found[i] = min(np.abs(opinions) if name in _TWO_SIDED else opinions)
-    scale = np.nanquantile(found, 0.95) / 1.645 if n > _FEW and np.isfinite(found).any() else 1.0
-    return found / max(1.0, scale), usual
+    order = np.sort(found[np.isfinite(found)])
+    if len(order) > _FEW:
+        place = int(0.95 * (len(order) - 2))
+        tail = np.where(found > order[place], order[place], order[place + 1])  # without the body itself
+        found = found / np.maximum(1.0, tail / 1.645)
+    return found, usual
 
 
 def _scatter(values: Values, least: float, tail: bool = True) -> float:
