@@ -244,8 +244,9 @@ def _deviations(values: Values, codes: NDArray[np.int64], name: str) -> tuple[Va
             found[i] = min(np.abs(opinions) if name in _TWO_SIDED else opinions)
     order = np.sort(found[np.isfinite(found)])
     if len(order) > _FEW:
-        place = int(0.95 * (len(order) - 2))
-        tail = np.where(found > order[place], order[place], order[place + 1])  # without the body itself
+        rank, place = order.searchsorted(found), 0.95 * (len(order) - 2)
+        low, high = (order[k + (rank <= k)] for k in (int(place), int(place) + 1))  # without the body itself
+        tail = low + (place - int(place)) * (high - low)
         found = found / np.maximum(1.0, tail / 1.645)
     return found, usual
 
