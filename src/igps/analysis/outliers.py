@@ -221,7 +221,7 @@ def _deviations(values: Values, codes: NDArray[np.int64], name: str) -> tuple[Va
 
     Usual is what the others of the class have; of a class of one, other classes. Where less is as odd as more, a body
     of a class of two or three is as far away as from both, whatever is less: other classes tell which of the two is
-    odd. All is over what a twentieth of the other bodies exceed, where that is more than by chance.
+    odd. All is over what a twentieth of the bodies exceed, where that is more than by chance.
     """
     n, least, known = len(values), _LEAST[name], np.isfinite(values)
     members = [np.setdiff1d(np.flatnonzero(known & (codes == codes[i])), i) for i in range(n)]
@@ -242,12 +242,8 @@ def _deviations(values: Values, codes: NDArray[np.int64], name: str) -> tuple[Va
                 usual[i] = usual[i] if len(own) else np.median(others)
         if opinions:
             found[i] = min(np.abs(opinions) if name in _TWO_SIDED else opinions)
-    order = np.sort(found[np.isfinite(found)])
-    if len(order) > _FEW:
-        rank, place = order.searchsorted(found), 0.95 * (len(order) - 2)
-        low, high = (order[k + (rank <= k)] for k in (int(place), int(place) + 1))  # without the body itself
-        tail = low + (place - int(place)) * (high - low)
-        found = found / np.maximum(1.0, tail / 1.645)
+    if (count := np.isfinite(found).sum()) > _FEW:  # without the largest, which may be the one that is odd
+        found /= max(1.0, np.nanquantile(found, min(0.95, 1 - 1 / (count - 1))) / 1.645)
     return found, usual
 
 
