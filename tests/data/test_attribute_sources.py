@@ -157,6 +157,18 @@ def write_vtk(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
     meshio.Mesh(mesh.vertices, [("triangle", mesh.faces)], point_data=arrays).write(path)
 
 
+def write_vtk_of_vtk(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
+    """With the notes that VTK writes behind arrays of a field."""
+    n, faces = len(values), len(mesh.faces)
+    points, heights, triangles = (" ".join(map(str, a.ravel())) for a in (mesh.vertices, values, mesh.faces))
+    head = f"# vtk DataFile Version 5.1\nvtk output\nASCII\nDATASET POLYDATA\nPOINTS {n} double\n{points}\n"
+    offsets = " ".join(map(str, range(0, 3 * faces + 1, 3)))
+    cells = f"POLYGONS {faces + 1} {3 * faces}\nOFFSETS vtktypeint64\n{offsets}\nCONNECTIVITY vtkIdType\n{triangles}\n"
+    notes = "METADATA\nINFORMATION 1\nNAME L2_NORM_RANGE LOCATION vtkDataArray\nDATA 2 0 1 \n\n"
+    field = f"FIELD FieldData 2\nother 1 {n} double\n{heights}\n{notes}height 1 {n} double\n{heights}\n{notes}"
+    path.write_text(f"{head}{cells}\nPOINT_DATA {n}\n{field}")
+
+
 def write_gifti(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
     nibabel = pytest.importorskip("nibabel")
     array = nibabel.gifti.GiftiDataArray(
@@ -175,6 +187,7 @@ def write_freesurfer(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> N
     [
         ("a.ply#height", write_ply),
         ("a.vtk#height", write_vtk),
+        ("a.vtk#height", write_vtk_of_vtk),
         ("a.vtu#height", write_vtk),
         ("a.shape.gii#height", write_gifti),
         ("lh.thickness", write_freesurfer),

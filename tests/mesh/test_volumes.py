@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from igps.mesh.formats import files_read
 from igps.mesh.formats.label_names import read_label_names
 from igps.mesh.formats.volumes import LabelVolume, label_surface, read_label_volume
-from igps.mesh.mesh import MeshError
+from igps.mesh.loading import each_body, load_mesh
+from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 
 nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
@@ -151,6 +152,42 @@ def test_a_stack_of_pictures_has_the_spacing_of_imagej_or_none(tmp_path: Path) -
     assert label_surface(plain, 3).volume == pytest.approx(384, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("words", "sides", "unit"),
+    [
+        ("unit=\\u00B5m\nspacing=2.0\n", (0.5e-3, 0.25e-3, 2e-3), "mm"),
+        ("unit=micron\n", (0.5e-3, 0.25e-3, 1e-3), "mm"),
+        ("unit=pixel\nspacing=2.0\n", (0.5, 0.25, 2), None),
+        ("", (0.5, 0.25, 1), None),
+    ],
+)
+def test_imagej_escapes_units_and_leaves_a_spacing_of_one_out(
+    words: str, sides: tuple[float, ...], unit: str | None, tmp_path: Path
+) -> None:
+    stack = np.ascontiguousarray(two_boxes().T)
+    about = f"ImageJ=1.53t\nimages={len(stack)}\nslices={len(stack)}\n{words}loop=false\n"
+    tifffile.imwrite(
+        tmp_path / "x.tif", stack, photometric="minisblack", description=about, metadata=None, resolution=(2, 4)
+    )
+    volume = read_label_volume(tmp_path / "x.tif")
+    np.testing.assert_allclose(np.diag(volume.affine)[:3], sides)
+    assert volume.unit == unit
+    np.testing.assert_array_equal(volume.layers[0], two_boxes())
+
+
+def test_pages_that_were_written_one_by_one_are_a_stack(tmp_path: Path) -> None:
+    with tifffile.TiffWriter(tmp_path / "x.tif") as file:
+        for page in np.ascontiguousarray(two_boxes().T):
+            file.write(page, photometric="minisblack")
+    np.testing.assert_array_equal(read_label_volume(tmp_path / "x.tif").layers[0], two_boxes())
+
+
+def test_a_stack_compressed_by_lzw_is_read(tmp_path: Path) -> None:
+    image = sitk.GetImageFromArray(np.ascontiguousarray(two_boxes().T))
+    sitk.WriteImage(image, str(tmp_path / "x.tif"), useCompression=True, compressor="LZW")
+    np.testing.assert_array_equal(read_label_volume(tmp_path / "x.tif").layers[0], two_boxes())
+
+
 def write_nrrd(path: Path, *lines: str) -> None:
     """Boxes in voxels of 1 × 1.5 × 2.5, by hand."""
     sizes, spacing = ["sizes: 14 12 10", "encoding: raw"], ["spacings: 1 1.5 2.5"]
@@ -174,6 +211,13 @@ def test_lengths_of_a_nrrd_file_are_in_its_unit(
     found = read_label_volume(tmp_path / "x.nrrd")
     assert found.unit == unit
     assert label_surface(found, 3).volume == pytest.approx(volume, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["x.mha", "x.nrrd", "x.nii.gz", "x.mgz"])
+def test_suffixes_may_be_upper_case(name: str, tmp_path: Path) -> None:
+    WRITERS.get(name, write_itk)(tmp_path / name, two_boxes())
+    path = (tmp_path / name).rename(tmp_path / name.upper())
+    np.testing.assert_array_equal(read_label_volume(path).layers[0], two_boxes())
 
 
 @pytest.mark.parametrize("name", ["x.raw", "./x.raw"])
@@ -200,6 +244,20 @@ def test_segments_of_slicer_have_names_and_may_overlap(tmp_path: Path) -> None:
     assert label_surface(volume, "body").volume == pytest.approx(704 * 3.75, rel=1e-3)
 
 
+def test_segments_of_slicer_before_4_11_each_have_a_layer(tmp_path: Path) -> None:
+    """It wrote no values and no layers; names are on one line, as in every table."""
+    image = itk_image(np.stack([two_boxes() == 3, two_boxes() > 0], axis=-1).astype(np.uint8), vector=True)
+    for number, name in enumerate(("left  kidney ", "body")):
+        image.SetMetaData(f"Segment{number}_Name", name)
+        image.SetMetaData(f"Segment{number}_ID", f"Segment_{number + 1}")
+    sitk.WriteImage(image, str(tmp_path / "x.seg.nrrd"))
+    assert label_bodies(read_label_volume(tmp_path / "x.seg.nrrd")) == [(1, "left kidney", 384), (2, "body", 704)]
+    one = itk_image((two_boxes() == 3).astype(np.uint8))
+    one.SetMetaData("Segment0_Name", "liver")
+    sitk.WriteImage(one, str(tmp_path / "y.seg.nrrd"))
+    assert label_bodies(read_label_volume(tmp_path / "y.seg.nrrd")) == [(1, "liver", 384)]
+
+
 @pytest.mark.parametrize("overlap", [False, True])
 def test_segments_of_dicom_have_names_and_may_overlap(overlap: bool, tmp_path: Path) -> None:
     write_segmentation(tmp_path / "x.dcm", two_boxes(), ["liver", "spleen"], overlap)
@@ -219,6 +277,7 @@ def test_segments_of_dicom_have_names_and_may_overlap(overlap: bool, tmp_path: P
         ("x.ctbl", "# Color table\n3 a_b 10 20 30 255\n"),
         ("FreeSurferColorLUT.txt", "#No. Label Name: R G B A\n\n3   a_b      70  130 180 0\n"),
         ("x.csv", "LabelValue,Name,Color_R\n3,a b,1\n"),
+        ("x.csv", "index\tname\tabbreviation\n3\ta b\tA\n"),
         ("dataset.json", json.dumps({"labels": {"background": 0, "a b": 3}})),
         ("x.json", json.dumps({"3": "a b"})),
     ],
@@ -276,6 +335,22 @@ def test_probabilities_are_cut_at_the_threshold(tmp_path: Path) -> None:
         radius[threshold] = (mesh.volume * 3 / 4 / np.pi) ** (1 / 3)
         assert any("probabilities" in note for note in mesh.notes)
     assert radius == pytest.approx({0.5: 8, 0.75: 6}, rel=0.02)
+
+
+def test_probabilities_may_overshoot(tmp_path: Path) -> None:
+    """SPM keeps them as bytes times 1/255 in single precision, so that the largest is more than 1."""
+    ball = np.linalg.norm(np.indices((20, 20, 20)) - 9.5, axis=0)
+    share = np.clip(1.5 - ball / 8, 0, 1)
+    image = nibabel.Nifti1Image(np.round(share * 255).astype(np.uint8), np.eye(4))
+    header = bytearray(image.header.binaryblock)
+    header[108:120] = np.array([352, 1 / 255, 0], dtype="<f4").tobytes()
+    header[344:348] = b"n+1\0"
+    (tmp_path / "x.nii").write_bytes(header + bytes(4) + image.dataobj.tobytes(order="F"))
+    assert np.asarray(nibabel.load(tmp_path / "x.nii").dataobj).max() > 1
+    nibabel.save(nibabel.Nifti1Image((share - 1e-6 * (share == 0)).astype(np.float32), np.eye(4)), tmp_path / "y.nii")
+    for name in ("x.nii", "y.nii"):
+        (body,) = read_label_volume(tmp_path / name).bodies
+        assert body.n_voxels == (ball <= 8).sum()
 
 
 def test_large_labels_are_kept(tmp_path: Path) -> None:
@@ -365,6 +440,17 @@ def test_labels_of_one_name_are_told_apart_by_their_numbers(tmp_path: Path) -> N
         volume.body("rib")
     with pytest.raises(MeshError, match=r"labels 3 and 5 are both named 'rib \(3\)'.*Rename"):
         LabelVolume((labels,), AFFINE, names={3: "rib", 7: "rib", 5: "rib (3)"})
+
+
+def test_a_name_that_is_the_number_of_another_label_is_the_name(tmp_path: Path) -> None:
+    """Dentists call teeth by numbers."""
+    nifti(tmp_path / "x.nii", two_boxes())
+    (tmp_path / "x.csv").write_text("label,name\n3,11\n7,3\n")
+    volumes = {str(ref.part): mesh.volume for ref, mesh in each_body(tmp_path / "x.nii") if isinstance(mesh, Mesh)}
+    assert volumes == pytest.approx({"11": 384 * 3.75, "3": 320 * 3.75}, rel=1e-3)
+    assert load_mesh(tmp_path / "x.nii", part="3").volume == pytest.approx(320 * 3.75, rel=1e-3)
+    volume = read_label_volume(tmp_path / "x.nii")
+    assert [volume.body(part).label for part in (3, 7, "7", "3")] == [3, 7, 7, 7]
 
 
 def test_one_small_label_leaves_the_others() -> None:

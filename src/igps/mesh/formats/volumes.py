@@ -18,7 +18,7 @@ from igps._arrays import Booleans, Floats
 from igps.mesh._label_measures import LabelVoxels
 from igps.mesh.formats._format import Format, RawBody, faults, made_later
 from igps.mesh.formats._volume_files import READERS, RawVolume, detached, read_raw, suffix_of
-from igps.mesh.formats.label_names import read_label_names, table_beside
+from igps.mesh.formats.label_names import cleaned, read_label_names, table_beside
 from igps.mesh.label_surface import checked_spacing, voxel_surface
 from igps.mesh.mending import Cavities, Mending, mend
 from igps.mesh.mesh import Mesh, MeshError
@@ -95,9 +95,10 @@ class LabelVolume:
 
     def body(self, part: int | str) -> LabelBody:
         """The body of a label, or of a name; a MeshError with the names that there are, if there is none."""
-        for body in self.bodies:
-            if part in (body.label, body.name) or part == str(body.label):
-                return body
+        named: dict[int | str, LabelBody] = {str(body.label): body for body in self.bodies}
+        named |= {key: body for body in self.bodies for key in (body.label, body.name)}  # teeth are named by numbers
+        if part in named:
+            return named[part]
         known = ", ".join(body.name for body in self.bodies[:10]) + (", …" if len(self.bodies) > 10 else "")
         raise MeshError(f"{self.name}: no label {part!r}. It has {len(self.bodies)}: {known}.")
 
@@ -162,7 +163,7 @@ def _labelled(raw: RawVolume, path: Path, options: LoadOptions) -> LabelVolume:
         unique = len(set(values)) == len(values)
         labels = values if unique else list(range(1, len(values) + 1))
         segments = tuple((label, layer, value) for label, (_, layer, value) in zip(labels, raw.segments, strict=True))
-        names = {label: name for label, (name, _, _) in zip(labels, raw.segments, strict=True) if name.strip()}
+        names = cleaned({label: name for label, (name, _, _) in zip(labels, raw.segments, strict=True)})
     if options.names is not None:
         names = read_label_names(options.names)
     elif not names:
@@ -180,7 +181,8 @@ def _whole_numbers(values: NDArray[Any], path: Path, threshold: float, notes: li
         if n_bad := int(np.count_nonzero(~np.isfinite(values))):
             raise MeshError(f"{path}: {n_bad} voxels are NaN or infinite; labels expected. Set them to 0.")
         odd = values[np.abs(values - np.round(values)) > _ROUNDING]
-        if len(odd) and values.min() >= 0 and values.max() <= 1:
+        # SPM keeps them as bytes times a rounded 1/255, and resampled ones overshoot
+        if len(odd) and values.min() >= -_ROUNDING and values.max() <= 1 + _ROUNDING:
             notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
             return (values >= threshold).astype(np.uint8)
         if len(odd):
