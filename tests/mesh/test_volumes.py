@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from igps.mesh.formats import files_read
 from igps.mesh.formats.label_names import read_label_names
 from igps.mesh.formats.volumes import LabelVolume, label_surface, read_label_volume
-from igps.mesh.loading import each_body, load_mesh
+from igps.mesh.loading import each_body, list_bodies, load_mesh
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 
@@ -451,6 +451,26 @@ def test_a_name_that_is_the_number_of_another_label_is_the_name(tmp_path: Path) 
     assert load_mesh(tmp_path / "x.nii", part="3").volume == pytest.approx(320 * 3.75, rel=1e-3)
     volume = read_label_volume(tmp_path / "x.nii")
     assert [volume.body(part).label for part in (3, 7, "7", "3")] == [3, 7, 7, 7]
+
+
+def test_pieces_of_a_volume_are_what_does_not_touch_whatever_its_label(tmp_path: Path) -> None:
+    """Each with the volume of its voxels; they were joined by bars to one."""
+    labels = np.pad(two_boxes(), ((0, 16), (0, 0), (0, 0)))
+    labels[20:28, 2:10, 1:9] = 3
+    labels[16, 0, 0:3] = 3
+    nifti(tmp_path / "x.nii", labels)
+    options = LoadOptions(bodies="pieces")
+    assert [ref.part for ref in list_bodies(tmp_path / "x.nii", options)] == ["piece 1", "piece 2"]
+    for part, n_voxels in (("piece 1", 384 + 320), ("piece 2", 512)):
+        mesh = load_mesh(tmp_path / "x.nii", options, part=part)
+        assert mesh.volume == pytest.approx(n_voxels * 3.75, rel=1e-3)
+        assert mesh.notes == ("left out 1 specks",)
+        assert mesh.unit == "mm"
+    with pytest.raises(MeshError, match="2 connected components"):
+        load_mesh(tmp_path / "x.nii", LoadOptions(bodies="whole", mend="never"))
+    nifti(tmp_path / "y.nii", labels * (np.arange(30) == 16)[:, None, None].astype(np.uint8))
+    with pytest.raises(MeshError, match=r"y\.nii#piece 1: 3 voxels, at least 8 expected"):
+        load_mesh(tmp_path / "y.nii", options)
 
 
 def test_one_small_label_leaves_the_others() -> None:

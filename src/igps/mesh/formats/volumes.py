@@ -19,7 +19,7 @@ from igps.mesh._label_measures import LabelVoxels
 from igps.mesh.formats._format import Format, RawBody, faults, made_later
 from igps.mesh.formats._volume_files import READERS, RawVolume, detached, read_raw, suffix_of
 from igps.mesh.formats.label_names import cleaned, read_label_names, table_beside
-from igps.mesh.label_surface import checked_spacing, voxel_surface
+from igps.mesh.label_surface import LEAST_VOXELS, checked_spacing, voxel_surface
 from igps.mesh.mending import Cavities, Mending, mend
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
@@ -229,16 +229,29 @@ def _counted(labels: ArrayLike, name: str) -> tuple[NDArray[Any], NDArray[Any], 
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The surfaces of the labels of a volume; or of all of them together as the whole."""
+    """The surfaces of the labels of a volume; or of all of them together as the whole, or in pieces."""
     volume = read_label_volume(path, options)
     if options.bodies in ("whole", "pieces"):
         labelled = np.any([layer > 0 for layer in volume.layers], axis=0).astype(np.uint8)
         volume = replace(volume, layers=(labelled,), names=None, segments=None)
-        made = partial(label_surface, volume, 1, cavities=options.cavities)
-        return [made_later(made, None, volume.unit, partial(volume.voxels, 1))]
+        volume = _in_pieces(volume) if options.bodies == "pieces" else volume
     made = partial(label_surface, volume, how=options.mend, cavities=options.cavities)
+    if options.bodies == "whole":
+        return [made_later(partial(made, 1), None, volume.unit, partial(volume.voxels, 1))]
     names = [body.name for body in volume.bodies] if part is None else [volume.body(part).name]
     return [made_later(partial(made, name), name, volume.unit, partial(volume.voxels, name)) for name in names]
+
+
+def _in_pieces(volume: LabelVolume) -> LabelVolume:
+    """With a label for each piece, in the order of the voxels; without those that are too small to be bodies."""
+    label, _ = ndimage.label(volume.layers[0], np.ones((3, 3, 3)))
+    small = np.bincount(label.ravel(), minlength=2) < LEAST_VOXELS
+    small[0] = False
+    if small[1:].all():  # one of them says so
+        small[:] = False
+    names = {k: f"piece {i}" for i, k in enumerate((np.flatnonzero(~small[1:]) + 1).tolist(), 1)}
+    notes = (f"left out {small.sum()} specks",) if small.any() else ()
+    return replace(volume, layers=(np.where(small[label], 0, label),), names=names, notes=(*volume.notes, *notes))
 
 
 def _beside(path: Path, options: LoadOptions) -> list[Path]:
@@ -247,4 +260,4 @@ def _beside(path: Path, options: LoadOptions) -> list[Path]:
     return [*detached(path), *([table] if table else [])]
 
 
-FORMAT = Format("a label volume", tuple(READERS), read, ("labels",), extra="volumes", beside=_beside)
+FORMAT = Format("a label volume", tuple(READERS), read, ("labels", "pieces"), extra="volumes", beside=_beside)
