@@ -55,7 +55,7 @@ def suffix_of(path: Path) -> str:
     return ".nii.gz" if name.endswith(".nii.gz") else path.suffix.lower()
 
 
-def check_voxels(path: Path, shape: Sequence[int], n_bytes: int, n_components: int = 1) -> None:
+def check_voxels(path: str | Path, shape: Sequence[int], n_bytes: int, n_components: int = 1) -> None:
     """Raise a MeshError for other than three axes, a single slice, several values in a voxel, or too many voxels."""
     if n_components != 1:
         raise MeshError(f"{path}: {n_components} values in each voxel, as of colours; one label expected. {_EXPORT}")
@@ -72,14 +72,20 @@ def check_voxels(path: Path, shape: Sequence[int], n_bytes: int, n_components: i
     check_fits(math.prod(size) * (n_bytes + _BESIDE), f"{path}: {math.prod(size):,} voxels need", remedy)
 
 
-def _no_numbers(path: Path, what: str) -> MeshError:
+def _no_numbers(path: str | Path, what: str) -> MeshError:
     return MeshError(f"{path}: voxels of {what}; whole numbers expected. {_EXPORT}")
 
 
 def _nibabel(path: Path) -> RawVolume:
     import nibabel
 
-    image: Any = nibabel.load(path)
+    return of_nibabel(nibabel.load(path), path)
+
+
+def of_nibabel(image: Any, path: str | Path) -> RawVolume:
+    """What an image of nibabel holds; `path` is what messages call it."""
+    import nibabel
+
     dtype = np.dtype(image.get_data_dtype())
     if dtype.fields or dtype.kind not in "biuf":
         raise _no_numbers(path, f"{'colours' if dtype.fields else 'complex numbers'} ({dtype})")

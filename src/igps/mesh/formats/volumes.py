@@ -4,6 +4,7 @@ The world is RAS, x to the patient's right, y to the front and z up, in millimet
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from igps._arrays import Booleans, Floats
 from igps.mesh._label_measures import LabelVoxels
 from igps.mesh.formats._format import Format, RawBody, faults, made_later
-from igps.mesh.formats._volume_files import READERS, RawVolume, detached, read_raw, suffix_of
+from igps.mesh.formats._volume_files import READERS, RawVolume, detached, of_nibabel, read_raw, suffix_of
 from igps.mesh.formats.label_names import cleaned, read_label_names, table_beside
 from igps.mesh.label_surface import LEAST_VOXELS, checked_spacing, voxel_surface
 from igps.mesh.mending import Cavities, Mending, mend
@@ -128,6 +129,24 @@ def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) ->
     return _labelled(raw, path, options)
 
 
+def volume_in_memory(
+    labels: Any, spacing: Sequence[float] | None = None, name: str = "volume", options: LoadOptions = LoadOptions()
+) -> LabelVolume:
+    """The volume of an array (X, Y, Z) with the sides of its voxels, in millimetres, or of an image of nibabel."""
+    if hasattr(labels, "dataobj"):
+        raw = of_nibabel(labels, name)
+    else:
+        array = np.asarray(labels)
+        if array.ndim != 3 or array.dtype.kind not in "biuf" or (spacing is not None and len(spacing) != 3):
+            got = f"{array.dtype} of shape {array.shape}, spacing {spacing}"
+            raise MeshError(f"{name}: expected labels of shape (X, Y, Z) and three sides of a voxel, got {got}.")
+        raw = RawVolume([array], np.diag([*(spacing or (1, 1, 1)), 1.0]), unit="mm" if spacing else None)
+    notes: list[str] = []
+    layers = tuple(_whole_numbers(values, name, options.threshold, notes) for values in raw.layers)
+    names = raw.names if options.names is None else read_label_names(options.names)
+    return LabelVolume(layers, raw.affine, name, names, unit=raw.unit, notes=tuple(notes))
+
+
 def label_surface(volume: LabelVolume, part: int | str, *, how: Mending = "auto", cavities: Cavities = "fill") -> Mesh:
     """The surface of a label, by its number or name, as a body in the world; see `voxel_surface` and `mend`."""
     body = volume.body(part)
@@ -175,7 +194,7 @@ def _labelled(raw: RawVolume, path: Path, options: LoadOptions) -> LabelVolume:
     return LabelVolume(layers, raw.affine, str(path), names, segments, raw.unit, tuple(dict.fromkeys(notes)))
 
 
-def _whole_numbers(values: NDArray[Any], path: Path, threshold: float, notes: list[str]) -> NDArray[Any]:
+def _whole_numbers(values: NDArray[Any], path: str | Path, threshold: float, notes: list[str]) -> NDArray[Any]:
     """Labels from 0, of the smallest type; probabilities are cut at the threshold."""
     if values.dtype.kind == "f":
         if n_bad := int(np.count_nonzero(~np.isfinite(values))):
@@ -230,7 +249,11 @@ def _counted(labels: ArrayLike, name: str) -> tuple[NDArray[Any], NDArray[Any], 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The surfaces of the labels of a volume; or of all of them together as the whole, or in pieces."""
-    volume = read_label_volume(path, options)
+    return label_bodies(read_label_volume(path, options), options, part)
+
+
+def label_bodies(volume: LabelVolume, options: LoadOptions, part: str | None = None) -> list[RawBody]:
+    """The bodies of a volume, or the one named, by `options`; their surfaces are made later."""
     if options.bodies in ("whole", "pieces"):
         labelled = np.any([layer > 0 for layer in volume.layers], axis=0).astype(np.uint8)
         volume = replace(volume, layers=(labelled,), names=None, segments=None)
