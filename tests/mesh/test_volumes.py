@@ -397,6 +397,10 @@ def broken(path: Path, kind: str) -> None:
         image.header["srow_x"] = image.header["srow_y"]
         with gzip.open(path, "wb") as file:
             file.write(image.header.binaryblock + bytes(4) + labels.tobytes(order="F"))
+    elif kind == "bytes":  # of a scanner, with a background that is not 0
+        noise = np.random.default_rng(0).normal(120, 15, (40, 40, 40))
+        noise[:20] = 24
+        nifti(path, noise.astype(np.uint8))
     elif kind == "image":
         nifti(path, np.arange(40**3).reshape(40, 40, 40).astype(np.int32))
 
@@ -416,6 +420,7 @@ def broken(path: Path, kind: str) -> None:
         ("no label", "no voxel has a label"),
         ("singular", "affine.*singular.*Write the file again"),
         ("image", "look like an image"),
+        ("bytes", "look like an image and not like labels. Export the labels"),
     ],
 )
 def test_what_is_no_label_volume_is_refused_in_a_sentence(kind: str, words: str, tmp_path: Path) -> None:
@@ -423,6 +428,11 @@ def test_what_is_no_label_volume_is_refused_in_a_sentence(kind: str, words: str,
     broken(path, kind)
     with pytest.raises(MeshError, match=f"^{re.escape(str(path))}: .*{words}"):
         read_label_volume(path)
+
+
+def test_many_labels_as_small_as_they_may_be_are_no_image() -> None:
+    block = np.repeat(np.repeat(np.repeat(np.arange(1, 217).reshape(6, 6, 6), 2, 0), 2, 1), 2, 2)
+    assert {body.n_voxels for body in LabelVolume((block,), np.eye(4)).bodies} == {8}
 
 
 def test_labels_of_one_name_are_told_apart_by_their_numbers(tmp_path: Path) -> None:

@@ -25,8 +25,9 @@ from igps.mesh.mending import Cavities, Mending, mend
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 
-# More different values are intensities of an image.
-_MOST_LABELS = 20_000
+# More different values are intensities of an image; so are more than a few, if less than a share of neighbours are
+# alike: of labels of two voxels' width half are.
+_MOST_LABELS, _FEW_LABELS, _ALIKE = 20_000, 50, 0.3
 # How far labels may be off whole numbers: NIfTI keeps what was given as numbers with a fraction as scaled integers.
 _ROUNDING = 0.01
 
@@ -241,10 +242,17 @@ def _counted(labels: ArrayLike, name: str) -> tuple[NDArray[Any], NDArray[Any], 
         start = int(values[0] == 0)
         compact = index.reshape(array.shape) + (1 - start)
         values, counts = values[start:], counts[start:]
-    if len(values) > _MOST_LABELS:
+    if len(values) > _MOST_LABELS or (len(values) > _FEW_LABELS and _is_speckled(array, values[counts.argmax()])):
         many = f"{name}: {len(values)} different values, which look like an image and not like labels."
         raise MeshError(f"{many} Export the labels.")
     return values, counts, compact
+
+
+def _is_speckled(labels: NDArray[Any], most: int) -> bool:
+    """Whether hardly any neighbours along x are alike, but for the background and the most frequent value."""
+    counted = (labels != 0) & (labels != most)
+    pairs = counted[1:] & counted[:-1]
+    return bool(np.count_nonzero(pairs & (labels[1:] == labels[:-1])) < _ALIKE * np.count_nonzero(pairs))
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
