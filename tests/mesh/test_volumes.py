@@ -244,6 +244,21 @@ def test_segments_of_slicer_have_names_and_may_overlap(tmp_path: Path) -> None:
     assert label_surface(volume, "body").volume == pytest.approx(704 * 3.75, rel=1e-3)
 
 
+def test_groups_of_labels_of_mitk_have_names_and_may_overlap(tmp_path: Path) -> None:
+    liver, others = (two_boxes() == 3) * 1, (two_boxes() > 0) * 2 + (two_boxes() == 7)
+    image = itk_image(np.stack([liver, others], axis=-1).astype(np.uint16), vector=True)
+    groups: list[dict[str, Any]] = [
+        {"labels": [{"name": "liver", "value": 1, "opacity": 0.6}]},
+        {"labels": [{"name": "left", "value": 2}, {"name": "right", "value": 3}]},
+        {"labels": None},
+    ]
+    image.SetMetaData("modality", "org.mitk.multilabel.segmentation")
+    image.SetMetaData("org.mitk.multilabel.segmentation.labelgroups", json.dumps(groups))
+    sitk.WriteImage(image, str(tmp_path / "x.nrrd"))
+    bodies = label_bodies(read_label_volume(tmp_path / "x.nrrd"))
+    assert bodies == [(1, "liver", 384), (2, "left", 384), (3, "right", 320)]
+
+
 def test_segments_of_slicer_before_4_11_each_have_a_layer(tmp_path: Path) -> None:
     """It wrote no values and no layers; names are on one line, as in every table."""
     image = itk_image(np.stack([two_boxes() == 3, two_boxes() > 0], axis=-1).astype(np.uint8), vector=True)

@@ -1,5 +1,6 @@
 """What files of volumes hold, read by nibabel, SimpleITK, highdicom and tifffile; sizes are checked before."""
 
+import json
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -20,6 +21,7 @@ _BESIDE = 4
 _FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])  # from LPS, which DICOM and ITK have, to RAS
 _EXPORT = "Export the labels."
 _NRRD, _META = (".nrrd", ".nhdr"), (".mha", ".mhd")
+_MITK = "org.mitk.multilabel.segmentation.labelgroups"
 _MOST_HEADER = 1 << 24
 # Where a header says that the voxels lie; MetaImage takes ":" for "=", and blanks before it.
 _DATA_FILE = re.compile(
@@ -111,7 +113,7 @@ def _simple_itk(path: Path) -> RawVolume:
     reader.SetImageIO("NrrdImageIO" if suffix_of(path) in _NRRD else "MetaImageIO")
     reader.ReadImageInformation()
     about = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys()}
-    segments = _slicer_segments(about)
+    segments = _segments(about)
     n_layers = reader.GetNumberOfComponents() if segments else 1
     if "complex" in SimpleITK.GetPixelIDValueAsString(reader.GetPixelID()):
         raise _no_numbers(path, "complex numbers")
@@ -135,8 +137,8 @@ def _nrrd_unit(header: bytes) -> str:
     return (words.pop() if len(words) == 1 else "of several units") if words else "mm"
 
 
-def _slicer_segments(about: dict[str, str]) -> list[tuple[str, int, int]]:
-    """(name, layer, value) of the segments that 3D Slicer writes into a NRRD header."""
+def _segments(about: dict[str, str]) -> list[tuple[str, int, int]]:
+    """(name, layer, value) of the segments that 3D Slicer or MITK write into a NRRD header."""
     segments = []
     found = (re.fullmatch(r"Segment(\d+)_(?:Name|LabelValue)", key) for key in about)
     for number in sorted({one[1] for one in found if one}, key=int):
@@ -146,6 +148,8 @@ def _slicer_segments(about: dict[str, str]) -> list[tuple[str, int, int]]:
         if not value or value.isdigit():
             name = about.get(f"Segment{number}_Name", "")
             segments.append((name, int(layer) if layer.isdigit() else 0, int(value or 1)))
+    for at, group in enumerate(json.loads(about.get(_MITK, "[]"))):
+        segments += [(one.get("name", ""), at, int(one["value"])) for one in group["labels"] or ()]
     return segments
 
 
