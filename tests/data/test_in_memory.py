@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -65,3 +66,10 @@ def test_each_has_a_label() -> None:
         SignatureDataset({"a": BALL}, CONFIG, labels=["x", "y"])
     with pytest.raises(ValueError, match=r"bodies: expected at least one"):
         SignatureDataset({}, CONFIG)
+
+
+def test_an_executor_gets_them_too(tmp_path: Path) -> None:
+    dataset = SignatureDataset({"a": BALL, "b": BALL.copy().apply_scale(2)}, CONFIG, tmp_path)
+    with ThreadPoolExecutor(2) as executor:
+        assert dataset.precompute(executor, progress=False) == []
+    assert dataset[1].signature.volume == pytest.approx(8 * BALL.volume)
