@@ -141,6 +141,16 @@ def test_a_map_of_no_use_is_refused(values: np.ndarray, size: float, message: st
         attribute_source("a.mrc")(body, INSIDE)
 
 
+def test_a_map_that_was_cut_short_is_to_be_exported_again(body: BodyRef) -> None:
+    mrcfile = pytest.importorskip("mrcfile")
+    path = body.path.with_name("a.mrc")
+    with mrcfile.new(path) as file:
+        file.set_data(np.ones((9, 9, 9), np.float32))
+    path.write_bytes(path.read_bytes()[:-4])
+    with pytest.raises(MeshError, match=r"a\.mrc: 3936 of 3940 announced bytes are there\. Export it again\.$"):
+        attribute_source("a.mrc")(body, INSIDE)
+
+
 def write_ply(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
     rows = "\n".join(" ".join(map(repr, map(float, row))) for row in np.column_stack([mesh.vertices, values]))
     faces = "\n".join("3 " + " ".join(map(str, face)) for face in mesh.faces)
