@@ -141,6 +141,16 @@ def test_a_map_of_no_use_is_refused(values: np.ndarray, size: float, message: st
         attribute_source("a.mrc")(body, INSIDE)
 
 
+def test_a_map_that_was_cut_short_is_to_be_exported_again(body: BodyRef) -> None:
+    mrcfile = pytest.importorskip("mrcfile")
+    path = body.path.with_name("a.mrc")
+    with mrcfile.new(path) as file:
+        file.set_data(np.ones((9, 9, 9), np.float32))
+    path.write_bytes(path.read_bytes()[:-4])
+    with pytest.raises(MeshError, match=r"a\.mrc: 3936 of 3940 announced bytes are there\. Export it again\.$"):
+        attribute_source("a.mrc")(body, INSIDE)
+
+
 def write_ply(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
     rows = "\n".join(" ".join(map(repr, map(float, row))) for row in np.column_stack([mesh.vertices, values]))
     faces = "\n".join("3 " + " ".join(map(str, face)) for face in mesh.faces)
@@ -155,6 +165,18 @@ def write_vtk(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
     meshio = pytest.importorskip("meshio")
     arrays = {"height": values, "other": np.zeros((len(values), 3))}
     meshio.Mesh(mesh.vertices, [("triangle", mesh.faces)], point_data=arrays).write(path)
+
+
+def write_vtk_of_vtk(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
+    """With the notes that VTK writes behind arrays of a field."""
+    n, faces = len(values), len(mesh.faces)
+    points, heights, triangles = (" ".join(map(str, a.ravel())) for a in (mesh.vertices, values, mesh.faces))
+    head = f"# vtk DataFile Version 5.1\nvtk output\nASCII\nDATASET POLYDATA\nPOINTS {n} double\n{points}\n"
+    offsets = " ".join(map(str, range(0, 3 * faces + 1, 3)))
+    cells = f"POLYGONS {faces + 1} {3 * faces}\nOFFSETS vtktypeint64\n{offsets}\nCONNECTIVITY vtkIdType\n{triangles}\n"
+    notes = "METADATA\nINFORMATION 1\nNAME L2_NORM_RANGE LOCATION vtkDataArray\nDATA 2 0 1 \n\n"
+    field = f"FIELD FieldData 2\nother 1 {n} double\n{heights}\n{notes}height 1 {n} double\n{heights}\n{notes}"
+    path.write_text(f"{head}{cells}\nPOINT_DATA {n}\n{field}")
 
 
 def write_gifti(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> None:
@@ -175,6 +197,7 @@ def write_freesurfer(path: Path, mesh: trimesh.Trimesh, values: np.ndarray) -> N
     [
         ("a.ply#height", write_ply),
         ("a.vtk#height", write_vtk),
+        ("a.vtk#height", write_vtk_of_vtk),
         ("a.vtu#height", write_vtk),
         ("a.shape.gii#height", write_gifti),
         ("lh.thickness", write_freesurfer),

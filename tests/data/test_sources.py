@@ -78,6 +78,10 @@ def test_a_part_is_told_from_a_folder_with_its_mark(tmp_path: Path) -> None:
     assert file_and_part(folder / "a.obj#liver#2") == (folder / "a.obj", "liver#2")
     assert file_and_part(folder / "b#2.obj#liver") == (folder / "b#2.obj", "liver")
     assert file_and_part(folder / "b#2.obj") == (folder / "b#2.obj", None)
+    assert file_and_part(folder / ("a.obj#" + 300 * "x")) == (
+        folder / "a.obj",
+        300 * "x",
+    )  # no name of a file is as long
 
 
 def test_what_is_left_out_of_a_folder_is_told(

@@ -58,6 +58,15 @@ def binary_polydata() -> bytes:
     return head + VERTICES.astype(">f4").tobytes() + f"\nPOLYGONS {len(FACES)} {4 * len(FACES)}\n".encode() + cells
 
 
+def polydata_of_vtk_9() -> bytes:
+    """As VTK 9 writes it: identifiers, which it keeps as 64 bits, as 32, and notes about an array behind it."""
+    head = f"# vtk DataFile Version 5.1\nvtk output\nBINARY\nDATASET POLYDATA\nPOINTS {len(VERTICES)} float\n".encode()
+    notes = b"\nMETADATA\nCOMPONENT_NAMES\nPOLYGONS\ny\nz\nINFORMATION 0\n\n"
+    cells = f"POLYGONS {len(FACES) + 1} {3 * len(FACES)}\nOFFSETS vtktypeint64\n".encode()
+    cells += np.arange(0, 3 * len(FACES) + 1, 3).astype(">i8").tobytes() + b"\nCONNECTIVITY vtkIdType\n"
+    return head + VERTICES.astype(">f4").tobytes() + notes + cells + FACES.astype(">i4").tobytes() + b"\n"
+
+
 def vtp(form: str) -> bytes:
     arrays = {
         "points": VERTICES.astype("<f4"),
@@ -115,6 +124,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "polygons3.vtk": lambda path: path.write_text(polydata("3.0")),
     "polygons5.vtk": lambda path: path.write_text(polydata("5.1")),
     "binary.vtk": lambda path: path.write_bytes(binary_polydata()),
+    "binary5.vtk": lambda path: path.write_bytes(polydata_of_vtk_9()),
     "text.vtp": lambda path: path.write_bytes(vtp("ascii")),
     "raw.vtp": lambda path: path.write_bytes(vtp("raw")),
     "zlib.vtu": lambda path: meshio.write(path, CELLS, compression="zlib"),

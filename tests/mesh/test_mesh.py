@@ -145,6 +145,20 @@ def test_meshes_of_other_libraries(blob: Mesh) -> None:
     assert Mesh.of(SimpleNamespace(points=corners, faces=np.ravel([[4, *quad] for quad in quads]))).volume == 1
 
 
+def test_voxels_of_one_label_are_a_mesh() -> None:
+    ball = ((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0) < 8**2
+    image = nibabel.Nifti1Image(5 * ball.astype(np.uint8), np.diag([-1, 1, 2, 1]))
+    for thing, spacing, unit in ((image, None, "mm"), (ball, (1, 1, 2), "mm"), (ball, None, None)):
+        mesh = Mesh.of(thing, spacing)
+        sides = 1 if unit is None else 2
+        assert mesh.volume == pytest.approx(sides * ball.sum(), rel=1e-3)
+        assert (mesh.name, mesh.unit) == ("volume", unit)
+    with pytest.raises(MeshError, match=r"one label expected, got 1, 3\. Choose one, as labels == 1"):
+        Mesh.of(ball + 2 * (ball & (np.arange(20) < 9)))
+    with pytest.raises(MeshError, match=r"three sides of a voxel, got .*spacing \(1, 2\)"):
+        Mesh.of(ball, (1, 2))
+
+
 def test_an_image_without_a_surface_is_none() -> None:
     with pytest.raises(TypeError, match="holds no surface"):
         Mesh.of(nibabel.gifti.GiftiImage())

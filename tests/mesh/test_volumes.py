@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from igps.mesh.formats import files_read
 from igps.mesh.formats.label_names import read_label_names
 from igps.mesh.formats.volumes import LabelVolume, label_surface, read_label_volume
-from igps.mesh.mesh import MeshError
+from igps.mesh.loading import each_body, list_bodies, load_mesh
+from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 
 nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
@@ -151,6 +152,42 @@ def test_a_stack_of_pictures_has_the_spacing_of_imagej_or_none(tmp_path: Path) -
     assert label_surface(plain, 3).volume == pytest.approx(384, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("words", "sides", "unit"),
+    [
+        ("unit=\\u00B5m\nspacing=2.0\n", (0.5e-3, 0.25e-3, 2e-3), "mm"),
+        ("unit=micron\n", (0.5e-3, 0.25e-3, 1e-3), "mm"),
+        ("unit=pixel\nspacing=2.0\n", (0.5, 0.25, 2), None),
+        ("", (0.5, 0.25, 1), None),
+    ],
+)
+def test_imagej_escapes_units_and_leaves_a_spacing_of_one_out(
+    words: str, sides: tuple[float, ...], unit: str | None, tmp_path: Path
+) -> None:
+    stack = np.ascontiguousarray(two_boxes().T)
+    about = f"ImageJ=1.53t\nimages={len(stack)}\nslices={len(stack)}\n{words}loop=false\n"
+    tifffile.imwrite(
+        tmp_path / "x.tif", stack, photometric="minisblack", description=about, metadata=None, resolution=(2, 4)
+    )
+    volume = read_label_volume(tmp_path / "x.tif")
+    np.testing.assert_allclose(np.diag(volume.affine)[:3], sides)
+    assert volume.unit == unit
+    np.testing.assert_array_equal(volume.layers[0], two_boxes())
+
+
+def test_pages_that_were_written_one_by_one_are_a_stack(tmp_path: Path) -> None:
+    with tifffile.TiffWriter(tmp_path / "x.tif") as file:
+        for page in np.ascontiguousarray(two_boxes().T):
+            file.write(page, photometric="minisblack")
+    np.testing.assert_array_equal(read_label_volume(tmp_path / "x.tif").layers[0], two_boxes())
+
+
+def test_a_stack_compressed_by_lzw_is_read(tmp_path: Path) -> None:
+    image = sitk.GetImageFromArray(np.ascontiguousarray(two_boxes().T))
+    sitk.WriteImage(image, str(tmp_path / "x.tif"), useCompression=True, compressor="LZW")
+    np.testing.assert_array_equal(read_label_volume(tmp_path / "x.tif").layers[0], two_boxes())
+
+
 def write_nrrd(path: Path, *lines: str) -> None:
     """Boxes in voxels of 1 × 1.5 × 2.5, by hand."""
     sizes, spacing = ["sizes: 14 12 10", "encoding: raw"], ["spacings: 1 1.5 2.5"]
@@ -174,6 +211,13 @@ def test_lengths_of_a_nrrd_file_are_in_its_unit(
     found = read_label_volume(tmp_path / "x.nrrd")
     assert found.unit == unit
     assert label_surface(found, 3).volume == pytest.approx(volume, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["x.mha", "x.nrrd", "x.nii.gz", "x.mgz"])
+def test_suffixes_may_be_upper_case(name: str, tmp_path: Path) -> None:
+    WRITERS.get(name, write_itk)(tmp_path / name, two_boxes())
+    path = (tmp_path / name).rename(tmp_path / name.upper())
+    np.testing.assert_array_equal(read_label_volume(path).layers[0], two_boxes())
 
 
 @pytest.mark.parametrize("name", ["x.raw", "./x.raw"])
@@ -200,6 +244,35 @@ def test_segments_of_slicer_have_names_and_may_overlap(tmp_path: Path) -> None:
     assert label_surface(volume, "body").volume == pytest.approx(704 * 3.75, rel=1e-3)
 
 
+def test_groups_of_labels_of_mitk_have_names_and_may_overlap(tmp_path: Path) -> None:
+    liver, others = (two_boxes() == 3) * 1, (two_boxes() > 0) * 2 + (two_boxes() == 7)
+    image = itk_image(np.stack([liver, others], axis=-1).astype(np.uint16), vector=True)
+    groups: list[dict[str, Any]] = [
+        {"labels": [{"name": "liver", "value": 1, "opacity": 0.6}]},
+        {"labels": [{"name": "left", "value": 2}, {"name": "right", "value": 3}]},
+        {"labels": None},
+    ]
+    image.SetMetaData("modality", "org.mitk.multilabel.segmentation")
+    image.SetMetaData("org.mitk.multilabel.segmentation.labelgroups", json.dumps(groups))
+    sitk.WriteImage(image, str(tmp_path / "x.nrrd"))
+    bodies = label_bodies(read_label_volume(tmp_path / "x.nrrd"))
+    assert bodies == [(1, "liver", 384), (2, "left", 384), (3, "right", 320)]
+
+
+def test_segments_of_slicer_before_4_11_each_have_a_layer(tmp_path: Path) -> None:
+    """It wrote no values and no layers; names are on one line, as in every table."""
+    image = itk_image(np.stack([two_boxes() == 3, two_boxes() > 0], axis=-1).astype(np.uint8), vector=True)
+    for number, name in enumerate(("left  kidney ", "body")):
+        image.SetMetaData(f"Segment{number}_Name", name)
+        image.SetMetaData(f"Segment{number}_ID", f"Segment_{number + 1}")
+    sitk.WriteImage(image, str(tmp_path / "x.seg.nrrd"))
+    assert label_bodies(read_label_volume(tmp_path / "x.seg.nrrd")) == [(1, "left kidney", 384), (2, "body", 704)]
+    one = itk_image((two_boxes() == 3).astype(np.uint8))
+    one.SetMetaData("Segment0_Name", "liver")
+    sitk.WriteImage(one, str(tmp_path / "y.seg.nrrd"))
+    assert label_bodies(read_label_volume(tmp_path / "y.seg.nrrd")) == [(1, "liver", 384)]
+
+
 @pytest.mark.parametrize("overlap", [False, True])
 def test_segments_of_dicom_have_names_and_may_overlap(overlap: bool, tmp_path: Path) -> None:
     write_segmentation(tmp_path / "x.dcm", two_boxes(), ["liver", "spleen"], overlap)
@@ -219,6 +292,7 @@ def test_segments_of_dicom_have_names_and_may_overlap(overlap: bool, tmp_path: P
         ("x.ctbl", "# Color table\n3 a_b 10 20 30 255\n"),
         ("FreeSurferColorLUT.txt", "#No. Label Name: R G B A\n\n3   a_b      70  130 180 0\n"),
         ("x.csv", "LabelValue,Name,Color_R\n3,a b,1\n"),
+        ("x.csv", "index\tname\tabbreviation\n3\ta b\tA\n"),
         ("dataset.json", json.dumps({"labels": {"background": 0, "a b": 3}})),
         ("x.json", json.dumps({"3": "a b"})),
     ],
@@ -278,6 +352,22 @@ def test_probabilities_are_cut_at_the_threshold(tmp_path: Path) -> None:
     assert radius == pytest.approx({0.5: 8, 0.75: 6}, rel=0.02)
 
 
+def test_probabilities_may_overshoot(tmp_path: Path) -> None:
+    """SPM keeps them as bytes times 1/255 in single precision, so that the largest is more than 1."""
+    ball = np.linalg.norm(np.indices((20, 20, 20)) - 9.5, axis=0)
+    share = np.clip(1.5 - ball / 8, 0, 1)
+    image = nibabel.Nifti1Image(np.round(share * 255).astype(np.uint8), np.eye(4))
+    header = bytearray(image.header.binaryblock)
+    header[108:120] = np.array([352, 1 / 255, 0], dtype="<f4").tobytes()
+    header[344:348] = b"n+1\0"
+    (tmp_path / "x.nii").write_bytes(header + bytes(4) + image.dataobj.tobytes(order="F"))
+    assert np.asarray(nibabel.load(tmp_path / "x.nii").dataobj).max() > 1
+    nibabel.save(nibabel.Nifti1Image((share - 1e-6 * (share == 0)).astype(np.float32), np.eye(4)), tmp_path / "y.nii")
+    for name in ("x.nii", "y.nii"):
+        (body,) = read_label_volume(tmp_path / name).bodies
+        assert body.n_voxels == (ball <= 8).sum()
+
+
 def test_large_labels_are_kept(tmp_path: Path) -> None:
     labels = two_boxes().astype(np.int32) * 100_000_000
     nibabel.save(nibabel.Nifti1Image(labels, AFFINE), tmp_path / "x.nii.gz")
@@ -322,6 +412,10 @@ def broken(path: Path, kind: str) -> None:
         image.header["srow_x"] = image.header["srow_y"]
         with gzip.open(path, "wb") as file:
             file.write(image.header.binaryblock + bytes(4) + labels.tobytes(order="F"))
+    elif kind == "bytes":  # of a scanner, with a background that is not 0
+        noise = np.random.default_rng(0).normal(120, 15, (40, 40, 40))
+        noise[:20] = 24
+        nifti(path, noise.astype(np.uint8))
     elif kind == "image":
         nifti(path, np.arange(40**3).reshape(40, 40, 40).astype(np.int32))
 
@@ -341,6 +435,7 @@ def broken(path: Path, kind: str) -> None:
         ("no label", "no voxel has a label"),
         ("singular", "affine.*singular.*Write the file again"),
         ("image", "look like an image"),
+        ("bytes", "look like an image and not like labels. Export the labels"),
     ],
 )
 def test_what_is_no_label_volume_is_refused_in_a_sentence(kind: str, words: str, tmp_path: Path) -> None:
@@ -348,6 +443,11 @@ def test_what_is_no_label_volume_is_refused_in_a_sentence(kind: str, words: str,
     broken(path, kind)
     with pytest.raises(MeshError, match=f"^{re.escape(str(path))}: .*{words}"):
         read_label_volume(path)
+
+
+def test_many_labels_as_small_as_they_may_be_are_no_image() -> None:
+    block = np.repeat(np.repeat(np.repeat(np.arange(1, 217).reshape(6, 6, 6), 2, 0), 2, 1), 2, 2)
+    assert {body.n_voxels for body in LabelVolume((block,), np.eye(4)).bodies} == {8}
 
 
 def test_labels_of_one_name_are_told_apart_by_their_numbers(tmp_path: Path) -> None:
@@ -365,6 +465,37 @@ def test_labels_of_one_name_are_told_apart_by_their_numbers(tmp_path: Path) -> N
         volume.body("rib")
     with pytest.raises(MeshError, match=r"labels 3 and 5 are both named 'rib \(3\)'.*Rename"):
         LabelVolume((labels,), AFFINE, names={3: "rib", 7: "rib", 5: "rib (3)"})
+
+
+def test_a_name_that_is_the_number_of_another_label_is_the_name(tmp_path: Path) -> None:
+    """Dentists call teeth by numbers."""
+    nifti(tmp_path / "x.nii", two_boxes())
+    (tmp_path / "x.csv").write_text("label,name\n3,11\n7,3\n")
+    volumes = {str(ref.part): mesh.volume for ref, mesh in each_body(tmp_path / "x.nii") if isinstance(mesh, Mesh)}
+    assert volumes == pytest.approx({"11": 384 * 3.75, "3": 320 * 3.75}, rel=1e-3)
+    assert load_mesh(tmp_path / "x.nii", part="3").volume == pytest.approx(320 * 3.75, rel=1e-3)
+    volume = read_label_volume(tmp_path / "x.nii")
+    assert [volume.body(part).label for part in (3, 7, "7", "3")] == [3, 7, 7, 7]
+
+
+def test_pieces_of_a_volume_are_what_does_not_touch_whatever_its_label(tmp_path: Path) -> None:
+    """Each with the volume of its voxels; they were joined by bars to one."""
+    labels = np.pad(two_boxes(), ((0, 16), (0, 0), (0, 0)))
+    labels[20:28, 2:10, 1:9] = 3
+    labels[16, 0, 0:3] = 3
+    nifti(tmp_path / "x.nii", labels)
+    options = LoadOptions(bodies="pieces")
+    assert [ref.part for ref in list_bodies(tmp_path / "x.nii", options)] == ["piece 1", "piece 2"]
+    for part, n_voxels in (("piece 1", 384 + 320), ("piece 2", 512)):
+        mesh = load_mesh(tmp_path / "x.nii", options, part=part)
+        assert mesh.volume == pytest.approx(n_voxels * 3.75, rel=1e-3)
+        assert mesh.notes == ("left out 1 specks",)
+        assert mesh.unit == "mm"
+    with pytest.raises(MeshError, match="2 connected components"):
+        load_mesh(tmp_path / "x.nii", LoadOptions(bodies="whole", mend="never"))
+    nifti(tmp_path / "y.nii", labels * (np.arange(30) == 16)[:, None, None].astype(np.uint8))
+    with pytest.raises(MeshError, match=r"y\.nii#piece 1: 3 voxels, at least 8 expected"):
+        load_mesh(tmp_path / "y.nii", options)
 
 
 def test_one_small_label_leaves_the_others() -> None:

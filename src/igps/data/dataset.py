@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
-from typing import Self, overload
+from typing import Any, Self, overload
 
 import numpy as np
 import torch
@@ -19,9 +19,11 @@ from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.collation import collate
 from igps.data.collection import About, CollectionFile, write_collection
 from igps.data.filling import Failure, fill, hits_in_cache
+from igps.data.in_memory import bodies_in_memory
 from igps.data.pipeline import CacheHit, PreTransform, SignaturePipeline
 from igps.data.requirements import AnyDescriptor, requirements_of
 from igps.data.sources import Bodies, ClassRule, bodies_of
+from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature, SignatureConfig
@@ -41,7 +43,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         (1, 'ball.off', (20,))
 
     Args:
-        root_or_paths: a folder (see `find_bodies`), files, or `Bodies`.
+        root_or_paths: a folder (see `find_bodies`), files, or `Bodies`; or objects in memory by name: what `Mesh.of`
+            takes, of images all labels, and of arrays, given as pairs `(labels, spacing)`.
         config: parameters of the Signatures; 250 eigenpairs where neither it nor a descriptor names a number.
         cache_dir: where Signatures are kept, by the content of the file, how it is read, every parameter, and the
             algorithm's version; the user's cache directory if None. One with more eigenpairs or attributes serves too.
@@ -67,7 +70,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def __init__(
         self,
-        root_or_paths: str | Path | Sequence[str | Path] | Bodies,
+        root_or_paths: str | Path | Sequence[str | Path] | Bodies | Mapping[str, Any],
         config: SignatureConfig | None = None,
         cache_dir: str | Path | None = None,
         *,
@@ -79,19 +82,21 @@ class SignatureDataset(Dataset[LabelledSignature]):
         pre_transform: PreTransform | None = None,
         transform: Callable[[Signature], Signature] | None = None,
     ) -> None:
-        config, reading = config or SignatureConfig(), reading or LoadOptions()
-        given = dict(attributes or {})
+        config, reading, given = config or SignatureConfig(), reading or LoadOptions(), dict(attributes or {})
         if descriptor is not None:
             requirements = requirements_of(descriptor)
             config, given = requirements.apply_to(config), {**requirements.sources, **given}
         sources, self._functions = split_attributes(given)
+        meshes: Mapping[BodyRef, Mesh | MeshError] = {}
+        if isinstance(root_or_paths, Mapping):
+            (root_or_paths, meshes), labels = bodies_in_memory(root_or_paths, labels, reading, config), None
         self.bodies = bodies_of(root_or_paths, labels, reading, sources.values()).classed(classes or "folder")
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
         if pre_transform is not None and self._functions:
             raise ValueError("pre_transform: expected attributes with a cache_tag beside it, got a function of points.")
         directory = Path(cache_dir or default_cache_dir())
         self.config, self.reading = config.resolved(), reading
-        self.pipeline = SignaturePipeline(self.config, reading, directory, sources, pre_transform)
+        self.pipeline = SignaturePipeline(self.config, reading, directory, sources, pre_transform, meshes)
         self.transform = transform
         # What serves each body, once `precompute` has seen to it; Signatures that need no cache, and whose each is
         self._hits: tuple[CacheHit | None, ...] = (None,) * len(self.bodies)
@@ -108,8 +113,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
     @property
     def sizes(self) -> Tensor:
         """(N,) int64 interior samples of each body, for `BucketBatchSampler`. Each Signature is looked at for it."""
-        found = [len(self._signature(i).interior) for i in range(len(self))]
-        return torch.tensor(found, dtype=torch.int64, device="cpu")
+        return torch.tensor([len(one.interior) for one in self.signatures()], dtype=torch.int64, device="cpu")
 
     def __len__(self) -> int:
         return len(self.bodies)

@@ -118,7 +118,8 @@ def filled(
     if executor is not None:  # elsewhere, and from another folder
         there = replace(pipeline, cache_dir=pipeline.cache_dir.absolute())
         work = partial(fill_elsewhere, there.fill, version())
-        given = [[replace(body, path=body.path.absolute()) for body in job] for job in given]
+        known = pipeline.meshes  # these are in no file
+        given = [[b if b in known else replace(b, path=b.path.absolute()) for b in job] for job in given]
     lost: list[int] = []
     results = run(work, given, n_workers=n_workers, executor=executor, limits=limits)
     with contextlib.closing(results):

@@ -79,6 +79,8 @@ class SignaturePipeline:
     cache_dir: Path
     attributes: Mapping[str, AttributeSource] = field(default_factory=dict)  # added to the samples, by name
     pre_transform: PreTransform | None = None  # done to the Signature with its attributes before it is kept
+    # Of bodies in memory, or what is wrong with them
+    meshes: Mapping[BodyRef, Mesh | MeshError] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.pre_transform is not None and not getattr(self.pre_transform, "cache_tag", None):
@@ -89,11 +91,22 @@ class SignaturePipeline:
 
     def mesh(self, body: BodyRef) -> Mesh:
         """The checked mesh of a body; a MeshError where it cannot be used."""
-        return load_mesh(body.path, self.reading, part=body.part, least_vertices=self.config.n_vertices_read)
+        if body not in self.meshes:
+            return load_mesh(body.path, self.reading, part=body.part, least_vertices=self.config.n_vertices_read)
+        if isinstance(mesh := self.meshes[body], MeshError):
+            raise mesh
+        return mesh
+
+    def _file(self, body: BodyRef) -> BodyFile:
+        if body not in self.meshes:
+            return BodyFile.of(body.path, self.reading)
+        mesh = self.mesh(body)
+        content = mesh.vertices.tobytes(), mesh.faces.tobytes(), repr((mesh.unit, mesh.notes)).encode()
+        return BodyFile((0, 0, 0), b"".join(hashlib.sha256(one).digest() for one in content))
 
     def signature(self, body: BodyRef) -> Signature:
         """The Signature of a body, from the cache where it or a larger one is there, and there afterwards."""
-        file = BodyFile.of(body.path, self.reading)
+        file = self._file(body)
         hit = self._lookup(body, file)
         found = None if hit is None else self.read(hit)
         return self._made(body, file)[1] if found is None else found
@@ -106,6 +119,8 @@ class SignaturePipeline:
         """
         if len(bodies) == 1:
             return [self.hit(bodies[0])]
+        if bodies[0] in self.meshes:
+            return [attempt(partial(self.hit, body)) for body in bodies]
         file = BodyFile.of(bodies[0].path, self.reading)
         served = {body: self._lookup(body, file) for body in bodies}
         done: dict[BodyRef, CacheHit | Failed] = {body: hit for body, hit in served.items() if hit is not None}
@@ -125,12 +140,12 @@ class SignaturePipeline:
 
     def hit(self, body: BodyRef) -> CacheHit:
         """What serves a body, which is in the cache then; a MeshError where it cannot be used."""
-        return self._hit(body, BodyFile.of(body.path, self.reading))
+        return self._hit(body, self._file(body))
 
     def lookup(self, bodies: Sequence[BodyRef]) -> list[CacheHit | None]:
         """What in the cache serves each body of one file, None where nothing does; a MeshError if unreadable."""
-        file = BodyFile.of(bodies[0].path, self.reading)
-        return [self._lookup(body, file) for body in bodies]
+        file = self._file(bodies[0])
+        return [self._lookup(body, self._file(body) if body in self.meshes else file) for body in bodies]
 
     def with_attributes(self, body: BodyRef, hit: CacheHit) -> CacheHit | None:
         """What serves a body whose Signature in the cache is known, with its attributes; None if one is missing."""
@@ -158,7 +173,7 @@ class SignaturePipeline:
 
     def key(self, body: BodyRef) -> str:
         """A Signature's name in the cache, by all that it depends on; a MeshError where the file cannot be read."""
-        key = self._key(body, BodyFile.of(body.path, self.reading), self.config, False)
+        key = self._key(body, self._file(body), self.config, False)
         return key if self.pre_transform is None else self._changed_key(body, key)
 
     def _hit(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> CacheHit:

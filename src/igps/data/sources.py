@@ -208,7 +208,7 @@ def bodies_of(
 def file_and_part(path: Path) -> tuple[Path, str | None]:
     """The file and the part of ``FILE#PART``; no part where a file has this name, or none has what stands before."""
     name = str(path)
-    for at in [] if path.exists() else [i for i, letter in enumerate(name) if letter == "#"]:
+    for at in [] if os.path.exists(path) else [i for i, letter in enumerate(name) if letter == "#"]:
         if name[at + 1 :] and (file := Path(name[:at])).is_file():
             return file, name[at + 1 :]
     return path, None

@@ -160,7 +160,7 @@ def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[Raw
         bodies = list(kind.read(path, replace(options, bodies=how), part if how not in ("whole", "pieces") else None))
         if how == "whole":
             return [joined(bodies)]
-        return pieces(joined(bodies)) if how == "pieces" else bodies
+        return pieces(joined(bodies)) if how == "pieces" and how not in kind.bodies else bodies
 
 
 def _bodies(kind: Format, options: LoadOptions) -> BodyKind:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 MILLIMETRES: Mapping[str, float] = {
     "m": 1e3, "cm": 10.0, "mm": 1.0, "µm": 1e-3, "um": 1e-3, "micron": 1e-3, "microns": 1e-3, "nm": 1e-6, "Å": 1e-7,
     "in": 25.4, "inch": 25.4, "inches": 25.4, "ft": 304.8, "feet": 304.8, "meter": 1e3, "meters": 1e3,
-    "centimeters": 10.0, "millimeter": 1.0, "millimeters": 1.0, "\\u00b5m": 1e-3,
+    "centimeters": 10.0, "millimeter": 1.0, "millimeters": 1.0, "micrometer": 1e-3, "\\u00B5m": 1e-3,
 }  # fmt: skip
 """In a unit of length, by the names that files and libraries give it."""
 
@@ -114,24 +114,28 @@ class Mesh:
         object.__setattr__(self, "faces", faces)
 
     @classmethod
-    def of(cls, body: Any) -> Mesh:
+    def of(cls, body: Any, spacing: Sequence[float] | None = None) -> Mesh:
         """The Mesh of a body as another library keeps it; a Mesh is given back as it is.
 
         Example:
             >>> import trimesh
             >>> Mesh.of(trimesh.creation.box((1, 2, 3)))
             Mesh('mesh', 8 vertices, 12 faces)
+            >>> ball = ((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0) < 8**2
+            >>> round(float(Mesh.of(ball, spacing=(1, 1, 2)).volume / ball.sum()), 3)
+            2.0
 
         Args:
-            body: a Mesh, or a closed surface as a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage. Polygons
-                are cut into triangles. Its file, if it knows one, becomes the name.
+            body: a Mesh; a closed surface as a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage, whose
+                polygons are cut into triangles; or voxels of one label, an array (X, Y, Z) or an image of nibabel.
+            spacing: of an array, the sides of a voxel in millimetres; voxels of side 1 without a unit if None.
         """
         if isinstance(body, cls):
             return body
         from igps.mesh.objects import raw_of
 
-        name, raw = raw_of(body)
-        return cls(raw.vertices, raw.faces, name=name, unit=raw.unit)
+        name, raw = raw_of(body, spacing)
+        return cls(raw.vertices, raw.faces, name=name, unit=raw.unit, notes=raw.notes)
 
     def annotated(self, *, notes: tuple[str, ...] = (), unit: str | None = None) -> Mesh:
         """The same mesh with more notes, before its own, and with a unit if one is given; nothing is checked again."""

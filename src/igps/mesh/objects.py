@@ -1,5 +1,7 @@
-"""Surfaces of other libraries, in memory, recognised by their attributes: none of the libraries is imported."""
+"""Bodies in memory, of other libraries, recognised by their attributes: none of the libraries is imported."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -7,10 +9,33 @@ import numpy as np
 
 from igps.mesh.formats._format import RawBody, corners_of_rows
 from igps.mesh.formats._polygons import flat_triangles
+from igps.mesh.formats.volumes import label_bodies, volume_in_memory
+from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
 
 
-def raw_of(thing: Any) -> tuple[str, RawBody]:
-    """Name and surface of a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage, unchecked; or a TypeError."""
+def bodies_of_object(thing: Any, name: str, options: LoadOptions = LoadOptions()) -> list[RawBody]:
+    """The bodies of a surface, see `raw_of`; or of labels: an array, a pair of one and its spacing, or an image."""
+    labels, spacing = thing if isinstance(thing, tuple) and len(thing) == 2 else (thing, None)
+    if not _is_volume(labels):
+        return [raw_of(thing)[1]]
+    found = label_bodies(volume_in_memory(labels, spacing, name, options), options)
+    return [replace(found[0], part=None)] if [body.part for body in found] == ["1"] else found  # of a mask
+
+
+def raw_of(thing: Any, spacing: Sequence[float] | None = None) -> tuple[str, RawBody]:
+    """Name and surface, unchecked, of a trimesh.Trimesh, a pyvista.PolyData, a nibabel.GiftiImage; or of the one label
+    of an array or an image of nibabel. A TypeError of anything else.
+    """
+    if _is_volume(thing):
+        bodies = bodies_of_object((thing, spacing), "volume")
+        if len(bodies) > 1:
+            several = f"volume: one label expected, got {', '.join(str(body.part) for body in bodies)[:80]}."
+            raise MeshError(f"{several} Choose one, as labels == 1, or make a SignatureDataset of all.")
+        raw = bodies[0].made()
+        if raw.fault is not None:
+            raise raw.fault
+        return "volume", raw
     metadata, source = getattr(thing, "metadata", None), getattr(thing, "source", None)
     known = metadata.get("file_name") if isinstance(metadata, dict) else None
     path = getattr(source, "file_path", None)  # where trimesh keeps that of a file that it read
@@ -26,10 +51,17 @@ def raw_of(thing: Any) -> tuple[str, RawBody]:
             vertices, flat_triangles(*corners_of_rows(np.asarray(thing.faces, dtype=np.int64)), vertices)
         )
     if hasattr(thing, "vertices") and hasattr(thing, "faces"):
-        unit = getattr(thing, "units", None)
-        return name, RawBody(np.asarray(thing.vertices, np.float64), np.asarray(thing.faces, np.int64), unit=unit)
+        unit = getattr(thing, "units", None) or getattr(thing, "unit", None)
+        vertices, triangles = np.asarray(thing.vertices, np.float64), np.asarray(thing.faces, np.int64)
+        return name, RawBody(vertices, triangles, unit=unit, notes=getattr(thing, "notes", ()))
     given = f"{type(thing).__module__}.{type(thing).__qualname__}"
     raise TypeError(
-        f"mesh: expected a Mesh, a trimesh.Trimesh, a pyvista.PolyData or a nibabel.GiftiImage, got {given}. "
+        f"mesh: expected a Mesh, a trimesh.Trimesh, a pyvista.PolyData, a nibabel.GiftiImage or labels, got {given}. "
         "Read a file with igps.load_mesh, or pass Mesh(vertices, faces)."
     )
+
+
+def _is_volume(thing: Any) -> bool:
+    """Whether it is an array of voxels, or an image of nibabel of them."""
+    is_image = hasattr(thing, "dataobj") and hasattr(thing, "affine")
+    return is_image or (isinstance(thing, np.ndarray) and thing.ndim == 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,9 @@ from igps.mesh._tidying import are_specks, places
 from igps.mesh.mesh import Mesh, MeshError, check_arrays
 from igps.mesh.options import BodyKind, LoadOptions
 from igps.mesh.surface import compact, face_parts, stacked
+
+# What ITK says before a fault: where in its sources and memory it was found.
+_PLACES_IN_ITK = re.compile(r"^Exception thrown in SimpleITK .*ERROR: (\w+\(0x\w+\): )?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +91,7 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
         unit=units.pop() if len(units) == 1 else None,
         normals=np.concatenate(normals) if len(normals) == len(kept) else None,
         notes=tuple(dict.fromkeys(note for body in kept for note in body.notes)),
+        denoise=any(body.denoise for body in kept),
     )
 
 
@@ -143,7 +148,8 @@ def faults(path: Path, kind: Format) -> Iterator[None]:
         install = f'Install it: pip install "interior-gps[{kind.extra}]"; or convert the file to OFF, OBJ, PLY or STL.'
         raise MeshError(f"{missing} {install}") from error
     except Exception as error:  # the loaders of some thirty formats raise whatever they like
-        fault = f"{path}: not readable as {kind.name} ({type(error).__name__}: {' '.join(str(error).split())[:300]})."
+        words = _PLACES_IN_ITK.sub("", " ".join(str(error).split()))[:300]
+        fault = f"{path}: not readable as {kind.name} ({type(error).__name__}: {words})."
         remedy = "Check that the file is complete and in the format that its name tells; or export it again."
         raise MeshError(f"{fault} {remedy}") from error
 

@@ -1,5 +1,6 @@
 """What files of volumes hold, read by nibabel, SimpleITK, highdicom and tifffile; sizes are checked before."""
 
+import json
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -20,6 +21,7 @@ _BESIDE = 4
 _FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])  # from LPS, which DICOM and ITK have, to RAS
 _EXPORT = "Export the labels."
 _NRRD, _META = (".nrrd", ".nhdr"), (".mha", ".mhd")
+_MITK = "org.mitk.multilabel.segmentation.labelgroups"
 _MOST_HEADER = 1 << 24
 # Where a header says that the voxels lie; MetaImage takes ":" for "=", and blanks before it.
 _DATA_FILE = re.compile(
@@ -55,7 +57,7 @@ def suffix_of(path: Path) -> str:
     return ".nii.gz" if name.endswith(".nii.gz") else path.suffix.lower()
 
 
-def check_voxels(path: Path, shape: Sequence[int], n_bytes: int, n_components: int = 1) -> None:
+def check_voxels(path: str | Path, shape: Sequence[int], n_bytes: int, n_components: int = 1) -> None:
     """Raise a MeshError for other than three axes, a single slice, several values in a voxel, or too many voxels."""
     if n_components != 1:
         raise MeshError(f"{path}: {n_components} values in each voxel, as of colours; one label expected. {_EXPORT}")
@@ -72,14 +74,20 @@ def check_voxels(path: Path, shape: Sequence[int], n_bytes: int, n_components: i
     check_fits(math.prod(size) * (n_bytes + _BESIDE), f"{path}: {math.prod(size):,} voxels need", remedy)
 
 
-def _no_numbers(path: Path, what: str) -> MeshError:
+def _no_numbers(path: str | Path, what: str) -> MeshError:
     return MeshError(f"{path}: voxels of {what}; whole numbers expected. {_EXPORT}")
 
 
 def _nibabel(path: Path) -> RawVolume:
     import nibabel
 
-    image: Any = nibabel.load(path)
+    return of_nibabel(nibabel.load(path), path)
+
+
+def of_nibabel(image: Any, path: str | Path) -> RawVolume:
+    """What an image of nibabel holds; `path` is what messages call it."""
+    import nibabel
+
     dtype = np.dtype(image.get_data_dtype())
     if dtype.fields or dtype.kind not in "biuf":
         raise _no_numbers(path, f"{'colours' if dtype.fields else 'complex numbers'} ({dtype})")
@@ -87,7 +95,7 @@ def _nibabel(path: Path) -> RawVolume:
     values = np.asanyarray(image.dataobj).reshape(image.shape[:3])
     affine, names = np.array(image.affine, dtype=np.float64), {}
     if isinstance(image, nibabel.Nifti1Image):
-        affine[:3] *= MILLIMETRES.get(image.header.get_xyzt_units()[0], 1.0)
+        affine[:3] *= {1: 1e3, 3: 1e-3}.get(int(image.header["xyzt_units"]) % 8, 1.0)  # metres, micrometres
         names = names_in_extensions(
             bytes(one.get_content_bytes()) if hasattr(one, "get_content_bytes") else str(one.get_content()).encode()
             for one in image.header.extensions
@@ -102,9 +110,10 @@ def _simple_itk(path: Path) -> RawVolume:
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
+    reader.SetImageIO("NrrdImageIO" if suffix_of(path) in _NRRD else "MetaImageIO")
     reader.ReadImageInformation()
     about = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys()}
-    segments = _slicer_segments(about)
+    segments = _segments(about)
     n_layers = reader.GetNumberOfComponents() if segments else 1
     if "complex" in SimpleITK.GetPixelIDValueAsString(reader.GetPixelID()):
         raise _no_numbers(path, "complex numbers")
@@ -128,13 +137,19 @@ def _nrrd_unit(header: bytes) -> str:
     return (words.pop() if len(words) == 1 else "of several units") if words else "mm"
 
 
-def _slicer_segments(about: dict[str, str]) -> list[tuple[str, int, int]]:
-    """(name, layer, value) of the segments that 3D Slicer writes into a NRRD header."""
+def _segments(about: dict[str, str]) -> list[tuple[str, int, int]]:
+    """(name, layer, value) of the segments that 3D Slicer or MITK write into a NRRD header."""
     segments = []
-    for key, value in about.items():
-        if (found := re.fullmatch(r"Segment(\d+)_LabelValue", key)) and value.strip().isdigit():
-            name, layer = about.get(f"Segment{found[1]}_Name", ""), about.get(f"Segment{found[1]}_Layer", "0").strip()
-            segments.append((name, int(layer) if layer.isdigit() else 0, int(value)))
+    found = (re.fullmatch(r"Segment(\d+)_(?:Name|LabelValue)", key) for key in about)
+    for number in sorted({one[1] for one in found if one}, key=int):
+        value = about.get(f"Segment{number}_LabelValue", "").strip()
+        # Before 4.11 each segment was 1 in a layer of its own
+        layer = about.get(f"Segment{number}_Layer", "0" if value else number).strip()
+        if not value or value.isdigit():
+            name = about.get(f"Segment{number}_Name", "")
+            segments.append((name, int(layer) if layer.isdigit() else 0, int(value or 1)))
+    for at, group in enumerate(json.loads(about.get(_MITK, "[]"))):
+        segments += [(one.get("name", ""), at, int(one["value"])) for one in group["labels"] or ()]
     return segments
 
 
@@ -200,15 +215,25 @@ def _tifffile(path: Path) -> RawVolume:
         if dtype.kind not in "biuf":
             raise _no_numbers(path, str(dtype))
         shape = [n for n in series.shape if n > 1] if len(series.shape) > 3 else list(series.shape)
-        check_voxels(path, shape if len(shape) > 2 else [1, *shape], dtype.itemsize)
-        values = series.asarray().reshape(shape).T
-        spacing = _tiff_spacing(file)
-    affine = np.diag([*(spacing or (1.0, 1.0, 1.0)), 1.0])
-    return RawVolume([values], affine, unit="mm" if spacing else None)
+        pages = [series]
+        if len(shape) < 3:  # written one by one
+            pages = [one for one in file.series if (one.shape, one.dtype) == (series.shape, series.dtype)]
+            shape = [len(pages), *shape]
+        check_voxels(path, shape, dtype.itemsize)
+        try:
+            values = series.asarray() if len(pages) == 1 else np.stack([one.asarray() for one in pages])
+        except ValueError as error:
+            if "imagecodecs" not in str(error):
+                raise
+            import SimpleITK
+
+            values = SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(str(path)))  # which knows LZW
+        sides, unit = _tiff_sides(file)
+    return RawVolume([values.reshape(shape).T], np.diag([*sides, 1.0]), unit=unit)
 
 
-def _tiff_spacing(file: Any) -> tuple[float, float, float] | None:
-    """Sides of a voxel along x, y and z in millimetres, of OME's or ImageJ's metadata; None where they say none."""
+def _tiff_sides(file: Any) -> tuple[tuple[float, float, float], str | None]:
+    """Sides of a voxel along x, y and z by OME's or ImageJ's metadata, and their unit: "mm", or None if unknown."""
     if file.ome_metadata:
         found = {}
         for axis in "XYZ":
@@ -217,13 +242,16 @@ def _tiff_spacing(file: Any) -> tuple[float, float, float] | None:
             scale = MILLIMETRES.get(unit[1] if unit else "µm")
             if size and scale:
                 found[axis] = float(size[1]) * scale
-        return (found["X"], found["Y"], found["Z"]) if len(found) == 3 else None
-    about, tags = file.imagej_metadata or {}, file.pages[0].tags
-    scale = MILLIMETRES.get(str(about.get("unit", "")))
-    if scale is None or not about.get("spacing") or "XResolution" not in tags or "YResolution" not in tags:
-        return None
-    (n_x, per_x), (n_y, per_y) = (tags[f"{axis}Resolution"].value for axis in "XY")
-    return (scale * per_x / n_x, scale * per_y / n_y, scale * abs(float(about["spacing"]))) if n_x and n_y else None
+        return ((found["X"], found["Y"], found["Z"]), "mm") if len(found) == 3 else ((1.0, 1.0, 1.0), None)
+    about, tags = file.imagej_metadata, file.pages[0].tags
+    if about is None:
+        return (1.0, 1.0, 1.0), None
+    # What is 1 ImageJ does not write; without a unit, in pixels, voxels still are as long as they are
+    known = [tags[name].value if (name := f"{axis}Resolution") in tags else (1, 1) for axis in "XY"]
+    x, y = (per / n if n and per else 1.0 for n, per in known)
+    scale = MILLIMETRES.get(str(about.get("unit")))
+    factor = scale or 1.0
+    return (factor * x, factor * y, factor * (abs(float(about.get("spacing", 1))) or 1.0)), "mm" if scale else None
 
 
 READERS: dict[str, Callable[[Path], RawVolume]] = {

@@ -65,7 +65,7 @@ def _map(path: Path) -> tuple[NDArray[Any], Floats]:
     head = head.byteswap() if len(head) == 4 and not 0 <= head[3] < 256 else head
     needed = 1024 + (math.prod(map(int, head[:3])) * _MODES.get(int(head[3]), 1) if len(head) == 4 else 0)
     if len(head) < 4 or min(head[:3]) < 1 or path.stat().st_size < needed:
-        raise MeshError(f"{path}: {path.stat().st_size} of the {needed} bytes that its header announces.")
+        raise MeshError(f"{path}: {path.stat().st_size} of {needed} announced bytes are there. Export it again.")
     with mrcfile.open(path) as file:
         header, values = file.header, file.data
         if values is None or values.ndim != 3 or not np.allclose(header.cellb.item(), 90):

@@ -27,8 +27,8 @@ def read_label_names(path: str | Path) -> dict[int, str]:
     """The names that a table gives to labels.
 
     Label descriptions of ITK-SNAP, colour tables of 3D Slicer and FreeSurfer, JSON from numbers to names or back, also
-    under "labels" as nnU-Net has it, and CSV whose first line names a column of labels (label, LabelValue, index, id or
-    value) and one of names (name or label_name).
+    under "labels" as nnU-Net has it, and CSV or TSV whose first line names a column of labels (label, LabelValue,
+    index, id or value) and one of names (name or label_name).
 
     Example:
         >>> import tempfile
@@ -78,10 +78,10 @@ def names_in_extensions(contents: Iterable[bytes]) -> dict[int, str]:
             if key := _KEY.search(attributes):
                 inner = re.sub(rb"<!\[CDATA\[(.*?)\]\]>", rb"\1", name, flags=re.DOTALL)
                 names[int(key[1])] = html.unescape(inner.decode("utf-8", "replace"))
-    return _clean(names)
+    return cleaned(names)
 
 
-def _clean(names: dict[int, str]) -> dict[int, str]:
+def cleaned(names: dict[int, str]) -> dict[int, str]:
     """On one line each, without those that are empty, and without the background."""
     words = {label: " ".join(name.split()) for label, name in names.items()}
     return {label: name for label, name in words.items() if name and label > 0}
@@ -89,18 +89,19 @@ def _clean(names: dict[int, str]) -> dict[int, str]:
 
 def _of_lines(text: str) -> dict[int, str]:
     rows = (_SNAP.match(line.strip()) or _COLOURS.match(line.strip()) for line in text.splitlines())
-    return _clean({int(row[1]): row[2].strip('"') for row in rows if row})
+    return cleaned({int(row[1]): row[2].strip('"') for row in rows if row})
 
 
 def _of_csv(text: str) -> dict[int, str]:
-    rows = csv.DictReader(text.splitlines())
+    lines = text.splitlines()
+    rows = csv.DictReader(lines, delimiter="\t" if lines and "\t" in lines[0] else ",")
     columns = {(column or "").strip().lower(): column for column in rows.fieldnames or ()}
     number = next((columns[key] for key in ("labelvalue", "label", "index", "id", "value") if key in columns), None)
     name = next((columns[key] for key in ("name", "label_name", "labelname") if key in columns), None)
     if number is None or name is None:
         return {}
     pairs = ((str(row[number] or "").strip(), str(row[name] or "")) for row in rows)
-    return _clean({int(label): words for label, words in pairs if _is_number(label)})
+    return cleaned({int(label): words for label, words in pairs if _is_number(label)})
 
 
 def _of_json(text: str) -> dict[int, str]:
@@ -111,7 +112,7 @@ def _of_json(text: str) -> dict[int, str]:
     table = content.get("labels", content) if isinstance(content, dict) else {}
     rows = table.items() if isinstance(table, dict) else ()
     pairs = ((value, key) if isinstance(value, int) else (key, value) for key, value in rows)
-    return _clean({int(label): name for label, name in pairs if _is_number(str(label)) and isinstance(name, str)})
+    return cleaned({int(label): name for label, name in pairs if _is_number(str(label)) and isinstance(name, str)})
 
 
 def _is_number(text: str) -> bool:

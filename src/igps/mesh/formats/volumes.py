@@ -4,6 +4,7 @@ The world is RAS, x to the patient's right, y to the front and z up, in millimet
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,15 +18,16 @@ from scipy.optimize import linear_sum_assignment
 from igps._arrays import Booleans, Floats
 from igps.mesh._label_measures import LabelVoxels
 from igps.mesh.formats._format import Format, RawBody, faults, made_later
-from igps.mesh.formats._volume_files import READERS, RawVolume, detached, read_raw, suffix_of
-from igps.mesh.formats.label_names import read_label_names, table_beside
-from igps.mesh.label_surface import checked_spacing, voxel_surface
+from igps.mesh.formats._volume_files import READERS, RawVolume, detached, of_nibabel, read_raw, suffix_of
+from igps.mesh.formats.label_names import cleaned, read_label_names, table_beside
+from igps.mesh.label_surface import LEAST_VOXELS, checked_spacing, voxel_surface
 from igps.mesh.mending import Cavities, Mending, mend
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
 
-# More different values are intensities of an image.
-_MOST_LABELS = 20_000
+# More different values are intensities of an image; so are more than a few, if less than a share of neighbours are
+# alike: of labels of two voxels' width half are.
+_MOST_LABELS, _FEW_LABELS, _ALIKE = 20_000, 50, 0.3
 # How far labels may be off whole numbers: NIfTI keeps what was given as numbers with a fraction as scaled integers.
 _ROUNDING = 0.01
 
@@ -95,9 +97,10 @@ class LabelVolume:
 
     def body(self, part: int | str) -> LabelBody:
         """The body of a label, or of a name; a MeshError with the names that there are, if there is none."""
-        for body in self.bodies:
-            if part in (body.label, body.name) or part == str(body.label):
-                return body
+        named: dict[int | str, LabelBody] = {str(body.label): body for body in self.bodies}
+        named |= {key: body for body in self.bodies for key in (body.label, body.name)}  # teeth are named by numbers
+        if part in named:
+            return named[part]
         known = ", ".join(body.name for body in self.bodies[:10]) + (", …" if len(self.bodies) > 10 else "")
         raise MeshError(f"{self.name}: no label {part!r}. It has {len(self.bodies)}: {known}.")
 
@@ -125,6 +128,24 @@ def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) ->
     with faults(path, FORMAT):
         raw = read_raw(path)
     return _labelled(raw, path, options)
+
+
+def volume_in_memory(
+    labels: Any, spacing: Sequence[float] | None = None, name: str = "volume", options: LoadOptions = LoadOptions()
+) -> LabelVolume:
+    """The volume of an array (X, Y, Z) with the sides of its voxels, in millimetres, or of an image of nibabel."""
+    if hasattr(labels, "dataobj"):
+        raw = of_nibabel(labels, name)
+    else:
+        array = np.asarray(labels)
+        if array.ndim != 3 or array.dtype.kind not in "biuf" or (spacing is not None and len(spacing) != 3):
+            got = f"{array.dtype} of shape {array.shape}, spacing {spacing}"
+            raise MeshError(f"{name}: expected labels of shape (X, Y, Z) and three sides of a voxel, got {got}.")
+        raw = RawVolume([array], np.diag([*(spacing or (1, 1, 1)), 1.0]), unit="mm" if spacing else None)
+    notes: list[str] = []
+    layers = tuple(_whole_numbers(values, name, options.threshold, notes) for values in raw.layers)
+    names = raw.names if options.names is None else read_label_names(options.names)
+    return LabelVolume(layers, raw.affine, name, names, unit=raw.unit, notes=tuple(notes))
 
 
 def label_surface(volume: LabelVolume, part: int | str, *, how: Mending = "auto", cavities: Cavities = "fill") -> Mesh:
@@ -162,7 +183,7 @@ def _labelled(raw: RawVolume, path: Path, options: LoadOptions) -> LabelVolume:
         unique = len(set(values)) == len(values)
         labels = values if unique else list(range(1, len(values) + 1))
         segments = tuple((label, layer, value) for label, (_, layer, value) in zip(labels, raw.segments, strict=True))
-        names = {label: name for label, (name, _, _) in zip(labels, raw.segments, strict=True) if name.strip()}
+        names = cleaned({label: name for label, (name, _, _) in zip(labels, raw.segments, strict=True)})
     if options.names is not None:
         names = read_label_names(options.names)
     elif not names:
@@ -174,13 +195,14 @@ def _labelled(raw: RawVolume, path: Path, options: LoadOptions) -> LabelVolume:
     return LabelVolume(layers, raw.affine, str(path), names, segments, raw.unit, tuple(dict.fromkeys(notes)))
 
 
-def _whole_numbers(values: NDArray[Any], path: Path, threshold: float, notes: list[str]) -> NDArray[Any]:
+def _whole_numbers(values: NDArray[Any], path: str | Path, threshold: float, notes: list[str]) -> NDArray[Any]:
     """Labels from 0, of the smallest type; probabilities are cut at the threshold."""
     if values.dtype.kind == "f":
         if n_bad := int(np.count_nonzero(~np.isfinite(values))):
             raise MeshError(f"{path}: {n_bad} voxels are NaN or infinite; labels expected. Set them to 0.")
         odd = values[np.abs(values - np.round(values)) > _ROUNDING]
-        if len(odd) and values.min() >= 0 and values.max() <= 1:
+        # SPM keeps them as bytes times a rounded 1/255, and resampled ones overshoot
+        if len(odd) and values.min() >= -_ROUNDING and values.max() <= 1 + _ROUNDING:
             notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
             return (values >= threshold).astype(np.uint8)
         if len(odd):
@@ -220,23 +242,47 @@ def _counted(labels: ArrayLike, name: str) -> tuple[NDArray[Any], NDArray[Any], 
         start = int(values[0] == 0)
         compact = index.reshape(array.shape) + (1 - start)
         values, counts = values[start:], counts[start:]
-    if len(values) > _MOST_LABELS:
+    if len(values) > _MOST_LABELS or (len(values) > _FEW_LABELS and _is_speckled(array, values[counts.argmax()])):
         many = f"{name}: {len(values)} different values, which look like an image and not like labels."
         raise MeshError(f"{many} Export the labels.")
     return values, counts, compact
 
 
+def _is_speckled(labels: NDArray[Any], most: int) -> bool:
+    """Whether hardly any neighbours along x are alike, but for the background and the most frequent value."""
+    counted = (labels != 0) & (labels != most)
+    pairs = counted[1:] & counted[:-1]
+    return bool(np.count_nonzero(pairs & (labels[1:] == labels[:-1])) < _ALIKE * np.count_nonzero(pairs))
+
+
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The surfaces of the labels of a volume; or of all of them together as the whole."""
-    volume = read_label_volume(path, options)
+    """The surfaces of the labels of a volume; or of all of them together as the whole, or in pieces."""
+    return label_bodies(read_label_volume(path, options), options, part)
+
+
+def label_bodies(volume: LabelVolume, options: LoadOptions, part: str | None = None) -> list[RawBody]:
+    """The bodies of a volume, or the one named, by `options`; their surfaces are made later."""
     if options.bodies in ("whole", "pieces"):
         labelled = np.any([layer > 0 for layer in volume.layers], axis=0).astype(np.uint8)
         volume = replace(volume, layers=(labelled,), names=None, segments=None)
-        made = partial(label_surface, volume, 1, cavities=options.cavities)
-        return [made_later(made, None, volume.unit, partial(volume.voxels, 1))]
+        volume = _in_pieces(volume) if options.bodies == "pieces" else volume
     made = partial(label_surface, volume, how=options.mend, cavities=options.cavities)
+    if options.bodies == "whole":
+        return [made_later(partial(made, 1), None, volume.unit, partial(volume.voxels, 1))]
     names = [body.name for body in volume.bodies] if part is None else [volume.body(part).name]
     return [made_later(partial(made, name), name, volume.unit, partial(volume.voxels, name)) for name in names]
+
+
+def _in_pieces(volume: LabelVolume) -> LabelVolume:
+    """With a label for each piece, in the order of the voxels; without those that are too small to be bodies."""
+    label, _ = ndimage.label(volume.layers[0], np.ones((3, 3, 3)))
+    small = np.bincount(label.ravel(), minlength=2) < LEAST_VOXELS
+    small[0] = False
+    if small[1:].all():  # one of them says so
+        small[:] = False
+    names = {k: f"piece {i}" for i, k in enumerate((np.flatnonzero(~small[1:]) + 1).tolist(), 1)}
+    notes = (f"left out {small.sum()} specks",) if small.any() else ()
+    return replace(volume, layers=(np.where(small[label], 0, label),), names=names, notes=(*volume.notes, *notes))
 
 
 def _beside(path: Path, options: LoadOptions) -> list[Path]:
@@ -245,4 +291,4 @@ def _beside(path: Path, options: LoadOptions) -> list[Path]:
     return [*detached(path), *([table] if table else [])]
 
 
-FORMAT = Format("a label volume", tuple(READERS), read, ("labels",), extra="volumes", beside=_beside)
+FORMAT = Format("a label volume", tuple(READERS), read, ("labels", "pieces"), extra="volumes", beside=_beside)

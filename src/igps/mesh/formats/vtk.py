@@ -19,9 +19,9 @@ from igps.mesh.formats import _vtk_cells, _xml
 from igps.mesh.formats._format import Format, RawBody, check_unpacked, corners_of_rows
 from igps.mesh.options import LoadOptions
 
-_LEGACY_TYPES = {
+_LEGACY_TYPES = {  # VTK writes its identifiers as int
     "float": "f4", "double": "f8", "int": "i4", "unsigned_int": "u4", "long": "i8", "vtktypeint64": "i8",
-    "vtktypeint32": "i4", "short": "i2", "unsigned_short": "u2", "char": "i1", "unsigned_char": "u1", "vtkidtype": "i8",
+    "vtktypeint32": "i4", "short": "i2", "unsigned_short": "u2", "char": "i1", "unsigned_char": "u1", "vtkidtype": "i4",
 }  # fmt: skip
 _CELLS = {"POLYGONS": _vtk_cells.POLYGON, "TRIANGLE_STRIPS": _vtk_cells.STRIP}
 _POLYS = {"Polys": _vtk_cells.POLYGON, "Strips": _vtk_cells.STRIP}
@@ -54,7 +54,10 @@ class _Legacy:
             end = self._content.find(b"\n", self._at)
             end = len(self._content) if end < 0 else end
             text, self._at = self._content[self._at : end].decode("latin-1").strip(), end + 1
-            if text:
+            if text == "METADATA":  # up to a blank line
+                blank = self._content.find(b"\n\n", self._at)
+                self._at = len(self._content) if blank < 0 else blank
+            elif text:
                 return text
         return ""
 

@@ -1,0 +1,39 @@
+"""Bodies in memory, as those of files."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from igps.data.sources import Bodies
+from igps.mesh.loading import BodyRef, surface_body
+from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.objects import bodies_of_object
+from igps.mesh.options import LoadOptions
+from igps.signature.signature import SignatureConfig
+
+
+def bodies_in_memory(
+    given: Mapping[str, Any], labels: Sequence[str] | None, options: LoadOptions, config: SignatureConfig
+) -> tuple[Bodies, dict[BodyRef, Mesh | MeshError]]:
+    """The bodies of objects by name, see `bodies_of_object`, and the mesh of each, or what is wrong with it."""
+    if labels is not None and len(labels) != len(given):
+        raise ValueError(f"labels: expected one for each of {len(given)} bodies, got {len(labels)}.")
+    if not given:
+        raise ValueError("bodies: expected at least one, got none.")
+    least_vertices = config.resolved().n_vertices_read
+    meshes: dict[BodyRef, Mesh | MeshError] = {}
+    classes: list[str] = []
+    for i, (name, thing) in enumerate(given.items()):
+        n_before = len(meshes)
+        try:
+            for raw in bodies_of_object(thing, name, options):
+                ref = BodyRef(Path(name), raw.part)
+                try:
+                    meshes[ref] = surface_body(raw.made(), ref, options, least_vertices=least_vertices)
+                except MeshError as error:
+                    meshes[ref] = error
+        except MeshError as error:
+            meshes[BodyRef(Path(name))] = error
+        classes += [] if labels is None else [labels[i]] * (len(meshes) - n_before)
+    paths, parts = zip(*((ref.path, ref.part) for ref in meshes), strict=True)
+    return Bodies(paths, tuple(map(str, meshes)), None if labels is None else tuple(classes), parts), meshes
