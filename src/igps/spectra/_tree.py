@@ -13,6 +13,9 @@ from igps._compiled import compiled
 # Unknowns from which a subtree is worth a thread of its own, and the most subtrees, as a power of two
 SUBTREE, MOST_SUBTREES = 2**13, 3
 
+Nodes = tuple[int, int]
+"""A range of nodes: the first, and the one behind the last."""
+
 
 class Structure(NamedTuple):
     """What is known of a matrix before its values: its pattern, and the nodes of the tree, N in number."""
@@ -26,10 +29,18 @@ class Structure(NamedTuple):
     start: np.ndarray  # (N + 1,) where each node's boundary starts among all boundaries
     boundary: np.ndarray  # sorted numbers each
     parent_row: np.ndarray  # the row of each vertex of a boundary in the front of the node's parent
+    block_start: np.ndarray  # (N + 1,) where each node's block [D E] starts among all blocks
+    update_start: np.ndarray  # (N,) where its complement starts among those that wait to be added
+    carried_start: np.ndarray  # (N,) where the rows that it adds to its boundary start among those that wait
 
 
-def tree_structure(node: np.ndarray, n_levels: int, indptr: np.ndarray, indices: np.ndarray) -> Structure:
-    """Of a full binary tree for vertices (V,) assigned to the places of a heap."""
+def tree_structure(
+    node: np.ndarray, n_levels: int, indptr: np.ndarray, indices: np.ndarray
+) -> tuple[Structure, list[Nodes], list[Nodes]]:
+    """Of a full binary tree for vertices (V,) assigned to the places of a heap, with its `side_by_side` subtrees.
+
+    The third result are the nodes above these, as ranges, each behind its children.
+    """
     n_nodes = 2**n_levels - 1
     post = np.full(n_nodes, n_nodes - 1)  # the number of each place in the heap
     children, parent = np.full((n_nodes, 2), -1), np.full(n_nodes, -1)
@@ -49,7 +60,16 @@ def tree_structure(node: np.ndarray, n_levels: int, indptr: np.ndarray, indices:
     owner = np.repeat(np.arange(n_nodes), np.diff(start))
     boundary = np.sort(owner * len(node) + boundary) - owner * len(node)
     rows = _parent_rows(first, parent, start, boundary)
-    return Structure(indptr, indices, order, number, first, children, start, boundary, rows)
+    n_own, n_boundary = np.diff(first), np.diff(start)
+    subtrees = side_by_side(n_levels, len(node))
+    inside = {n for begin, end in subtrees for n in range(begin, end)}
+    alone = [(n, n + 1) for n in range(n_nodes) if n not in inside]
+    blocks = np.append(0, np.cumsum(n_own * (n_own + n_boundary)))
+    updates, carried = (stacked_places(children, sizes, [*subtrees, *alone]) for sizes in (n_boundary**2, n_boundary))
+    structure = Structure(
+        indptr, indices, order, number, first, children, start, boundary, rows, blocks, updates, carried
+    )
+    return structure, subtrees, alone
 
 
 @compiled()
@@ -115,7 +135,7 @@ def _parent_rows(first: np.ndarray, parent: np.ndarray, start: np.ndarray, bound
     return rows
 
 
-def side_by_side(n_levels: int, n_unknowns: int) -> list[tuple[int, int]]:
+def side_by_side(n_levels: int, n_unknowns: int) -> list[Nodes]:
     """The ranges of nodes of a few large subtrees, in the order in which a full tree is numbered depth first.
 
     They depend on the matrix alone, not on the threads that there are: neither do rounding errors.
@@ -128,8 +148,8 @@ def side_by_side(n_levels: int, n_unknowns: int) -> list[tuple[int, int]]:
     return subtrees
 
 
-def stacked_places(children: np.ndarray, sizes: np.ndarray, ranges: list[tuple[int, int]]) -> tuple[np.ndarray, int]:
-    """Where the result of each node starts, of these sizes, and the size of all; each range of nodes has its own place.
+def stacked_places(children: np.ndarray, sizes: np.ndarray, ranges: list[Nodes]) -> np.ndarray:
+    """Where the result of each node starts, of these sizes; each range of nodes has its own place.
 
     In a range, a node's result waits until its parent takes it: when a node is done, its children's results are the
     last two that wait, and its own takes their place.
@@ -142,4 +162,4 @@ def stacked_places(children: np.ndarray, sizes: np.ndarray, ranges: list[tuple[i
             place[n] = top if left[n] < first else place[left[n]]
             top = int(place[n]) + length[n]
             end = max(end, top)
-    return place, end
+    return place
