@@ -20,14 +20,14 @@ class Basis:
     """Rows of a basis, a copy of them in single precision, and the matrix of the problem projected on them.
 
     The columns are cut into pieces, which a team works on side by side; how many depends on their number alone, so that
-    a team changes no bit.
+    a team changes no bit. One that `loses_basis` is so large that it must make place for the eigenvectors.
     """
 
     def __init__(self, first_row: np.ndarray, capacity: int, team: Team = ALONE) -> None:
         self._team = team
         n_columns = len(first_row)
         self._pieces = pieces_of(n_columns, max(1, min(MOST_PIECES, n_columns // PIECE)))
-        self._large = (capacity + 1) * n_columns > MOST_SINGLE_ENTRIES
+        self.loses_basis = (capacity + 1) * n_columns > MOST_SINGLE_ENTRIES
         # to be read in half the time
         self._single: torch.Tensor | None
         self._allocate(capacity + 1, n_columns)
@@ -44,8 +44,8 @@ class Basis:
 
         A smaller one and its copy are one piece: the C library keeps what was one piece for the next basis.
         """
-        self._memory = np.empty((n_rows if self._large else 0, n_columns))
-        if self._large:
+        self._memory = np.empty((n_rows if self.loses_basis else 0, n_columns))
+        if self.loses_basis:
             self._basis, self._single = torch.from_numpy(self._memory), None
             return
         size = n_rows * n_columns

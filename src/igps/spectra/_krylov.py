@@ -80,11 +80,6 @@ class Krylov(Basis):
         """Dimension m of the projected problem."""
         return self._current - 1
 
-    @property
-    def loses_basis(self) -> bool:
-        """Whether the basis must make place for the eigenvectors."""
-        return self._large
-
     def expand(self) -> None:
         """Multiply the last block, and append what is new in the product as the next block."""
         last = slice(self._current, self._stop)

@@ -8,6 +8,7 @@ from operator import or_
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import one_hot
 
 from igps.data.requirements import Requirements
 from igps.nn._kernels.pair_values import PairValues, euclidean_distances
@@ -184,9 +185,7 @@ def pair_histogram(
             "expected n_classes >= 1, n_bins >= 2 and positive ranges, got "
             f"{n_classes=}, {n_bins=}, {distance_range=}, {potential_range=}."
         )
-    classes = (potential * (n_classes / potential_range)).long().clamp_(max=n_classes - 1)[None, :, None]
+    classes = (potential * (n_classes / potential_range)).long().clamp_(max=n_classes - 1)
     dtype = torch.promote_types(embedding.dtype, torch.float32)
     centres = (torch.arange(n_bins, dtype=dtype, device=embedding.device) + 0.5) * (distance_range / n_bins)
-    pairs, mask = [euclidean_distances(embedding[None], centres)], torch.ones_like(classes[..., 0], dtype=torch.bool)
-    check_pairs(pairs, mask)
-    return count_pairs(classes, torch.ones_like(classes, dtype=dtype), n_classes, pairs, mask)[0]
+    return joint_histogram(one_hot(classes, n_classes).to(dtype), [euclidean_distances(embedding, centres)])
