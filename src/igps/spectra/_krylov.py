@@ -13,7 +13,7 @@ from igps._threads import ALONE, Team
 from igps.spectra._basis import Basis, pieces_of
 from igps.spectra._checks import ROUNDING
 from igps.spectra._multifrontal import Factors
-from igps.spectra._products import combinations, overlaps, subtract
+from igps.spectra._products import overlaps, subtract
 
 # Below this, relative to what it came from, a pivot makes a Cholesky factor inaccurate
 CHOLESKY_QR_PIVOT = 1e-6
@@ -137,11 +137,11 @@ class Krylov(Basis):
 
         Entry i of a vector becomes row ``order[i]``.
         """
-        coefficients = _coefficients(ritz, index)
+        coefficients = _coefficients(ritz, index).numpy()
         vectors = torch.empty(self._basis.shape[1], len(index), dtype=torch.float64, device="cpu").numpy()
 
         def combine(piece: slice) -> None:
-            vectors[order[piece]] = combinations(self._basis[1 : self._stop], coefficients, piece)
+            vectors[order[piece]] = self._basis[1 : self._stop, piece].numpy().T @ coefficients
 
         return vectors, [partial(combine, piece) for piece in self._small_pieces()]
 
@@ -185,13 +185,11 @@ class Krylov(Basis):
             return 0.0
         (lost,) = self._sums(lambda piece: (overlaps(new, old, piece),))
         largest = float(lost.abs().max())
-        single = self._single if largest <= SINGLE_LOSS else None
+        if self._single is not None and largest <= SINGLE_LOSS:
+            old, lost = self._single[: self._swept], lost.float()
 
         def take_out(piece: slice) -> tuple[torch.Tensor]:
-            if single is None:
-                new[:, piece].addmm_(lost, old[:, piece], alpha=-1)
-            else:
-                subtract(new, lost.float(), single[: self._swept], piece)
+            subtract(new, lost, old, piece)
             return (overlaps(new, new, piece),)
 
         (squares,) = self._sums(take_out)
