@@ -209,13 +209,12 @@ class Krylov(Basis):
         what rounding has left. Together that costs one product with the basis and one back.
         """
         scale = float(torch.linalg.norm(block, dim=1).max()) if scale is None else scale
-        first: torch.Tensor | None = None
+        coupling = torch.eye(len(block), dtype=torch.float64, device="cpu")
         for rows in (self._basis[near : self._stop], self._basis[: self._stop]):
             block = torch.addmm(block, (rows @ block.T).T, rows, alpha=-1)
             block, factor = self._factor_rows(block, scale)
-            first, scale = (factor, 1.0) if first is None else (factor @ first, 1.0)
-        assert first is not None
-        return block, first
+            coupling, scale = factor @ coupling, 1.0
+        return block, coupling
 
     def _factor_rows(self, block: torch.Tensor, scale: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Orthonormal rows Q and R with blockᵀ = Qᵀ R; for a direction lost in rounding a random row and no R."""
