@@ -12,6 +12,7 @@ from torch import Tensor, nn
 import igps.nn.functional as functional
 from batches import alone, two_bodies
 from igps.data.batch import SampleBatch, SignatureBatch
+from igps.nn._kernels import count_by_torch
 from igps.nn.axes import (
     Attribute,
     BallRadius,
@@ -19,6 +20,7 @@ from igps.nn.axes import (
     EuclideanDistance,
     InteriorDistance,
     PairCosines,
+    PairTwist,
     Potential,
 )
 from igps.nn.descriptor import HistogramDescriptor
@@ -42,6 +44,7 @@ MODULES: dict[str, Callable[[], DescriptionPart]] = {
     ),
     "in space": lambda: PairHistogram([PairCosines(3, learnable=True)]),
     "in the embedding": lambda: PairHistogram([InteriorDistance(4), EmbeddedPairCosines(3)], filtered()),
+    "twists": lambda: PairHistogram([PairTwist(4), InteriorDistance(4)], filtered()),
     "of points": lambda: PointHistogram([BallRadius("inside"), Potential(3, learnable=True)], filtered()),
 }
 
@@ -63,6 +66,27 @@ def test_the_whole_graph_is_traced(module: DescriptionPart) -> None:
     torch.testing.assert_close(traced(batch), module(batch), rtol=0, atol=1e-6)
     for found, expected in zip(gradients(traced, batch), gradients(module, batch), strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-7)
+
+
+def test_what_is_compiled_does_not_grow_with_the_samples(
+    module: DescriptionPart, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Thousands of samples are counted in many blocks: unrolled they would take minutes to compile."""
+    monkeypatch.setattr(count_by_torch, "_BLOCK", 1)
+    batch, nodes = two_bodies(), []
+    twice = {
+        kind: getattr(batch, kind).map(lambda one: torch.cat([one, one], dim=1)) for kind in ("interior", "surface")
+    }
+
+    def backend(program: torch.fx.GraphModule, _: object) -> Callable[..., object]:
+        nodes.append(len(program.graph.nodes))
+        return program.forward
+
+    for one in (batch, replace(batch, **twice)):
+        torch.compiler.reset()
+        with torch.no_grad():
+            torch.compile(module, backend=backend, fullgraph=True)(one)
+    assert nodes[0] == nodes[1]
 
 
 class OfTensors(nn.Module):
@@ -95,6 +119,7 @@ def test_a_description_of_a_padded_batch_is_exported() -> None:
     other = replace(batch, interior=replace(batch.interior, points=batch.interior.points.flip(2) * 1.5))
     with torch.no_grad():
         program = torch.export.export(OfTensors(descriptor, batch), tensors(batch)).module()
+        assert not any("igps" in str(node.target) for node in program.graph.nodes if node.op == "call_function")
         for one in (batch, other):
             torch.testing.assert_close(program(*tensors(one)), descriptor(one), rtol=0, atol=1e-6)
 

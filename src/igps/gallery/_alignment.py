@@ -133,8 +133,8 @@ def surface_distance(
     The search ends at a distance that is `enough`. Beyond `hopeless` it matters no more how far apart they are: where
     few samples are farther after some steps, the other surface itself is not asked for; nor are all samples laid onto
     that, where few are farther from it than two thirds of it. What is farther than `most` is told to be, not how far:
-    one way may do. With a `patch` of 1 instead of ten neighbours lost relief counts, and the farthest sample instead of
-    the mean. The result is symmetric but for where the search ends.
+    one way may do. With a `patch` of 1 instead of ten neighbours, for two that are known to be the same, lost relief
+    counts, and the farthest sample instead of the mean. The result is symmetric but for where the search ends.
     """
     best = math.inf
     is_ambiguous = min(_least_step(one), _least_step(other)) < _AMBIGUOUS
@@ -153,8 +153,9 @@ def surface_distance(
             if far <= hopeless / _FINER:
                 far = _apart(one, other, placing, patch, most)
         best = min(best, far)
-        # A body may be nearly its own mirror image: near is not yet the nearest
-        if best <= enough or (best > hopeless and not is_ambiguous):
+        # A body may be nearly its own mirror image: near is not yet the nearest; but of two that are known to be the
+        # same, clear axes tell which of their starts is
+        if best <= enough or ((best > hopeless or patch == 1) and not is_ambiguous):
             break
     return best
 

@@ -88,6 +88,7 @@ class Surfaces:
         self._tolerance = tolerance
         self._dataset = dataset
         self._last = lru_cache(_SURFACES)(self.samples)
+        self._last_mesh = lru_cache(_TRIANGLES)(self._mesh)
         self._last_triangles = lru_cache(_TRIANGLES)(self._triangles)
         self._numbered = lru_cache(_TRIANGLES)(self._as_numbered)
         self._known = lru_cache(None)(self._coarseness_and_handles)
@@ -173,7 +174,7 @@ class Surfaces:
 
     def _coarseness_and_handles(self, i: int) -> tuple[float, int | None]:
         """Handles are None where the mesh is open, and where mending may have made some or closed holes."""
-        mesh = self._mesh(i)
+        mesh = self._last_mesh(i)
         blurred = TriangleSurface(mean_of_neighbours(self._placed(i, mesh), mesh.faces), mesh.faces)
         handles = None
         if not set(repair_steps(mesh.notes)) - _KEEP_HANDLES:
@@ -191,12 +192,14 @@ class Surfaces:
 
     def _as_numbered(self, i: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """The vertices about their mean, over √area, as they are in the file; and the faces, turned or not."""
-        body, reading = self._dataset.bodies[i], self._dataset.pipeline.reading
-        mesh = load_mesh(body.path, reading, part=body.part)
+        mesh = self._last_mesh(i)
+        if "subdivided" in repair_steps(mesh.notes):
+            body = self._dataset.bodies[i]
+            mesh = load_mesh(body.path, self._dataset.pipeline.reading, part=body.part)
         return (mesh.vertices - mesh.vertices.mean(axis=0)) / math.sqrt(mesh.area), np.sort(mesh.faces, axis=1)
 
     def _triangles(self, i: int) -> TriangleSurface:
-        mesh = self._mesh(i)
+        mesh = self._last_mesh(i)
         return TriangleSurface(self._placed(i, mesh), mesh.faces)
 
     def _placed(self, i: int, mesh: Mesh) -> NDArray[np.float64]:

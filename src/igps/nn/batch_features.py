@@ -40,7 +40,7 @@ class SampleFeatures:
         self.samples = samples
         self._embedded: dict[nn.Module, Tensor] = {}
         self._ball_radii: Tensor | None = None
-        self._neighbours: dict[nn.Module, list[Tensor]] = {}
+        self._neighbours: dict[nn.Module, Tensor] = {}
 
     def embedded(self, embedding: nn.Module) -> Tensor:
         """(N, P, D) embedding of the samples."""
@@ -82,12 +82,11 @@ class SampleFeatures:
         potential = barycentroid_potential(self.embedded(embedding))
         return potential.clamp_min(torch.finfo(potential.dtype).tiny).log()
 
-    def neighbours(self, embedding: nn.Module) -> list[Tensor]:
-        """Of each shape, (P, k) the other samples that are nearest to each in the embedding, padding left out."""
+    def neighbours(self, embedding: nn.Module) -> Tensor:
+        """(N, P, k) of each shape the other samples that are nearest to each in the embedding, see their function."""
         if embedding not in self._neighbours:
-            coordinates = self.embedded(embedding)
-            shapes = zip(coordinates, self.samples.mask, strict=True)
-            self._neighbours[embedding] = [nearest_neighbours(one[real]) for one, real in shapes]
+            shapes = zip(self.embedded(embedding), self.samples.mask, strict=True)
+            self._neighbours[embedding] = torch.stack([nearest_neighbours(one, mask=real) for one, real in shapes])
         return self._neighbours[embedding]
 
     def embedded_directions(self, embedding: nn.Module) -> Tensor:
@@ -136,11 +135,17 @@ def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest:
     return functional.normalize(mean - points, dim=1)
 
 
-def nearest_neighbours(points: Tensor, n_nearest: int = N_NEIGHBOURS) -> Tensor:
-    """(P, k) the others nearest to each of points (P, D), nearest first; a ValueError if there is no point."""
+def nearest_neighbours(points: Tensor, n_nearest: int = N_NEIGHBOURS, mask: Tensor | None = None) -> Tensor:
+    """(P, k) the others nearest to each of points (P, D), those of the mask alone if there is one, nearest first.
+
+    A point has itself for those that it lacks. A ValueError if there is no point.
+    """
     if not len(points):
         raise ValueError("samples: expected at least one of each body, got none.")
     with full_precision():
         squares = torch.cdist(points.detach(), points.detach(), compute_mode="use_mm_for_euclid_dist")
     squares.diagonal().fill_(torch.inf)
-    return smallest(squares, min(n_nearest, len(points) - 1))[1]
+    if mask is not None:
+        squares.masked_fill_(~mask, torch.inf)
+    nearest, which = smallest(squares, min(n_nearest, len(points) - 1))
+    return torch.where(nearest < torch.inf, which, torch.arange(len(points), device=points.device)[:, None])

@@ -86,8 +86,8 @@ def test_axes_are_those_of_a_brick_the_longest_first_and_point_to_its_heavy_end(
     points = torch.cat([brick, far.expand(50, 3)]) @ turn.T + 7
     weights = torch.ones(len(points), dtype=torch.float64)
     weights[len(brick) :] = 1e-9  # what is far off tells the direction, not the axes
-    centre, axes = principal_axes(points, weights)
-    np.testing.assert_allclose(centre, [7, 7, 7], atol=0.05)
+    (centre,), (axes,) = principal_axes(points[None], weights[None])
+    np.testing.assert_allclose(centre[0], [7, 7, 7], atol=0.05)
     np.testing.assert_allclose((turn.T @ axes).abs(), np.eye(3)[[1, 2, 0]].T, atol=0.05)
     assert float((turn.T @ axes)[1, 0]) < -0.99
 
@@ -101,8 +101,8 @@ def test_a_limb_that_moves_hardly_turns_the_axes() -> None:
     axes, plain = [], []
     for direction in ([1.0, 1.0, 0.0], [1.0, -0.2, 0.0]):
         points = torch.cat([trunk, limb * torch.tensor(direction)])
-        axes.append(principal_axes(points, weights)[1][:, 0])
-        plain.append(principal_axes(points, torch.ones(1000, dtype=torch.float64))[1][:, 0])
+        axes.append(principal_axes(points[None], weights[None])[1][0, :, 0])
+        plain.append(principal_axes(points[None], torch.ones(1, 1000, dtype=torch.float64))[1][0, :, 0])
     turned = [float(torch.rad2deg(torch.arccos((one @ other).abs()))) for one, other in (axes, plain)]
     assert turned[0] < 10 < 30 < turned[1]
 

@@ -86,6 +86,22 @@ def test_what_is_apart_ends_at_the_bottom() -> None:
     assert sorted(zip(tree.peaks.tolist(), tree.saddles.tolist(), strict=True)) == [(0, 3), (2, 3)]
 
 
+def test_points_outside_the_mask_are_not_there() -> None:
+    values, neighbours = random_graph(7)
+    mask = torch.arange(80) % 3 != 1
+    numbers = mask.nonzero()[:, 0]
+    place = torch.full((80,), -1)
+    place[numbers] = torch.arange(len(numbers))
+    own = torch.where(mask[neighbours], neighbours, torch.arange(80)[:, None])  # without those that are not there
+    expected = merge_tree(values[mask], place[own[mask]], [5, 20])
+    tree = merge_tree(values.masked_fill(~mask, torch.nan), neighbours, [5, 20], mask)
+    assert torch.equal(tree.peaks, numbers[expected.peaks])
+    assert torch.equal(tree.saddles, numbers[expected.saddles])
+    there = expected.pieces >= 0
+    assert torch.equal(tree.pieces[:, mask][there], numbers[expected.pieces[there]])
+    assert (tree.pieces >= 0).sum(dim=1).tolist() == [5, 20]
+
+
 def test_a_single_point_is_one_branch_of_no_length() -> None:
     tree = merge_tree(torch.tensor([1.0]), nearest_neighbours(torch.zeros(1, 3), 4), [1])
     assert [one.tolist() for one in tree] == [[0], [0], [[0]]]

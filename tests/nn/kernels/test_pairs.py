@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
+from torch.nn.utils.rnn import pad_sequence
 
 from conftest import torch_threads
 from igps import _threads as threads
@@ -285,6 +286,21 @@ def test_no_cell_of_cosines_is_negative(device: str) -> None:
         oriented_pairs(points.to(device), directions.to(device), angles, angles),
     ]
     assert joint_histogram(torch.ones(800, 2, 1, device=device), pairs).min() >= 0
+
+
+def test_shapes_of_any_sizes_are_counted_as_alone(device: str) -> None:
+    sizes = [5, 40, 2, 38, 12, 13, 40]
+    shapes = [{name: value.to(device) for name, value in some(n, seed=n).items()} for n in sizes]
+    padded = {
+        name: pad_sequence([one[name] for one in shapes], batch_first=True, padding_value=torch.nan)
+        for name in shapes[0]
+    }
+    mask = torch.arange(40, device=device) < torch.tensor(sizes, device=device)[:, None]
+    layout = centres(MANY, padded["points"])
+    together = joint_histogram(padded["memberships"], [euclidean_distances(padded["coordinates"], layout)], mask)
+    for found, one in zip(together, shapes, strict=True):
+        expected = joint_histogram(one["memberships"], [euclidean_distances(one["coordinates"], layout)])
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 
 def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,10 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from igps._arrays import Integers
 from igps._compiled import compiled
+from igps.nn.batch_features import SampleFeatures
 
 
 class MergeTree(NamedTuple):
@@ -19,34 +20,52 @@ class MergeTree(NamedTuple):
     pieces: Tensor  # (L, P) of each point the peak of the piece of the superlevel set it belongs to; −1 where below
 
 
-def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = ()) -> MergeTree:
+def merge_trees(features: SampleFeatures, embedding: nn.Module, levels: Sequence[float] = ()) -> list[MergeTree]:
+    """The merge tree of log U of some samples of each body, U the barycentroid potential of an embedding.
+
+    Two samples are neighbours if one is among the nearest to the other in the embedding. Pieces are those of the
+    levels, shares of the samples of a body that are in them, ascending. All is on the CPU. A ValueError of values that
+    are not finite, or of a body without samples.
+    """
+    if torch.compiler.is_compiling():  # the loops are compiled already; as a decorator this would import the compiler
+        return torch.compiler.disable(_merge_trees)(features, embedding, levels)
+    return _merge_trees(features, embedding, levels)
+
+
+def _merge_trees(features: SampleFeatures, embedding: nn.Module, levels: Sequence[float]) -> list[MergeTree]:
+    asked = features.log_potential(embedding).detach(), features.neighbours(embedding), features.samples.mask
+    trees = []
+    for values, neighbours, mask in zip(*(one.cpu() for one in asked), strict=True):
+        if not (n := int(mask.sum())):
+            raise ValueError("samples: expected at least one of each body, got none.")
+        trees.append(merge_tree(values, neighbours, [max(1, round(share * n)) for share in levels], mask))
+    return trees
+
+
+def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = (), mask: Tensor | None = None) -> MergeTree:
     """The merge tree of finite values (P,) on points; two are neighbours if either names the other in (P, k).
 
     From the highest value down, each point joins the pieces of those of its neighbours that are higher; where it joins
     two pieces, the one with the lower peak ends. A branch is as long as its peak is above its end, which is called its
     persistence. Source: Edelsbrunner, Letscher and Zomorodian 2002; on shapes, Skraba, Ovsjanikov, Chazal and Guibas
     2010. Of equal values, that of the smaller number is the higher. Superlevel sets are told by counts (L,), how many
-    points each has, 1 to P, ascending. A value that is not finite is a ValueError.
+    points each has, 1 to P, ascending. All are on the CPU; of the points, those of a mask (P,) alone are there. A value
+    that is not finite is a ValueError.
     """
-    if not torch.isfinite(values).all():
+    there = torch.arange(len(values)) if mask is None else mask.nonzero()[:, 0]
+    if not torch.isfinite(values[there]).all():
         raise ValueError("values: expected finite numbers, got NaN or infinity.")
-    if torch.compiler.is_compiling():  # the loops are compiled already; as a decorator this would import the compiler
-        return torch.compiler.disable(_merge_tree)(values, neighbours, counts)
-    return _merge_tree(values, neighbours, counts)
-
-
-def _merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int]) -> MergeTree:
-    order = torch.argsort(values.detach(), descending=True, stable=True).cpu().numpy()
-    place = np.empty_like(order)
+    order = there[torch.argsort(values[there], descending=True, stable=True)].numpy()
+    place = np.full(len(values), -1)
     place[order] = np.arange(len(order))
-    pairs = np.stack([place.repeat(neighbours.shape[1]), place[neighbours.cpu().numpy().ravel()]])
+    pairs = np.stack([place.repeat(neighbours.shape[1]), place[neighbours.numpy().ravel()]])
+    pairs = pairs[:, (pairs >= 0).all(axis=0)]
     higher, lower = pairs.min(axis=0), pairs.max(axis=0)
     met = np.argsort(lower)  # of those that meet at one point, the order does not matter
-    ends = np.empty((len(values), 2), np.int64)
+    ends = np.empty((len(order), 2), np.int64)
     pieces = np.full((len(counts), len(values)), -1, np.int64)
     n = _merge(order, higher[met], lower[met], np.array(counts, np.int64), ends, pieces)
-    found = torch.from_numpy(ends[:n]).to(values.device)
-    return MergeTree(found[:, 0], found[:, 1], torch.from_numpy(pieces).to(values.device))
+    return MergeTree(torch.from_numpy(ends[:n, 0]), torch.from_numpy(ends[:n, 1]), torch.from_numpy(pieces))
 
 
 @compiled()
@@ -55,9 +74,9 @@ def _merge(
 ) -> int:
     """Write the branches and the pieces of a function on a graph, see `merge_tree`; how many branches there are.
 
-    The points (P,) come in order, the highest first, and go by their places in it, as do the higher and the lower of
-    each pair of neighbours, in the order of the lower. Written are the peak and the saddle of each branch to (P, 2),
-    and the peak of the piece of each point to (L, P), which holds −1.
+    The points come in order, the highest first, and go by their places in it, as do the higher and the lower of each
+    pair of neighbours, in the order of the lower. Written are the peak and the saddle of each branch, and the peak of
+    the piece of each point to (L, P), which holds −1.
     """
     parent = np.arange(len(order))
     n_branches = level = pair = 0

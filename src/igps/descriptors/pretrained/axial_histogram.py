@@ -8,12 +8,14 @@ from igps.data.requirements import Requirements
 from igps.nn.axes.points import soft_memberships
 from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential
-from igps.nn.histograms.base import SampleHistogram, counted, joint, present
+from igps.nn.histograms.base import SampleHistogram, counted, joint
 
 # The weight of a sample is so great a power of its potential: the trunk decides where the axes lie, limbs hardly
 _POWER = -4
 # Of places, in units of the root mean square distance from the centre
 _REACH = 2.2
+# The two other axes of each
+_OTHERS = torch.tensor([[1, 2], [0, 2], [0, 1]])
 
 
 class AxialHistogram(SampleHistogram):
@@ -70,47 +72,46 @@ class AxialHistogram(SampleHistogram):
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, 3, ...) histograms of some samples of N shapes."""
-        potential = barycentroid_potential(features.embedded(self.embedding))
-        positions, directions = features.positions(), features.attribute("surface_direction")
-        weights = features.weights_or_ones(potential)
-        values = (positions, directions, potential, weights)
-        shapes = enumerate(present(features))
-        return torch.stack([self._of_shape(*(one[i, real] for one in values)) for i, real in shapes])
-
-    def _of_shape(self, points: Tensor, directions: Tensor, potential: Tensor, own: Tensor) -> Tensor:
-        if not all(torch.isfinite(one).all() for one in (points, directions, potential)):
+        mask, potential = features.samples.mask, barycentroid_potential(features.embedded(self.embedding))
+        # What is padded may be anything, and counts nowhere.
+        points, directions, potential, own = (
+            one.masked_fill(~mask.view(*mask.shape, *[1] * (one.ndim - 2)), 0)
+            for one in (
+                features.positions(), features.attribute("surface_direction"), potential,
+                features.weights_or_ones(potential),
+            )
+        )  # fmt: skip
+        if not torch.isfinite(points.sum() + directions.sum() + potential.sum()):
             raise ValueError("AxialHistogram: expected finite values, got NaN or infinity.")
         with torch.no_grad():
-            weights = potential.double().clamp_min(torch.finfo().tiny).pow(_POWER)
+            weights = potential.double().clamp_min(torch.finfo().tiny).pow(_POWER) * mask
             centre, axes = (one.to(points.dtype) for one in principal_axes(points, weights))
-        places = (points - centre) @ axes
-        directions = directions @ axes
-        places = places / places.square().sum(dim=1).mean().sqrt()
-        found = []
-        for axis in range(3):
-            along, of_direction = places[:, axis], directions[:, axis]
-            others = [other for other in range(3) if other != axis]
-            aside = places[:, others]
-            outward = (directions[:, others] * normalize(aside, dim=1)).sum(dim=1)
-            place = [soft_memberships(along, self.along), soft_memberships(aside.norm(dim=1), self.beside)]
-            # towards the nearer end of the axis: so a body and its mirror image agree
-            away = torch.where(along < 0, -of_direction, of_direction)
-            direction = [soft_memberships(away, self.cosine), soft_memberships(outward, self.outward)]
-            counts = counted(joint(place) * own[:, None], joint(direction), own.new_tensor(len(points)))
-            found.append(counts.view(self.n_bins))
-        return torch.stack(found) / 3
+        n_points = mask.sum(dim=1)
+        places, directions = (points - centre) @ axes * mask[:, :, None], directions @ axes
+        places = places / (places.square().sum(dim=(1, 2)) / n_points).sqrt()[:, None, None]
+        # (N, 3, P) along each axis, and (N, 3, P, 2) along the two others
+        along, of_direction = places.mT, directions.mT
+        aside, of_aside = (one[:, :, _OTHERS].transpose(1, 2) for one in (places, directions))
+        outward = (of_aside * normalize(aside, dim=3)).sum(dim=3)
+        place = [soft_memberships(along, self.along), soft_memberships(aside.norm(dim=3), self.beside)]
+        # towards the nearer end of the axis: so a body and its mirror image agree
+        away = torch.where(along < 0, -of_direction, of_direction)
+        direction = [soft_memberships(away, self.cosine), soft_memberships(outward, self.outward)]
+        counts = counted(joint(place) * own[:, None, :, None], joint(direction), n_points[:, None])
+        return counts.view(-1, *self.shape) / 3
 
 
 def principal_axes(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """The centre (3,) of points (P, 3) of weights (P,) and their principal axes (3, 3), in columns, the longest first.
+    """The centres (N, 1, 3) of points (N, P, 3) of weights (N, P) and their principal axes (N, 3, 3).
 
-    Each axis points to where the third moment of all points about the centre, each counted once, is positive.
+    Axes are in columns, the longest first. Each points to where the third moment of all points of any weight about the
+    centre, each counted once, is positive.
     """
-    weights = weights / weights.sum()
+    weights = (weights / weights.sum(dim=1, keepdim=True))[:, :, None]
     points = points.to(weights.dtype)
-    centre = weights @ points
-    places = points - centre
-    _, axes = torch.linalg.eigh(places.T @ (places * weights[:, None]))
-    axes = axes.flip(1)
-    third = (places @ axes).pow(3).sum(dim=0)
+    centre = (weights * points).sum(dim=1, keepdim=True)
+    places = (points - centre) * (weights > 0)
+    _, axes = torch.linalg.eigh(places.mT @ (places * weights))
+    axes = axes.flip(2)
+    third = (places @ axes).pow(3).sum(dim=1, keepdim=True)
     return centre, axes * torch.where(third < 0, -1, 1)

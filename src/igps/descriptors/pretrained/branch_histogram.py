@@ -2,11 +2,13 @@
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.utils.rnn import pad_sequence
 
-from igps.descriptors.pretrained._merge_tree import merge_tree
+from igps.descriptors.pretrained._merge_tree import MergeTree, merge_tree, merge_trees
 from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histograms.base import SampleHistogram, present
+from igps.nn.histograms.base import SampleHistogram
 
 
 class BranchHistogram(SampleHistogram):
@@ -52,27 +54,32 @@ class BranchHistogram(SampleHistogram):
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, B) histograms of some samples of N shapes."""
-        heights, neighbours = features.log_potential(self.embedding), features.neighbours(self.embedding)
-        weights = features.weights()
-        found = []
-        for i, real in enumerate(present(features)):
-            found.append(self._of_shape(heights[i, real], neighbours[i], None if weights is None else weights[i, real]))
-        return torch.stack(found)
+        trees, heights = merge_trees(features, self.embedding), features.log_potential(self.embedding)
+        peaks, saddles = (
+            pad_sequence(list(one), batch_first=True).to(heights.device)
+            for one in zip(*((tree.peaks, tree.saddles) for tree in trees), strict=True)
+        )
+        lengths, longest = (heights.gather(1, peaks) - heights.gather(1, saddles)).sort(dim=1, descending=True)
+        lengths = lengths[:, : self.n_branches]
+        total = lengths.sum(dim=1, keepdim=True)
+        shares = lengths / torch.where(total > 0, total, 1)
+        if (weights := features.weights()) is not None:
+            asked = longest[:, : self.n_branches], heights.detach(), features.neighbours(self.embedding)
+            of_bodies = zip(trees, *(one.cpu() for one in (*asked, features.samples.mask)), strict=True)
+            limbs = torch.stack([_limbs(*body) for body in of_bodies]).to(weights)
+            shares = shares * (limbs @ weights[:, :, None])[:, :, 0] / limbs.sum(dim=2).clamp_min(1)
+        found = functional.pad(shares, (0, self.n_branches - shares.shape[1]))
+        # A body that is the same everywhere has one branch, of no length.
+        return torch.where(total > 0, found, functional.one_hot(torch.zeros_like(peaks[:, 0]), self.n_branches))
 
-    def _of_shape(self, heights: Tensor, neighbours: Tensor, weights: Tensor | None) -> Tensor:
-        tree = merge_tree(heights, neighbours)
-        lengths, longest = (heights[tree.peaks] - heights[tree.saddles]).sort(descending=True)
-        lengths, longest = lengths[: self.n_branches], longest[: self.n_branches]
-        found = heights.new_zeros(self.n_branches)
-        if not lengths[0] > 0:  # a body that is the same everywhere has one branch, of no length
-            found[0] = 1
-            return found
-        shares = lengths / lengths.sum()
-        if weights is not None:  # a limb counts as its samples do: those of the piece that joins no other yet
-            places = torch.argsort(torch.argsort(heights, descending=True, stable=True))
-            counts = sorted({max(1, int(places[saddle])) for saddle in tree.saddles[longest]})
-            pieces = dict(zip(counts, merge_tree(heights, neighbours, counts).pieces, strict=True))
-            limbs = [pieces[max(1, int(places[tree.saddles[one]]))] == tree.peaks[one] for one in longest]
-            shares = shares * torch.stack([weights[limb].mean() for limb in limbs])
-        found[: len(lengths)] = shares
-        return found
+
+def _limbs(tree: MergeTree, longest: Tensor, heights: Tensor, neighbours: Tensor, mask: Tensor) -> Tensor:
+    """(B, P) which samples each of the longest branches has: those of the piece that joins no other yet."""
+    kept = longest[longest < len(tree.peaks)]
+    order = heights.masked_fill(~mask, -torch.inf).argsort(descending=True, stable=True)
+    above = order.argsort()[tree.saddles[kept]].clamp_min(1)
+    levels, which = above.unique(return_inverse=True)
+    pieces = merge_tree(heights, neighbours, levels.tolist(), mask).pieces[which]
+    limbs = torch.zeros(len(longest), len(heights), dtype=torch.bool)
+    limbs[: len(kept)] = pieces == tree.peaks[kept][:, None]
+    return limbs

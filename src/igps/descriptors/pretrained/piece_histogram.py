@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from igps.descriptors.pretrained._merge_tree import merge_tree
+from igps.descriptors.pretrained._merge_tree import merge_trees
 from igps.nn.axes.points import soft_memberships
 from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histograms.base import SampleHistogram, present
+from igps.nn.histograms.base import SampleHistogram
 
 # Centres are logarithms to base 2. Of sizes, from one sample in 64 on
 _SMALLEST, _LARGEST = -6.0, -0.5
@@ -26,7 +26,7 @@ class PieceHistogram(SampleHistogram):
     then whole limbs, at last the body but for its middle. Each sample counts by the size of the piece it belongs to, as
     a share of all samples, and by the length of that piece, √(12 λ₁), λ₁ the largest eigenvalue of the covariance of
     its samples (a rod's own length), over the root of its area. Sizes are pose-invariant, and so are lengths as long as
-    limbs only turn. Pieces are those of `merge_tree`.
+    limbs only turn. Pieces are those of `merge_trees`.
 
     The histogram is differentiable in places within given pieces; sizes have no gradient.
 
@@ -71,24 +71,18 @@ class PieceHistogram(SampleHistogram):
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, L, ...) histograms of some samples of N shapes."""
-        heights, positions = features.log_potential(self.embedding), features.positions()
-        neighbours = features.neighbours(self.embedding)
-        weights = features.weights_or_ones(heights)
-        found = []
-        for i, real in enumerate(present(features)):
-            found.append(self._of_shape(heights[i, real], positions[i, real], neighbours[i], weights[i, real]))
-        return torch.stack(found)
-
-    def _of_shape(self, heights: Tensor, points: Tensor, neighbours: Tensor, weights: Tensor) -> Tensor:
-        if not torch.isfinite(points).all():
+        mask, points = features.samples.mask, features.positions()
+        if not torch.isfinite(points.masked_fill(~mask[:, :, None], 0)).all():
             raise ValueError("PieceHistogram: expected finite places, got NaN or infinity.")
-        counts = [max(1, round(share * len(heights))) for share in self.levels]
-        pieces = merge_tree(heights, neighbours, counts).pieces
-        left = pieces >= 0
-        # Pieces of all levels at once, those of each level side by side
-        numbers = pieces + len(heights) * torch.arange(len(pieces), device=pieces.device)[:, None]
-        found, piece, n_points = numbers[left].unique(return_inverse=True, return_counts=True)
-        points, weights = points.expand(*left.shape, 3)[left], weights.expand_as(left)[left].to(points.dtype)
+        trees = merge_trees(features, self.embedding, self.levels)
+        pieces = torch.stack([tree.pieces for tree in trees]).to(points.device)
+        left, weights = pieces >= 0, features.weights_or_ones(points[..., 0])
+        # Pieces of all levels of all bodies at once, those of each level side by side
+        n_shapes, n_levels, longest = left.shape
+        levels = torch.arange(n_shapes * n_levels, device=pieces.device).view(n_shapes, n_levels, 1)
+        found, piece, n_points = (pieces + longest * levels)[left].unique(return_inverse=True, return_counts=True)
+        points = points[:, None].expand(*left.shape, 3)[left]
+        weights = weights[:, None].expand_as(left)[left].to(points.dtype)
 
         def sums(values: Tensor) -> Tensor:
             return values.new_zeros(len(found), *values.shape[1:]).index_add(0, piece, values)
@@ -96,11 +90,11 @@ class PieceHistogram(SampleHistogram):
         places = points - (sums(points) / n_points[:, None])[piece]
         covariance = sums((places[:, :, None] * places[:, None, :]).flatten(1)) / n_points[:, None]
         spread = torch.linalg.eigvalsh(covariance.view(-1, 3, 3))[:, -1]
-        sizes = n_points.to(points.dtype) / len(heights)
+        level = found // longest
+        sizes = (n_points / mask.sum(dim=1)[level // n_levels]).to(points.dtype)
         lengths = 12 * torch.where(n_points < _FEWEST, 0, spread) / sizes
         lengths = lengths.clamp_min(torch.finfo(points.dtype).tiny).log2() / 2
         of_sizes = soft_memberships(sizes.log2(), self.sizes) * sums(weights)[:, None]
-        of_lengths = soft_memberships(lengths, self.lengths)
-        n_pieces = torch.bincount(found // len(heights), minlength=len(pieces)).tolist()
-        of_levels = zip(of_sizes.split(n_pieces), of_lengths.split(n_pieces), strict=True)
-        return torch.stack([one.T @ other for one, other in of_levels]) / sum(counts)
+        cells = of_sizes[:, :, None] * soft_memberships(lengths, self.lengths)[:, None, :]
+        counts = cells.new_zeros(n_shapes * n_levels, *self.n_bins).index_add(0, level, cells)
+        return counts.view(n_shapes, *self.shape) / left.sum(dim=(1, 2))[:, None, None, None]

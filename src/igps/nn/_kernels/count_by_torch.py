@@ -14,16 +14,36 @@ from igps.nn._precision import full_precision
 
 # Numbers of a block, which fill a device
 _BLOCK = 2**25
+# Shapes side by side have so many points at least, as a share of the most: each pays for as many as the largest
+_ALIKE = 0.8
 
 
 def count_by_torch(
     classes: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: Tensor, weights: Tensor, *tensors: Tensor
 ) -> Tensor:
     """(N, C(C+1)/2, B, ...) float64 counts."""
-    n_shapes, n_points, n_members = classes.shape
     # What is padded may be anything, and 0 times that no number.
     clean = [t.masked_fill(~mask.view(*mask.shape, *[1] * (t.ndim - 2)), 0) if t.ndim > 1 else t for t in tensors]
     weights = weights.masked_fill(~mask[:, :, None], 0)
+    if torch.compiler.is_compiling():  # what is traced cannot look at numbers
+        return _count_together(classes, n_classes, pairs, weights, *clean)
+    ends = (mask * torch.arange(1, mask.shape[1] + 1, device=mask.device)).amax(dim=1)
+    ends, order = ends.sort(descending=True)
+    sizes, counts, first = ends.tolist(), [], 0
+    while first < len(sizes):
+        last = first + sum(size >= _ALIKE * sizes[first] for size in sizes[first:])
+        shapes = order[first:last]
+        own = (t[shapes, : sizes[first]] if t.ndim > 1 else t for t in (classes, weights, *clean))
+        counts.append(_count_together(next(own), n_classes, pairs, *own))
+        first = last
+    return torch.cat(counts)[order.argsort()]
+
+
+def _count_together(
+    classes: Tensor, n_classes: int, pairs: Sequence[PairValues], weights: Tensor, *tensors: Tensor
+) -> Tensor:
+    """(N, C(C+1)/2, B, ...) counts of shapes side by side, whose padding weighs nothing."""
+    n_shapes, n_points, n_members = classes.shape
     bins = [len(centres) for centres in centres_of(pairs)]
     n_cells = n_classes * math.prod(bins)
     total = torch.zeros(n_shapes, n_classes, n_cells, dtype=torch.float64, device=classes.device)
@@ -33,7 +53,7 @@ def count_by_torch(
         # What the gradient needs of the pairs is many times what it needs of the points: computed again.
         differentiable = torch.is_grad_enabled()
         total = total + (
-            checkpoint(task, weights, *clean, use_reentrant=False) if differentiable else task(weights, *clean)
+            checkpoint(task, weights, *tensors, use_reentrant=False) if differentiable else task(weights, *tensors)
         )
     total = total.view(n_shapes, n_classes, n_classes, *bins)
     total = total + total.transpose(1, 2)

@@ -1,13 +1,15 @@
 """One count of pairs of points, into a product of classes and bins, with two back ends.
 
 `count_pairs` is what every histogram of pairs comes down to. On the CPU it runs in compiled loops, with a gradient of
-their own (`count_by_loops`); on other devices, where PyTorch traces it for `torch.compile` or `torch.export`, and for
-derivatives of gradients, in operations of PyTorch (`count_by_torch`). Both count in double precision, hold no matrix of
-all pairs, and have gradients by all that the values are computed from, by the weights and by the centres.
+their own (`count_by_loops`); on other devices, in programs of `torch.export`, and for derivatives of gradients, in
+operations of PyTorch (`count_by_torch`). Both count in double precision, hold no matrix of all pairs, and have
+gradients by all that the values are computed from, by the weights and by the centres. To `torch.compile` the count is
+one operator: block by block, that of a few large bodies would take minutes to compile.
 """
 
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +17,10 @@ from torch import Tensor
 from igps.nn._kernels.count_by_loops import CompiledCount, Layout
 from igps.nn._kernels.count_by_torch import count_by_torch
 from igps.nn._kernels.pair_cells import VALUES
-from igps.nn._kernels.pair_values import PairValues
+from igps.nn._kernels.pair_values import WAYS, PairValues, centres_of, with_tensors
+
+# Since PyTorch 2.7; an exported program is to hold what any machine knows, not an operator of this library.
+_is_exporting = getattr(torch.compiler, "is_exporting", lambda: False)
 
 
 def class_pairs(n_classes: int) -> list[tuple[int, int]]:
@@ -45,12 +50,69 @@ def count_pairs(classes: Tensor, weights: Tensor, n_classes: int, pairs: Sequenc
     tensors = [weights, *(tensor for one in pairs for tensor in (*one.inputs, *one.centres))]
     tensors = [tensor.to(dtype) for tensor in tensors]
     with torch.autocast(classes.device.type, enabled=False):
-        if _is_compiled(dtype, classes.device):
-            counts = CompiledCount.apply(Layout(classes, n_classes, tuple(pairs), mask), *tensors)
+        ways = [k for one in pairs for k, way in enumerate(WAYS) if one.between is way.between]
+        if torch.compiler.is_compiling() and not _is_exporting() and len(ways) == len(pairs):
+            counts = _operator(classes, n_classes, ways, mask, tensors)
         else:
-            counts = count_by_torch(classes, n_classes, pairs, mask, *tensors)
+            counts = _count(classes, n_classes, pairs, mask, tensors)
         n_points = mask.sum(dim=1).double().view(-1, *[1] * (counts.ndim - 1))
         return (counts / (n_points * (n_points - 1) / 2)).to(dtype)
+
+
+def _count(classes: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: Tensor, tensors: list[Tensor]) -> Tensor:
+    """(N, C(C+1)/2, B, ...) float64 counts, by the back end that is there for the tensors."""
+    if _is_compiled(tensors[0].dtype, classes.device):
+        counts: Tensor = CompiledCount.apply(Layout(classes, n_classes, tuple(pairs), mask), *tensors)
+        return counts
+    return count_by_torch(classes, n_classes, pairs, mask, *tensors)
+
+
+@torch.library.custom_op("igps::count_pairs", mutates_args=())
+def _operator(classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, tensors: list[Tensor]) -> Tensor:
+    """What `_count` counts, of pairs by their numbers in `WAYS`; gradients flow to the tensors."""
+    return _count(classes, n_classes, with_tensors([WAYS[k] for k in ways], tensors[1:]), mask, tensors)
+
+
+@_operator.register_fake
+def _(classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, tensors: list[Tensor]) -> Tensor:
+    bins = [len(one) for one in centres_of(with_tensors([WAYS[k] for k in ways], tensors[1:]))]
+    return classes.new_empty(len(mask), n_classes * (n_classes + 1) // 2, *bins, dtype=torch.float64)
+
+
+@torch.library.custom_op("igps::count_pairs_backward", mutates_args=())
+def _gradients(
+    upstream: Tensor, classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, tensors: list[Tensor]
+) -> list[Tensor]:
+    keys = torch._C.DispatchKey
+    # Within an operator PyTorch has put aside what records derivatives.
+    with (
+        torch._C._SetExcludeDispatchKeyGuard(keys.AutogradFunctionality, False),
+        torch._C._SetExcludeDispatchKeyGuard(keys.ADInplaceOrView, False),
+        torch.enable_grad(),
+    ):
+        leaves = [one.detach().requires_grad_() for one in tensors]
+        pairs = with_tensors([WAYS[k] for k in ways], leaves[1:])
+        return list(torch.autograd.grad(_count(classes, n_classes, pairs, mask, leaves), leaves, upstream))
+
+
+@_gradients.register_fake
+def _(
+    upstream: Tensor, classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, tensors: list[Tensor]
+) -> list[Tensor]:
+    return [torch.empty_like(one) for one in tensors]
+
+
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    classes, ctx.n_classes, ctx.ways, mask, tensors = inputs
+    ctx.save_for_backward(classes, mask, *tensors)
+
+
+def _backward(ctx: Any, upstream: Tensor) -> tuple[None, None, None, None, list[Tensor]]:
+    classes, mask, *tensors = ctx.saved_tensors
+    return None, None, None, None, _gradients(upstream, classes, ctx.n_classes, ctx.ways, mask, tensors)
+
+
+_operator.register_autograd(_backward, setup_context=_keep)
 
 
 def _is_compiled(dtype: torch.dtype, device: torch.device) -> bool:

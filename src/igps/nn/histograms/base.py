@@ -126,8 +126,3 @@ def counted(one: Tensor, other: Tensor, n_points: Tensor) -> Tensor:
     if not torch.compiler.is_compiling() and int(n_points.min()) < 1:
         raise ValueError("samples: expected at least one of each body, got none.")
     return one.mT @ other / n_points[..., None, None]
-
-
-def present(features: SampleFeatures) -> list[Tensor | slice]:
-    """Which samples of each body are real; where nothing is padding, nothing need be copied."""
-    return [slice(None) if bool(torch.all(real)) else real for real in features.samples.mask]
