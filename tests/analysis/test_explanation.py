@@ -11,7 +11,7 @@ import trimesh
 from sklearn.metrics import roc_auc_score
 
 from conftest import as_mesh
-from igps.analysis.explanation import explain, explain_groups, on_surface, significant_cells, unit_shares
+from igps.analysis.explanation import contents_of, explain, explain_groups, on_surface, significant_cells, unit_shares
 from igps.data.batch import SignatureBatch
 from igps.data.collation import collate
 from igps.descriptors import descriptor
@@ -50,7 +50,20 @@ def described_by(name: str) -> Descriptor:
     return EmbeddedDescriptor(histograms, WhitenedHead().fit(cells, torch.arange(12) // 3, histograms.part_cells))
 
 
-@pytest.mark.parametrize("name", ["interior", "gps", "rich", "multiscale", "pretrained", "whitened"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "interior",
+        "gps",
+        "rich",
+        "multiscale",
+        "pretrained",
+        "whitened",
+        "interior+size",
+        "rich+side",
+        "pretrained+side+size",
+    ],
+)
 def test_all_shares_add_up_to_the_distance(name: str, batches: list[SignatureBatch]) -> None:
     chosen = described_by(name)
     with torch.no_grad():
@@ -65,6 +78,25 @@ def test_all_shares_add_up_to_the_distance(name: str, batches: list[SignatureBat
     assert by_place.sum() == pytest.approx(found.distance, rel=1e-6)
     assert by_place.min() >= 0
     assert "%" in found.summary()
+
+
+def test_of_bodies_that_differ_in_size_alone_all_is_size(signatures: list[Signature]) -> None:
+    """Twice as large: |Δ log √area| + |Δ log ∛volume| is 2 log 2, and every place has the same of it."""
+    one = signatures[0]
+    larger = replace(
+        one,
+        area=4 * one.area,
+        volume=8 * one.volume,
+        eigenvalues=one.eigenvalues / 4,
+        interior=replace(one.interior, points=2 * one.interior.points, eigenfunctions=one.interior.eigenfunctions / 2),
+        surface=replace(one.surface, points=2 * one.surface.points, eigenfunctions=one.surface.eigenfunctions / 2),
+    )
+    found = explain(descriptor("interior+size"), *(collate([each]) for each in (one, larger)))
+    apart = 2 * np.log(2)
+    assert found.distance == pytest.approx(0.017 / 4 * 2 * apart / (0.3 + apart), rel=1e-5)
+    assert found.parts["size"] == pytest.approx(found.distance, rel=1e-5)
+    for shares in (values for of_body in found.samples for values in of_body.values()):
+        np.testing.assert_allclose(shares, found.distance / 4 / len(shares), rtol=1e-3)
 
 
 def test_shares_of_chi_square_are_those_of_a_loop_over_all_pairs(batches: list[SignatureBatch]) -> None:
@@ -206,6 +238,20 @@ def test_groups_are_explained_by_the_cells_that_are_held(batches: list[Signature
     assert 0 < kept.sum() < len(kept)
     means = groups.double().mean(dim=1)
     terms = (means[0] - means[1]) ** 2 / (means[0] + means[1]).clamp_min(1e-300) / 2
+    assert found.distance == pytest.approx(float(terms[kept].sum()), rel=1e-6)
     with pytest.raises(ValueError, match="3 and 3 bodies can be arranged in 10 ways alone"):
         explain_groups(chosen, groups[0, :3], groups[1, :3], batches)
-    assert found.distance == pytest.approx(float(terms[kept].sum()), rel=1e-6)
+
+
+def test_groups_that_differ_in_size_alone_differ_in_size(batches: list[SignatureBatch]) -> None:
+    chosen = descriptor("interior+side+size")
+    with torch.no_grad():
+        contents = contents_of(chosen)(batches[0]).repeat(16, 1)
+    contents[:, -2:] += torch.randn(16, 2, generator=torch.Generator().manual_seed(0)) / 100
+    contents[8:, -2:] += 3
+    found, kept = explain_groups(chosen, contents[:8], contents[8:], [batches[0]] * 2, n_permutations=199)
+    assert kept.nonzero().flatten().tolist() == [len(kept) - 2, len(kept) - 1]
+    assert found.parts["size"] == pytest.approx(found.distance)
+    assert found.distance == pytest.approx(
+        float(chosen.distances(contents[:8].mean(0)[None], contents[8:].mean(0)[None]))
+    )

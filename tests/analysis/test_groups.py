@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -132,6 +134,33 @@ def test_the_interval_covers_the_effect() -> None:
     assert 0.88 < np.mean(covered) < 0.99
 
 
+def test_matched_pairs_tell_nothing_where_there_is_nothing() -> None:
+    """Strata of two leave what mirrors itself: one of a pair must not tell the other, nor chance count half."""
+    random = np.random.default_rng(10)
+    pairs, found = [str(i) for i in range(12)] * 2, []
+    for draw in range(40):
+        vectors = random.normal(size=(24, 20)) + np.tile(3 * random.normal(size=(12, 20)), (2, 1))
+        test = quick(vectors, seed=draw, strata=pairs, n_bootstraps=200, n_repeats=1)
+        found.append((test.auc, test.effect, (test.effect_low or 1) <= 0 <= (test.effect_high or -1)))
+    auc, effect, covered = np.array(found, dtype=float).mean(axis=0)
+    assert abs(auc - 0.5) < 0.1
+    assert abs(effect) < 0.01
+    assert covered > 0.9
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_no_permutation_changes_has_a_probability_of_one() -> None:
+    """All bodies but one are the same; or both groups hold the same: rounding decides nothing. Or groups are all."""
+    random = np.random.default_rng(11)
+    one, twice = np.outer(np.arange(24) == 3, random.normal(size=5)), np.tile(random.normal(size=(12, 3)), (2, 1))
+    for vectors in (one, twice):
+        test = quick(vectors)
+        assert (test.permanova_p, test.kernel_p) == (1, 1)
+    apart = quick(np.repeat([[0.0], [1.0]], 12, axis=0))
+    assert apart.permanova_p == apart.kernel_p == 1 / 200
+    assert (apart.permanova_f or 0) > 1e12
+
+
 @pytest.mark.filterwarnings("error")
 def test_small_groups_have_an_interval() -> None:
     """In two of five runs all six of a group are drawn as one body at least once, which has no scatter."""
@@ -189,6 +218,8 @@ def test_discovery_rates_are_over_what_was_tested() -> None:
     assert found[1] is refused
     assert [one.permanova_q for one in found] == pytest.approx([0.03, None, 0.04, 0.04])
     assert with_discovery_rates([refused]) == [refused]
+    same = with_discovery_rates([replace(one, body="all") for one in tests])
+    assert [one.permanova_p for one in same] == [0.01, 0.04, 0.03]
 
 
 def test_three_groups_are_tested_together() -> None:

@@ -46,8 +46,9 @@ def test_the_improved_map_has_less_stress_than_the_classical_one() -> None:
     assert found.stress < stress(classical) - 0.01
 
 
-def test_alike_bodies_lie_in_one_point() -> None:
-    found = body_map(np.zeros((4, 4)))
+@pytest.mark.parametrize("n", [4, 12, 600])
+def test_alike_bodies_lie_in_one_point(n: int) -> None:
+    found = body_map(np.zeros((n, n)))
     assert not found.points.any()
     assert found.stress == 0
 

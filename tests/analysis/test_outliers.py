@@ -45,6 +45,16 @@ def test_a_body_of_another_shape_comes_first() -> None:
     assert first.score > LIMIT
 
 
+@pytest.mark.parametrize(("n", "n_odd"), [(10, 1), (11, 1), (12, 1), (20, 1), (40, 2)])
+def test_bodies_far_off_are_found_whatever_the_size_of_the_class(n: int, n_odd: int) -> None:
+    """Thirty standard deviations off: an odd body is left out of what is taken to be a tail."""
+    random = np.random.default_rng(n)
+    points, volumes = random.normal(size=(n, 4)), 0.1 * random.normal(size=n)
+    volumes[:n_odd] += 3
+    found = outliers(squared_distances(points) ** 0.5, ["a"] * n, {"volume": volumes})
+    assert {one.body for one in found if one.is_outlier} == set(range(n_odd))
+
+
 def test_a_wrong_label_is_told() -> None:
     vectors = usual()
     vectors[20] = vectors[:12].mean(axis=0)

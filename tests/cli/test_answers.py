@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from matplotlib.image import imread
 
 from igps.analysis.clusters import clusters_of
@@ -80,6 +81,29 @@ def test_groups_prints_and_writes_the_tests(
     assert (tmp_path / "groups.svg").read_text().startswith("<?xml")
 
 
+def test_a_covariate_may_be_words_but_no_mistyped_number(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = table(root / "labels.csv")
+    lines = [
+        f"{root / row['file']},{row['label']},{'fmm'[i % 3]},{'5o' if i == 4 else i}" for i, row in enumerate(rows)
+    ]
+    (tmp_path / "labels.csv").write_text("\n".join(["file,label,sex,dose", *lines]))
+    words = ["groups", tmp_path, *OWN, "--n_permutations", "199"]
+    igps(monkeypatch, root, *words, "--covariate", "sex", "--json")
+    (found,) = json.loads(capsys.readouterr().out)
+    vectors = vectors_of(
+        small_interior(), describe(SignatureDataset(root, CONFIG, root.parent / "cache"), small_interior())
+    )
+    is_f = np.arange(13)[:, None] % 3 == 0
+    expected = group_test(vectors, [row["label"] for row in rows], covariates=is_f.astype(float), n_permutations=199)
+    assert found["permanova_f"] == pytest.approx(expected.permanova_f)
+    assert found["permanova_p"] == expected.permanova_p
+    with pytest.raises(SystemExit, match="1"):
+        igps(monkeypatch, root, *words, "--covariate", "dose")
+    assert "dose: expected numbers, got '5o'" in capsys.readouterr().err
+
+
 def test_groups_refuses_three_of_a_group(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -102,6 +126,9 @@ def test_outliers_lists_the_short_egg_among_the_long_first(
     assert rows[0]["body"] == "long6.off"
     assert "lies among short" in rows[0]["reason"]
     assert "long6.off" in printed.splitlines()[1]
+    svg = (tmp_path / "outliers.svg").read_text()
+    assert f"<!-- {float(rows[0]['score']):.1f}  long6.off -->" in svg
+    assert str(root) not in svg
     assert [float(row["score"]) for row in rows] == sorted((float(row["score"]) for row in rows), reverse=True)
     assert imread(tmp_path / "outliers.png").std() > 0.02
 
@@ -122,6 +149,28 @@ def test_explain_writes_shares_that_add_up(
         assert sum(shares) == pytest.approx(float(part["share"]), rel=1e-6)
         assert f"short0.off and {root}/long3.off: {float(part['share']):.4g}" in printed
     assert imread(tmp_path / "explain.png").std() > 0.02
+
+
+@pytest.mark.parametrize("is_group", [False, True])
+def test_explain_heeds_size_and_side(
+    is_group: bool, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Bodies that are twice as large as others of their form differ in size; the side of symmetric ones is rounding."""
+    folder = root.parent / f"sized{is_group}"
+    for label, factor in (("small", 1.0), ("large", 2.0)):
+        for i in range(8):
+            egg = trimesh.creation.icosphere(subdivisions=2)
+            egg.vertices *= np.array([1, 1, 1.2 + i / 50]) * factor
+            (folder / label).mkdir(parents=True, exist_ok=True)
+            egg.export(folder / label / f"{i}.off")
+    what = [folder] if is_group else [folder / "small" / "0.off", folder / "large" / "0.off"]
+    own = ["--descriptor", "own_descriptors:small_gps"]
+    igps(monkeypatch, root, "explain", *what, *own, "--size", "keep", "--mirror", "distinct", "--json")
+    found = json.loads(capsys.readouterr().out)
+    shares = {row["histogram"]: row["share"] for row in found["shares"]}
+    assert list(shares)[-2:] == ["side", "size"]
+    assert shares["size"] > 0.5 * found["distance"]
+    assert shares["size"] + shares["side"] == pytest.approx(found["distance"], rel=1e-3)
 
 
 @pytest.mark.parametrize("words", [["clusters"], ["figure", "clusters"]])
@@ -198,6 +247,18 @@ def test_names_are_drawn_as_they_are_and_not_as_formulas(tmp_path: Path) -> None
         assert all(f"<!-- {one}" in drawn for one in names)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_picture_is_the_same_each_time_and_has_room_for_long_names(tmp_path: Path) -> None:
+    distances = np.array([[0.0, 1, 3], [1, 0, 2], [3, 2, 0]])
+    for folder in ("one", "other"):
+        figure = clusters_figure(clusters_of(distances, 2), ["a", "b", "sub-01/" + "x" * 200 + ".off"])
+        write_answer(tmp_path / folder, "clusters", [{"body": "a"}], figure)
+        assert figure.axes[0].get_window_extent().width > 0.4 * figure.bbox.width
+    one, other = ((tmp_path / folder / "clusters.svg").read_bytes() for folder in ("one", "other"))
+    assert one == other
+    assert "<!-- sub-01/xxx" in one.decode()
+
+
 @pytest.mark.parametrize(
     ("command", "message"),
     [
@@ -207,7 +268,7 @@ def test_names_are_drawn_as_they_are_and_not_as_formulas(tmp_path: Path) -> None
         ),
         (["groups", "--group", "weight"], "weight: no such column of labels.csv; further columns: scanner, age"),
         (["groups", "--strata", "weight"], "weight: no such column of labels.csv"),
-        (["groups", "--covariate", "age", "scanner"], "scanner: expected numbers, got 'x' of short0.off"),
+        (["groups", "--covariate", "age", "weight"], "weight: no such column of labels.csv"),
     ],
 )
 def test_what_labels_do_not_tell_is_refused_before_anything_is_computed(

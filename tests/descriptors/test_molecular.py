@@ -10,6 +10,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from igps.analysis.explanation import explain
+from igps.analysis.fitting import histograms_and_prior
 from igps.data.collation import collate
 from igps.descriptors import NAMES, descriptor
 from igps.descriptors.molecular import MOLECULAR_ATTRIBUTES, Shares, molecular
@@ -119,3 +121,17 @@ def test_shares_of_another_kind_are_named() -> None:
         PairHistogram([Shares("residue_shares", 7), InteriorDistance(4)])(collate([signature(0, 0.0)]))
     with pytest.raises(ValueError, match="expected finite shares"):
         Shares("residue_shares", 2).memberships(torch.tensor([[float("nan"), 1.0]]))
+
+
+def test_a_head_is_fitted_to_the_histograms_and_an_explanation_holds_the_size() -> None:
+    """The logarithms of area and volume are no cells."""
+    found = described(signature(0, 0), signature(1, 0))
+    assert found.shape[1] == molecular().n_features
+    histograms, _ = histograms_and_prior("molecular")
+    batch = collate([signature(0, 0), signature(1, 0)])
+    torch.testing.assert_close(histograms(batch), found[:, :-2])
+    assert histograms.n_features == found.shape[1] - 2
+    told = explain(molecular(), collate([signature(0, 0)]), collate([signature(1, 0)]))
+    assert told.distance == pytest.approx(float(molecular().distances(found[:1], found[1:])), rel=1e-3)
+    assert sum(told.parts.values()) == pytest.approx(told.distance, rel=1e-6)
+    assert sum(one.sum() for of_body in told.samples for one in of_body.values()) == pytest.approx(told.distance)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from igps.analysis.correspondence import dissimilarity
 from igps.data.batch import SampleBatch, SignatureBatch
+from igps.descriptors.individual import IndividualDescriptor
 from igps.nn.batch_features import WEIGHT, BatchFeatures, SampleKind
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.histograms.base import DescriptionPart, SampleHistogram
@@ -41,7 +42,7 @@ class Explanation:
 
     def summary(self, most: int = 3) -> str:
         """The largest shares in words."""
-        if not self.distance:
+        if self.distance < 1e-12:  # but for rounding
             return "no difference"
         largest = sorted(self.parts.items(), key=lambda one: -abs(one[1]))[:most]
         return ", ".join(f"{share / self.distance:.0%} {name}" for name, share in largest)
@@ -63,7 +64,8 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
     unlike it is to those of the other body that correspond to it.
 
     Args:
-        descriptor: of histograms, such as interior or rich, alone or under a head, such as pretrained.
+        descriptor: of histograms, such as interior or rich, alone or under a head, such as pretrained; with side or
+            size, or without.
 
     Raises:
         ValueError: a descriptor of another kind, or not one body each.
@@ -71,15 +73,16 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
     if len(one) != 1 or len(other) != 1:
         raise ValueError(f"one, other: expected a body each, got {len(one)} and {len(other)}.")
     descriptor = copy.deepcopy(descriptor).double().eval()
-    histograms = _histograms(descriptor)
+    histograms, contents = _histograms(descriptor), contents_of(descriptor)
     pair = (_doubled(one), _doubled(other))
-    cells = torch.cat([histograms(batch).detach().flatten(1) for batch in pair])
-    units, distance = unit_shares(descriptor, cells[0], cells[1])
-    parts, samples = _shared(histograms, pair[0], units)
-    others, samples_of_other = _shared(histograms, pair[1], -units)
+    first, second = torch.cat([contents(batch).detach().flatten(1) for batch in pair])
+    units, distance = unit_shares(descriptor, first, second)
+    whole = _of_the_whole(descriptor, units * (first - second))
+    parts, samples = _shared(histograms, pair[0], units, whole)
+    others, samples_of_other = _shared(histograms, pair[1], -units, whole)
     return Explanation(
         distance,
-        {name: share + others[name] for name, share in parts.items()},
+        {name: share + others[name] for name, share in parts.items()} | whole,
         (samples, samples_of_other),
         (_placed(one, other, samples, distance), _placed(other, one, samples_of_other, distance)),
     )
@@ -91,18 +94,31 @@ def _placed(body: SignatureBatch, other: SignatureBatch, samples: Shares, distan
     return {"interior": np.zeros(len(samples["interior"])), "surface": distance / 2 * weights / weights.sum()}
 
 
+def contents_of(descriptor: Descriptor) -> Descriptor:
+    """What describes the cells of a descriptor, and behind them its numbers of side and size; without its head."""
+    histograms = _histograms(descriptor)
+    return descriptor.beside(histograms) if isinstance(descriptor, IndividualDescriptor) else histograms
+
+
 def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Tensor, float]:
     """What a unit of each cell's contents counts, positive in the one and negative in the other body, and the distance.
 
-    The descriptor is in double precision, see `explain`; the histograms are (cells,).
+    The descriptor is in double precision, see `explain`; its contents are (cells,), see `contents_of`, whose numbers of
+    side and size come apart as they are and not as roots.
     """
-    roots = torch.stack([one, other]).double().sqrt()
+    n, form = (
+        _n_cells(descriptor),
+        descriptor.descriptor if isinstance(descriptor, IndividualDescriptor) else descriptor,
+    )
+    ends = torch.stack([one, other]).double()
+    roots = torch.cat([ends[:, :n].sqrt(), ends[:, n:]], dim=1)
     middle, half = roots.mean(dim=0), (roots[0] - roots[1]) / 2
 
     def distances(ends: Tensor) -> Tensor:
-        rows = (one.square().view(len(one), -1) for one in ends)
-        if isinstance(descriptor, EmbeddedDescriptor):
-            rows = (descriptor.head(one) for one in rows)
+        cells = (one[:, :n].square() for one in ends)
+        if isinstance(form, EmbeddedDescriptor):
+            cells = (form.head(one) for one in cells)
+        rows = (torch.cat([own, one[:, n:]], dim=1) for own, one in zip(cells, ends, strict=True))
         return descriptor.distances(*rows).diagonal()
 
     with torch.no_grad():
@@ -119,8 +135,9 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
             gradient += (found[0] - found[1]).sum(dim=0) / 2
         if abs(float(gradient @ half) * 2 - distance) <= _MISSED * distance:
             break
-    total = roots.sum(dim=0)
-    return torch.where(total > 0, gradient / total.clamp_min(torch.finfo(total.dtype).tiny), 0), distance
+    total = roots[:, :n].sum(dim=0)
+    units = torch.where(total > 0, gradient[:n] / total.clamp_min(torch.finfo(total.dtype).tiny), 0)
+    return torch.cat([units, gradient[n:]]), distance
 
 
 def on_surface(shares: Shares, samples: Mapping[SampleKind, NDArray[np.float64]], points: NDArray[np.float64]) -> Any:
@@ -137,13 +154,27 @@ def on_surface(shares: Shares, samples: Mapping[SampleKind, NDArray[np.float64]]
 
 
 def _histograms(descriptor: Descriptor) -> HistogramDescriptor:
-    found = descriptor.descriptor if isinstance(descriptor, EmbeddedDescriptor) else descriptor
+    found = descriptor.descriptor if isinstance(descriptor, IndividualDescriptor) else descriptor
+    found = found.descriptor if isinstance(found, EmbeddedDescriptor) else found
     if not isinstance(found, HistogramDescriptor):
         raise ValueError(
             f"descriptor: expected histograms of samples, such as interior, rich or pretrained, whose cells know their "
             f"samples, got {descriptor.name!r}."
         )
     return found
+
+
+def _n_cells(descriptor: Descriptor) -> int:
+    return sum(_histograms(descriptor).part_cells)
+
+
+def _of_the_whole(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
+    """What side and size have of the distance, by the shares of all contents; without those that are not told."""
+    form, side, size = (shares[None], *shares.new_empty(2, 1, 0))
+    if isinstance(descriptor, IndividualDescriptor):
+        form, side, size = descriptor.split(shares[None])
+    told = {"side": side, "size": torch.cat([form[:, _n_cells(descriptor) :], size], dim=1)}
+    return {name: float(values.sum()) for name, values in told.items() if values.numel()}
 
 
 def _doubled(batch: SignatureBatch) -> SignatureBatch:
@@ -157,8 +188,10 @@ def _doubled(batch: SignatureBatch) -> SignatureBatch:
     return replace(batch, interior=doubled(batch.interior), surface=doubled(batch.surface))
 
 
-def _shared(histograms: HistogramDescriptor, batch: SignatureBatch, units: Tensor) -> tuple[dict[str, float], Shares]:
-    """What each histogram, and each sample, of a body has of the distance."""
+def _shared(
+    histograms: HistogramDescriptor, batch: SignatureBatch, units: Tensor, whole: Mapping[str, float]
+) -> tuple[dict[str, float], Shares]:
+    """What each histogram, and each sample, of a body has of the distance; it has half of what is of the whole."""
     weights = [getattr(batch, kind).attributes[WEIGHT] for kind in KINDS]
     totals = [torch.zeros_like(one) for one in weights]
     features, parts, first = BatchFeatures(batch, False), dict[str, float](), 0
@@ -176,12 +209,15 @@ def _shared(histograms: HistogramDescriptor, batch: SignatureBatch, units: Tenso
             found = torch.autograd.grad(values, weights, allow_unused=True, retain_graph=True)
             for total, gradient in zip(totals, found, strict=True):
                 total += 0 if gradient is None else gradient / part.degree
-    return parts, {kind: total[0].detach().numpy() for kind, total in zip(KINDS, totals, strict=True)}
+    everywhere = sum(whole.values()) / 4  # half in each body, of that half in each kind of samples
+    samples = {kind: total[0].detach().numpy() for kind, total in zip(KINDS, totals, strict=True)}
+    return parts, {kind: values + everywhere / len(values) for kind, values in samples.items()}
 
 
 _AXES = {
     "InteriorDistance": "interior distances", "EuclideanDistance": "distances in space", "PairCosines": "directions",
     "EmbeddedPairCosines": "directions to the surface", "BallRadius": "thickness", "Attribute": "attributes",
+    "Shares": "kinds of residues",
     "AxialHistogram": "place along the axes", "BranchHistogram": "lengths of limbs",
     "PieceHistogram": "sizes of pieces", "SpectrumShares": "spectrum",
 }  # fmt: skip
@@ -230,7 +266,7 @@ def explain_groups(
 
     Args:
         descriptor: see `explain`.
-        one, other: (N, ...) descriptions of its histograms (for a head, those that the head is given).
+        one, other: (N, ...) contents, see `contents_of`.
         batches: two bodies to be painted, one of each group.
         test: options of `significant_cells`, whose result comes behind the explanation.
 
@@ -245,17 +281,17 @@ def explain_groups(
             f"chance at a level of {level}. Add bodies, or explain one of each."
         )
     descriptor = copy.deepcopy(descriptor).double().eval()
-    rows = [group.double().flatten(1) for group in (one, other)]
-    kept = significant_cells(rows[0].sqrt(), rows[1].sqrt(), **test)
+    rows, n = [group.double().flatten(1) for group in (one, other)], _n_cells(descriptor)
+    kept = significant_cells(*(torch.cat([group[:, :n].sqrt(), group[:, n:]], dim=1) for group in rows), **test)
     means = [group.mean(dim=0) for group in rows]
-    units, _ = unit_shares(descriptor, *means)
-    units = torch.where(kept, units, 0)
-    histograms = _histograms(descriptor)
-    shared = [_shared(histograms, _doubled(b), sign * units) for b, sign in zip(batches, (1, -1), strict=True)]
+    units = torch.where(kept, unit_shares(descriptor, *means)[0], 0)
+    shares, histograms = units * (means[0] - means[1]), _histograms(descriptor)
+    whole = _of_the_whole(descriptor, shares)
+    shared = [_shared(histograms, _doubled(b), sign * units, whole) for b, sign in zip(batches, (1, -1), strict=True)]
     parts, first = dict[str, float](), 0
     for part in (part for group in histograms.parts for part in group):
-        own = slice(first, first + part.n_cells)
+        share = float(shares[first : first + part.n_cells].sum())
         first += part.n_cells
-        share = float(units[own] @ (means[0] - means[1])[own])
         parts[part_name(part)] = parts.get(part_name(part), 0.0) + share
+    parts |= whole
     return Explanation(sum(parts.values()), parts, (shared[0][1], shared[1][1])), kept

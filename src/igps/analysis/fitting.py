@@ -14,6 +14,7 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
 from igps.descriptors.individual import IndividualDescriptor
+from igps.descriptors.molecular import SizedHistograms
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead, Head, WhitenedHead
@@ -52,6 +53,7 @@ class Classification:
 def histograms_and_prior(which: str | Descriptor) -> tuple[Descriptor, Head | None]:
     """The descriptor whose histograms heads are fitted to, and the metric of these that it has already, if any."""
     found = descriptor_of(which)
+    found = found.without_size() if isinstance(found, SizedHistograms) else found
     return (found.descriptor, found.head) if isinstance(found, EmbeddedDescriptor) else (found, None)
 
 
@@ -99,8 +101,10 @@ def fit(
         if value not in get_args(allowed):
             raise ValueError(f"{name}: expected one of {', '.join(get_args(allowed))}, got {value!r}.")
     which = descriptor_of(descriptor)
-    individual = which if isinstance(which, IndividualDescriptor) else None  # size and side stay beside the head
-    base, metric = histograms_and_prior(which if individual is None else individual.descriptor)
+    kept = {"size": isinstance(which, SizedHistograms), "side": False}  # they stay beside the head
+    if isinstance(which, IndividualDescriptor):
+        kept, which = {"size": which.keeps_size, "side": which.twists is not None}, which.descriptor
+    base, metric = histograms_and_prior(which)
     metric = metric if prior else None
     histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
     labels, counts = dataset.labels, Counter(dataset.bodies.labels or ())
@@ -135,8 +139,7 @@ def fit(
     apart = labels[:_MOST_MEASURED, None] != labels[None, :_MOST_MEASURED]
     # Bodies of one class that the head has seen are nearer than others will be
     scale = float(model.distances(vectors, vectors)[apart].median()) / 5
-    if individual is not None:
-        kept = {"size": individual.keeps_size, "side": individual.twists is not None}
+    if any(kept.values()):
         model = IndividualDescriptor(model, scale=scale, **kept).eval()
     model.scale = scale
     model.card = {

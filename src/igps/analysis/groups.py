@@ -127,14 +127,16 @@ def group_test(
     if n - known.shape[1] - added.shape[1] < 3:
         return replace(untested, refused=f"{n} bodies are too few for so many strata and covariates.")
     beside = np.eye(n) - known @ known.T
-    rows = beside @ vectors
-    gram = rows @ rows.T
+    centred = vectors - vectors.mean(axis=0)
+    whole = centred @ centred.T
+    gram = beside @ whole @ beside
     if np.trace(gram) <= _ROUNDING * np.square(vectors).sum():
         return replace(untested, refused="the vectors do not differ, but for what covariates and strata explain.")
-    squares = _squares(gram)
     ridge = _RIDGE * np.trace(gram) / (n - known.shape[1])
     whitened = _squares(np.linalg.solve(gram + ridge * np.eye(n), gram))
-    kernel = beside @ np.exp(-whitened / (2 * np.median(whitened[np.triu_indices(n, 1)]) + 1e-300)) @ beside
+    apart = whitened[np.triu_indices(n, 1)]
+    width = np.median(apart[apart > _ROUNDING * apart.max()])  # more than half of the pairs may be the same twice
+    kernel = beside @ np.exp(-whitened / (2 * width)) @ beside
 
     random = np.random.default_rng(seed)
     of_groups, of_known, of_kernel, overlap = np.empty((4, n_permutations + 1))
@@ -146,11 +148,18 @@ def group_test(
         part = slice(first, first + len(orders))
         of_groups[part], of_known[part] = _along(gram, added, orders), _along(gram, along, orders)
         of_kernel[part], overlap[part] = _along(kernel, added, orders), _along(along @ along.T, added, orders)
-    left = np.trace(gram) - of_groups - of_known
-    pseudo_f = of_groups / added.shape[1] / (left / (n - known.shape[1] - added.shape[1]))
+    share = of_groups / np.maximum(np.trace(gram) - of_known, np.finfo(float).tiny)  # grows with pseudo-F, to 1
+    freedom = n - known.shape[1] - added.shape[1]
     # Covariates explain a share of permuted groups, of which the kernel then sees nothing
     unexplained = np.maximum(1 - overlap / added.shape[1], _ROUNDING)
+    # For the effect, what the groups add stands at their means, and the rest has the variance that its degrees of
+    # freedom leave: matched pairs have half of it
     sizes = np.bincount(group)
+    at_means = _orthonormal(indicators - indicators.mean(axis=0), 1e-6)
+    one, _, other = np.linalg.svd(at_means.T @ added)
+    inflation = (n - len(sizes)) / freedom
+    told = at_means @ one @ other @ added.T + np.sqrt(inflation) * (beside - added @ added.T)
+    squares = _squares(told @ gram @ told.T)
     weights = [random.multinomial(k, np.full(k, 1 / k), n_bootstraps) for k in sizes]
     # Of a small group all may be drawn as one body, whose scatter nobody knows
     with np.errstate(invalid="ignore"):
@@ -158,14 +167,14 @@ def group_test(
     low, high = np.nanquantile(effects, (0.025, 0.975)) if n_bootstraps else (None, None)
     return replace(
         untested,
-        permanova_f=float(pseudo_f[0]),
-        permanova_p=_probability(pseudo_f),
+        permanova_f=float(share[0] / max(1 - share[0], np.finfo(float).eps) * freedom / added.shape[1]),
+        permanova_p=_probability(share),
         kernel=float(of_kernel[0] * (n / np.prod(sizes) if len(sizes) == 2 else 1 / n)),
         kernel_p=_probability(of_kernel / unexplained),
         effect=float(_effects(squares, group, [np.ones((1, k)) for k in sizes])[0]),
         effect_low=None if low is None else float(low),
         effect_high=None if high is None else float(high),
-        auc=_auc(gram, group, n_repeats, seed) if n_repeats else None,
+        auc=_auc(whole, known, group, n_repeats, seed) if n_repeats else None,
     )
 
 
@@ -179,9 +188,11 @@ def with_discovery_rates(tests: Sequence[GroupTest]) -> list[GroupTest]:
     of_permanova, of_kernel = (
         false_discovery_control([getattr(one, name) for one in tested]).tolist() for name in ("permanova_p", "kernel_p")
     )
-    rates = zip(of_permanova, of_kernel, strict=True)
-    found = {one.body: replace(one, permanova_q=a, kernel_q=b) for one, (a, b) in zip(tested, rates, strict=True)}
-    return [found.get(one.body, one) for one in tests]
+    rates = iter(zip(of_permanova, of_kernel, strict=True))
+    return [
+        replace(one, **dict(zip(("permanova_q", "kernel_q"), next(rates), strict=True))) if one.refused is None else one
+        for one in tests
+    ]
 
 
 def _senseless(sizes: Mapping[str, int], group: NDArray[np.int64], stratum: NDArray[np.int64]) -> str | None:
@@ -237,7 +248,7 @@ def _along(matrix: Rows, basis: Rows, orders: NDArray[np.int64]) -> Rows:
 
 def _probability(values: Rows) -> float:
     """Of the first among all; ties within rounding count as extreme."""
-    return float((values >= values[0] * (1 - _ROUNDING)).mean())
+    return float((values >= values[0] - _ROUNDING * values.max()).mean())
 
 
 def _effects(squares: Rows, group: NDArray[np.int64], weights: Sequence[NDArray[Any]]) -> Rows:
@@ -261,8 +272,11 @@ def _effects(squares: Rows, group: NDArray[np.int64], weights: Sequence[NDArray[
     return effects
 
 
-def _auc(gram: Rows, group: NDArray[np.int64], n_repeats: int, seed: int) -> float:
-    """By five folds; the rows' principal coordinates are to a ridge what the rows are."""
+def _auc(gram: Rows, known: Rows, group: NDArray[np.int64], n_repeats: int, seed: int) -> float:
+    """By five folds; the rows' principal coordinates are to a ridge what the rows are.
+
+    What is known (N, k) is regressed out by the bodies that train alone: of a pair, the mean would tell the other.
+    """
     from sklearn.linear_model import RidgeClassifierCV
     from sklearn.metrics import roc_auc_score
     from sklearn.model_selection import RepeatedStratifiedKFold
@@ -274,8 +288,8 @@ def _auc(gram: Rows, group: NDArray[np.int64], n_repeats: int, seed: int) -> flo
     found = []
     folds = RepeatedStratifiedKFold(n_splits=5, n_repeats=n_repeats, random_state=seed)
     for training, test in folds.split(gram, group):
-        scores = RidgeClassifierCV(alphas).fit(coordinates[training], group[training])
-        scores = scores.decision_function(coordinates[test])
+        left = coordinates - known @ np.linalg.lstsq(known[training], coordinates[training], rcond=1e-9)[0]
+        scores = RidgeClassifierCV(alphas).fit(left[training], group[training]).decision_function(left[test])
         if scores.ndim == 1:  # of two groups, for the second
             scores = np.stack([-scores, scores], axis=1)
         found.append(np.mean([roc_auc_score(group[test] == one, column) for one, column in enumerate(scores.T)]))

@@ -123,10 +123,8 @@ def outliers(
                 )
             )
         alone = "alone in its class, its shape is not judged" if np.isnan(own[i]) else "nothing unusual"
-        reason = "; ".join(told) if score > LIMIT else alone
-        if among is not None:
-            reason += f"; labelled {label}, lies among {among}"
-        found.append(Outlier(i, label, score, of_body, among, reason))
+        said = [*(told if score > LIMIT else ()), *([] if among is None else [f"labelled {label}, lies among {among}"])]
+        found.append(Outlier(i, label, score, of_body, among, "; ".join(said) or alone))
     return sorted(found, key=lambda one: -one.score)
 
 
@@ -244,8 +242,9 @@ def _deviations(values: Values, codes: NDArray[np.int64], name: str) -> tuple[Va
                 usual[i] = usual[i] if len(own) else np.median(others)
         if opinions:
             found[i] = min(np.abs(opinions) if name in _TWO_SIDED else opinions)
-    scale = np.nanquantile(found, 0.95) / 1.645 if n > _FEW and np.isfinite(found).any() else 1.0
-    return found / max(1.0, scale), usual
+    if (count := np.isfinite(found).sum()) > _FEW:  # without the largest, which may be the one that is odd
+        found /= max(1.0, np.nanquantile(found, min(0.95, 1 - 1 / (count - 1))) / 1.645)
+    return found, usual
 
 
 def _scatter(values: Values, least: float, tail: bool = True) -> float:

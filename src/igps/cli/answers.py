@@ -1,5 +1,6 @@
 """`igps groups`, `igps outliers` and `igps explain`."""
 
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from igps._parameters import check_at_least
-from igps.analysis.explanation import KINDS, Explanation, explain_groups, on_surface
+from igps.analysis.explanation import KINDS, Explanation, contents_of, explain_groups, on_surface
 from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, vectors_of, with_discovery_rates
 from igps.analysis.outliers import measures_of
@@ -17,8 +18,9 @@ from igps.cli.reading import Folder, described, files_or_folder, print_failures
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
+from igps.descriptors.fingerprint import cache_tag
 from igps.mesh.mesh import Mesh
-from igps.nn.descriptor import EmbeddedDescriptor
+from igps.nn.description import describe
 from igps.report.answers import explanation_figure, groups_figure, outliers_figure, write_answer
 from igps.report.tables import groups_table
 
@@ -44,7 +46,7 @@ def groups(
         root: folder with one subfolder per group, or with files and a labels.csv (columns file,label and more).
         group: a column of labels.csv that tells the groups; the class if not given.
         strata: a column within whose values bodies are permuted, such as scanner.
-        covariate: columns of numbers that are regressed out first, such as age.
+        covariate: columns that are regressed out first: numbers, such as age, or words, such as sex.
         size: test the size, too, the logarithm of the volume, in lines of its own
         out: folder for groups.csv, groups.json, and the effects as groups.svg and groups.png.
         n_permutations: random ones.
@@ -54,7 +56,7 @@ def groups(
     def columns(bodies: Bodies) -> tuple[Any, Any, Any]:
         labels = np.array(bodies.labels if group is None else bodies.column(group))
         of_strata = None if strata is None else np.array(bodies.column(strata))
-        return labels, of_strata, np.array([bodies.numbers(name) for name in covariate]).T if covariate else None
+        return labels, of_strata, np.hstack([_numbers(bodies, name) for name in covariate]) if covariate else None
 
     folder = Folder(root, labelled=group is None, check=columns)
     found = described(folder, descriptor, size="ignore", **reading)
@@ -84,6 +86,14 @@ def groups(
         write_answer(out, "groups", rows, groups_figure(tests))
         print(f"written to {out}")
     return [asdict(one) for one in tests]
+
+
+def _numbers(bodies: Bodies, name: str) -> Any:
+    """(N, k) the numbers of a column; of one of words alone, which of them each body has."""
+    words = bodies.column(name)
+    if any(re.match(r"[-+.\d]|nan|inf", word, re.IGNORECASE) for word in words):
+        return np.array(bodies.numbers(name))[:, None]
+    return np.array([[word == one for one in sorted(set(words))] for word in words], dtype=float)
 
 
 def outliers(
@@ -119,7 +129,7 @@ def outliers(
     print(f"{sum(one.is_outlier for one in found)} of {len(rows)} bodies have a score above what chance explains")
     print_failures(bodies.failures, len(dataset))
     if out is not None:
-        pictured = [(one, dataset.mesh(one.body)) for one in found[: min(top, 12)]]
+        pictured = [(one, dataset.bodies.names[one.body], dataset.mesh(one.body)) for one in found[: min(top, 12)]]
         write_answer(out, "outliers", rows, outliers_figure(pictured))
         print(f"written to {out}")
     return rows
@@ -138,14 +148,15 @@ def explain(
         out: folder for explain.csv, the shares of the histograms; explain_samples.csv, those of the samples; and both
             bodies painted from two sides as explain.svg and explain.png.
     """
-    module = descriptor_of(descriptor)
     source = files_or_folder(meshes)
+    contents_of(descriptor_of(descriptor))  # refuses others before anything is computed
     if isinstance(source, Folder):
-        inner = module.descriptor if isinstance(module, EmbeddedDescriptor) else module
         folder = Folder(source.root, labelled=True, needs_meshes=True, check=_check_two_classes)
-        bodies = described(folder, inner, **reading)
+        bodies = described(folder, descriptor, **reading)
         _check_two_classes(bodies.dataset.bodies)  # those that are left
-        dataset, descriptions, labels = bodies.dataset, bodies.descriptions, np.array(bodies.dataset.bodies.labels)
+        dataset, module, labels = bodies.dataset, bodies.descriptor, np.array(bodies.dataset.bodies.labels)
+        inner, n_workers = contents_of(module), reading.get("n_workers")
+        descriptions = describe(dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True)
         classes = sorted(set(labels))
         members = [np.flatnonzero(labels == name) for name in classes]
         squares = squared_distances(descriptions.flatten(1).double().sqrt().numpy())
@@ -154,14 +165,15 @@ def explain(
         found, kept = explain_groups(module, descriptions[members[0]], descriptions[members[1]], batches, level=level)
         print(f"{int(kept.sum())} of {len(kept)} cells differ by more than chance; painted: the middle of each group")
     else:
-        dataset, chosen = described(source, module, **{**reading, "strict": True}).dataset, [0, 1]
+        bodies, chosen = described(source, descriptor, **{**reading, "strict": True}), [0, 1]
+        dataset, module = bodies.dataset, bodies.descriptor
         if len(dataset) != 2:
             raise ValueError(f"meshes: expected two bodies, got {len(dataset)}. Name two files, or FILE#PART.")
         found = explain_pair(module, *(dataset.batch([i]) for i in chosen))
     names = [dataset.bodies.names[i] for i in chosen]
-    print(f"{' and '.join(names)}: {found.distance:.4g} by {descriptor}: {found.summary()}")
+    print(f"{' and '.join(names)}: {found.distance:.4g} by {module.name}: {found.summary()}")
     painted = [_painted(dataset, i, found, place) for place, i in enumerate(chosen)]
-    for name, (_, values) in zip(names, painted, strict=True):
+    for name, _, values in painted:
         print(f"{name}: half of what is its own lies on {_half(values):.0%} of its surface")
     parts = [{"histogram": name, "share": share} for name, share in found.parts.items()]
     if out is not None:
@@ -176,12 +188,12 @@ def _check_two_classes(bodies: Bodies) -> None:
         raise ValueError(f"meshes: expected a folder of two classes, got {n}.")
 
 
-def _painted(dataset: SignatureDataset, i: int, found: Explanation, place: int) -> tuple[Mesh, Any]:
-    """A body, and what each of its faces has of the difference."""
+def _painted(dataset: SignatureDataset, i: int, found: Explanation, place: int) -> tuple[str, Mesh, Any]:
+    """A body's name and mesh, and what each of its faces has of the difference."""
     mesh, signature = dataset.mesh(i), dataset[i].signature
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     samples = {kind: getattr(signature, kind).points for kind in KINDS}
-    return mesh, on_surface((found.places or found.samples)[place], samples, centres)
+    return dataset.bodies.names[i], mesh, on_surface((found.places or found.samples)[place], samples, centres)
 
 
 def _half(values: Any) -> float:

@@ -230,13 +230,10 @@ def _parts(path: Path, options: LoadOptions) -> Sequence[str | None]:
 def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
     file = root / LABELS_FILE
     with file.open(newline="", encoding="utf-8-sig") as stream:
-        reader = csv.DictReader(stream, skipinitialspace=True)
+        reader = csv.DictReader(stream, skipinitialspace=True, restval="")
         try:
             reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
-            rows = [
-                (reader.line_num, {name: value.strip() for name, value in row.items() if isinstance(value, str)})
-                for row in reader
-            ]
+            rows = [(reader.line_num, {name: "".join(value).strip() for name, value in row.items()}) for row in reader]
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{file}: not readable as a table ({error}). Save it as CSV in UTF-8.") from error
         header = [name for name in reader.fieldnames if name]
@@ -246,6 +243,8 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
             raise ValueError(f"{file}: {expected}, got {reader.fieldnames}.")
         if len(set(header)) < len(header):
             raise ValueError(f"{file}: a column is named twice in {header}. Give each column a name of its own.")
+    if longer := [line for line, row in rows if row.get(None)]:  # under which stands what has no column
+        raise ValueError(f"{file}: line {longer[0]} has more values than columns. Put a value with a comma in quotes.")
     needed = [name for name in ("file", "label") if name in header]
     incomplete = [line for line, row in rows if not all(row.get(name) for name in needed)]
     if not rows or incomplete:

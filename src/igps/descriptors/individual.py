@@ -101,7 +101,7 @@ class IndividualDescriptor(Descriptor):
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, D) and (G, D) descriptions to (Q, G) distances."""
-        (form, side, size), (forms, sides, sizes) = self._parts(queries), self._parts(gallery)
+        (form, side, size), (forms, sides, sizes) = self.split(queries), self.split(gallery)
         shape = self.descriptor.description_shape
         found = self.descriptor.distances(form.unflatten(1, shape), forms.unflatten(1, shape))
         if self.twists is not None:
@@ -113,10 +113,18 @@ class IndividualDescriptor(Descriptor):
 
     def short(self, descriptions: Tensor) -> Tensor:
         """(N, D) descriptions to (N, ≤ 256 + 55): those of the descriptor, or a ValueError, and of side and size."""
-        form, *others = self._parts(descriptions)
+        form, *others = self.split(descriptions)
         return torch.cat([self.descriptor.short(form), *others], dim=1)
 
-    def _parts(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def beside(self, descriptor: Descriptor) -> "IndividualDescriptor":
+        """The same numbers of side and size beside another descriptor."""
+        kept = {"size": self.keeps_size, "side": self.twists is not None}
+        found = IndividualDescriptor(descriptor, scale=self.scale, **kept)
+        found._unit = self._unit
+        return found
+
+    def split(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(N, D) descriptions to those of the descriptor, and the numbers of side and of size, of which may be none."""
         n_volumes = math.comb(_N_VECTORS, 3)
         n_size, n_side = 2 * self.keeps_size, 0 if self.twists is None else n_volumes + self.twists.n_cells // 2
         n_form = descriptions.shape[1] - n_side - n_size

@@ -78,6 +78,16 @@ class SizedHistograms(HistogramDescriptor):
 
     searched_by = None
 
+    @property
+    def n_features(self) -> int:
+        """Cells of all parts, and the two logarithms."""
+        return super().n_features + 2
+
+    def without_size(self) -> HistogramDescriptor:
+        """The same histograms alone."""
+        invariant_to = (*self.invariant_to, "scale")
+        return HistogramDescriptor(self.parts, name=self.name, source=self.source, invariant_to=invariant_to)
+
     def describe(self, batch: SignatureBatch) -> Tensor:
         """(N, cells + 2)."""
         size = torch.stack([batch.area, batch.volume], dim=1).log()

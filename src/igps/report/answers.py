@@ -17,7 +17,7 @@ from igps.analysis.groups import GroupTest
 from igps.analysis.map import BodyMap
 from igps.analysis.outliers import Outlier
 from igps.mesh.mesh import Mesh
-from igps.report.drawing import PALETTE, draw_body, new_figure, paint, save_figure, seen_from_the_front
+from igps.report.drawing import PALETTE, draw_body, new_figure, paint, save_figure, seen_from_the_front, shown
 from igps.report.page_data import finite
 from igps.retrieval import PrecisionRecallCurve
 
@@ -55,38 +55,38 @@ def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:
         axes.plot([lows[place], highs[place]], [place, place], color=colour, linewidth=1.6)
         axes.plot(effects[place], place, "o" if colour == _FOUND else "s", color=colour, markersize=5)
     axes.axvline(0, color="#BBBBBB", linewidth=0.8, zorder=0)
-    axes.set_yticks(range(len(tested)), [one.body for one in tested])
+    axes.set_yticks(range(len(tested)), [shown(one.body) for one in tested])
     axes.set_xlabel("share of squared distances that the groups explain, 95 % interval")
     axes.set_title(f"round, orange: false discovery rate at most {LEVEL:.0%}; square, grey: above", fontsize=9)
     return figure
 
 
-def outliers_figure(pictured: Sequence[tuple[Outlier, Mesh]]) -> Figure:
-    """Bodies with their scores and reasons, four in a row."""
+def outliers_figure(pictured: Sequence[tuple[Outlier, str, Mesh]]) -> Figure:
+    """Bodies with their scores, names and reasons, four in a row."""
     n_rows = -(-len(pictured) // 4)
     figure = new_figure(9, 2.6 * n_rows)
     all_axes = list(figure.subplots(n_rows, 4, squeeze=False).flat)
     for axes in all_axes:
         axes.set_axis_off()
-    for axes, (one, mesh) in zip(all_axes, pictured, strict=False):
+    for axes, (one, name, mesh) in zip(all_axes, pictured, strict=False):
         draw_body(axes, mesh)
-        title = f"{one.score:.1f}  {mesh.name}\n" + "\n".join(wrap(one.reason, 38))
+        title = "\n".join(wrap(f"{one.score:.1f}  {shown(name)}", 38) + wrap(one.reason, 38))
         axes.set_title(title, fontsize=6, color=_FOUND if one.is_outlier else "#000000")
     return figure
 
 
-def explanation_figure(painted: Sequence[tuple[Mesh, NDArray[np.float64]]]) -> Figure:
-    """Bodies from the front and from behind, in red what each face (F,) has of the difference, blue if less."""
+def explanation_figure(painted: Sequence[tuple[str, Mesh, NDArray[np.float64]]]) -> Figure:
+    """Named bodies from the front and from behind, in red what each face (F,) has of the difference, blue if less."""
     figure = new_figure(7, 3.4 * len(painted))
     all_axes = figure.subplots(len(painted), 2, squeeze=False)
-    for row, (mesh, values) in zip(all_axes, painted, strict=True):
+    for row, (name, mesh, values) in zip(all_axes, painted, strict=True):
         largest = np.quantile(np.abs(values), 0.98) or 1.0
         shares = np.clip(values / largest, -1, 1)[:, None]
         colours = np.where(shares > 0, _WHITE + shares * (_RED - _WHITE), _WHITE - shares * (_BLUE - _WHITE))
         turned = seen_from_the_front(mesh.vertices)
         for axes, turn, side in zip(row, ([1, 1, 1], [-1, 1, -1]), ("front", "back"), strict=True):
             paint(axes, turned * turn, mesh.faces, colours)
-            axes.set_title(f"{mesh.name}, {side}", fontsize=7)
+            axes.set_title(f"{shown(name)}, {side}", fontsize=7)
     return figure
 
 
@@ -102,7 +102,14 @@ def map_figure(found: BodyMap, values: Sequence[str] | Sequence[float], title: s
             mark, colour = _MARKS[number // len(PALETTE) % len(_MARKS)], PALETTE[number % len(PALETTE)]
             drawn.append(axes.scatter(x[own], y[own], s=20, label=name, linewidths=0.8, marker=mark, color=colour))
         if any(names):  # by hand: Matplotlib leaves out what begins with an underscore
-            figure.legend(drawn, names, loc="outside right upper", title=title, fontsize=7, ncols=1 + len(names) // 30)
+            figure.legend(
+                drawn,
+                list(map(shown, names)),
+                loc="outside right upper",
+                title=title,
+                fontsize=7,
+                ncols=1 + len(names) // 30,
+            )
     else:
         figure.colorbar(axes.scatter(x, y, s=20, c=values, cmap="viridis"), label=title)
     axes.set(aspect="equal", xticks=[], yticks=[], xlabel=f"stress {found.stress:.2f}")
@@ -117,7 +124,9 @@ def clusters_figure(found: Clusters, names: Sequence[str]) -> Figure:
     axes = figure.add_subplot()
     leaves = dendrogram(found.tree, orientation="left", ax=axes, link_color_func=lambda _: _OTHER)["leaves"]
     clusters = found.numbers[leaves]
-    told = [f"{names[i]}  {one + 1} ({found.stability[one]:.2f})" for i, one in zip(leaves, clusters, strict=True)]
+    told = [
+        f"{shown(names[i])}  {one + 1} ({found.stability[one]:.2f})" for i, one in zip(leaves, clusters, strict=True)
+    ]
     axes.set_yticks(5 + 10 * np.arange(len(leaves)), told, fontsize=5)
     for label, one in zip(axes.get_yticklabels(), clusters, strict=True):
         label.set(color=PALETTE[one % len(PALETTE)], weight="bold" if found.stability[one] >= STABLE else "normal")

@@ -30,6 +30,7 @@ PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 _RELEVANT, _IRRELEVANT, _QUERY = PALETTE[1], PALETTE[0], "#444444"
 # A thumbnail shows no more detail than this, and drawing takes time with every face.
 _THUMBNAIL_VERTICES = 800
+_MOST_LETTERS = 60
 
 
 def paint(axis: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int64], colour: Any) -> None:
@@ -71,12 +72,19 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path, dpi: float | None = None) -> None:
-    """Save a figure by the suffix of the path; a $ in the name of a body begins no formula."""
+    """Save a figure by the suffix of the path, the same each time; a $ in the name of a body begins no formula."""
+    from matplotlib import rc_context
     from matplotlib.text import Text
 
     for text in figure.findobj(Text):
         text.set_parse_math(False)
-    figure.savefig(path, dpi=dpi or "figure")
+    with rc_context({"svg.hashsalt": "igps"}):
+        figure.savefig(path, dpi=dpi or "figure", metadata={"Date": None} if path.suffix == ".svg" else None)
+
+
+def shown(name: str) -> str:
+    """A name as it is drawn: the middle of a long one is left out, which would leave no room for the picture."""
+    return name if len(name) <= _MOST_LETTERS else f"{name[: _MOST_LETTERS // 2]}…{name[1 - _MOST_LETTERS // 2 :]}"
 
 
 def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progress: bool = False) -> None:

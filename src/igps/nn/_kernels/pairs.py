@@ -67,19 +67,30 @@ def _count(classes: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: T
     return count_by_torch(classes, n_classes, pairs, mask, *tensors)
 
 
-@torch.library.custom_op("igps::count_pairs", mutates_args=())
+def _known(ways: Sequence[int], tensors: list[Tensor]) -> list[PairValues]:
+    """Those of `WAYS` by their numbers, of tensors that follow the weights."""
+    return with_tensors([WAYS[k] for k in ways], tensors[1:])
+
+
+# Written out, as the first versions that have operators do not know what `list[int]` is.
+_ARGUMENTS = "Tensor classes, int n_classes, int[] ways, Tensor mask, Tensor[] tensors"
+
+
+@torch.library.custom_op("igps::count_pairs", mutates_args=(), schema=f"({_ARGUMENTS}) -> Tensor")
 def _operator(classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, tensors: list[Tensor]) -> Tensor:
-    """What `_count` counts, of pairs by their numbers in `WAYS`; gradients flow to the tensors."""
-    return _count(classes, n_classes, with_tensors([WAYS[k] for k in ways], tensors[1:]), mask, tensors)
+    """What `_count` counts; gradients flow to the tensors."""
+    return _count(classes, n_classes, _known(ways, tensors), mask, tensors)
 
 
 @_operator.register_fake
 def _(classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, tensors: list[Tensor]) -> Tensor:
-    bins = [len(one) for one in centres_of(with_tensors([WAYS[k] for k in ways], tensors[1:]))]
+    bins = [len(one) for one in centres_of(_known(ways, tensors))]
     return classes.new_empty(len(mask), n_classes * (n_classes + 1) // 2, *bins, dtype=torch.float64)
 
 
-@torch.library.custom_op("igps::count_pairs_backward", mutates_args=())
+@torch.library.custom_op(
+    "igps::count_pairs_backward", mutates_args=(), schema=f"(Tensor upstream, {_ARGUMENTS}) -> Tensor[]"
+)
 def _gradients(
     upstream: Tensor, classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, tensors: list[Tensor]
 ) -> list[Tensor]:
@@ -91,8 +102,8 @@ def _gradients(
         torch.enable_grad(),
     ):
         leaves = [one.detach().requires_grad_() for one in tensors]
-        pairs = with_tensors([WAYS[k] for k in ways], leaves[1:])
-        return list(torch.autograd.grad(_count(classes, n_classes, pairs, mask, leaves), leaves, upstream))
+        counts = _count(classes, n_classes, _known(ways, leaves), mask, leaves)
+        return list(torch.autograd.grad(counts, leaves, upstream))
 
 
 @_gradients.register_fake
