@@ -75,8 +75,8 @@ def test_far_rule_error_falls_with_the_third_power_in_a_flat_hat_and_the_second_
     ring = np.array([[1.0, 0, 0.2], [0.2, 1.1, 0], [-0.9, 0.4, 0.3], [-0.5, -0.8, -0.1], [0.6, -0.9, 0.1]])
     vertices = np.concatenate([[[0.1, 0, 0.4]], ring]) * [1, 1, bend]
     faces = np.array([[0, i + 1, (i + 1) % 5 + 1] for i in range(5)])
-    surface, order = Surface.of(vertices, faces)
-    assert sorted(order) == [0, 1, 2, 3, 4, 5]
+    surface = Surface(vertices, faces)
+    assert sorted(surface.order) == [0, 1, 2, 3, 4, 5]
     errors = []
     for distance in (10.0, 20.0, 40.0):
         x = distance * surface.axes.T @ [[0.3], [-0.5], [-0.8]] / np.sqrt(0.98)
@@ -156,8 +156,8 @@ def test_spatial_order_is_one_for_any_number(n: int) -> None:
 def scaled_surface(mesh: Mesh) -> tuple[Surface, np.ndarray]:
     """The surface, and its vertices (V, 3) in its own axes and order."""
     vertices, faces, _ = coordinates._scaled(*mesh, np.zeros((0, 3)))
-    surface, order = Surface.of(vertices, faces)
-    return surface, (vertices @ surface.axes)[order]
+    surface = Surface(vertices, faces)
+    return surface, (vertices @ surface.axes)[surface.order]
 
 
 @pytest.mark.parametrize("ratio", [1.1, 2.0, 1e9])

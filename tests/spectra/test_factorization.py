@@ -65,9 +65,10 @@ def backward_error(matrix: np.ndarray, solution: np.ndarray, right: np.ndarray, 
 
 def eliminations(factors: Factors) -> list[np.ndarray]:
     """E of every node that has one."""
-    tree, found = factors.tree, []
-    for node, n_own in enumerate(np.diff(tree.structure.first)):
-        block = factors.blocks[tree.block_start[node] : tree.block_start[node + 1]]
+    structure, found = factors.tree.structure, []
+    starts = structure.block_start
+    for node, n_own in enumerate(np.diff(structure.first)):
+        block = factors.blocks[starts[node] : starts[node + 1]]
         found.append(block.reshape(n_own, -1)[:, n_own:] if n_own else block)
     return [elimination for elimination in found if elimination.size]
 

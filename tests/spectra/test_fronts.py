@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from igps.spectra._pivots import AT_ONCE, invert_front
+from igps.spectra._pivots import AT_ONCE, Room, invert_front
 
 
 def invert(matrix: np.ndarray) -> tuple[int, np.ndarray]:
@@ -14,10 +14,10 @@ def invert(matrix: np.ndarray) -> tuple[int, np.ndarray]:
     width = -(-n // AT_ONCE) * AT_ONCE
     front = np.full((n, n + 3), np.nan)
     front[:, :n] = np.triu(matrix)
-    inverse, copy, room = (np.full(n * width, np.nan) for _ in range(3))
+    squares = [np.full(n * width, np.nan) for _ in range(3)]
     strips = [np.full(AT_ONCE * (width + AT_ONCE), np.nan) for _ in range(2)]
-    n_negative = invert_front(inverse, front.ravel(), n, n + 3, width, copy, room, *strips)
-    return n_negative, inverse.reshape(n, width)[:, :n]
+    room = Room(np.empty(0, dtype=np.int64), front.ravel(), *squares, *strips)
+    return invert_front(room, n, n + 3, width), room.pivot.reshape(n, width)[:, :n]
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 8, 9, 26, 63, 120])

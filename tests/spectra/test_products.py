@@ -7,11 +7,11 @@ import pytest
 import torch
 from llvmlite import binding
 
-from igps.spectra._products import combinations, loops_beat_blas, overlaps, product, subtract
+from igps.spectra._products import loops_beat_blas, overlaps, product, subtract
 
 SHAPES = [(1, 1, 1), (6, 8, 5), (7, 9, 3), (13, 7, 20), (5, 1, 40), (30, 31, 30), (12, 12, 0), (0, 8, 4), (2, 16, 1)]
 N_ROWS = [(1, 1), (3, 2), (4, 6), (5, 7), (8, 13), (12, 24), (24, 41)]
-# One that is shorter than a strip, and one that is longer than a chunk
+# A short one, and one that is longer than a chunk
 PIECES = [(0, 9), (17, 4999)]
 N_COLUMNS = 5003
 
@@ -60,16 +60,6 @@ def test_overlaps_are_the_products_of_the_rows(n_rows: tuple[int, int], piece: t
     np.testing.assert_allclose(found.numpy(), a[:, columns] @ b[:, columns].T, rtol=0, atol=1e-11)
 
 
-@pytest.mark.usefixtures("either_processor")
-@pytest.mark.parametrize("piece", PIECES)
-@pytest.mark.parametrize("n_rows", N_ROWS)
-def test_combinations_are_the_products_of_the_columns(n_rows: tuple[int, int], piece: tuple[int, int]) -> None:
-    a, coefficients = rows(n_rows[0], seed=0), np.random.default_rng(1).standard_normal(n_rows)
-    found = combinations(torch.from_numpy(a), torch.from_numpy(coefficients), slice(*piece))
-    np.testing.assert_allclose(found, a[:, slice(*piece)].T @ coefficients, rtol=0, atol=1e-13 * len(a) * 10)
-
-
-@pytest.mark.usefixtures("either_processor")
 @pytest.mark.parametrize(("precision", "error"), [(np.float64, 1e-13), (np.float32, 1e-5)])
 @pytest.mark.parametrize("piece", PIECES)
 @pytest.mark.parametrize("n_rows", N_ROWS)

@@ -6,6 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from igps._arrays import Floats, Integers, Singles
@@ -90,13 +91,13 @@ def least_squares_scaling(distances: Floats, start: Floats) -> Floats:
     No step raises the stress.
     """
     points = start - start.mean(axis=0)
-    lengths = _lengths(points)
+    lengths = cdist(points, points)
     stress = float(np.square(lengths - distances).sum())
     for _ in range(_MAX_STEPS):
         # Guttman transform for weights 1. Points that coincide do not pull.
         pull = np.divide(distances, lengths, out=np.zeros_like(distances), where=lengths > 0)
         points = (pull.sum(axis=1)[:, None] * points - pull @ points) / len(points)
-        lengths = _lengths(points)
+        lengths = cdist(points, points)
         before, stress = stress, float(np.square(lengths - distances).sum())
         if before - stress <= _TOLERANCE * before:
             break
@@ -123,9 +124,3 @@ def moments(points: Floats, max_order: int) -> Floats:
     unit = centred @ axes / radius
     powers = unit[:, None, :] ** exponents(max_order)
     return radius * powers.prod(axis=2).mean(axis=0)
-
-
-def _lengths(points: Floats) -> Floats:
-    inner = points @ points.T
-    norm = np.diag(inner)
-    return np.sqrt(np.maximum(norm[:, None] + norm - 2 * inner, 0))

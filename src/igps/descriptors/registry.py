@@ -41,22 +41,21 @@ _MAKERS: Mapping[str, Callable[[], Descriptor]] = {
     "canonical_form": CanonicalForm,
     "geodesic_spectral": GeodesicSpectral,
     "spectral_gw": SpectralGromovWasserstein,
+    "molecular": molecular,
 }
 
-NAMES: tuple[str, ...] = tuple(_MAKERS)
+# That of molecules is for bodies that bring attributes of their own
+NAMES: tuple[str, ...] = tuple(name for name in _MAKERS if name != "molecular")
 """The names of the library's descriptors of any body."""
 
 _MARK = re.compile(r"\+(?:size|side)(?=\+|$)")
 _WITH = re.compile(r"\+(\w+)(?:=([\d.]+))?")
 _WRITTEN = (".yaml", ".yml")
 
-# Descriptors of bodies that bring attributes of their own.
-_OF_ATTRIBUTES: Mapping[str, Callable[[], Descriptor]] = {"molecular": molecular}
-
 
 def is_file(which: str | Path) -> bool:
     """Whether a descriptor is asked for by its file, or by its folder."""
-    if str(which) in _MAKERS or str(which) in _OF_ATTRIBUTES:
+    if str(which) in _MAKERS:
         return False
     in_folder = bool(which) and os.path.isfile(os.path.join(which, IN_FOLDER))  # False of what cannot be a path
     return str(which).endswith((".safetensors", *_WRITTEN)) or in_folder
@@ -148,13 +147,13 @@ def _plain(which: str | Path | Descriptor) -> Descriptor:
     if words and all(found):
         attributes, weights = zip(*((one[1], float(one[2] or 1)) for one in found if one), strict=True)
         return WithAttributes(_plain(base), attributes, weights).eval()
-    if maker := _MAKERS.get(which) or _OF_ATTRIBUTES.get(which):
-        return maker().eval()
+    if which in _MAKERS:
+        return _MAKERS[which]().eval()
     module, colon, name = which.partition(":")
     if not colon:
         raise ValueError(
-            f"descriptor: expected one of {', '.join((*NAMES, *_OF_ATTRIBUTES))}, or package.module:NAME of one of "
-            f"your own, got {which!r}."
+            f"descriptor: expected one of {', '.join(_MAKERS)}, or package.module:NAME of one of your own, got "
+            f"{which!r}."
         )
     try:
         own = getattr(importlib.import_module(module), name)

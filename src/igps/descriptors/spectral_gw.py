@@ -59,9 +59,8 @@ class SpectralGromovWasserstein(BodyDescriptor):
     def __post_init__(self) -> None:
         super().__init__()
         self.description_shape = (len(self.times), -1)
-        _check_samples(self.samples, self.n_samples)
+        _check(self.samples, self.times, self.n_samples)
         check_one_of(get_args(Bound), bound=self.bound)
-        _check_times(self.times)
         check_at_least(1, n_quantiles=self.n_quantiles, n_eigenpairs=self.n_eigenpairs)
         self.requirements = Requirements(n_eigenpairs=self.n_eigenpairs)
 
@@ -98,8 +97,7 @@ def heat_kernels(
 
     For the parameters and errors see `SpectralGromovWasserstein`; without a number of eigenpairs all are taken.
     """
-    _check_samples(samples, n_samples)
-    _check_times(times)
+    _check(samples, times, n_samples)
     eigenfunctions = getattr(body, samples).eigenfunctions[:, :n_eigenpairs]
     # Samples come in an order of form, along which the like are neighbours: steps of it see all parts of the body.
     count = min(n_samples, len(eigenfunctions))
@@ -160,11 +158,8 @@ def gromov_wasserstein(
     return largest
 
 
-def _check_samples(samples: Where, n_samples: int) -> None:
+def _check(samples: Where, times: Sequence[float], n_samples: int) -> None:
     check_one_of(get_args(Where), samples=samples)
     check_at_least(1, n_samples=n_samples)
-
-
-def _check_times(times: Sequence[float]) -> None:
     if not times or not all(0 < time < np.inf for time in times):
         raise ValueError(f"times: expected at least one positive number, got {tuple(times)}.")

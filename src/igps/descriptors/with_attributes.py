@@ -50,16 +50,12 @@ class WithAttributes(Descriptor):
         self.descriptor, self.scale = descriptor, scale
         self.weights = tuple(weight * scale / SCALES["interior"] for weight in weights)
         embedding = SpectralEmbedding(n_eigenpairs=50)
-        self.inside = HistogramDescriptor(
-            [
-                PairHistogram(
-                    [Attribute(name, quantiles=8, soft=True), InteriorDistance(_N_BINS)],
-                    embedding,
-                    n_samples=_N_SAMPLES,
-                )
-                for name in attributes
-            ]
-        )
+
+        def histogram(name: str) -> PairHistogram:
+            axes = (Attribute(name, quantiles=8, soft=True), InteriorDistance(_N_BINS))
+            return PairHistogram(axes, embedding, n_samples=_N_SAMPLES)
+
+        self.inside = HistogramDescriptor([histogram(name) for name in attributes])
         marks = (f"+{name}" + f"={weight:g}" * (weight != 1) for name, weight in zip(attributes, weights, strict=True))
         self.name, self.source = descriptor.name + "".join(marks), f"{descriptor.source}; Rustamov 2010, section 4"
         self.invariant_to = descriptor.invariant_to

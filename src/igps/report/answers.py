@@ -141,8 +141,8 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], out: Path) -> N
     for i, (name, curve) in enumerate(curves.items()):
         colour, line = PALETTE[i % len(PALETTE)], _STYLES[i // len(PALETTE) % len(_STYLES)]
         recall, precision = 100 * curve.recall.numpy(), 100 * curve.precision.numpy()
-        (drawn,) = axes.plot(recall, precision, label=name, color=colour, linestyle=line, linewidth=1.4)
-        drawn.set(marker=_MARKERS[i % len(_MARKERS)], markersize=4)
+        mark = _MARKERS[i % len(_MARKERS)]
+        axes.plot(recall, precision, label=name, color=colour, linestyle=line, linewidth=1.4, marker=mark, markersize=4)
     axes.set(xlim=(0, 102), ylim=(0, 102))
     axes.set_xlabel("recall: share of the query's class that is found (%)")
     axes.set_ylabel("precision: share of the query's class among the found (%)")

@@ -32,14 +32,14 @@ N_TERMS = 19
 _HALVES = 1 - np.eye(3) / 2
 
 
-@dataclass(frozen=True)
 class Surface:
     """A scaled mesh without flat faces and loose vertices, numbered so that close vertices follow each other.
 
-    It is turned into its principal axes, so that boxes turn with the body.
+    It is turned into its principal axes, so that boxes turn with the body. A ValueError if no face has an area.
 
-    Args:
+    Attributes:
         axes: (3, 3) the principal axes, as columns: points x become x @ axes.
+        order: (V,) which of the mesh's vertices its own are.
         faces: (F, 3).
         table: (F, 22) of each face its corners, unit normal, the vectors in its plane across its first two sides,
             inwards and as long as these, the squared sides, and twice its area. Side i is opposite to corner i.
@@ -50,28 +50,19 @@ class Surface:
             yz, zz.
     """
 
-    axes: Floats
-    faces: Integers
-    table: Floats
-    first: Integers
-    around: Integers
-    hats: Floats
-
-    @staticmethod
-    def of(vertices: Floats, faces: Integers) -> tuple[Surface, Integers]:
-        """The surface, and which vertices (V,) its own are; a ValueError if no face has an area."""
+    def __init__(self, vertices: Floats, faces: Integers) -> None:
         faces = faces[has_area(vertices[faces])]
         if len(faces) == 0:
             raise ValueError("faces: expected at least one face with an area, got flat ones only; check the mesh")
         used = np.flatnonzero(np.bincount(faces.ravel(), minlength=len(vertices)))
-        axes = principal_axes(vertices[used])
-        vertices = vertices @ axes
-        order = used[spatial_order(vertices[used], _LEAF)]
+        self.axes = principal_axes(vertices[used])
+        vertices = vertices @ self.axes
+        self.order = used[spatial_order(vertices[used], _LEAF)]
         rank = np.empty(len(vertices), np.int64)
-        rank[order] = np.arange(len(order))
-        vertices, faces = vertices[order], rank[faces]
+        rank[self.order] = np.arange(len(self.order))
+        vertices, self.faces = vertices[self.order], rank[faces]
 
-        corners = vertices[faces]
+        corners = vertices[self.faces]
         sides = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
         normals = np.cross(sides[:, 0], sides[:, 1])
         double_areas = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -79,14 +70,14 @@ class Surface:
         inward = np.cross(normals[:, None], sides[:, :2])
         squared_sides = np.square(sides).sum(axis=2)
         flat = corners.reshape(-1, 9), normals, inward.reshape(-1, 6), squared_sides, double_areas
+        self.table = np.concatenate(flat, axis=1)
         n_corners = 3 * len(faces)
         of_corner = sparse.csr_matrix(
-            (np.ones(n_corners), faces.ravel(), np.arange(n_corners + 1)), shape=(n_corners, len(order))
+            (np.ones(n_corners), self.faces.ravel(), np.arange(n_corners + 1)), shape=(n_corners, len(vertices))
         )
         at_vertex = of_corner.T.tocsr()
-        hats = _hats(vertices, at_vertex, corners, normals, double_areas / 6, squared_sides)
-        first, around = at_vertex.indptr.astype(np.int64), at_vertex.indices.astype(np.int64) // 3
-        return Surface(axes, faces, np.concatenate(flat, axis=1), first, around, hats), order
+        self.hats = _hats(vertices, at_vertex, corners, normals, double_areas / 6, squared_sides)
+        self.first, self.around = at_vertex.indptr.astype(np.int64), at_vertex.indices.astype(np.int64) // 3
 
     def weights(self, x: Floats, hats: Integers, ratio: float, out: Floats) -> None:
         """Fill the last rows of `out` (…, n) with the weights of hats (h,) at points x (3, n), far by `ratio` radii.

@@ -57,12 +57,12 @@ def mean_value_coordinates(
         ValueError: a shape, an index or a value of an argument is invalid, or the weights of a point sum to zero.
     """
     scaled, faces, x = _scaled(vertices, faces, points)
-    surface, order = Surface.of(scaled, faces)
+    surface = Surface(scaled, faces)
     out = np.zeros((len(x), len(scaled)))
     x = x @ surface.axes
-    for rows in _pieces(np.arange(len(x)), len(order)):
+    for rows in _pieces(np.arange(len(x)), len(surface.order)):
         weights = _exact_weights(surface, x[rows])
-        out[rows[:, None], order] = _normalised(weights.T, weights.sum(axis=0)[:, None])
+        out[rows[:, None], surface.order] = _normalised(weights.T, weights.sum(axis=0)[:, None])
     return out
 
 
@@ -135,7 +135,8 @@ class Extension:
             raise ValueError(
                 f"divisors: expected one for each of {values.shape[1]} functions, got shape {np.shape(divisors)}"
             )
-        self._surface, order = Surface.of(scaled, scaled_faces)
+        self._surface = Surface(scaled, scaled_faces)
+        order = self._surface.order
         self._n_functions = values.shape[1]
         # Those behind the functions sum the weights: one would do, but whole registers are multiplied faster.
         n_columns = -(-(self._n_functions + 1) // _REGISTER) * _REGISTER

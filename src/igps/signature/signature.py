@@ -128,22 +128,14 @@ class Signature:
         """The Signature of a configuration of which this one's is one of the larger, see `SignatureConfig.larger`."""
 
         def cut(samples: Samples) -> Samples:
-            kept: dict[str, Singles] = {
-                name: values for name, values in samples.attributes.items() if name in config.attributes
-            }
-            return replace(
-                samples,
-                eigenfunctions=np.ascontiguousarray(samples.eigenfunctions[:, : config.n_kept]),
-                attributes=kept,
-            )
+            attributes = samples.attributes.items()
+            kept: dict[str, Singles] = {name: one for name, one in attributes if name in config.attributes}
+            functions = np.ascontiguousarray(samples.eigenfunctions[:, : config.n_kept])
+            return replace(samples, eigenfunctions=functions, attributes=kept)
 
-        return replace(
-            self,
-            eigenvalues=self.eigenvalues[: config.n_kept].copy(),
-            interior=cut(self.interior),
-            surface=cut(self.surface),
-            config=config,
-        )
+        eigenvalues = self.eigenvalues[: config.n_kept].copy()
+        interior, surface = cut(self.interior), cut(self.surface)
+        return replace(self, eigenvalues=eigenvalues, interior=interior, surface=surface, config=config)
 
 
 @one_thread()
@@ -186,20 +178,14 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
         )
     points = interior_samples(mesh, config.resolution, config.min_samples)
     spectrum, notes = _spectrum(outer, config)
+    eigenvalues, functions, residual = spectrum.eigenvalues, spectrum.eigenfunctions, spectrum.residual
+    roots = np.sqrt(eigenvalues)
     # The accuracy is that of interior distances, which are those between rows of eigenfunctions so weighted.
-    extension = Extension(
-        outer.vertices,
-        outer.faces,
-        spectrum.eigenfunctions,
-        divisors=np.sqrt(spectrum.eigenvalues),
-        accuracy=config.accuracy,
-    )
-    eigenvalues, residual = spectrum.eigenvalues, spectrum.residual
-    functions = spectrum.eigenfunctions
+    extension = Extension(outer.vertices, outer.faces, functions, divisors=roots, accuracy=config.accuracy)
     if not is_outer.all():  # a cavity is a part of the inside that is missing
         functions = np.empty((len(mesh.vertices), len(eigenvalues)))
         functions[is_outer] = spectrum.eigenfunctions
-        functions[~is_outer] = extension(mesh.vertices[~is_outer]) * np.sqrt(eigenvalues)
+        functions[~is_outer] = extension(mesh.vertices[~is_outer]) * roots
     surface = _surface(mesh, functions, eigenvalues, config)
     del spectrum, functions  # of a large mesh the eigenfunctions fill more memory than all else
     interior = _interior(mesh, extension, eigenvalues, points, config)

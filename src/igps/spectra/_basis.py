@@ -10,8 +10,8 @@ from igps._threads import ALONE, Team
 
 # Of a larger basis there is no copy in single precision, to save memory: 1 GiB
 MOST_SINGLE_ENTRIES = 2**28
-# Up to 256 MiB a basis gains by the huge pages that NumPy asks the system for; for larger ones the wait costs more
-MOST_HUGE_ENTRIES = 2**25
+# Up to 128 MiB a basis gains by the huge pages that NumPy asks the system for; for larger ones the wait costs more
+MOST_HUGE_ENTRIES = 2**24
 # Columns of a piece of the basis, of which a thread computes with one at a time, and the most pieces
 PIECE, MOST_PIECES = 2**12, 8
 
@@ -20,14 +20,14 @@ class Basis:
     """Rows of a basis, a copy of them in single precision, and the matrix of the problem projected on them.
 
     The columns are cut into pieces, which a team works on side by side; how many depends on their number alone, so that
-    a team changes no bit.
+    a team changes no bit. One that `loses_basis` is so large that it must make place for the eigenvectors.
     """
 
     def __init__(self, first_row: np.ndarray, capacity: int, team: Team = ALONE) -> None:
         self._team = team
         n_columns = len(first_row)
         self._pieces = pieces_of(n_columns, max(1, min(MOST_PIECES, n_columns // PIECE)))
-        self._large = (capacity + 1) * n_columns > MOST_SINGLE_ENTRIES
+        self.loses_basis = (capacity + 1) * n_columns > MOST_SINGLE_ENTRIES
         # to be read in half the time
         self._single: torch.Tensor | None
         self._allocate(capacity + 1, n_columns)
@@ -40,20 +40,16 @@ class Basis:
         self._stop = self._swept = 1
 
     def _allocate(self, n_rows: int, n_columns: int) -> None:
-        """A new basis. Of NumPy's memory a part can be given back.
-
-        A smaller one and its copy are one piece: the C library keeps what was one piece for the next basis.
-        """
-        self._memory = np.empty((n_rows if self._large else 0, n_columns))
-        if self._large:
+        """A new basis. Of NumPy's memory a part can be given back."""
+        shape = n_rows, n_columns
+        self._memory = np.empty(shape if self.loses_basis else (0, n_columns))
+        if self.loses_basis:
             self._basis, self._single = torch.from_numpy(self._memory), None
-            return
-        size = n_rows * n_columns
-        length = size + (size + 1) // 2
-        huge = length <= MOST_HUGE_ENTRIES
-        room = torch.from_numpy(np.empty(length)) if huge else torch.empty(length, dtype=torch.float64, device="cpu")
-        self._basis = room[:size].view(n_rows, n_columns)
-        self._single = room[size:].view(torch.float32)[:size].view(n_rows, n_columns)
+        elif n_rows * n_columns <= MOST_HUGE_ENTRIES:
+            self._basis, self._single = (torch.from_numpy(np.empty(shape, kind)) for kind in (np.float64, np.float32))
+        else:
+            self._basis = torch.empty(shape, dtype=torch.float64, device="cpu")
+            self._single = torch.empty(shape, dtype=torch.float32, device="cpu")
 
     def _sums(self, parts: Callable[[slice], tuple[torch.Tensor, ...]]) -> tuple[torch.Tensor, ...]:
         """What each piece of the columns contributes, added in the order of the pieces."""

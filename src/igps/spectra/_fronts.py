@@ -1,31 +1,16 @@
 """The compiled loops of `_multifrontal`: elimination of fronts, and the two ways through the tree of a solve."""
 
-from typing import NamedTuple
-
 import numpy as np
 
+from igps._arrays import Floats
 from igps._compiled import compiled
-from igps.spectra._pivots import AT_ONCE, invert_front
+from igps.spectra._pivots import AT_ONCE, Room, invert_front
 from igps.spectra._products import COLUMNS, ONE, ROWS, ZERO, product
-from igps.spectra._tree import Structure
-
-
-class Room(NamedTuple):
-    """Flat arrays to compute in: the rows of a boundary in a front, the front itself, and five of `invert_front`."""
-
-    place: np.ndarray
-    front: np.ndarray
-    pivot: np.ndarray
-    copy: np.ndarray
-    squares: np.ndarray
-    rows: np.ndarray
-    columns: np.ndarray
+from igps.spectra._tree import Nodes, Structure
 
 
 @compiled()
-def assemble(
-    n: int, tree: Structure, values: np.ndarray, shift: float, updates: np.ndarray, update_start: np.ndarray, room: Room
-) -> None:
+def assemble(n: int, tree: Structure, values: Floats, shift: float, updates: Floats, room: Room) -> None:
     """Write the upper triangle of a node's front, (S + B, S + B): of the matrix, and its children's complements."""
     first, start, place, front = tree.first, tree.start, room.place, room.front
     begin, stop = first[n], first[n + 1]
@@ -49,22 +34,20 @@ def assemble(
         base, size = start[child], start[child + 1] - start[child]
         for i in range(size):
             row = tree.parent_row[base + i] * width
-            source = update_start[child] + i * size
+            source = tree.update_start[child] + i * size
             for j in range(i, size):
                 front[row + tree.parent_row[base + j]] += updates[source + j]
 
 
 @compiled()
 def eliminate(
-    nodes: tuple[int, int],
+    nodes: Nodes,
     largest: int,
     tree: Structure,
-    values: np.ndarray,
+    values: Floats,
     shift: float,
-    updates: np.ndarray,
-    update_start: np.ndarray,
-    blocks: np.ndarray,
-    block_start: np.ndarray,
+    updates: Floats,
+    blocks: Floats,
     room: Room,
 ) -> tuple[int, int]:
     """Eliminate the nodes of a range one after another; their negative pivots, and the node at which it stops.
@@ -75,39 +58,38 @@ def eliminate(
     n_negative = 0
     first, start, front, pivot = tree.first, tree.start, room.front, room.pivot
     for n in range(nodes[0], nodes[1]):
-        assemble(n, tree, values, shift, updates, update_start, room)
+        assemble(n, tree, values, shift, updates, room)
         n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
         width = n_own + n_boundary
         if n_own > largest:
             return n_negative, n
         padded = -(-n_own // AT_ONCE) * AT_ONCE
-        negative = invert_front(pivot, front, n_own, width, padded, room.copy, room.squares, room.rows, room.columns)
+        negative = invert_front(room, n_own, width, padded)
         if negative < 0:
             return n_negative, n
         n_negative += negative
-        block = blocks[block_start[n] :]
+        begin, at = tree.block_start[n], tree.update_start[n]
         for i in range(n_own):
             for j in range(n_own):
-                block[i * width + j] = pivot[j * padded + i]
+                blocks[begin + i * width + j] = pivot[j * padded + i]
         if n_boundary == 0:
             continue
-        coupling, elimination = (front, n_own, width), (blocks, block_start[n] + n_own, width)
+        coupling, elimination = (front, n_own, width), (blocks, begin + n_own, width)
         shape = (n_own, n_boundary, n_own)
         product(shape, -1.0, (pivot, ZERO, ONE, padded), coupling, False, elimination, elimination)
         # of the complement the upper triangle, some rows at a time
         for i in range(0, n_boundary, ROWS):
-            n_rows, begin = min(ROWS, n_boundary - i), max(0, min(i, n_boundary - COLUMNS))
+            n_rows, left = min(ROWS, n_boundary - i), max(0, min(i, n_boundary - COLUMNS))
             product(
-                (n_rows, n_boundary - begin, n_own), 1.0, (front, n_own + i, width, ONE),
-                (blocks, block_start[n] + n_own + begin, width), True,
-                (front, (n_own + i) * width + n_own + begin, width),
-                (updates, update_start[n] + i * n_boundary + begin, n_boundary),
+                (n_rows, n_boundary - left, n_own), 1.0, (front, n_own + i, width, ONE),
+                (blocks, begin + n_own + left, width), True, (front, (n_own + i) * width + n_own + left, width),
+                (updates, at + i * n_boundary + left, n_boundary),
             )  # fmt: skip
     return n_negative, nodes[1]
 
 
 @compiled()
-def add_row(into: np.ndarray, at: int, source: np.ndarray, of: int, b: int) -> None:
+def add_row(into: Floats, at: int, source: Floats, of: int, b: int) -> None:
     """Add row ``of`` of one flat array to row ``at`` of another, rows of b numbers each."""
     # An unsigned index is one that need not be counted from the end.
     begin, origin = np.uint64(at * b), np.uint64(of * b)
@@ -117,15 +99,7 @@ def add_row(into: np.ndarray, at: int, source: np.ndarray, of: int, b: int) -> N
 
 @compiled()
 def forward(
-    nodes: tuple[int, int],
-    right: np.ndarray,
-    tree: Structure,
-    blocks: np.ndarray,
-    block_start: np.ndarray,
-    x: np.ndarray,
-    carried: np.ndarray,
-    carried_start: np.ndarray,
-    largest: int,
+    nodes: Nodes, right: Floats, tree: Structure, blocks: Floats, x: Floats, carried: Floats, largest: int
 ) -> None:
     """The way up through a range of nodes: x, (V, b) flat, becomes D x; Eᵀ x is carried to the boundary's owners.
 
@@ -133,6 +107,7 @@ def forward(
     """
     b = len(right)
     order, first, children, start, parent_row = tree.order, tree.first, tree.children, tree.start, tree.parent_row
+    carried_start = tree.carried_start
     rows = np.empty(largest * b)
     for n in range(nodes[0], nodes[1]):
         n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
@@ -151,7 +126,7 @@ def forward(
                     add_row(own, parent_row[place + k], source, k, b)
                     k += 1
         # D is symmetric: one product with the transposed block gives D x and Eᵀ x
-        block, found = (blocks, block_start[n], width, ONE), (rows, ZERO, b)
+        block, found = (blocks, tree.block_start[n], width, ONE), (rows, ZERO, b)
         product((width, b, n_own), 1.0, block, (x, first[n] * b, b), False, found, found)
         for i in range(n_own * b):
             own[i] = rows[i]
@@ -169,15 +144,7 @@ def forward(
 
 
 @compiled()
-def backward(
-    nodes: tuple[int, int],
-    tree: Structure,
-    blocks: np.ndarray,
-    block_start: np.ndarray,
-    x: np.ndarray,
-    largest: int,
-    solution: np.ndarray,
-) -> None:
+def backward(nodes: Nodes, tree: Structure, blocks: Floats, x: Floats, largest: int, solution: Floats) -> None:
     """The way down through a range of nodes: x, (V, b) flat, becomes D x + E x_boundary, the solution (b, V)."""
     b = len(solution)
     order, first, start, boundary = tree.order, tree.first, tree.start, tree.boundary
@@ -189,7 +156,7 @@ def backward(
             to, place = np.uint64(k * b), np.uint64(boundary[start[n] + k]) * np.uint64(b)
             for c in range(np.uint64(b)):
                 known[to + c] = x[place + c]
-        elimination = (blocks, block_start[n] + n_own, ONE, width)
+        elimination = (blocks, tree.block_start[n] + n_own, ONE, width)
         product(
             (n_own, b, n_boundary), 1.0, elimination, (known, ZERO, b), True, (x, first[n] * b, b), (found, ZERO, b)
         )

@@ -13,7 +13,7 @@ from igps._threads import ALONE, Team
 from igps.spectra._basis import Basis, pieces_of
 from igps.spectra._checks import ROUNDING
 from igps.spectra._multifrontal import Factors
-from igps.spectra._products import combinations, overlaps, subtract
+from igps.spectra._products import overlaps, subtract
 
 # Below this, relative to what it came from, a pivot makes a Cholesky factor inaccurate
 CHOLESKY_QR_PIVOT = 1e-6
@@ -80,11 +80,6 @@ class Krylov(Basis):
         """Dimension m of the projected problem."""
         return self._current - 1
 
-    @property
-    def loses_basis(self) -> bool:
-        """Whether the basis must make place for the eigenvectors."""
-        return self._large
-
     def expand(self) -> None:
         """Multiply the last block, and append what is new in the product as the next block."""
         last = slice(self._current, self._stop)
@@ -142,11 +137,11 @@ class Krylov(Basis):
 
         Entry i of a vector becomes row ``order[i]``.
         """
-        coefficients = _coefficients(ritz, index)
+        coefficients = _coefficients(ritz, index).numpy()
         vectors = torch.empty(self._basis.shape[1], len(index), dtype=torch.float64, device="cpu").numpy()
 
         def combine(piece: slice) -> None:
-            vectors[order[piece]] = combinations(self._basis[1 : self._stop], coefficients, piece)
+            vectors[order[piece]] = self._basis[1 : self._stop, piece].numpy().T @ coefficients
 
         return vectors, [partial(combine, piece) for piece in self._small_pieces()]
 
@@ -190,13 +185,11 @@ class Krylov(Basis):
             return 0.0
         (lost,) = self._sums(lambda piece: (overlaps(new, old, piece),))
         largest = float(lost.abs().max())
-        single = self._single if largest <= SINGLE_LOSS else None
+        if self._single is not None and largest <= SINGLE_LOSS:
+            old, lost = self._single[: self._swept], lost.float()
 
         def take_out(piece: slice) -> tuple[torch.Tensor]:
-            if single is None:
-                new[:, piece].addmm_(lost, old[:, piece], alpha=-1)
-            else:
-                subtract(new, lost.float(), single[: self._swept], piece)
+            subtract(new, lost, old, piece)
             return (overlaps(new, new, piece),)
 
         (squares,) = self._sums(take_out)
@@ -216,13 +209,12 @@ class Krylov(Basis):
         what rounding has left. Together that costs one product with the basis and one back.
         """
         scale = float(torch.linalg.norm(block, dim=1).max()) if scale is None else scale
-        first: torch.Tensor | None = None
+        coupling = torch.eye(len(block), dtype=torch.float64, device="cpu")
         for rows in (self._basis[near : self._stop], self._basis[: self._stop]):
             block = torch.addmm(block, (rows @ block.T).T, rows, alpha=-1)
             block, factor = self._factor_rows(block, scale)
-            first, scale = (factor, 1.0) if first is None else (factor @ first, 1.0)
-        assert first is not None
-        return block, first
+            coupling, scale = factor @ coupling, 1.0
+        return block, coupling
 
     def _factor_rows(self, block: torch.Tensor, scale: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Orthonormal rows Q and R with blockᵀ = Qᵀ R; for a direction lost in rounding a random row and no R."""

@@ -40,7 +40,8 @@ from igps._threads import ALONE, Team
 from igps.spectra import _fronts as loops
 from igps.spectra._checks import checked_entries
 from igps.spectra._ordering import LEAF_SIZE, checked_graph, nested_dissection
-from igps.spectra._tree import Structure, side_by_side, stacked_places, tree_structure
+from igps.spectra._pivots import Room
+from igps.spectra._tree import Nodes, Structure, tree_structure
 
 # Own unknowns of a node above which its dense algebra is PyTorch's, for which a team can work
 LARGE = 127
@@ -57,13 +58,8 @@ class Tree:
     """Elimination order and fronts for one sparsity pattern; serves any number of values and shifts."""
 
     structure: Structure
-    block_start: np.ndarray  # (N + 1,) where each node's block [D E] starts among all blocks
-    update_start: np.ndarray  # (N,) where its complement starts among those that wait to be added
-    n_updates: int  # entries of all complements that wait at the same time, at most
-    subtrees: list[tuple[int, int]]  # ranges of nodes that may be eliminated, and solved, side by side
-    above: list[tuple[int, int]]  # the other nodes, as ranges, each behind its children
-    carried_start: np.ndarray  # (N,) where the rows that a node adds to its boundary start among those that wait
-    n_carried: int  # rows that wait at the same time, at most
+    subtrees: list[Nodes]  # may be eliminated, and solved, side by side
+    above: list[Nodes]  # the other nodes, each behind its children
 
     def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> Factors:
         """The factors of ``matrix − shift · I``, of which both triangles are read; a team changes none of their bits.
@@ -71,7 +67,7 @@ class Tree:
         A ValueError if the matrix stores other entries than the one that was analysed, a SingularMatrixError if a pivot
         block is singular, as at an eigenvalue.
         """
-        blocks = np.empty(self.block_start[-1])
+        blocks = np.empty(self.structure.block_start[-1])
         return Factors(self, blocks, self._eliminate(matrix, shift, team, blocks))
 
     def inertia(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> int:
@@ -91,39 +87,39 @@ class Tree:
     def _eliminate(self, matrix: sparse.csr_array, shift: float, team: Team, blocks: np.ndarray | None) -> int:
         """Write the blocks, if they are to be kept; the number of negative eigenvalues."""
         matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)
-        values, updates = matrix.data.astype(np.float64, copy=False), np.empty(self.n_updates)
+        n_updates = (self.structure.update_start + np.diff(self.structure.start) ** 2).max()
+        values, updates = matrix.data.astype(np.float64, copy=False), np.empty(n_updates)
 
-        def eliminate(nodes: tuple[int, int]) -> int:
+        def eliminate(nodes: Nodes) -> int:
             return self._eliminate_range(nodes, values, float(shift), updates, blocks, team)
 
         return sum(team.each(eliminate, self.subtrees)) + sum(map(eliminate, self.above))
 
     def _eliminate_range(
-        self, nodes: tuple[int, int], values: Floats, shift: float, updates: Floats, blocks: Floats | None, team: Team
+        self, nodes: Nodes, values: Floats, shift: float, updates: Floats, blocks: Floats | None, team: Team
     ) -> int:
         """Write the blocks of a range of nodes, and what they leave to nodes behind it; their negative pivots."""
         (begin, end), structure = nodes, self.structure
         n_own, n_boundary = np.diff(structure.first[begin : end + 1]), np.diff(structure.start[begin : end + 1])
         front = np.empty(int((n_own + n_boundary).max()) ** 2)
-        block_start = self.block_start
-        if blocks is None:
-            blocks, block_start = np.empty(int((n_own * (n_own + n_boundary)).max())), np.zeros_like(block_start)
+        if blocks is None:  # each takes the place of the last
+            blocks = np.empty(int((n_own * (n_own + n_boundary)).max()))
+            structure = structure._replace(block_start=np.zeros_like(structure.block_start))
         padded = min(LARGE, int(n_own.max())) + loops.AT_ONCE
         squares = [np.empty(padded**2) for _ in range(3)]
         strips = [np.empty(loops.AT_ONCE * (padded + loops.AT_ONCE)) for _ in range(2)]
-        room = loops.Room(np.empty(len(structure.order), dtype=np.int64), front, *squares, *strips)
-        problem = structure, values, shift, updates, self.update_start, blocks, block_start, room
+        room = Room(np.empty(len(structure.order), dtype=np.int64), front, *squares, *strips)
         n_negative, node = 0, begin
         while True:
-            n_more, node = loops.eliminate((node, end), LARGE, *problem)
+            n_more, node = loops.eliminate((node, end), LARGE, structure, values, shift, updates, blocks, room)
             n_negative += n_more
             if node == end:
                 return n_negative
             size, n_bound = int(n_own[node - begin]), int(n_boundary[node - begin])
             n_negative += _eliminate_alone(
                 torch.from_numpy(front[: (size + n_bound) ** 2].reshape(size + n_bound, size + n_bound)),
-                torch.from_numpy(blocks[block_start[node] :][: size * (size + n_bound)].reshape(size, -1)),
-                torch.from_numpy(updates[self.update_start[node] :][: n_bound**2].reshape(n_bound, n_bound)),
+                torch.from_numpy(blocks[structure.block_start[node] :][: size * (size + n_bound)].reshape(size, -1)),
+                torch.from_numpy(updates[structure.update_start[node] :][: n_bound**2].reshape(n_bound, n_bound)),
                 team,
             )
             node += 1
@@ -143,15 +139,15 @@ class Factors:
         n_vertices, b = right_hand_sides.shape
         right = right_hand_sides.T.contiguous().numpy()
         solution = torch.empty(b, n_vertices, dtype=torch.float64, device="cpu")
-        x, carried = (np.empty(n * b) for n in (n_vertices, tree.n_carried))
-        largest = int((np.diff(structure.first) + np.diff(structure.start)).max())
+        n_boundary = np.diff(structure.start)
+        x, carried = np.empty(n_vertices * b), np.empty((structure.carried_start + n_boundary).max() * b)
+        largest = int((np.diff(structure.first) + n_boundary).max())
 
-        def forward(nodes: tuple[int, int]) -> None:
-            places = x, carried, tree.carried_start
-            loops.forward(nodes, right, structure, self.blocks, tree.block_start, *places, largest)
+        def forward(nodes: Nodes) -> None:
+            loops.forward(nodes, right, structure, self.blocks, x, carried, largest)
 
-        def backward(nodes: tuple[int, int]) -> None:
-            loops.backward(nodes, structure, self.blocks, tree.block_start, x, largest, solution.numpy())
+        def backward(nodes: Nodes) -> None:
+            loops.backward(nodes, structure, self.blocks, x, largest, solution.numpy())
 
         team.each(forward, tree.subtrees)
         for nodes in tree.above:
@@ -177,23 +173,7 @@ def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, 
     matrix, coordinates = checked_graph(matrix, coordinates)
     node, n_levels = nested_dissection(matrix, coordinates, leaf_size)
     indptr, indices = (array.astype(np.int32, copy=False) for array in (matrix.indptr, matrix.indices))
-    structure = tree_structure(node, n_levels, indptr, indices)
-    n_own, n_boundary = np.diff(structure.first), np.diff(structure.start)
-    subtrees = side_by_side(n_levels, len(node))
-    inside = {number for begin, end in subtrees for number in range(begin, end)}
-    above = [(number, number + 1) for number in range(len(n_own)) if number not in inside]
-    update_start, n_updates = stacked_places(structure.children, n_boundary**2, [*subtrees, *above])
-    carried_start, n_carried = stacked_places(structure.children, n_boundary, [*subtrees, *above])
-    return Tree(
-        structure=structure,
-        block_start=np.append(0, np.cumsum(n_own * (n_own + n_boundary))),
-        update_start=update_start,
-        n_updates=n_updates,
-        subtrees=subtrees,
-        above=above,
-        carried_start=carried_start,
-        n_carried=n_carried,
-    )
+    return Tree(*tree_structure(node, n_levels, indptr, indices))
 
 
 def _eliminate_alone(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor, team: Team) -> int:

@@ -1,11 +1,24 @@
 """The compiled loops that invert the pivot blocks of `_fronts`."""
 
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from igps._compiled import compiled
 from igps.spectra._products import COLUMNS, ONE, ZERO, product
+
+
+class Room(NamedTuple):
+    """Flat arrays to compute in."""
+
+    place: np.ndarray  # the rows of a boundary in a front
+    front: np.ndarray
+    pivot: np.ndarray  # the inverse of a front's pivot block
+    copy: np.ndarray  # of as many entries as that, as the next
+    squares: np.ndarray
+    rows: np.ndarray  # see `invert`
+    columns: np.ndarray
+
 
 # Unknowns that are eliminated at once inside of a pivot block
 AT_ONCE = cast(int, np.int64(COLUMNS))
@@ -104,29 +117,20 @@ def missing(matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, room: n
 
 
 @compiled()
-def invert_front(
-    inverse: np.ndarray,
-    front: np.ndarray,
-    n: int,
-    front_width: int,
-    width: int,
-    copy: np.ndarray,
-    room: np.ndarray,
-    rows: np.ndarray,
-    columns: np.ndarray,
-) -> int:
+def invert_front(room: Room, n: int, front_width: int, width: int) -> int:
     """Write the inverse (n, width) of a front's pivot block; the negative eigenvalues of that, -1 if it cannot tell.
 
     A definite block is inverted accurately with its pivots in any order. An indefinite one may lose digits in one
     order, rarely in both; I − A X tells how many. Where it is small, the signs of the pivots are right as well: on the
     way from A to the matrix whose inverse X is, no eigenvalue passes zero.
     """
+    inverse = room.pivot
     for backwards in (False, True):
-        load(inverse, front, n, front_width, width, backwards)
-        n_negative = invert(inverse, n, width, rows, columns)
+        load(inverse, room.front, n, front_width, width, backwards)
+        n_negative = invert(inverse, n, width, room.rows, room.columns)
         if n_negative > 0:
-            load(copy, front, n, front_width, width, backwards)
-            if not missing(copy, inverse, n, width, room) <= MOST_MISSING:
+            load(room.copy, room.front, n, front_width, width, backwards)
+            if not missing(room.copy, inverse, n, width, room.squares) <= MOST_MISSING:
                 continue
         if n_negative >= 0:
             if backwards:

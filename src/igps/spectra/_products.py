@@ -8,28 +8,26 @@ COLUMNS, stays in the processor's registers until it is complete, and takes a th
 not find this by itself: with loops that it arranges over rows of four, all of `eigenpairs` takes 1.9 times as long at
 10,000 vertices. So the tile is written in LLVM's own words (`_tile`); everything around it is plain Numba.
 
-*A few long rows with many* (`overlaps`, `subtract`, `combinations`), of which the Krylov basis is made. On AMD's
-processors compiled loops take down to half the time of PyTorch's BLAS. On Intel's with AVX-512, for which MKL is made,
+*A few long rows with many* (`overlaps`), of which the Krylov basis is made. On AMD's processors compiled loops take
+down to half the time of a BLAS, and all of `eigenpairs` 0.88 times. On Intel's with AVX-512, for which MKL is made,
 they take up to twice its time, and all of `eigenpairs` 1.14 times. So the processor decides (`loops_beat_blas`).
 """
 
 from functools import cache, partial
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from igps._arrays import Floats
 from igps._compiled import SUMS, Lazy, compiled
 
-Real = TypeVar("Real", np.float32, np.float64)
 Four = tuple[float, float, float, float]
 
 # Of a tile: as many sums as the registers of AVX2 hold, beside what they are made of
 ROWS, COLUMNS = 6, 8
-# Columns of a few rows that the processor's second cache holds, and sums of as many rows that the first one holds
-CHUNK, STRIP = 4096, 512
+# Columns of a few rows that the processor's second cache holds
+CHUNK = 4096
 # In a tuple for `product` a plain 0 or 1 would be part of its type, for each of which Numba compiles once more
 ZERO, ONE = cast(int, np.int64(0)), cast(int, np.int64(1))
 
@@ -56,23 +54,11 @@ def overlaps(rows: torch.Tensor, others: torch.Tensor, piece: slice) -> torch.Te
 
 
 def subtract(rows: torch.Tensor, factors: torch.Tensor, others: torch.Tensor, piece: slice) -> None:
-    """Take factors (n, m) times others from rows, in a piece of the columns; in the precision of the others."""
-    if loops_beat_blas():
-        subtract_by_loops(rows.numpy(), factors.numpy(), others.numpy(), piece.start, piece.stop)
-    else:
-        rows[:, piece].sub_(factors @ others[:, piece])
+    """Take factors (n, m) times others from rows, in a piece of the columns; in the precision of the others.
 
-
-def combinations(rows: torch.Tensor, coefficients: torch.Tensor, piece: slice) -> np.ndarray:
-    """The products (n, K) of n columns, a piece of rows (m, V), with coefficients (m, K)."""
-    if not loops_beat_blas():
-        return (coefficients.T @ rows[:, piece]).numpy().T
-    shape = piece.stop - piece.start, coefficients.shape[1], len(rows)
-    found = np.empty(shape[:2])
-    columns = rows.numpy().ravel(), piece.start, rows.shape[1], 1
-    out = found.ravel(), 0, shape[1]
-    product(shape, 1.0, columns, (coefficients.numpy().ravel(), 0, shape[1]), False, out, out)
-    return found
+    NumPy's product: single precision stays what it is, whatever PyTorch is told of its own.
+    """
+    rows.numpy()[:, piece] -= factors.numpy() @ others.numpy()[:, piece]
 
 
 def _tile(n_columns: int) -> Any:
@@ -220,53 +206,3 @@ def four_by_six(
 def added(sums: Four, x: Four, y: float) -> Four:
     """Sums with y times x added."""
     return sums[0] + x[0] * y, sums[1] + x[1] * y, sums[2] + x[2] * y, sums[3] + x[3] * y
-
-
-@compiled()
-def subtract_by_loops(rows: Floats, factors: NDArray[Real], others: NDArray[Real], begin: int, end: int) -> None:
-    """Take (n, m) times (m, V) from rows (n, V), in the columns from ``begin`` to ``end``.
-
-    The product is computed in the precision of the others, the difference in that of the rows.
-    """
-    n, m = factors.shape
-    padded = np.zeros((-(-n // 4) * 4, -(-m // 4) * 4), others.dtype)
-    for i in range(n):
-        for j in range(m):
-            padded[i, j] = factors[i, j]
-    sums = np.empty((len(padded), STRIP), others.dtype)
-    for start in range(begin, end, STRIP):
-        width = min(STRIP, end - start)
-        sums[:] = 0
-        for j in range(0, m, 4):
-            for i in range(0, n, 4):
-                add_four(sums[i : i + 4], padded[i : i + 4, j : j + 4], others, j, start, width)
-        for i in range(n):
-            for v in range(width):
-                rows[i, start + v] -= sums[i, v]
-
-
-@compiled(fastmath=SUMS)
-def add_four(
-    sums: NDArray[Real], factors: NDArray[Real], others: NDArray[Real], j: int, begin: int, width: int
-) -> None:
-    """Add to four rows of sums four of the others, from ``j`` on, times factors (4, 4); beyond the last, by 0."""
-    last = len(others) - 1
-    y0, y1 = others[j, begin:], others[min(j + 1, last), begin:]
-    y2, y3 = others[min(j + 2, last), begin:], others[min(j + 3, last), begin:]
-    f0 = factors[0, 0], factors[0, 1], factors[0, 2], factors[0, 3]
-    f1 = factors[1, 0], factors[1, 1], factors[1, 2], factors[1, 3]
-    f2 = factors[2, 0], factors[2, 1], factors[2, 2], factors[2, 3]
-    f3 = factors[3, 0], factors[3, 1], factors[3, 2], factors[3, 3]
-    s0, s1, s2, s3 = sums[0], sums[1], sums[2], sums[3]
-    for v in range(np.uint64(width)):
-        y = y0[v], y1[v], y2[v], y3[v]
-        s0[v] += dot(f0, y)
-        s1[v] += dot(f1, y)
-        s2[v] += dot(f2, y)
-        s3[v] += dot(f3, y)
-
-
-@compiled(fastmath=SUMS)
-def dot(x: Four, y: Four) -> float:
-    """Inner product."""
-    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3]

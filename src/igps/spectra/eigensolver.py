@@ -21,7 +21,7 @@ Lewis & Simon 1994):
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -47,6 +47,8 @@ RESIDUAL_LIMIT = 1e-4
 ROWS_AT_ONCE = 2**12
 # Up to here a dense solver is as fast, or the basis would fill most of the space
 DENSE_VERTICES, DENSE_VERTICES_PER_EIGENPAIR = 1000, 4
+
+Solver = Callable[[], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -116,29 +118,12 @@ def eigenpairs(
     scale = np.sqrt(area / mass)
     matrix = stiffness.copy()
     matrix.data *= scale.repeat(np.diff(matrix.indptr)) * scale[matrix.indices]
-    eigenvalues, vectors, residual = _solve(matrix, stiffness, mass, n_eigenpairs, positions, tolerance, seed)
-    vectors /= np.sqrt(mass)[:, None]
-    return Spectrum(eigenvalues / area, vectors, mass, residual)
-
-
-def _solve(
-    matrix: sparse.csr_array,
-    stiffness: sparse.csr_array,
-    mass: np.ndarray,
-    n_eigenpairs: int,
-    positions: np.ndarray | None,
-    tolerance: float,
-    seed: int,
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Eigenvalues (K,), orthonormal eigenvectors (V, K) and the largest residual, by the first solver that passes."""
-    area = mass.sum()
 
     def dense() -> tuple[np.ndarray, np.ndarray]:
         return eigh(matrix.toarray(), subset_by_index=(1, n_eigenpairs), overwrite_a=True)
 
     def krylov(inside: bool) -> tuple[np.ndarray, np.ndarray]:
-        zero_mode = np.sqrt(mass / area)
-        return lanczos(matrix, zero_mode, n_eigenpairs, positions, tolerance, seed, inside)
+        return lanczos(matrix, np.sqrt(mass / area), n_eigenpairs, positions, tolerance, seed, inside)
 
     def arpack() -> tuple[np.ndarray, np.ndarray]:
         n_guarded = min(n_eigenpairs + N_GUARDS, len(mass) - 2)
@@ -148,8 +133,16 @@ def _solve(
         return eigenvalues[:n_eigenpairs], eigenfunctions[:, :n_eigenpairs] * np.sqrt(mass)[:, None]
 
     small = len(mass) <= max(DENSE_VERTICES, DENSE_VERTICES_PER_EIGENPAIR * n_eigenpairs)
-    solvers: list[Callable[[], tuple[np.ndarray, np.ndarray]]]
-    solvers = [dense, arpack] if small else [partial(krylov, True), partial(krylov, False), arpack]
+    solvers: list[Solver] = [dense, arpack] if small else [partial(krylov, True), partial(krylov, False), arpack]
+    eigenvalues, vectors, residual = _first_that_passes(solvers, matrix, tolerance)
+    vectors /= np.sqrt(mass)[:, None]
+    return Spectrum(eigenvalues / area, vectors, mass, residual)
+
+
+def _first_that_passes(
+    solvers: Sequence[Solver], matrix: sparse.csr_array, tolerance: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Eigenvalues (K,), orthonormal eigenvectors (V, K) and the largest residual, by the first solver that passes."""
     for solver in solvers:
         try:
             eigenvalues, vectors = solver()

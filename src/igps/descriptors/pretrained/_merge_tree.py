@@ -56,74 +56,56 @@ def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = (), m
     if not torch.isfinite(values[there]).all():
         raise ValueError("values: expected finite numbers, got NaN or infinity.")
     order = there[torch.argsort(values[there], descending=True, stable=True)].numpy()
+    place = np.full(len(values), -1)
+    place[order] = np.arange(len(order))
+    pairs = np.stack([place.repeat(neighbours.shape[1]), place[neighbours.numpy().ravel()]])
+    pairs = pairs[:, (pairs >= 0).all(axis=0)]
+    higher, lower = pairs.min(axis=0), pairs.max(axis=0)
+    met = np.argsort(lower)  # of those that meet at one point, the order does not matter
     ends = np.empty((len(order), 2), np.int64)
     pieces = np.full((len(counts), len(values)), -1, np.int64)
-    n = _merge(order, neighbours.numpy(), np.array(counts, np.int64), ends, pieces)
+    n = _merge(order, higher[met], lower[met], np.array(counts, np.int64), ends, pieces)
     return MergeTree(torch.from_numpy(ends[:n, 0]), torch.from_numpy(ends[:n, 1]), torch.from_numpy(pieces))
 
 
 @compiled()
 def _merge(
-    order: Integers, neighbours: Integers, counts: Integers, ends: Integers,
-    pieces: Integers,
-) -> int:  # fmt: skip
+    order: Integers, higher: Integers, lower: Integers, counts: Integers, ends: Integers, pieces: Integers
+) -> int:
     """Write the branches and the pieces of a function on a graph, see `merge_tree`; how many branches there are.
 
-    The points come in order, the highest first; those of (P, k) neighbours that do not come are not there. Written are
-    the peak and the saddle of each branch, and the peak of the piece of each point to (L, P), which holds −1.
+    The points come in order, the highest first, and go by their places in it, as do the higher and the lower of each
+    pair of neighbours, in the order of the lower. Written are the peak and the saddle of each branch, and the peak of
+    the piece of each point to (L, P), which holds −1.
     """
-    n_points, n_neighbours = neighbours.shape
-    n_there = len(order)
-    place = np.full(n_points, n_there, np.int64)
-    for k in range(n_there):
-        place[order[k]] = k
-    # of each point the others that name it, one list after the other; while they are filled, point i has place i + 1
-    starts = np.zeros(n_points + 2, np.int64)
-    for i in range(n_points):
-        for j in range(n_neighbours):
-            starts[neighbours[i, j] + 2] += 1
-    parent = np.empty(n_points, np.int64)
-    for i in range(n_points):
-        starts[i + 1] += starts[i]
-        parent[i] = i
-    naming = np.empty(n_points * n_neighbours, np.int64)
-    for i in range(n_points):
-        for j in range(n_neighbours):
-            named = neighbours[i, j]
-            naming[starts[named + 1]] = i
-            starts[named + 1] += 1
-    n_branches = level = 0
-    for reached in range(n_there):
-        point = order[reached]
-        for j in range(n_neighbours + starts[point + 1] - starts[point]):
-            other = neighbours[point, j] if j < n_neighbours else naming[starts[point] + j - n_neighbours]
-            if place[other] >= reached:
+    parent = np.arange(len(order))
+    n_branches = level = pair = 0
+    for reached in range(len(order)):
+        while pair < len(lower) and lower[pair] == reached:
+            one, other = _root(parent, reached), _root(parent, higher[pair])
+            pair += 1
+            if one == other:
                 continue
-            first, second = point, other
-            while parent[first] != first:
-                parent[first] = parent[parent[first]]
-                first = parent[first]
-            while parent[second] != second:
-                parent[second] = parent[parent[second]]
-                second = parent[second]
-            if first == second:
-                continue
-            if place[first] < place[second]:
-                first, second = second, first
-            parent[first] = second  # the higher peak lives on
-            if first != point:
-                ends[n_branches, 0], ends[n_branches, 1] = first, point
+            ending = max(one, other)  # the higher peak lives on
+            parent[ending] = min(one, other)
+            if ending != reached:
+                ends[n_branches, 0], ends[n_branches, 1] = order[ending], order[reached]
                 n_branches += 1
         while level < len(counts) and counts[level] == reached + 1:
             for k in range(reached + 1):
-                root = order[k]
-                while parent[root] != root:
-                    root = parent[root]
-                pieces[level, order[k]] = root
+                pieces[level, order[k]] = order[_root(parent, k)]
             level += 1
-    for k in range(n_there):
-        point = order[k]
-        if parent[point] == point:
-            ends[n_branches, 0], ends[n_branches, 1] = point, order[n_there - 1]
+    for k in range(len(order)):
+        if parent[k] == k:
+            ends[n_branches, 0], ends[n_branches, 1] = order[k], order[-1]
             n_branches += 1
     return n_branches
+
+
+@compiled()
+def _root(parent: Integers, point: int) -> int:
+    """Where the parents of a point lead, on a way that is halved for the next."""
+    while parent[point] != point:
+        parent[point] = parent[parent[point]]
+        point = parent[point]
+    return point

@@ -3,6 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from functools import reduce
+from operator import or_
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +11,8 @@ from torch import Tensor, nn
 from igps._parameters import check_at_least
 from igps.data.batch import SignatureBatch
 from igps.data.requirements import Requirements, embedding_requirements
+from igps.nn.axes.pairs import DistanceAxis, PairAxis
+from igps.nn.axes.points import PointAxis
 from igps.nn.batch_features import BatchFeatures, SampleFeatures, SampleKind, check_kind
 from igps.nn.specification import Specified
 
@@ -88,6 +91,29 @@ class SampleHistogram(DescriptionPart):
     def of_features(self, features: BatchFeatures) -> Tensor:
         """(N, ...) histograms of N shapes."""
         return self.of_samples(features.of(self.samples, self.n_samples, self.n_training_samples))
+
+
+class AxesHistogram(SampleHistogram):
+    """A histogram along some axes."""
+
+    axes: nn.ModuleList
+
+    @property
+    def point_axes(self) -> list[PointAxis]:
+        """The axes of points."""
+        return [one for one in self.axes if isinstance(one, PointAxis)]
+
+    @property
+    def pair_axes(self) -> list[PairAxis]:
+        """The axes of pairs in the order of the histogram's dimensions: distances before cosines."""
+        axes = [one for one in self.axes if isinstance(one, PairAxis)]
+        return sorted(axes, key=lambda one: not isinstance(one, DistanceAxis))
+
+    @property
+    def requirements(self) -> Requirements:
+        """What all axes together need of a body."""
+        axes: list[PointAxis | PairAxis] = [*self.point_axes, *self.pair_axes]
+        return reduce(or_, (axis.requirements(self.embedding) for axis in axes))
 
 
 def joint(memberships: list[Tensor]) -> Tensor:

@@ -3,24 +3,21 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import reduce
-from operator import or_
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import one_hot
 
-from igps.data.requirements import Requirements
 from igps.nn._kernels.pair_values import PairValues, euclidean_distances
 from igps.nn._kernels.pairs import check_pairs, class_pairs, count_pairs
 from igps.nn.axes import PairAxis, PointAxis, axis_of
-from igps.nn.axes.pairs import DistanceAxis
 from igps.nn.axes.points import largest_members
 from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histograms.base import SampleHistogram
+from igps.nn.histograms.base import AxesHistogram
 
 
-class PairHistogram(SampleHistogram):
+class PairHistogram(AxesHistogram):
     """The joint histogram of all pairs of samples of each body, along some axes.
 
     Axes of points sort the samples into classes: their combinations are C classes, and the histogram has a row for
@@ -68,27 +65,10 @@ class PairHistogram(SampleHistogram):
         self.embedding = embedding or SpectralEmbedding()
 
     @property
-    def point_axes(self) -> list[PointAxis]:
-        """The axes of points."""
-        return [one for one in self.axes if isinstance(one, PointAxis)]
-
-    @property
-    def pair_axes(self) -> list[PairAxis]:
-        """The axes of pairs in the order of the histogram's dimensions: distances before cosines."""
-        axes = [one for one in self.axes if isinstance(one, PairAxis)]
-        return sorted(axes, key=lambda one: not isinstance(one, DistanceAxis))
-
-    @property
     def shape(self) -> tuple[int, ...]:
         """Of a body's histogram: pairs of classes, and bins along each axis of pairs."""
         bins = [n for one in self.pair_axes for n in one.shape]
         return (len(class_pairs(math.prod(one.n_classes for one in self.point_axes))), *bins)
-
-    @property
-    def requirements(self) -> Requirements:
-        """What all axes together need of a body."""
-        axes: list[PointAxis | PairAxis] = [*self.point_axes, *self.pair_axes]
-        return reduce(or_, (axis.requirements(self.embedding) for axis in axes))
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, C(C+1)/2, B, ...) histograms of some samples of N shapes."""
@@ -184,9 +164,7 @@ def pair_histogram(
             "expected n_classes >= 1, n_bins >= 2 and positive ranges, got "
             f"{n_classes=}, {n_bins=}, {distance_range=}, {potential_range=}."
         )
-    classes = (potential * (n_classes / potential_range)).long().clamp_(max=n_classes - 1)[None, :, None]
+    classes = (potential * (n_classes / potential_range)).long().clamp_(max=n_classes - 1)
     dtype = torch.promote_types(embedding.dtype, torch.float32)
     centres = (torch.arange(n_bins, dtype=dtype, device=embedding.device) + 0.5) * (distance_range / n_bins)
-    pairs, mask = [euclidean_distances(embedding[None], centres)], torch.ones_like(classes[..., 0], dtype=torch.bool)
-    check_pairs(pairs, mask)
-    return count_pairs(classes, torch.ones_like(classes, dtype=dtype), n_classes, pairs, mask)[0]
+    return joint_histogram(one_hot(classes, n_classes).to(dtype), [euclidean_distances(embedding, centres)])

@@ -1,20 +1,17 @@
 """Joint histograms over the samples of a body, as products of axes of points."""
 
 from collections.abc import Sequence
-from functools import reduce
-from operator import or_
 
 import torch
 from torch import Tensor, nn
 
-from igps.data.requirements import Requirements
 from igps.nn.axes.points import PointAxis
 from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.histograms.base import SampleHistogram, counted, joint
+from igps.nn.histograms.base import AxesHistogram, counted, joint
 
 
-class PointHistogram(SampleHistogram):
+class PointHistogram(AxesHistogram):
     """The joint histogram of the samples of each body along some axes of points: how much of it is of each kind.
 
     Example:
@@ -50,19 +47,9 @@ class PointHistogram(SampleHistogram):
         self.embedding = embedding or SpectralEmbedding()
 
     @property
-    def point_axes(self) -> list[PointAxis]:
-        """The axes."""
-        return [one for one in self.axes if isinstance(one, PointAxis)]
-
-    @property
     def shape(self) -> tuple[int, ...]:
         """Classes along each axis."""
         return tuple(one.n_classes for one in self.point_axes)
-
-    @property
-    def requirements(self) -> Requirements:
-        """What all axes together need of a body."""
-        return reduce(or_, (axis.requirements(self.embedding) for axis in self.point_axes))
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, C, ...) histograms of some samples of N shapes."""
