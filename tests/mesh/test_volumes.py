@@ -191,6 +191,7 @@ def test_a_stack_compressed_by_lzw_is_read(tmp_path: Path) -> None:
 def write_nrrd(path: Path, *lines: str) -> None:
     """Boxes in voxels of 1 × 1.5 × 2.5, by hand."""
     sizes, spacing = ["sizes: 14 12 10", "encoding: raw"], ["spacings: 1 1.5 2.5"]
+    spacing = [] if any("directions" in line for line in lines) else spacing
     header = "\n".join(["NRRD0005", "type: uint8", "dimension: 3", *sizes, *spacing, *lines])
     path.write_bytes(header.encode() + b"\n\n" + two_boxes().tobytes(order="F"))
 
@@ -211,6 +212,16 @@ def test_lengths_of_a_nrrd_file_are_in_its_unit(
     found = read_label_volume(tmp_path / "x.nrrd")
     assert found.unit == unit
     assert label_surface(found, 3).volume == pytest.approx(volume, rel=1e-3)
+
+
+@pytest.mark.parametrize("lost", ["none", "(nan,nan,nan)"])
+def test_a_nrrd_axis_without_a_direction_is_refused(lost: str, tmp_path: Path) -> None:
+    space = "space: right-anterior-superior"
+    write_nrrd(tmp_path / "x.nrrd", space, "space directions: (1,0,0) (0,1.5,0) (0,0,2.5)")
+    assert label_surface(read_label_volume(tmp_path / "x.nrrd"), 3).volume == pytest.approx(1440, rel=1e-3)
+    write_nrrd(tmp_path / "x.nrrd", space, f"space directions: {lost} (0,1.5,0) (0,0,2.5)")
+    with pytest.raises(MeshError, match=r"x\.nrrd: directions of 2 axes in space; three expected"):
+        read_label_volume(tmp_path / "x.nrrd")
 
 
 @pytest.mark.parametrize("name", ["x.mha", "x.nrrd", "x.nii.gz", "x.mgz"])

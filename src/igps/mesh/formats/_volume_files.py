@@ -124,10 +124,21 @@ def _simple_itk(path: Path) -> RawVolume:
     affine = np.eye(4)
     affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
     affine[:3, 3] = image.GetOrigin()
-    unit = _nrrd_unit(_header(path)) if suffix_of(path) in _NRRD else "mm"
+    unit = "mm"
+    if suffix_of(path) in _NRRD:
+        _check_directions(header := _header(path), path)
+        unit = _nrrd_unit(header)
     affine[:3] *= MILLIMETRES.get(unit, 1.0)
     named = [one for one in segments if one[1] < len(layers)]
     return RawVolume(layers, _FLIP @ affine, segments=named, unit="mm" if unit in MILLIMETRES else None)
+
+
+def _check_directions(header: bytes, path: Path) -> None:
+    """Raise a MeshError where a NRRD header leaves out the direction of an axis in space; ITK makes one up."""
+    if line := re.search(rb"^space directions:(.*)$", header, re.MULTILINE):
+        known = [one for one in re.findall(rb"\(.*?\)", line[1]) if b"nan" not in one.lower()]
+        if len(known) != 3:
+            raise MeshError(f"{path}: directions of {len(known)} axes in space; three expected. Export it again.")
 
 
 def _nrrd_unit(header: bytes) -> str:
