@@ -251,7 +251,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         file = CollectionFile(path)
         about = file.about
         if descriptor is not None:
-            requirements_of(descriptor).check_config(about.config)
+            file.check_serves(requirements_of(descriptor))
         dataset = cls.__new__(cls)
         SignatureDataset.__init__(dataset, about.bodies, about.config, cache_dir, reading=about.reading)
         dataset.classes, dataset._at_hand = about.classes, file
