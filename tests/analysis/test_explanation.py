@@ -239,7 +239,7 @@ def test_groups_are_explained_by_the_cells_that_are_held(batches: list[Signature
     means = groups.double().mean(dim=1)
     terms = (means[0] - means[1]) ** 2 / (means[0] + means[1]).clamp_min(1e-300) / 2
     assert found.distance == pytest.approx(float(terms[kept].sum()), rel=1e-6)
-    with pytest.raises(ValueError, match="3 and 3 bodies can be arranged in 10 ways alone"):
+    with pytest.raises(ValueError, match="3 and 3 bodies can be arranged in only 10 ways"):
         explain_groups(chosen, groups[0, :3], groups[1, :3], batches)
 
 

@@ -48,7 +48,7 @@ def test_the_file_stands_for_the_folder(
         for option in (["--mend", "never"], ["--attribute", "ct={file}.nii"]):
             with pytest.raises(SystemExit, match="1"):
                 call(monkeypatch, *command, out, "--descriptor", INTERIOR, *cache, *option)
-            assert "expected no options of reading beside a file of signatures" in capsys.readouterr().err
+            assert "expected no reading options beside a file of signatures" in capsys.readouterr().err
         call(monkeypatch, "extract", out, "--out", tmp_path / "rows.npz", "--descriptor", INTERIOR, *cache)
         names = np.load(tmp_path / "rows.npz")["names"].tolist()
         assert names == ["flat/0.off", "flat/1.off", "long/0.off", "long/1.off"]

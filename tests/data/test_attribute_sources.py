@@ -381,7 +381,7 @@ def test_words_of_the_command_line_become_sources() -> None:
     }
     assert pickle.loads(pickle.dumps(found)) == found
     for wrong in ("ct", "=a.nii", "a b=c.nii", "ct="):
-        with pytest.raises(ValueError, match="attribute: expected such as ct=images"):
+        with pytest.raises(ValueError, match="attribute: expected a pattern such as ct=images"):
             attribute_sources([wrong], None)
 
 

@@ -146,7 +146,7 @@ def test_shards_have_all_files_once(
         numbers = [i for k in range(1, n + 1) for i in of_shard(100, f"{k}/{n}")]
         assert sorted(numbers) == list(range(100))
     for wrong in ("0/4", "5/4", "3", "a/b", "-1/4", "1/4/2"):
-        with pytest.raises(ValueError, match="shard: expected such as 3/64"):
+        with pytest.raises(ValueError, match="shard: expected a part such as 3/64"):
             of_shard(100, wrong)
     words = ["igps", "precompute", str(root), "--cache_dir", str(tmp_path / "cache"), "--n_workers", "1", *SMALL]
     words += ["--descriptors", "own_descriptors:small_interior"]

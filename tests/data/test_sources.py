@@ -49,7 +49,7 @@ def test_meshes_alone_have_no_classes(tmp_path: Path) -> None:
         ("file,label,age,age\n1.off,cat,1,2\n", "named twice"),
         ("file,label\n1.off,cat\n2.off,\n", "line 3"),
         ("file,label\n\n1.off,cat\n\n2.off,\n", "line 5"),
-        ("file;label\n1.off;cat\n", "parted by a comma"),
+        ("file;label\n1.off;cat\n", "separated by commas"),
         ("file,label\n1.off,Wölfe\n", "CSV in UTF-8"),
         (f"file,label\n1.off,{'x' * 200_000}\n", "not readable as a table"),
         ("file,label\n1.off,cat\n1.off,dog\n", r"1\.off is listed twice"),

@@ -277,7 +277,7 @@ def explain_groups(
     ways = math.comb(n + m, n) // (1 + (n == m))  # of equal groups two are the same difference
     if ways * level <= 1:
         raise ValueError(
-            f"one, other: {n} and {m} bodies can be arranged in {ways} ways alone, too few to tell anything from "
+            f"one, other: {n} and {m} bodies can be arranged in only {ways} ways, too few to tell anything from "
             f"chance at a level of {level}. Add bodies, or explain one of each."
         )
     descriptor = copy.deepcopy(descriptor).double().eval()

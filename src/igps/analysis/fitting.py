@@ -90,7 +90,7 @@ def fit(
             that come up later, where whole classes are held out.
         head: classifier (`ClassifierHead`), whitened (`WhitenedHead`), as_is for the descriptor itself; auto takes the
             one that is best on held-out bodies, by FT.
-        prior: whether the metric that the descriptor has counts beside the new head.
+        prior: whether the descriptor's own metric counts beside the new head.
         failures: a list to which bodies that cannot be described are added; None to raise at the first.
         n_workers: threads that describe; all cores if None.
 

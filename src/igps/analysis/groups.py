@@ -206,7 +206,7 @@ def _senseless(sizes: Mapping[str, int], group: NDArray[np.int64], stratum: NDAr
     np.add.at(counts, (stratum, group), 1)
     logs = sum(math.lgamma(row.sum() + 1) - sum(math.lgamma(k + 1) for k in row) for row in counts)
     if logs < math.log(_FEWEST_ARRANGEMENTS):
-        return f"within strata the groups can be arranged in {math.exp(logs):.0f} ways alone, too few for a test."
+        return f"within strata the groups can be arranged in only {math.exp(logs):.0f} ways, too few for a test."
     return None
 
 

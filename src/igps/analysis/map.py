@@ -20,7 +20,7 @@ class BodyMap:
 
     points: Values  # (N, 2), in units of the distances for "mds", in none for "umap"
     # Root of the squared errors of all distances over their squares (Kruskal 1964), after the best scaling: 0 where the
-    # map tells every distance, above 0.2 it distorts much
+    # map keeps every distance, above 0.2 it distorts much
     stress: float
 
 

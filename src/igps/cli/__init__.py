@@ -147,7 +147,7 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
             if several != "with" or {"descriptor", "descriptors"} & set(parameters):
                 parser.add_argument(f"--{several}", nargs="+", help=told)
     if kinds["return"] is not type(None):
-        switches[JSON] = "print what the table tells as JSON, and all else to standard error"
+        switches[JSON] = "print the table as JSON, and everything else to standard error"
     by_hand: set[str | int] = {*switches, *LISTS}
     for place, (name, parameter) in enumerate(parameters.items()):
         positional = place == 0 and parameter.default is parameter.empty

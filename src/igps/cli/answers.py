@@ -47,10 +47,10 @@ def groups(
         group: a column of labels.csv that tells the groups; the class if not given.
         strata: a column within whose values bodies are permuted, such as scanner.
         covariate: columns that are regressed out first: numbers, such as age, or words, such as sex.
-        size: test the size, too, the logarithm of the volume, in lines of its own
+        size: also test the size, the logarithm of the volume, in lines of its own
         out: folder for groups.csv, groups.json, and the effects as groups.svg and groups.png.
-        n_permutations: random ones.
-        seed: of what is random.
+        n_permutations: number of random permutations.
+        seed: of the permutations and all else that is random.
     """
 
     def columns(bodies: Bodies) -> tuple[Any, Any, Any]:
@@ -103,8 +103,8 @@ def outliers(
 
     Each is compared with the others of its class: shape, volume, how coarse it is; of meshes handles, flat sides and
     repairs; of labels what lies apart, cavities, holes, gaps, cut ends, and overlap with other labels. A score is a
-    number of robust standard deviations; above 3.5 it is more than chance. A body that lies nearer to another class
-    than to its own is told.
+    number of robust standard deviations; above 3.5 it is more than chance. A body that is nearer to another class
+    than to its own is reported.
 
     Args:
         root: folder with one subfolder per class, or with files and a labels.csv (columns file,label).
@@ -143,8 +143,8 @@ def explain(
     Args:
         meshes: two files, or a folder with two classes.
         descriptor: of histograms, such as interior, rich or pretrained.
-        level: of two groups, only cells of the histograms count whose means differ by more than chance does, any false
-            one with this probability.
+        level: of two groups, only cells of the histograms count whose means differ significantly, at this family-wise
+            error rate.
         out: folder for explain.csv, the shares of the histograms; explain_samples.csv, those of the samples; and both
             bodies painted from two sides as explain.svg and explain.png.
     """
@@ -174,7 +174,7 @@ def explain(
     print(f"{' and '.join(names)}: {found.distance:.4g} by {module.name}: {found.summary()}")
     painted = [_painted(dataset, i, found, place) for place, i in enumerate(chosen)]
     for name, _, values in painted:
-        print(f"{name}: half of what is its own lies on {_half(values):.0%} of its surface")
+        print(f"{name}: half of its share lies on {_half(values):.0%} of its surface")
     parts = [{"histogram": name, "share": share} for name, share in found.parts.items()]
     if out is not None:
         write_answer(out, "explain_samples", _sample_rows(dataset, chosen, found))

@@ -34,10 +34,10 @@ def clusters(
 
     Args:
         n_clusters: how many; as many as have the largest mean silhouette if not given.
-        joining: two clusters are as far apart as their bodies are in mean (average), at most (complete), or at least
+        joining: two clusters are as far apart as their bodies are on average (average), at most (complete), or at least
             (single).
         n_resamples: random halves of the bodies, for the stability.
-        seed: of these.
+        seed: of the random halves.
         out: folder for clusters.csv and clusters.json, and the tree as clusters.svg and clusters.png.
     """
     dataset, distances, label_of = _compared(Folder(root), descriptor, **reading)
@@ -78,7 +78,7 @@ def map_bodies(
 
     Args:
         colour: class, cluster, volume, or a column of labels.csv.
-        layout: mds keeps all distances as well as that goes, umap keeps neighbours (needs umap-learn).
+        layout: mds keeps all distances as well as possible, umap keeps neighbours (needs umap-learn).
         seed: of umap, and of clusters.
         out: folder for map.csv, map.json, map.svg and map.png.
     """
@@ -108,7 +108,7 @@ def map_bodies(
         {"body": name, "x": x, "y": y, "class": label, column: value}
         for name, (x, y), label, value in zip(bodies.names, found.points.tolist(), label_of, values, strict=True)
     ]
-    print(f"{len(rows)} bodies; stress {found.stress:.2f}: 0 tells every distance, above 0.2 the map distorts much")
+    print(f"{len(rows)} bodies; stress {found.stress:.2f}: 0 keeps every distance, above 0.2 the map distorts much")
     if out is not None:
         write_answer(out, "map", rows, map_figure(found, values, colour))
         print(f"written to {out}")

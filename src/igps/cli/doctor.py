@@ -37,7 +37,7 @@ def doctor(
     Args:
         out: a CSV file for the findings, with all notes.
         signature: parameters of the signatures to come.
-        attribute: what bodies bring along, such as ct=images/{stem}.nii.gz; these files are no bodies.
+        attribute: values inside the bodies, such as ct=images/{stem}.nii.gz; these files are not taken as bodies.
     """
     reading, limits = LoadOptions(allow_open=allow_open, **options), limits_of(time_limit, memory_limit)
     bodies = find_bodies(root, reading, attributes=attribute_sources(attribute or (), root).values())

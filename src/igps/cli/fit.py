@@ -44,7 +44,7 @@ def fit(
         descriptor: a name (a wrong one lists all), a file, or package.module:NAME of one of your own.
         goal: known for the classes of the folder; new for a metric of classes that come up later.
         head: classifier, whitened, or as_is for the descriptor itself; auto takes the best on held-out bodies.
-        no_prior: leave the metric that the descriptor has aside, and take its histograms alone
+        no_prior: ignore the descriptor's own metric, and fit to its histograms alone
     """
     if out.suffix != ".safetensors":
         raise ValueError(f"out: expected a file ending in .safetensors, got {out}.")
@@ -65,7 +65,7 @@ def fit(
 
 
 def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading: Any) -> list[dict[str, Any]]:
-    """Tell the classes of meshes, how probable they are, and which meshes are like none.
+    """Classify meshes: the most probable class of each, its probability, and which meshes fit none.
 
     Args:
         meshes: mesh files, or one folder.

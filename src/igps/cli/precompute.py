@@ -37,7 +37,7 @@ def precompute(
     What is there already is not computed again, so that a run that was stopped is finished by another.
 
     Args:
-        descriptors: whose needs the signatures shall satisfy; pretrained if not given.
+        descriptors: compute what these require; pretrained if not given.
         cluster: address of a Dask scheduler, such as tcp://scheduler:8786, whose workers see folder and cache by the
             same paths as this machine.
         shard: such as 3/64, the third of 64 parts of the meshes, for as many jobs of a batch system.
@@ -69,7 +69,7 @@ def cache_export(root: Path, out: Path, descriptors: list[str] | None = None, **
 
     Args:
         out: the file, its name ending in .igps.
-        descriptors: whose needs the signatures shall satisfy; pretrained if not given.
+        descriptors: compute what these require; pretrained if not given.
     """
     chosen = [descriptor_of(name) for name in descriptors or ["pretrained"]]
     dataset, failures = signatures(Folder(root), chosen, **reading)
@@ -85,7 +85,7 @@ def of_shard(n_bodies: int, shard: str | None) -> range:
         return range(n_bodies)
     found = re.fullmatch(r"([1-9]\d*)/([1-9]\d*)", shard)
     if found is None or int(found[1]) > int(found[2]):
-        raise ValueError(f"shard: expected such as 3/64, from 1/64 to 64/64, got {shard!r}.")
+        raise ValueError(f"shard: expected a part such as 3/64, from 1/64 to 64/64, got {shard!r}.")
     return range(int(found[1]) - 1, n_bodies, int(found[2]))
 
 

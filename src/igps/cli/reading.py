@@ -34,9 +34,9 @@ FLAGS = {
 """Switches of every command that passes its `**reading` on to `signatures`, and what they do."""
 
 LISTS = {
-    "attribute": "what bodies bring along, such as ct=images/{stem}.nii.gz: an image, a grid, values at vertices or in "
-    "tetrahedra, below the folder; {stem}, {file} and {part} stand for the body's",
-    "with": "attributes that the descriptor takes in, such as ct, or ct=0.5 with half the weight of form",
+    "attribute": "values inside the bodies, such as ct=images/{stem}.nii.gz: an image, a grid, values at vertices or "
+    "in tetrahedra, below the folder; {stem}, {file} and {part} stand for the body's",
+    "with": "attributes that join the descriptor, such as ct, or ct=0.5 with half the weight of shape",
 }
 """Options of several words, of the same commands."""
 
@@ -198,7 +198,7 @@ def chosen_dataset(
     config, reading = SignatureConfig.paper() if paper else signature, LoadOptions(**options)
     if isinstance(source, Folder) and source.root.is_file():
         if config != SignatureConfig() or reading != LoadOptions() or classes is not None or attribute:
-            raise ValueError(f"{source.root}: expected no options of reading beside a file of signatures.")
+            raise ValueError(f"{source.root}: expected no reading options beside a file of signatures. Leave them out.")
         if source.needs_meshes:
             raise ValueError(f"{source.root}: holds signatures and no meshes, which are needed. Give their folder.")
         dataset = SignatureDataset.from_file(source.root, descriptor=needs, cache_dir=cache_dir)

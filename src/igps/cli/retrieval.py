@@ -41,11 +41,11 @@ def retrieve(
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
         out: folder for scores.json, ranking.csv, distances.npz, meshes.json that tells where the meshes lie, and
-            failures.csv if a mesh could not be used; and descriptor.safetensors where the descriptor has centres that
-            are the collection's, so that a query takes the same.
+            failures.csv if a mesh could not be used; and descriptor.safetensors if the descriptor's centres were fitted
+            to the collection, for queries.
         report: make a page of the results in that folder, report.html, see `igps report`
-        rerank: score the distances that the whole collection has set right by its neighbourhoods, too, in a table of
-            their own (diffusion and k-reciprocal re-ranking, without labels); distances.npz has them as "reranked".
+        rerank: also score the distances re-ranked by diffusion and k-reciprocal neighbours, without labels, in a table
+            of their own; distances.npz has them as "reranked".
     """
     check_report(report, out)
     found = described(Folder(root, labelled=True), descriptor, **reading)
@@ -134,8 +134,8 @@ def query(
         where: only bodies that satisfy this condition on columns of the gallery, such as "class = 'femur' AND volume >
             2e5".
         exact: compare with all bodies; the nearest of a large gallery are found by short vectors otherwise
-        rerank: put the nearest 200 in order by what neighbours they have in common (diffusion and k-reciprocal
-            re-ranking, without labels); the distances listed are those of this order, without unit.
+        rerank: order the nearest 200 by the neighbours they have in common (diffusion and k-reciprocal re-ranking,
+            without labels); the distances listed are those of this order.
     """
     if top < 1:
         raise ValueError(f"top: expected at least 1, got {top}.")

@@ -259,7 +259,7 @@ def attribute_sources(given: Sequence[str], root: Path | None) -> dict[str, Attr
     for word in given:
         name, _, path = word.partition("=")
         if not name.isidentifier() or not path:
-            raise ValueError(f"attribute: expected such as ct=images/{{stem}}.nii.gz, got {word!r}.")
+            raise ValueError(f"attribute: expected a pattern such as ct=images/{{stem}}.nii.gz, got {word!r}.")
         found[name] = attribute_source(path, root)
     return found
 

@@ -111,7 +111,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class SignatureBatch:
-    """N Signatures, padded so that no descriptor changes by it.
+    """N Signatures, padded; padding changes no description.
 
     Example:
         >>> import trimesh

@@ -13,6 +13,7 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from igps.data.cache import check_checksum, checksum, decode, encode, whole_file
+from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, file_of
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature, SignatureConfig
@@ -152,6 +153,13 @@ class CollectionFile:
         except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
             name = self.about.bodies.names[index]
             raise ValueError(f"{self.path}: {name} is not usable ({error}). Export the collection again.") from error
+
+    def check_serves(self, requirements: Requirements) -> None:
+        """Raise a ValueError that names the file where its Signatures have less than what is required."""
+        try:
+            requirements.check_config(self.about.config)
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {error} Or export the folder again for this descriptor.") from error
 
     def notes(self, index: int) -> tuple[str, ...]:
         """What was done to the mesh of a Signature, in words."""

@@ -1,4 +1,4 @@
-"""A torch Dataset of Signatures, computed on first touch and cached."""
+"""A torch Dataset of Signatures, computed on first access and cached."""
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,7 +30,7 @@ from igps.signature.signature import Signature, SignatureConfig
 
 
 class SignatureDataset(Dataset[LabelledSignature]):
-    """Signatures of bodies in files, computed on first touch and cached on disk.
+    """Signatures of bodies in files, computed on first access and cached on disk.
 
     Example:
         >>> import tempfile, trimesh
@@ -55,8 +55,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         attributes: further attributes of the samples, by name: an `AttributeSource` or a function `(body, points)`,
             whose values are kept beside the Signatures, which stay; or a function of points, (P, 3) in the file's
             coordinates, to (P,) or (P, C), which is called at each reading.
-        pre_transform: a change of every Signature, which is kept changed; its `cache_tag` is part of the key.
-        transform: a change of a Signature at each reading; see `igps.data.transforms`.
+        pre_transform: a change of every Signature, cached with it; its `cache_tag` is part of the key.
+        transform: a change of a Signature at each access; see `igps.data.transforms`.
 
     Attributes:
         bodies: files, names, classes, and further columns of the table of labels.
@@ -251,7 +251,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         file = CollectionFile(path)
         about = file.about
         if descriptor is not None:
-            requirements_of(descriptor).check_config(about.config)
+            file.check_serves(requirements_of(descriptor))
         dataset = cls.__new__(cls)
         SignatureDataset.__init__(dataset, about.bodies, about.config, cache_dir, reading=about.reading)
         dataset.classes, dataset._at_hand = about.classes, file

@@ -130,7 +130,7 @@ def find_bodies(
 
     Args:
         options: how files are read, which says what bodies there are in one.
-        attributes: what bodies bring along; the files of these are no bodies.
+        attributes: values inside the bodies; their files are not taken as bodies.
         labelled: whether it must tell classes.
 
     Raises:
@@ -239,7 +239,7 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
         header = [name for name in reader.fieldnames if name]
         further = [name for name in header if name not in ("file", "body", "label")]
         if "file" not in header or not ("label" in header or further):
-            expected = "expected the columns file,label in the first line, parted by a comma"
+            expected = "expected the columns file,label in the first line, separated by commas"
             raise ValueError(f"{file}: {expected}, got {reader.fieldnames}.")
         if len(set(header)) < len(header):
             raise ValueError(f"{file}: a column is named twice in {header}. Give each column a name of its own.")

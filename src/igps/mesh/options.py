@@ -34,14 +34,14 @@ class LoadOptions:
         allow_open: accept open boundaries; the winding number then decides what is inside.
         bodies: what of a file is a body. "whole": all of it; "labels" of a volume; "objects" of a scene, solids of a
             CAD file, files of an archive; "pieces": what is not connected; "chains", "models" or the "assembly" of a
-            molecule. None, or what a format does not have: labels, chains, or else the whole.
+            molecule. None takes labels, chains, or else the whole; so does a kind that the format does not have.
         max_unpacked: bytes that a file may unpack to.
         names: a table of the names of labels, see `read_label_names`; None for those of the volume, or beside it.
         threshold: a voxel of at least this probability belongs to the body, in volumes of probabilities.
-        cavities: "fill" takes a hollow body for the full one; "keep" lets the surfaces of its hollows bound it too.
+        cavities: "fill" fills hollow bodies; "keep" lets the surfaces of their hollows bound them too.
 
     Raises:
-        ValueError: a value that is not among those.
+        ValueError: an unknown value.
     """
 
     mend: Mending = "auto"

@@ -59,7 +59,7 @@ def describe(
             has been described under the same tag is read from the cache, and what is described now is kept there. None
             to describe all.
         batch_size: shapes at a time.
-        n_workers: threads, or for descriptors that work in NumPy processes; all cores if None.
+        n_workers: threads, or processes for descriptors that work in NumPy; all cores if None.
         progress: show a bar.
 
     Returns:

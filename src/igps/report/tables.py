@@ -20,7 +20,7 @@ def scores_table(scores: RetrievalScores) -> str:
     lines += [f"{name:<{width}}" + "".join(f"{100 * row[key]:>10.1f}" for key in columns) for name, row in rows.items()]
     lines.append(f"percent, {scores.n_queries} queries, each against all others")
     if scores.n_excluded:
-        lines.append(f"{scores.n_excluded} meshes are the only one of their class and were not scored as queries")
+        lines.append(f"not scored as queries, each alone in its class: {scores.n_excluded}")
     return "\n".join(lines)
 
 

@@ -29,8 +29,8 @@ class SignatureConfig:
         (1000, 0)
 
     Args:
-        n_eigenpairs: eigenpairs kept, without the constant one; None for as many as the descriptor needs that the
-            Signature is for (see `Requirements.apply_to`), 250 where there is none.
+        n_eigenpairs: eigenpairs kept, without the constant one; None for as many as the descriptor requires (see
+            `Requirements.apply_to`), 250 without a descriptor.
         resolution: voxels along the longest side of the bounding box.
         min_samples: the grid is refined until at least so many voxels lie inside; 0 keeps `resolution`.
         n_surface_samples: area-weighted random samples of the surface.
@@ -42,8 +42,8 @@ class SignatureConfig:
         attributes: of the samples: "depth" and "electrostatic_potential" of the interior ones, "surface_direction" of
             all, see `interior_attributes` and `surface_attributes`.
         seed: of the surface samples and of the eigensolver's start.
-        least_vertices: meshes with fewer are subdivided when they are read, unless they are mended never; None for the
-            two more than the eigenpairs without which these cannot be computed.
+        least_vertices: meshes with fewer are subdivided when they are read, unless `mend` is "never"; None for two more
+            than the eigenpairs, the fewest that these can be computed from.
     """
 
     # Raise it whenever the same mesh and parameters would give another Signature: it is part of every cache key.

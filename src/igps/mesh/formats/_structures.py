@@ -135,7 +135,7 @@ def _mark_unknown(block: gemmi.cif.Block) -> None:
 
 
 def _pqr(text: bytes, path: Path) -> gemmi.Structure:
-    """Fields are parted by blanks: type, serial number, atom, residue, [chain,] number, x, y, z, charge, radius."""
+    """Fields are separated by blanks: type, serial number, atom, residue, [chain,] number, x, y, z, charge, radius."""
     gemmi = gemmi_module()
     structure = gemmi.Structure()
     chains: dict[str, list[Any]] = {}
