@@ -478,3 +478,16 @@ def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path: Path) -> 
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), scan)
     assert sync(gallery, now(), tmp_path / "scans", n_workers=1) == (2, 1, [])
     assert sorted(row["part"] for row in gallery.rows("part")) == ["1", "1", "2", "2", "3"]
+
+
+def test_numbers_stay_as_they_are_written_in_a_column_of_text(root: Path, tmp_path: Path) -> None:
+    for label, ages in (("ball", ("old", "young", "")), ("egg", ("03", "4", ""))):
+        lines = [f"{i}.off,{label},{age}" for i, age in enumerate(ages)]
+        (root / label / "labels.csv").write_text("\n".join(["file,label,age", *lines]))
+    balls, eggs = (SignatureDataset(root / one, CONFIG, tmp_path / "cache") for one in ("ball", "egg"))
+    gallery, _ = Gallery.build(tmp_path / "g.igps", balls, small_interior(), n_workers=1)
+    gallery.add(eggs, n_workers=1)
+    assert {row["age"] for row in gallery.rows("age")} == {"old", "young", "03", "4", None}
+    n_versions = len(gallery.versions())
+    assert sync(gallery, eggs, root / "egg", n_workers=1) == (0, 0, [])
+    assert len(gallery.versions()) == n_versions

@@ -175,10 +175,11 @@ class Gallery:
         chosen, failures = descriptor_of(descriptor), list[Failure]()
         # In any order, as short vectors are fitted to the first
         mixed = dataset.subset(np.random.default_rng(0).permutation(len(dataset)).tolist())
-        batches = described_rows(mixed, chosen, {}, failures, n_workers, strict, progress)
+        kinds = further_columns(dataset.bodies)
+        batches = described_rows(mixed, chosen, kinds, {}, failures, n_workers, strict, progress)
         about = about_of(dataset.config, dataset.reading, descriptor)
         try:
-            tables().write(Path(path), about, chosen.searched_by, batches, further_columns(dataset.bodies))
+            tables().write(Path(path), about, chosen.searched_by, batches, kinds)
         except ValueError as error:
             if len(failures) < len(dataset):
                 raise
@@ -199,8 +200,8 @@ class Gallery:
         wanted = about_of(dataset.config, dataset.reading, self.descriptor)
         check_alike(self.path, self.about, {name: wanted[name] for name in ("signature", "reading")})
         known = {one["id"]: one["checksum"] for one in self.rows("id", "checksum")}
-        failures, further = list[Failure](), further_columns(dataset.bodies)
-        for some in described_rows(dataset, self.descriptor, known, failures, n_workers, strict, progress):
+        failures, further = list[Failure](), further_columns(dataset.bodies, self.columns)
+        for some in described_rows(dataset, self.descriptor, further, known, failures, n_workers, strict, progress):
             self.table.add(*some, further)
         return failures
 

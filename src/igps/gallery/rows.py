@@ -31,12 +31,12 @@ _YOUNG = 2 * 10**9
 
 
 def described_rows(
-    dataset: SignatureDataset, descriptor: Descriptor, known: Mapping[str, str], failures: list[Failure],
-    n_workers: int | None, strict: bool, progress: bool,
+    dataset: SignatureDataset, descriptor: Descriptor, kinds: Mapping[str, type], known: Mapping[str, str],
+    failures: list[Failure], n_workers: int | None, strict: bool, progress: bool,
 ) -> Iterator[Batch]:  # fmt: skip
     """Descriptions and rows of the bodies that are not known by their checksums; failures are added to the list."""
     dataset = once(dataset)
-    bodies, kinds = dataset.bodies, further_columns(dataset.bodies)
+    bodies = dataset.bodies
     with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
         for start in range(0, len(dataset), _AT_ONCE):
             numbers = range(start, min(start + _AT_ONCE, len(dataset)))
@@ -55,8 +55,8 @@ def described_rows(
             bar.update(len(numbers))
 
 
-def further_columns(bodies: Bodies) -> dict[str, type]:
-    """Further columns of the table of labels, and of which type: numbers where all values are.
+def further_columns(bodies: Bodies, there: Mapping[str, type] = KNOWN) -> dict[str, type]:
+    """Further columns of the table of labels, and of which type: numbers where all values are, unless text is there.
 
     Raises:
         ValueError: one has the name of a column that every gallery or LanceDB has, or a name with a dot.
@@ -71,7 +71,10 @@ def further_columns(bodies: Bodies) -> dict[str, type]:
         )
     if taken := bodies.columns.keys() & {*KNOWN, "vector", "code"}:
         raise ValueError(f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name.")
-    return {name: float if all(map(is_number, values)) else str for name, values in bodies.columns.items()}
+    texts = {
+        name for name, values in bodies.columns.items() if there.get(name) is str or not all(map(is_number, values))
+    }
+    return {name: str if name in texts else float for name in bodies.columns}
 
 
 def told_of(bodies: Bodies, kinds: Mapping[str, type], reading: LoadOptions) -> list[dict[str, Any]]:

@@ -36,7 +36,7 @@ def sync(
         that of a file in a folder that may not be read.
     """
     dataset = once(dataset)
-    kinds = further_columns(dataset.bodies)
+    kinds = further_columns(dataset.bodies, gallery.columns)
     now = told_of(dataset.bodies, kinds, dataset.reading)
     asked = [name for name in ("checksum", *now[0]) if name in gallery.columns]
     known = {one["id"]: one for one in gallery.rows(*asked)}
