@@ -389,3 +389,105 @@ def test_a_column_with_a_dot_is_told_before_anything_is_described(root: Path, tm
     with pytest.raises(ValueError, match=r"labels.csv: a gallery takes no dot .* got 'scan.age'"):
         Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
     assert not (tmp_path / "g.igps").exists()
+
+
+def test_a_column_with_a_name_of_the_engine_is_refused_before_it_spoils_the_gallery(
+    root: Path, dataset: SignatureDataset, tmp_path: Path
+) -> None:
+    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    (root / "labels.csv").write_text("file,label,_rowid\nball/0.off,ball,3\n")
+    for change in (Gallery.add, lambda one, other, **_: sync(one, other, root)):
+        with pytest.raises(ValueError, match=r"labels.csv: .* begins with an underscore, got '_rowid'"):
+            change(gallery, SignatureDataset(root, CONFIG, tmp_path / "cache"), n_workers=1)
+    assert len([*Gallery(tmp_path / "g.igps", small_interior()).rows("name")]) == 6
+
+
+@pytest.mark.parametrize(
+    "rest", ["; junk", " junk", ") OR (true", " LIMIT 1", " ORDER BY name", "; DELETE FROM t", " -- note\n junk"]
+)
+def test_a_condition_is_read_to_its_end(dataset: SignatureDataset, tmp_path: Path, rest: str) -> None:
+    """What follows it is no part of it, and may have been meant to narrow it."""
+    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    where = "name = 'ball/0.off'"
+    described = describe(dataset, small_interior())[:1]
+    for ask in (
+        gallery.remove,
+        lambda where: gallery.update(where, {"class": "egg"}),
+        lambda where: gallery.nearest(described, where=where),
+    ):
+        with pytest.raises(ValueError, match=r"where: expected a condition on the columns id, name") as told:
+            ask(where + rest)
+        assert "/" not in str(told.value).partition("parser error")[2]
+    assert [one["class"] for one in gallery.rows("class")].count("ball") == 3
+    assert gallery.remove(f"({where}) -- a note") == 1
+
+
+def test_a_folder_linked_twice_gives_each_body_once(root: Path, tmp_path: Path) -> None:
+    """By the first of its names, whether it is built, added or synced."""
+    (root / "zoo").symlink_to(root / "egg", target_is_directory=True)
+    dataset = SignatureDataset(root, CONFIG, tmp_path / "cache")
+    names = sorted(name for name in dataset.bodies.names if not name.startswith("zoo"))
+    assert len(names) == 6 < len(dataset)
+    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    assert sorted(row["name"] for row in gallery.rows("name")) == names
+    n_versions = len(gallery.versions())
+    assert sync(gallery, dataset, root, n_workers=1) == (0, 0, [])
+    assert len(gallery.versions()) == n_versions
+    gallery.remove("class = 'egg'")
+    gallery.add(dataset, n_workers=1)
+    assert sorted(row["name"] for row in gallery.rows("name")) == names
+
+
+def test_update_takes_finite_numbers_alone(dataset: SignatureDataset, tmp_path: Path) -> None:
+    """A condition would keep what is no number as if it were more than all numbers."""
+    gallery, _ = Gallery.build(tmp_path / "g.igps", dataset, small_interior(), n_workers=1)
+    for wrong in ("nan", "inf", float("nan"), "1e999"):
+        with pytest.raises(ValueError, match=r"values: expected numbers in columns of numbers, got .* for volume"):
+            gallery.update("true", {"volume": wrong})
+    with pytest.raises(ValueError, match="values: expected at least one column, got none"):
+        gallery.update("true", {})
+    assert gallery.update("true", {"volume": None, "area": "1e3"}) == 6
+    assert [*gallery.rows("area", "volume")] == [{"area": 1000.0, "volume": None}] * 6
+
+
+def test_a_gallery_is_no_file(dataset: SignatureDataset, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match=r"notes.txt: expected a gallery or a new folder, got a file"):
+        Gallery.build(tmp_path / "notes.txt", dataset, small_interior(), n_workers=1)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_sync_keeps_the_bodies_of_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+    """Until it can, when those that it no longer holds go, and the others are described from what it has become."""
+    nibabel = pytest.importorskip("nibabel")
+    labels = np.zeros((24, 16, 16), np.uint8)
+    labels[2:8, 3:12, 3:12], labels[11:22, 5:9, 5:9], labels[11:22, 11:15, 5:9] = 1, 2, 3
+    (tmp_path / "scans").mkdir()
+    scan = tmp_path / "scans" / "scan.nii.gz"
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), scan)
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "scans" / "other.nii.gz")
+
+    def now() -> SignatureDataset:
+        return SignatureDataset(tmp_path / "scans", CONFIG, tmp_path / "cache", reading=LoadOptions(bodies="labels"))
+
+    gallery, _ = Gallery.build(tmp_path / "g.igps", now(), small_interior(), n_workers=1)
+    scan.write_bytes(b"being copied")
+    n_new, n_gone, (failure,) = sync(gallery, now(), tmp_path / "scans", n_workers=1)
+    assert (n_new, n_gone, failure.id, len(gallery)) == (0, 0, "scan.nii.gz", 6)
+    labels[labels == 3] = 0
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), scan)
+    assert sync(gallery, now(), tmp_path / "scans", n_workers=1) == (2, 1, [])
+    assert sorted(row["part"] for row in gallery.rows("part")) == ["1", "1", "2", "2", "3"]
+
+
+def test_numbers_stay_as_they_are_written_in_a_column_of_text(root: Path, tmp_path: Path) -> None:
+    for label, ages in (("ball", ("old", "young", "")), ("egg", ("03", "4", ""))):
+        lines = [f"{i}.off,{label},{age}" for i, age in enumerate(ages)]
+        (root / label / "labels.csv").write_text("\n".join(["file,label,age", *lines]))
+    balls, eggs = (SignatureDataset(root / one, CONFIG, tmp_path / "cache") for one in ("ball", "egg"))
+    gallery, _ = Gallery.build(tmp_path / "g.igps", balls, small_interior(), n_workers=1)
+    gallery.add(eggs, n_workers=1)
+    assert {row["age"] for row in gallery.rows("age")} == {"old", "young", "03", "4", None}
+    n_versions = len(gallery.versions())
+    assert sync(gallery, eggs, root / "egg", n_workers=1) == (0, 0, [])
+    assert len(gallery.versions()) == n_versions

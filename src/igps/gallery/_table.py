@@ -80,9 +80,14 @@ class BodyTable:
     ) -> Iterator[Any]:
         """Arrow tables of the rows, some at a time; of all that `decoded` needs if no columns are named."""
         with self._told(where):
-            asked = self.table.search() if where is None else self.table.search().where(where)
+            asked = self.table.search() if where is None else self._whole(where).where(where)
             asked = asked.with_row_id("_rowid" in columns).select([*(columns or (*self.columns, "vector"))])
             yield from (pa.Table.from_batches([one]) for one in asked.to_batches(at_once) if one.num_rows)
+
+    def _whole(self, where: str) -> Any:
+        """A search, once the condition is read to its end: LanceDB passes over what follows it."""
+        self.table.search().where(f"CAST({where}\nAS BOOLEAN)").explain_plan()
+        return self.table.search()
 
     def decoded(self, rows: Any) -> tuple[Tensor, list[dict[str, Any]]]:
         """Descriptions, and what is known of each, of an Arrow table of rows."""
@@ -165,6 +170,8 @@ class BodyTable:
             self.table.checkout_latest()
             self._read_head()
             with contextlib.nullcontext() if where is None else self._told(where):
+                if where is not None:
+                    self._whole(where)
                 yield self.table
             self.table.checkout_latest()
             _index(self.table)
@@ -189,6 +196,8 @@ def write(
     Of what its users want to know of it, for JSON, the distance that finds candidates (None: all will be compared), and
     at least one row; the first few thousand should be like the others. Further columns are those beside `KNOWN`.
     """
+    if path.is_file():
+        raise ValueError(f"{path}: expected a gallery or a new folder, got a file. Name another.")
     there = {one.name for one in path.iterdir()} if path.is_dir() else set()
     if strange := {one for one in there if not one.startswith((_BODIES, _MAP, "lock"))}:
         raise ValueError(f"{path}: expected a gallery or a new folder, got one with {min(strange)}. Name another.")

@@ -67,7 +67,7 @@ def in_words(sentence: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, RuntimeError, OSError, KeyError, TypeError, IndexError) as error:
-        words = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        words = str(error).splitlines()[0].partition(", /root/.cargo")[0][:200] if str(error) else type(error).__name__
         raise ValueError(f"{sentence} ({words}).") from error
 
 

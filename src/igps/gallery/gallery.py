@@ -17,8 +17,8 @@ from igps.data.dataset import Failure, SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import fingerprint
 from igps.descriptors.registry import is_file
-from igps.gallery.about import KNOWN, Batch, about_of, check_alike, in_words, open_table, tables
-from igps.gallery.rows import described_rows, further_columns
+from igps.gallery.about import KNOWN, Batch, about_of, check_alike, open_table, tables
+from igps.gallery.rows import described_rows, further_columns, is_number
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
@@ -175,10 +175,11 @@ class Gallery:
         chosen, failures = descriptor_of(descriptor), list[Failure]()
         # In any order, as short vectors are fitted to the first
         mixed = dataset.subset(np.random.default_rng(0).permutation(len(dataset)).tolist())
-        batches = described_rows(mixed, chosen, {}, failures, n_workers, strict, progress)
+        kinds = further_columns(dataset.bodies)
+        batches = described_rows(mixed, chosen, kinds, {}, failures, n_workers, strict, progress)
         about = about_of(dataset.config, dataset.reading, descriptor)
         try:
-            tables().write(Path(path), about, chosen.searched_by, batches, further_columns(dataset.bodies))
+            tables().write(Path(path), about, chosen.searched_by, batches, kinds)
         except ValueError as error:
             if len(failures) < len(dataset):
                 raise
@@ -199,8 +200,8 @@ class Gallery:
         wanted = about_of(dataset.config, dataset.reading, self.descriptor)
         check_alike(self.path, self.about, {name: wanted[name] for name in ("signature", "reading")})
         known = {one["id"]: one["checksum"] for one in self.rows("id", "checksum")}
-        failures, further = list[Failure](), further_columns(dataset.bodies)
-        for some in described_rows(dataset, self.descriptor, known, failures, n_workers, strict, progress):
+        failures, further = list[Failure](), further_columns(dataset.bodies, self.columns)
+        for some in described_rows(dataset, self.descriptor, further, known, failures, n_workers, strict, progress):
             self.table.add(*some, further)
         return failures
 
@@ -251,12 +252,15 @@ class Gallery:
         """Set columns of the bodies that satisfy a condition, such as {"class": "femur"}; of how many."""
         ours = ("id", "checksum", "bytes", "modified", "thumbnail")
         kinds = {name: kind for name, kind in self.columns.items() if name not in ours}
+        if not values:
+            raise ValueError("values: expected at least one column, got none.")
         if wrong := values.keys() - kinds.keys():
             raise ValueError(f"{min(wrong)}: expected one of the columns {', '.join(kinds)}.")
         if empty := [name for name in ("name", "file") if values.get(name, name) is None]:
             raise ValueError(f"{empty[0]}: expected a value, got none; every body has one, by which it is told.")
-        with in_words("values: expected numbers in columns of numbers"):
-            typed = {name: None if value is None else kinds[name](value) for name, value in values.items()}
+        if bad := [name for name, value in values.items() if kinds[name] is float and not is_number(value)]:
+            raise ValueError(f"values: expected numbers in columns of numbers, got {values[bad[0]]!r} for {bad[0]}.")
+        typed = {name: None if value is None else kinds[name](value) for name, value in values.items()}
         with self.table.changing(where) as table:
             return int(table.update(where=where, values=typed).rows_updated)
 

@@ -31,11 +31,12 @@ _YOUNG = 2 * 10**9
 
 
 def described_rows(
-    dataset: SignatureDataset, descriptor: Descriptor, known: Mapping[str, str], failures: list[Failure],
-    n_workers: int | None, strict: bool, progress: bool,
+    dataset: SignatureDataset, descriptor: Descriptor, kinds: Mapping[str, type], known: Mapping[str, str],
+    failures: list[Failure], n_workers: int | None, strict: bool, progress: bool,
 ) -> Iterator[Batch]:  # fmt: skip
     """Descriptions and rows of the bodies that are not known by their checksums; failures are added to the list."""
-    bodies, kinds = dataset.bodies, further_columns(dataset.bodies)
+    dataset = once(dataset)
+    bodies = dataset.bodies
     with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
         for start in range(0, len(dataset), _AT_ONCE):
             numbers = range(start, min(start + _AT_ONCE, len(dataset)))
@@ -54,25 +55,31 @@ def described_rows(
             bar.update(len(numbers))
 
 
-def further_columns(bodies: Bodies) -> dict[str, type]:
-    """Further columns of the table of labels, and of which type: numbers where all values are.
+def further_columns(bodies: Bodies, there: Mapping[str, type] = KNOWN) -> dict[str, type]:
+    """Further columns of the table of labels, and of which type: numbers where all values are, unless text is there.
 
     Raises:
-        ValueError: one has the name of a column that every gallery has, or a name with a dot.
+        ValueError: one has the name of a column that every gallery or LanceDB has, or a name with a dot.
     """
+    if hidden := [name for name in bodies.columns if name.startswith("_")]:  # one called _rowid makes it unreadable
+        raise ValueError(
+            f"{LABELS_FILE}: a gallery takes no column that begins with an underscore, got {hidden[0]!r}. Rename it."
+        )
     if dotted := [name for name in bodies.columns if "." in name]:
         raise ValueError(
             f"{LABELS_FILE}: a gallery takes no dot in the name of a column, got {dotted[0]!r}. Rename it."
         )
     if taken := bodies.columns.keys() & {*KNOWN, "vector", "code"}:
         raise ValueError(f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name.")
-    return {name: float if all(map(_is_number, values)) else str for name, values in bodies.columns.items()}
+    texts = {
+        name for name, values in bodies.columns.items() if there.get(name) is str or not all(map(is_number, values))
+    }
+    return {name: str if name in texts else float for name in bodies.columns}
 
 
 def told_of(bodies: Bodies, kinds: Mapping[str, type], reading: LoadOptions) -> list[dict[str, Any]]:
     """What is known of bodies without reading their files, which are read by the options."""
-    folders = {folder: os.path.realpath(folder) for folder in {os.path.dirname(path) for path in bodies.paths}}
-    files = [os.path.join(folders[os.path.dirname(path)], os.path.basename(path)) for path in bodies.paths]
+    files = _files(bodies)
     labels = bodies.labels or [None] * len(bodies)
     stamps = {file: _stamp(Path(file), reading) for file in set(files)}
     told: list[dict[str, Any]] = []
@@ -83,6 +90,19 @@ def told_of(bodies: Bodies, kinds: Mapping[str, type], reading: LoadOptions) -> 
         for row, value in zip(told, values, strict=True):
             row[column] = None if value is None else kinds[column](value)
     return told
+
+
+def once(dataset: SignatureDataset) -> SignatureDataset:
+    """Without what a link to a folder shows again: of the names of a body the first in order stays."""
+    bodies = dataset.bodies
+    files = list(zip(_files(bodies), bodies.parts, strict=True))
+    kept = {files[i]: i for i in sorted(range(len(bodies)), key=bodies.names.__getitem__, reverse=True)}
+    return dataset if len(kept) == len(bodies) else dataset.subset(sorted(kept.values()))
+
+
+def _files(bodies: Bodies) -> list[str]:
+    folders = {folder: os.path.realpath(folder) for folder in {os.path.dirname(path) for path in bodies.paths}}
+    return [os.path.join(folders[os.path.dirname(path)], os.path.basename(path)) for path in bodies.paths]
 
 
 def _stamp(file: Path, reading: LoadOptions) -> dict[str, int]:
@@ -137,7 +157,8 @@ def _described(
     return torch.zeros(0)
 
 
-def _is_number(value: str | None) -> bool:
+def is_number(value: str | float | None) -> bool:
+    """Whether it is a finite number, or none."""
     try:
         return value is None or math.isfinite(float(value))
     except ValueError:

@@ -7,7 +7,7 @@ from typing import Any
 
 from igps.data.dataset import Failure, SignatureDataset
 from igps.gallery.gallery import Gallery
-from igps.gallery.rows import further_columns, key_of, told_of
+from igps.gallery.rows import further_columns, key_of, once, told_of
 
 # Rows that are removed, or told anew, at once.
 _AT_ONCE = 1000
@@ -35,7 +35,8 @@ def sync(
         How many bodies were described, how many removed, and those that failed, of which the old row stays; as does
         that of a file in a folder that may not be read.
     """
-    kinds = further_columns(dataset.bodies)
+    dataset = once(dataset)
+    kinds = further_columns(dataset.bodies, gallery.columns)
     now = told_of(dataset.bodies, kinds, dataset.reading)
     asked = [name for name in ("checksum", *now[0]) if name in gallery.columns]
     known = {one["id"]: one for one in gallery.rows(*asked)}
@@ -60,7 +61,9 @@ def sync(
         failures += gallery.add(chosen.usable(failures), n_workers=n_workers, strict=strict, progress=progress)
     here = f"{Path(root).resolve()}{os.sep}"
     gone = [name for name in known.keys() - {row["id"] for row in now} if name.startswith(here)]
-    gone = [name for name in gone if not _is_out_of_reach(known[name]["file"])]
+    lost = {failure.id for failure in failures}
+    unread = {row["file"] for row in now if row["part"] is None and row["name"] in lost}  # whose parts are not known
+    gone = [name for name in gone if known[name]["file"] not in unread and not _is_out_of_reach(known[name]["file"])]
     for where in _where_id(gone):
         gallery.remove(where)
     return len(new) - len(failures), len(gone), failures
