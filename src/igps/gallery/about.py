@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +15,9 @@ from igps.descriptors.fingerprint import fingerprint, name_of
 from igps.mesh.options import LoadOptions
 from igps.nn.descriptor import Descriptor
 from igps.signature.signature import SignatureConfig
+
+# Where in the engine's sources a fault was found
+_SOURCE = re.compile(r", /\S+\.rs:.*")
 
 KNOWN: dict[str, type] = {"id": str, "name": str, "class": str, "file": str, "part": str, "checksum": str,
                           "bytes": int, "modified": int, "area": float, "volume": float, "unit": str,
@@ -67,7 +71,7 @@ def in_words(sentence: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, RuntimeError, OSError, KeyError, TypeError, IndexError) as error:
-        words = str(error).splitlines()[0].partition(", /root/.cargo")[0][:200] if str(error) else type(error).__name__
+        words = _SOURCE.sub("", str(error).splitlines()[0])[:200] if str(error) else type(error).__name__
         raise ValueError(f"{sentence} ({words}).") from error
 
 
