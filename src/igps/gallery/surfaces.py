@@ -193,7 +193,7 @@ class Surfaces:
     def _as_numbered(self, i: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """The vertices about their mean, over √area, as they are in the file; and the faces, turned or not."""
         mesh = self._last_mesh(i)
-        if "subdivided" in repair_steps(mesh.notes):
+        if "subdivided" in repair_steps(mesh.notes):  # by more or less, as the configuration asks for eigenpairs
             body = self._dataset.bodies[i]
             mesh = load_mesh(body.path, self._dataset.pipeline.reading, part=body.part)
         return (mesh.vertices - mesh.vertices.mean(axis=0)) / math.sqrt(mesh.area), np.sort(mesh.faces, axis=1)

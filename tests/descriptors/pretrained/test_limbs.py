@@ -208,3 +208,15 @@ def test_a_program_is_compiled_around_them(make: Maker) -> None:
     batch, module = two_bodies(), make(embedding=EMBEDDING)
     torch.compiler.reset()
     torch.testing.assert_close(torch.compile(module, backend="aot_eager")(batch), module(batch), rtol=0, atol=1e-6)
+
+
+@BOTH
+def test_another_default_device_changes_nothing_of_weighted_samples(make: Maker) -> None:
+    batch, histogram = two_bodies(), make(embedding=EMBEDDING)
+    weights = torch.rand(batch.surface.mask.shape, generator=torch.Generator().manual_seed(3))
+    surface = replace(batch.surface, attributes={**batch.surface.attributes, "weight": weights})
+    batch = replace(batch, surface=surface)
+    expected = histogram(batch)
+    with torch.device("meta"):
+        found = histogram(batch)
+    assert torch.equal(found, expected)

@@ -52,7 +52,7 @@ def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = (), m
     points each has, 1 to P, ascending. All are on the CPU; of the points, those of a mask (P,) alone are there. A value
     that is not finite is a ValueError.
     """
-    there = torch.arange(len(values)) if mask is None else mask.nonzero()[:, 0]
+    there = torch.arange(len(values), device="cpu") if mask is None else mask.nonzero()[:, 0]
     if not torch.isfinite(values[there]).all():
         raise ValueError("values: expected finite numbers, got NaN or infinity.")
     order = there[torch.argsort(values[there], descending=True, stable=True)].numpy()

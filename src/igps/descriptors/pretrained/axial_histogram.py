@@ -15,7 +15,7 @@ _POWER = -4
 # Of places, in units of the root mean square distance from the centre
 _REACH = 2.2
 # The two other axes of each
-_OTHERS = torch.tensor([[1, 2], [0, 2], [0, 1]])
+_OTHERS = torch.tensor([[1, 2], [0, 2], [0, 1]], device="cpu")
 
 
 class AxialHistogram(SampleHistogram):

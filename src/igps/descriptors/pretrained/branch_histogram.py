@@ -80,6 +80,6 @@ def _limbs(tree: MergeTree, longest: Tensor, heights: Tensor, neighbours: Tensor
     above = order.argsort()[tree.saddles[kept]].clamp_min(1)
     levels, which = above.unique(return_inverse=True)
     pieces = merge_tree(heights, neighbours, levels.tolist(), mask).pieces[which]
-    limbs = torch.zeros(len(longest), len(heights), dtype=torch.bool)
+    limbs = torch.zeros(len(longest), len(heights), dtype=torch.bool, device="cpu")
     limbs[: len(kept)] = pieces == tree.peaks[kept][:, None]
     return limbs

@@ -137,7 +137,7 @@ def _inverse_distances(x: Tensor, y: Tensor) -> Tensor:
     return torch.where(squares > 0, torch.where(squares > 0, squares, 1).rsqrt(), 0)
 
 
-_NONE = torch.empty(0)
+_NONE = torch.empty(0, device="cpu")
 WAYS = (euclidean_distances(_NONE, _NONE), oriented_pairs(_NONE, _NONE, _NONE, _NONE), pair_twists(_NONE, _NONE, _NONE))
 """The values that this module makes, without their tensors."""
 
