@@ -164,15 +164,9 @@ def _by_executor(
     numbers: dict[Future[Result], int] = {}
     waiting = enumerate(jobs)
 
-    def broken(error: Exception) -> MachineError:
-        return MachineError(f"the executor broke ({error}). Run again: what is done is kept.")
-
     def submit(n_more: int) -> None:
         for number, job in islice(waiting, n_more):
-            try:
-                future = executor.submit(function, job)
-            except RuntimeError as error:  # it takes no work any more
-                raise broken(error) from error
+            future = executor.submit(function, job)
             numbers[future] = number
             future.add_done_callback(done.put)
 
@@ -180,14 +174,14 @@ def _by_executor(
         submit(_MOST_SUBMITTED)
         while numbers:
             future = done.get()
-            number = numbers.pop(future)
-            try:
-                yield number, attempt(future.result, Limits())
-            except CancelledError as error:
-                raise MachineError("the executor gave the work up. Run again: what is done is kept.") from error
-            except BrokenExecutor as error:
-                raise broken(error) from error
+            yield numbers.pop(future), attempt(future.result)
             submit(1)
+    except CancelledError as error:
+        raise MachineError("the executor gave the work up. Run again: what is done is kept.") from error
+    except MachineError:
+        raise
+    except RuntimeError as error:  # it broke, or takes no work any more
+        raise MachineError(f"the executor broke ({error}). Run again: what is done is kept.") from error
     finally:
         for future in numbers:
             future.cancel()

@@ -229,21 +229,6 @@ def voxels_128(data: Path | None) -> Figure:
     return Figure(seconds, "s", reference, "libigl winding number", reference / seconds, note)
 
 
-def winding_25k(data: Path | None) -> Figure:
-    import igl
-
-    mesh = model(data, 25_273)
-    points = interior_samples(mesh)
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
-    return against(
-        "libigl fast_winding_number",
-        lambda: winding_number(mesh.vertices, mesh.faces, points, accuracy=0.01),
-        lambda: igl.fast_winding_number(vertices, faces, points),
-        repeat=7,
-        note=f"to 0.01, at {len(points)} scattered points",
-    )
-
-
 def winding_25k_exact(data: Path | None) -> Figure:
     import igl
 
@@ -651,7 +636,6 @@ FIGURES: dict[str, Callable[[Path | None], Figure | dict[str, Figure]]] = {
     "eigen_11k_lapy": eigen_against_lapy,
     "eigen_11k_robust": eigen_against_robust,
     "coordinates_25k": coordinates_25k,
-    "winding_25k": winding_25k,
     "winding_25k_exact": winding_25k_exact,
     "voxels_128": voxels_128,
     "histogram_pairs": histogram_pairs,

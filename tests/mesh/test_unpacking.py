@@ -99,6 +99,13 @@ def test_a_fault_in_an_archive_names_the_archive(tmp_path: Path) -> None:
         load_mesh(tmp_path / "a.txt.gz")
 
 
+def test_no_body_of_an_archive_takes_vertices_of_another(tmp_path: Path) -> None:
+    beyond = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n"
+    (tmp_path / "a.zip").write_bytes(zip_of({"a.obj": beyond, "b.off": BOX}))
+    with pytest.raises(MeshError, match=r"a\.zip: .*a\.obj refers to vertices that are not there"):
+        read_surface(tmp_path / "a.zip")
+
+
 def gltf(uri: str) -> str:
     """A tetrahedron with its numbers in a file beside."""
     return json.dumps(

@@ -1,8 +1,7 @@
-"""Winding numbers, against closed solids, spherical excess and libigl itself."""
+"""Winding numbers, against closed solids and spherical excess."""
 
 from __future__ import annotations
 
-import igl
 import numpy as np
 import pytest
 
@@ -45,29 +44,13 @@ def test_winding_number_is_the_sum_of_solid_angles(kind: str) -> None:
     flat = np.array([[0, 1, 1], [2, 2, 2]])
     for more in (np.concatenate([faces, flat]), np.concatenate([np.tile(flat, (40, 1)), faces])):
         np.testing.assert_allclose(winding_number(vertices, more, points), expected, atol=1e-7)
-    np.testing.assert_allclose(winding_number(vertices, faces, points, accuracy=0.01), expected, atol=0.01)
     np.testing.assert_allclose(winding_number(1e3 + vertices, faces, 1e3 + points), expected, atol=1e-7)
-
-
-def test_fast_winding_numbers_are_within_their_error() -> None:
-    """Near the surface, where they are worst, and far off; exact ones are libigl's."""
-    generator = np.random.default_rng(2)
-    closed = bumpy_sphere(5)
-    for vertices, faces in (closed, (closed[0], closed[1][generator.random(len(closed[1])) < 0.5])):
-        on_surface = vertices[faces[generator.integers(len(faces), size=500)]].mean(axis=1)
-        points = np.concatenate([on_surface + generator.normal(scale=0.003, size=(500, 3)), 3 * on_surface])
-        error = np.abs(
-            winding_number(vertices, faces, points, accuracy=0.01) - igl.winding_number(vertices, faces, points)
-        )
-        assert 1e-6 < error.max() < 0.01
 
 
 def test_winding_number_of_flat_faces_alone_is_refused() -> None:
     flat = np.array([[0, 1, 1], [2, 2, 2]])
     with pytest.raises(ValueError, match="expected at least one face with an area"):
         winding_number(cube()[0], flat, np.zeros((1, 3)))
-    with pytest.raises(ValueError, match="accuracy: expected None"):
-        winding_number(*cube(), np.zeros((1, 3)), accuracy=0.0)
 
 
 def test_no_points_have_no_winding_numbers() -> None:

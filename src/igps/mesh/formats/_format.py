@@ -84,6 +84,9 @@ def joined(bodies: Sequence[RawBody]) -> RawBody:
     kept = meshes or [body for body in bodies if len(body.vertices)]
     if not kept:
         return RawBody(fault=next((body.fault for body in bodies if body.fault), None))
+    for body in meshes:
+        if body.faces.min() < 0 or body.faces.max() >= len(body.vertices):  # it would take those of another body
+            raise ValueError(f"{body.part} refers to vertices that are not there")
     units = {body.unit for body in kept}
     normals = [body.normals for body in kept if body.normals is not None]
     return RawBody(

@@ -127,7 +127,7 @@ def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) ->
         raise MeshError(f"{path}: no such file. Check the path.")
     with faults(path, FORMAT):
         raw = read_raw(path)
-    return _labelled(raw, path, options)
+    return _labelled(raw, str(path), options, path)
 
 
 def volume_in_memory(
@@ -142,10 +142,7 @@ def volume_in_memory(
             got = f"{array.dtype} of shape {array.shape}, spacing {spacing}"
             raise MeshError(f"{name}: expected labels of shape (X, Y, Z) and three sides of a voxel, got {got}.")
         raw = RawVolume([array], np.diag([*(spacing or (1, 1, 1)), 1.0]), unit="mm" if spacing else None)
-    notes: list[str] = []
-    layers = tuple(_whole_numbers(values, name, options.threshold, notes) for values in raw.layers)
-    names = raw.names if options.names is None else read_label_names(options.names)
-    return LabelVolume(layers, raw.affine, name, names, unit=raw.unit, notes=tuple(notes))
+    return _labelled(raw, name, options)
 
 
 def label_surface(volume: LabelVolume, part: int | str, *, how: Mending = "auto", cavities: Cavities = "fill") -> Mesh:
@@ -173,9 +170,10 @@ def _canonical(mask: Booleans, affine: Floats) -> tuple[Booleans, Floats]:
     return np.ascontiguousarray(mask), affine
 
 
-def _labelled(raw: RawVolume, path: Path, options: LoadOptions) -> LabelVolume:
+def _labelled(raw: RawVolume, name: str, options: LoadOptions, path: Path | None = None) -> LabelVolume:
+    """The labels, with their names by a table, or by the file or what lies beside it, if it is one."""
     notes: list[str] = []
-    layers = tuple(_whole_numbers(values, path, options.threshold, notes) for values in raw.layers)
+    layers = tuple(_whole_numbers(values, name, options.threshold, notes) for values in raw.layers)
     segments, names = None, raw.names
     if raw.segments:
         # A value may stand for one segment in each layer
@@ -186,20 +184,20 @@ def _labelled(raw: RawVolume, path: Path, options: LoadOptions) -> LabelVolume:
         names = cleaned({label: name for label, (name, _, _) in zip(labels, raw.segments, strict=True)})
     if options.names is not None:
         names = read_label_names(options.names)
-    elif not names:
+    elif not names and path is not None:
         names = read_label_names(table) if (table := table_beside(path)) else {}
         label = int(layers[0].max(initial=0))
         is_mask = label in (1, 255) and bool(((layers[0] == 0) | (layers[0] == label)).all())
         if not names and not raw.segments and is_mask:  # is called by its file
             names = {label: path.name[: -len(suffix_of(path))]}
-    return LabelVolume(layers, raw.affine, str(path), names, segments, raw.unit, tuple(dict.fromkeys(notes)))
+    return LabelVolume(layers, raw.affine, name, names, segments, raw.unit, tuple(dict.fromkeys(notes)))
 
 
-def _whole_numbers(values: NDArray[Any], path: str | Path, threshold: float, notes: list[str]) -> NDArray[Any]:
+def _whole_numbers(values: NDArray[Any], name: str, threshold: float, notes: list[str]) -> NDArray[Any]:
     """Labels from 0, of the smallest type; probabilities are cut at the threshold."""
     if values.dtype.kind == "f":
         if n_bad := int(np.count_nonzero(~np.isfinite(values))):
-            raise MeshError(f"{path}: {n_bad} voxels are NaN or infinite; labels expected. Set them to 0.")
+            raise MeshError(f"{name}: {n_bad} voxels are NaN or infinite; labels expected. Set them to 0.")
         odd = values[np.abs(values - np.round(values)) > _ROUNDING]
         # SPM keeps them as bytes times a rounded 1/255, and resampled ones overshoot
         if len(odd) and values.min() >= -_ROUNDING and values.max() <= 1 + _ROUNDING:
@@ -207,18 +205,18 @@ def _whole_numbers(values: NDArray[Any], path: str | Path, threshold: float, not
             return (values >= threshold).astype(np.uint8)
         if len(odd):
             raise MeshError(
-                f"{path}: {len(odd)} voxels have fractional labels, such as {odd[0]:g}. Resample labels to the nearest "
+                f"{name}: {len(odd)} voxels have fractional labels, such as {odd[0]:g}. Resample labels to the nearest "
                 "neighbour, or give probabilities between 0 and 1."
             )
         values = np.round(values)
     low, high = (int(values.min()), int(values.max())) if values.size else (0, 0)
     if low < 0:
         raise MeshError(
-            f"{path}: {int(np.count_nonzero(values < 0))} voxels have negative labels, such as {low}; 0 for the "
+            f"{name}: {int(np.count_nonzero(values < 0))} voxels have negative labels, such as {low}; 0 for the "
             "background and positive numbers expected. Is it an image? Export its labels."
         )
     if high >= 2**31:
-        raise MeshError(f"{path}: label {high} is too large; below 2³¹ expected. Number the labels anew.")
+        raise MeshError(f"{name}: label {high} is too large; below 2³¹ expected. Number the labels anew.")
     return np.asarray(values, dtype=np.min_scalar_type(high))
 
 
