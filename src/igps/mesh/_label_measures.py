@@ -27,7 +27,6 @@ class LabelVoxels:
     affine: Floats  # (4, 4) from indices of the volume to the world
 
     def measures(self) -> VoxelMeasures:
-        """Their number, pieces and thickness."""
         n_pieces = ndimage.label(self.mask, np.ones((3, 3, 3)))[1]
         return VoxelMeasures(int(np.count_nonzero(self.mask)), int(n_pieces), thinnest_part(self.mask))
 

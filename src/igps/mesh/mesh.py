@@ -192,7 +192,7 @@ class Mesh:
 def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
     """Raise a MeshError unless the arrays have the shapes of a mesh, indices in range and finite coordinates."""
     v, f = np.asarray(vertices), np.asarray(faces)
-    _check_shape(v, name)
+    check_places(v, name)
     if f.size == 0:
         raise MeshError(f"{name}: no faces. A surface is needed; a point cloud must be meshed first.")
     if f.ndim != 2 or f.shape[1] != 3 or not np.issubdtype(f.dtype, np.integer):
@@ -203,23 +203,18 @@ def check_arrays(vertices: ArrayLike, faces: ArrayLike, name: str) -> None:
             f"{name}: {bad} faces refer to vertices out of range (0 to {len(v) - 1} exist, {f.min()} to {f.max()} are "
             "used). The file is damaged; export it again."
         )
-    check_places(v, name)
 
 
 def check_places(vertices: NDArray[Any], name: str) -> None:
     """Raise a MeshError unless these are finite coordinates (V, 3)."""
-    _check_shape(vertices, name)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise MeshError(f"{name}: vertices: expected shape (V, 3), got {vertices.shape}.")
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         raise MeshError(
             f"{name}: {int((~finite).sum())} vertices have NaN or infinite coordinates, the first is vertex "
             f"{int(np.argmin(finite))}. Remove them or export the file again."
         )
-
-
-def _check_shape(vertices: NDArray[Any], name: str) -> None:
-    if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise MeshError(f"{name}: vertices: expected shape (V, 3), got {vertices.shape}.")
 
 
 def check_size(vertices: Floats, name: str) -> None:

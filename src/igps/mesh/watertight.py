@@ -18,11 +18,12 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from igps._arrays import Floats, Integers
+from igps._parameters import check_at_least
 from igps.mesh._isosurface import level_surface, simplified
 from igps.mesh._level_set import Grid, cell_sizes, distances, joined, level_set, rounded
 from igps.mesh._outside import OrientedSurface, outside_of
 from igps.mesh.mesh import Mesh, MeshError, check_places
-from igps.mesh.surface import diagonal, face_areas, largest, longest_side
+from igps.mesh.surface import diagonal, face_areas, largest, longest_side, unit
 
 # Groups of triangles of less than this share of the area are specks, if they are apart in a grid of so many cells.
 _SPECK_AREA, _SPECK_CELLS = 2e-3, 64
@@ -58,8 +59,7 @@ def watertight(
     Raises:
         MeshError: there is no surface (fewer than ten points, no triangle with an area).
     """
-    if resolution < 8:
-        raise ValueError(f"resolution: expected at least 8, got {resolution}.")
+    check_at_least(8, resolution=resolution)
     vertices = np.asarray(vertices, dtype=np.float64)
     check_places(vertices, name)
     notes: list[str] = []
@@ -177,10 +177,8 @@ def splats(points: Floats, normals: Floats | None, resolution: int, name: str) -
         raise MeshError(f"{name}: normals: expected finite numbers of shape {points.shape}. Leave them out.")
     # Two directions of the plane: the axis least along the normal gives the first.
     axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    u = np.cross(normals, axis)
-    u /= np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-12)
-    v = np.cross(normals, u)
-    v /= np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-12)
+    u = unit(np.cross(normals, axis))
+    v = unit(np.cross(normals, u))
     angle = np.arange(6)[:, None] * np.pi / 3
     rim = points[:, None] + radius[:, None, None] * (np.cos(angle) * u[:, None] + np.sin(angle) * v[:, None])
     fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])

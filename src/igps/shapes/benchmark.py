@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from igps._parameters import check_at_least
 from igps.shapes.meshing import Faces, defect, mesh, roughen
 from igps.shapes.skeleton import Skeleton, pose
 from igps.shapes.solids import Array
@@ -26,8 +27,6 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class GeneratedShape:
-    """One generated shape."""
-
     vertices: Array  # (V,3) float64, in units of about half the height of a figure
     faces: Faces  # (F,3) int64, outward
     label: str  # name of the class
@@ -60,14 +59,9 @@ class ArticulatedShapes:
     most_classes: int | None = len(TEMPLATES)
 
     def __init__(self, n_classes: int = 8, n_per_class: int = 10, seed: int = 0, n_vertices: int = 3000) -> None:
-        for name, value, least in (
-            ("n_classes", n_classes, 1),
-            ("n_per_class", n_per_class, 1),
-            ("seed", seed, 0),
-            ("n_vertices", n_vertices, 500),
-        ):
-            if operator.index(value) < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}")
+        check_at_least(1, n_classes=operator.index(n_classes), n_per_class=operator.index(n_per_class))
+        check_at_least(0, seed=operator.index(seed))
+        check_at_least(500, n_vertices=operator.index(n_vertices))
         if self.most_classes is not None and n_classes > self.most_classes:
             raise ValueError(f"n_classes must be at most {self.most_classes}, got {n_classes}")
         self.n_classes, self.n_per_class, self.seed, self.n_vertices = n_classes, n_per_class, seed, n_vertices

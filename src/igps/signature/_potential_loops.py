@@ -140,7 +140,6 @@ def near_potential(face: Floats, x: float, y: float, z: float) -> float:
 
 @compiled(error_model="numpy")
 def dot(p: tuple[float, float, float], q: tuple[float, float, float]) -> float:
-    """Inner product."""
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, get_args
 
-from igps._parameters import check_at_least, check_share
+from igps._parameters import check_at_least, check_one_of, check_share
 from igps.signature.attributes import AttributeName, check_attributes
 from igps.signature.laplacian import Backend
 
@@ -68,8 +68,7 @@ class SignatureConfig:
         counts = {"resolution": self.resolution, "n_surface_samples": self.n_surface_samples}
         check_at_least(1, n_eigenpairs=self.n_eigenpairs, **counts)
         check_at_least(0, min_samples=self.min_samples, least_vertices=self.least_vertices)
-        if self.backend not in ("cotangent", "robust"):
-            raise ValueError(f"backend: expected 'cotangent' or 'robust', got {self.backend!r}.")
+        check_one_of(get_args(Backend), backend=self.backend)
         if self.max_vertices is not None and self.max_vertices <= self.n_kept + 1:
             raise ValueError(
                 f"max_vertices: expected more than n_eigenpairs + 1 = {self.n_kept + 1}, got {self.max_vertices}."

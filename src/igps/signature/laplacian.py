@@ -1,11 +1,12 @@
 """The Laplace–Beltrami operator of a triangle mesh: positive semi-definite stiffness and lumped mass."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from scipy import sparse
 
 from igps._arrays import Floats, Integers
+from igps._parameters import check_one_of
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import longest_side
 
@@ -33,19 +34,18 @@ def laplacian(mesh: Mesh, backend: Backend = "cotangent") -> tuple[sparse.csr_ma
     Raises:
         ImportError: backend "robust" without `robust-laplacian` installed.
     """
+    check_one_of(get_args(Backend), backend=backend)
     if backend == "cotangent":
         return _cotangent(mesh)
-    if backend == "robust":
-        try:
-            import robust_laplacian
-        except ImportError as error:
-            raise ImportError('backend="robust" needs robust-laplacian: pip install "interior-gps[robust]".') from error
-        # In unit scale, because the library's mollification is an absolute length.
-        scale = longest_side(mesh.vertices)
-        centred = (mesh.vertices - mesh.vertices.mean(axis=0)) / scale
-        stiffness, mass = robust_laplacian.mesh_laplacian(centred, np.asarray(mesh.faces))
-        return stiffness.tocsr(), mass.diagonal() * scale**2
-    raise ValueError(f"backend: expected 'cotangent' or 'robust', got {backend!r}.")
+    try:
+        import robust_laplacian
+    except ImportError as error:
+        raise ImportError('backend="robust" needs robust-laplacian: pip install "interior-gps[robust]".') from error
+    # In unit scale, because the library's mollification is an absolute length.
+    scale = longest_side(mesh.vertices)
+    centred = (mesh.vertices - mesh.vertices.mean(axis=0)) / scale
+    stiffness, mass = robust_laplacian.mesh_laplacian(centred, np.asarray(mesh.faces))
+    return stiffness.tocsr(), mass.diagonal() * scale**2
 
 
 def _cotangent(mesh: Mesh) -> tuple[sparse.csr_matrix, Floats]:

@@ -14,12 +14,14 @@ import logging
 import math
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.distance import cdist
 
 from igps._arrays import Floats, Integers
+from igps._parameters import check_share
 from igps._threads import Team
 from igps.mesh.winding import checked_places
 from igps.signature._far_field import Clusters, Surface
@@ -71,16 +73,10 @@ def extend(
     faces: NDArray[np.integer],
     functions: NDArray[np.floating],
     points: NDArray[np.floating],
-    *,
-    divisors: NDArray[np.floating] | None = None,
-    accuracy: float | None = None,
-    dtype: DTypeLike | None = None,
+    **options: Any,
 ) -> Floats:
-    """Extend surface functions (V, K) to points (P, 3) by mean value interpolation (Ju, Schaefer, Warren 2005): (P, K).
-
-    See `Extension` for the arguments and the errors.
-    """
-    return Extension(vertices, faces, functions, divisors=divisors, accuracy=accuracy, dtype=dtype)(points)
+    """(P, K) of surface functions (V, K) at points (P, 3): see `Extension`, whose options and errors it has."""
+    return Extension(vertices, faces, functions, **options)(points)
 
 
 class Extension:
@@ -113,8 +109,7 @@ class Extension:
         accuracy: float | None = None,
         dtype: DTypeLike | None = None,
     ) -> None:
-        if accuracy is not None and not 0 < accuracy < 1:
-            raise ValueError(f"accuracy: expected None (exact) or a relative error in (0, 1), got {accuracy}")
+        check_share(accuracy=accuracy)
         if dtype is None:
             dtype = np.float32 if accuracy is not None and accuracy >= _FLOAT32_ACCURACY else np.float64
         if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):

@@ -34,7 +34,6 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
 
 
 def read_compressed(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """What a single compressed file holds."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / path.stem
         with _OPENERS[path.suffix.lower()](path) as stream:

@@ -19,7 +19,6 @@ _SURFACES = ("pial", "white", "inflated", "orig", "smoothwm", "sphere", "sphere.
 
 
 def read_gifti(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The surface of a GIFTI file."""
     root = _xml.parse(path.read_bytes())
     arrays = {
         intent: _array(element, path, options)
@@ -60,7 +59,6 @@ def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.gen
 
 
 def read_freesurfer(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The surface of a FreeSurfer file."""
     content = path.read_bytes()
     at = content.find(b"\n\n") + 2  # behind a line that tells who made it
     if not content.startswith(_MAGIC) or at < 2:

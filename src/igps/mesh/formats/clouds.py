@@ -9,7 +9,6 @@ from igps.mesh.options import LoadOptions
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The points of an XYZ file."""
     rows = np.loadtxt(path, ndmin=2, comments=("#", "//"), encoding="latin-1")  # which has a letter for any byte
     if rows.shape[1] not in (3, 6):
         raise ValueError(f"expected lines of 3 numbers, or of 6 with normals, got {rows.shape[1]}")

@@ -56,7 +56,6 @@ def _dx(path: Path) -> tuple[NDArray[Any], Floats]:
 
 
 def _map(path: Path) -> tuple[NDArray[Any], Floats]:
-    """Of an MRC or CCP4 file."""
     try:
         import mrcfile
     except ImportError as error:

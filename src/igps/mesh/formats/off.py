@@ -15,7 +15,6 @@ _WHOLE_NUMBERS = re.compile(r"\s*\d[\d\s]*", re.ASCII)
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The surface of an OFF file."""
     found = _plain(path) or _polygons(path)
     return objects(path, options) if found is None else [RawBody(*found)]
 

@@ -23,7 +23,6 @@ Property = tuple[str, str, str]  # its name; its kind; of a list also the kind o
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The surface, or the cloud of points, of a PLY file."""
     head, end, body = path.read_bytes().partition(b"end_header")
     try:
         polygons = _polygons(head.decode("latin-1"), body.partition(b"\n")[2])

@@ -25,7 +25,6 @@ _CONVERT = (
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The objects of a scene."""
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             check_unpacked(sum(one.file_size for one in archive.infolist()), path, options.max_unpacked)

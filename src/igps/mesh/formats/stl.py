@@ -15,7 +15,6 @@ _VERTEX = re.compile(rb"vertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The surface of an STL file."""
     content = path.read_bytes()
     announced = int.from_bytes(content[80:_HEADER], "little")
     exact = len(content) == _HEADER + _TRIANGLE.itemsize * announced

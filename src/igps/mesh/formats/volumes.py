@@ -4,7 +4,7 @@ The world is RAS, x to the patient's right, y to the front and z up, in millimet
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -32,6 +32,9 @@ _MOST_LABELS, _FEW_LABELS, _ALIKE = 20_000, 50, 0.3
 _ROUNDING = 0.01
 
 
+Box = tuple[slice, slice, slice]
+
+
 @dataclass(frozen=True)
 class LabelBody:
     """A body of a volume: its label and name, its number of voxels, and where in the arrays it lies."""
@@ -41,7 +44,7 @@ class LabelBody:
     n_voxels: int
     layer: int
     value: int
-    box: tuple[slice, slice, slice]
+    box: Box
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,14 +86,11 @@ class LabelVolume:
         """A body for each label that any voxel has, in ascending order; those of one name with their numbers behind."""
         names, found = self.names or {}, []
         for layer, labels in enumerate(self.layers):
-            values, counts, compact = _counted(labels, self.name)
-            boxes = ndimage.find_objects(compact)
             known = {value: label for label, at, value in self.segments or () if at == layer}
-            for index, (value, count) in enumerate(zip(values.tolist(), counts.tolist(), strict=True), start=1):
+            for value, count, box in _counted(labels, self.name):
                 label = known.get(value, value if len(self.layers) == 1 else None)
                 if label is not None:
-                    at = boxes[(value if compact is labels else index) - 1]
-                    found.append(LabelBody(label, names.get(label, str(label)), count, layer, value, at))
+                    found.append(LabelBody(label, names.get(label, str(label)), count, layer, value, box))
         given = Counter(body.name for body in found)
         told = (replace(one, name=f"{one.name} ({one.label})") if given[one.name] > 1 else one for one in found)
         return tuple(sorted(told, key=lambda body: body.label))
@@ -220,8 +220,8 @@ def _whole_numbers(values: NDArray[Any], name: str, threshold: float, notes: lis
     return np.asarray(values, dtype=np.min_scalar_type(high))
 
 
-def _counted(labels: ArrayLike, name: str) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """The values that occur, without 0; how often; and labels below 2¹⁶: the given ones, or else from 1 in order."""
+def _counted(labels: ArrayLike, name: str) -> Iterable[tuple[int, int, Box]]:
+    """The values that occur, without 0, ascending; how often; and the smallest box that holds each."""
     array = np.asarray(labels)
     if array.ndim != 3 or array.dtype.kind not in "biu":
         raise MeshError(f"{name}: expected whole numbers of shape (X, Y, Z), got {array.dtype} of shape {array.shape}.")
@@ -233,17 +233,18 @@ def _counted(labels: ArrayLike, name: str) -> tuple[NDArray[Any], NDArray[Any], 
         for plane in array:
             counts += np.bincount(plane.ravel(), minlength=len(counts))
         counts[0] = 0
-        values = np.nonzero(counts)[0]
-        compact, counts = array, counts[values]
+        values, numbered = np.nonzero(counts)[0], array
+        counts = counts[values]
     else:
         values, index, counts = np.unique(array, return_inverse=True, return_counts=True)
         start = int(values[0] == 0)
-        compact = index.reshape(array.shape) + (1 - start)
+        numbered = index.reshape(array.shape) + (1 - start)
         values, counts = values[start:], counts[start:]
     if len(values) > _MOST_LABELS or (len(values) > _FEW_LABELS and _is_speckled(array, values[counts.argmax()])):
         many = f"{name}: {len(values)} different values, which look like an image and not like labels."
         raise MeshError(f"{many} Export the labels.")
-    return values, counts, compact
+    boxes = [box for box in ndimage.find_objects(numbered) if box is not None]
+    return zip(values.tolist(), counts.tolist(), boxes, strict=True)
 
 
 def _is_speckled(labels: NDArray[Any], most: int) -> bool:

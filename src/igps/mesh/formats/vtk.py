@@ -134,7 +134,6 @@ class _Legacy:
 
 
 def read_legacy(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    """The surface of a legacy file of polygons or cells."""
     return [_body(*_Legacy(path.read_bytes()).geometry()[:2])]
 
 
