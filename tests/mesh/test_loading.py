@@ -186,6 +186,12 @@ def test_texture_seams_do_not_split_vertices(tmp_path: Path) -> None:
     lines += [f"f {a + 1}/{i % 4 + 1} {b + 1}/2 {c + 1}/3" for i, (a, b, c) in enumerate(FACES)]
     (tmp_path / "seams.obj").write_text("\n".join(lines) + "\n")
     np.testing.assert_allclose(load_mesh(tmp_path / "seams.obj").vertices, TETRAHEDRON)
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(TETRAHEDRON)}\nproperty float x\nproperty float y\nproperty float z\n"
+    head += f"element face {len(FACES)}\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\n"
+    rows = [f"{x} {y} {z}" for x, y, z in TETRAHEDRON]
+    rows += [f"3 {a} {b} {c} 6 0.{i} 0 1 0.{i} 0.{i} 1" for i, (a, b, c) in enumerate(FACES)]
+    (tmp_path / "seams.ply").write_text(head + "end_header\n" + "\n".join(rows) + "\n")
+    np.testing.assert_allclose(load_mesh(tmp_path / "seams.ply", LoadOptions(mend="never")).vertices, TETRAHEDRON)
 
 
 @pytest.mark.parametrize("away", [0.0, 1e-9])

@@ -174,6 +174,8 @@ def _n_vertices(mask: Booleans, sides: Floats) -> float:
 
 def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Floats, Integers]:
     """Shares of larger voxels, and how many of the given ones each takes along each axis."""
+    from skimage.measure import block_reduce
+
     share, factor = mask.astype(np.float32), np.ones(3, dtype=np.int64)
     n_pieces = ndimage.label(mask, _TOUCHING)[1]
     while _n_vertices(mask, spacing * factor) > _SPARE * max_vertices:
@@ -181,12 +183,7 @@ def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Floa
         halved = sides < 1.5 * sides.min()
         if not _is_thick(mask, halved):
             break
-        coarse = share
-        for axis in np.nonzero(halved)[0]:
-            if coarse.shape[axis] % 2:
-                coarse = np.concatenate([coarse, np.zeros_like(coarse.take([0], axis))], axis=axis)
-            even, odd = (coarse[(slice(None),) * axis + (slice(start, None, 2),)] for start in (0, 1))
-            coarse = (even + odd) / np.float32(2)
+        coarse = block_reduce(share, tuple(np.where(halved, 2, 1)), np.mean)  # of single precision, which is exact
         # Small pieces that hung on a thread go, as they would have without it.
         label, island, size = _islands(coarse >= 0.5)
         if np.count_nonzero(size) - len(island) != n_pieces:

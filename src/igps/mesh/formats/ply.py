@@ -30,8 +30,9 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
         polygons = None
     if polygons is not None:
         return [RawBody(*polygons)]
-    # trimesh takes the header for UTF-8
-    return objects(path, options, head.decode("latin-1").encode("ascii", "replace") + end + body)
+    # trimesh takes the header for UTF-8, and would split vertices at the seams of textures
+    content = head.decode("latin-1").encode("ascii", "replace") + end + body
+    return objects(path, options, content, fix_texture=False)
 
 
 def _polygons(head: str, body: bytes) -> Surface | None:
