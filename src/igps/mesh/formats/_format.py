@@ -126,6 +126,15 @@ def distinct(names: Iterable[str]) -> list[str]:
     return found
 
 
+def text_of(path: Path) -> str:
+    """The text of a file, in UTF-8, or else in Latin-1, which has a letter for any byte; no carriage returns."""
+    content = path.read_bytes().replace(b"\r", b"\n")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
 def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
     """The corners of polygons laid end to end, and how many each has, of rows that begin with these numbers."""
     starts, at = [], 0

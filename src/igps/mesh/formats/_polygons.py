@@ -29,9 +29,12 @@ def triangles(corners: Integers, n_corners: Integers) -> Integers:
 def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> Integers:
     """The same, but for polygons that would fold over themselves: of those ears are cut off (Meisters 1975), last.
 
-    Of polygons that cross themselves no ear may be left, and the rest is cut from its first corner.
+    Of polygons that cross themselves no ear may be left, and the rest is cut from its first corner. What has fewer than
+    three corners has no area, and is left out.
     """
-    if not len(corners) or corners.min() < 0 or corners.max() >= len(vertices):
+    kept = n_corners >= 3
+    corners, n_corners = corners[np.repeat(kept, n_corners)], n_corners[kept]
+    if n_corners.max(initial=0) < 4 or corners.min() < 0 or corners.max() >= len(vertices):
         return triangles(corners, n_corners)
     starts = np.cumsum(n_corners) - n_corners
     owner = np.repeat(np.arange(len(n_corners)), n_corners)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from igps._arrays import Booleans, Integers
-from igps.mesh.formats._format import Format, RawBody, distinct
+from igps.mesh.formats._format import Format, RawBody, distinct, text_of
 from igps.mesh.formats._polygons import flat_triangles
 from igps.mesh.options import LoadOptions
 
@@ -15,16 +15,11 @@ _BEYOND_PLACE = re.compile(r"/\S*")
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The surface of an OBJ file; or its objects, if it has none its groups."""
-    content = path.read_bytes()
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = content.decode("latin-1")  # which has a letter for any byte
     places: list[str] = []
     polygons: list[str] = []
     before: list[int] = []  # vertices above each polygon, from which negative indices count
     starts: dict[str, list[tuple[int, str]]] = {"o": [], "g": []}  # polygons above each, and its name
-    for line in text.replace("\r", "\n").replace("\\\n\n", " ").replace("\\\n", " ").split("\n"):
+    for line in text_of(path).replace("\\\n\n", " ").replace("\\\n", " ").split("\n"):
         word, _, rest = line.lstrip().replace("\t", " ").partition(" ")
         if word == "v":
             places.append(rest)

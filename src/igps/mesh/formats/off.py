@@ -1,69 +1,55 @@
-"""OFF: coordinates and polygons as text."""
+"""OFF: coordinates and polygons as text; what stands behind them in a line, as colours do, is passed over."""
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from igps._arrays import Surface
-from igps.mesh.formats._format import Format, RawBody
+from igps._arrays import Integers
+from igps.mesh.formats._format import Format, RawBody, text_of
 from igps.mesh.formats._polygons import flat_triangles
-from igps.mesh.formats._trimesh import objects
 from igps.mesh.options import LoadOptions
 
-_WHOLE_NUMBERS = re.compile(r"\s*\d[\d\s]*", re.ASCII)
+_WHOLE_NUMBERS = re.compile(r"[\d\s]+", re.ASCII)
 
 
 def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
-    found = _plain(path) or _polygons(path)
-    return objects(path, options) if found is None else [RawBody(*found)]
+    text = text_of(path)
+    if "#" in text:
+        text = "\n".join(line.partition("#")[0] for line in text.split("\n"))
+    lines = [line for line in text.partition("OFF")[2].splitlines() if line and not line.isspace()]
+    if not lines:
+        raise ValueError("no OFF with the numbers of vertices and faces behind it")
+    n_vertices, n_faces, *_ = map(int, lines[0].split())
+    places, rows = lines[1 : n_vertices + 1], lines[n_vertices + 1 :][:n_faces]
+    if min(n_vertices, n_faces) < 0 or len(rows) < n_faces or len(places) < n_vertices:
+        raise ValueError(f"{n_vertices} vertices and {n_faces} faces announced, {len(lines) - 1} lines there")
+    if not places:
+        return [RawBody()]
+    vertices = np.array([line.split()[:3] for line in places], dtype=np.float64).reshape(n_vertices, 3)
+    corners, n_corners = _corners(rows)
+    if corners.min(initial=0) < 0 or corners.max(initial=0) >= n_vertices:
+        raise ValueError("a face refers to a vertex that is not there")
+    return [RawBody(vertices, flat_triangles(corners, n_corners, vertices))]
 
 
-def _plain(path: Path) -> Surface | None:
-    """What trimesh reads of a file of coordinates and triangles alone, in a tenth of the time.
-
-    None where it holds anything else, or is broken.
-    """
-    try:
-        head, counts, *lines = path.read_text(encoding="utf-8").splitlines()
-        n_vertices, n_faces, _ = map(int, counts.split())
-        places, rows = lines[: max(n_vertices, 0)], lines[max(n_vertices, 0) :]
-        # Of no lines NumPy warns, and an older one makes whole numbers of broken ones
-        plain = head.strip() == "OFF" and "".join(places[:1]).strip() and _WHOLE_NUMBERS.fullmatch("\n".join(rows))
-        if not plain:
-            return None
-        vertices = np.loadtxt(places, np.float64, comments=None, ndmin=2)
-        faces = np.loadtxt(rows, np.int64, comments=None, ndmin=2)
-    except ValueError:  # comments, colours, polygons of several sizes, or no text
-        return None
-    if vertices.shape != (n_vertices, 3) or faces.shape != (n_faces, 4) or (faces[:, 0] != 3).any():
-        return None
-    return (vertices, np.ascontiguousarray(faces[:, 1:])) if faces[:, 1:].max() < n_vertices else None
-
-
-def _polygons(path: Path) -> Surface | None:
-    """The surface of polygons, behind which colours may stand; None of triangles alone, and of what is broken.
-
-    Trimesh folds concave ones, and cannot read those of more than four corners.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-        lines = [kept for line in text.splitlines() if (kept := line.partition("#")[0].strip())]
-        n_vertices, n_faces = map(int, lines[1].split()[:2])
-        rows = [line.split() for line in lines[2 + n_vertices : 2 + n_vertices + n_faces]]
-        n_corners = np.array([int(row[0]) for row in rows], dtype=np.int64)
-        if lines[0] != "OFF" or len(rows) < n_faces or min(n_vertices, n_faces) < 1 or not (n_corners > 3).any():
-            return None
-        corners = np.array(
-            [int(word) for n, row in zip(n_corners.tolist(), rows, strict=True) for word in row[1 : n + 1]],
-            dtype=np.int64,
-        )
-        vertices = np.loadtxt(lines[2 : 2 + n_vertices], np.float64, comments=None, usecols=(0, 1, 2), ndmin=2)
-    except (ValueError, IndexError):
-        return None
-    if len(corners) != n_corners.sum() or (n_corners < 3).any():
-        return None
-    return vertices, flat_triangles(corners, n_corners, vertices)
+def _corners(lines: list[str]) -> tuple[Integers, Integers]:
+    """The corners of polygons laid end to end, and how many each has."""
+    # An older NumPy makes whole numbers of broken ones
+    if _WHOLE_NUMBERS.fullmatch("\n".join(lines)):
+        with suppress(ValueError):  # of lines that are alike, many times faster
+            rows = np.loadtxt(lines, np.int64, comments=None, ndmin=2)
+            n_corners = rows[:, 0]
+            if (n_corners == n_corners[0]).all() and n_corners[0] < rows.shape[1]:
+                return rows[:, 1 : n_corners[0] + 1].ravel(), n_corners
+    words = [line.split() for line in lines]
+    n_corners = np.array([int(row[0]) for row in words], dtype=np.int64)
+    polygons = [row[1 : n + 1] for n, row in zip(n_corners.tolist(), words, strict=True)]
+    corners = np.array([int(corner) for polygon in polygons for corner in polygon], dtype=np.int64)
+    if len(corners) != n_corners.sum():
+        raise ValueError("a line with fewer corners than it announces")
+    return corners, n_corners
 
 
 FORMAT = Format("OFF", (".off",), read)

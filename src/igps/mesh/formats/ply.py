@@ -64,8 +64,7 @@ def _polygons(head: str, body: bytes) -> Surface | None:
     vertices, polygons = found
     n_corners = np.array([len(one) for one in polygons], dtype=np.int64)
     corners = np.array([corner for one in polygons for corner in one], dtype=np.int64)
-    kept = n_corners >= 3
-    return vertices, flat_triangles(corners[np.repeat(kept, n_corners)], n_corners[kept], vertices)
+    return vertices, flat_triangles(corners, n_corners, vertices)
 
 
 def _of_text(text: bytes, names: list[str], n_vertices: int, n_faces: int, at: int) -> Polygons | None:
