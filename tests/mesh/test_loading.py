@@ -128,7 +128,7 @@ def test_a_polygon_that_crosses_itself_or_has_many_corners_is_cut_all_the_same(n
 
 
 def by_trimesh(text: str, path: Path) -> trimesh.Trimesh:
-    """The surface of an OFF file; trimesh knows no comments but in the first line, and reads files that are cut short."""
+    """The surface of an OFF file; it knows no comments but in the first line, and reads files that are cut short."""
     text = "\n".join(line.partition("#")[0] for line in text.split("\n"))
     (n_vertices, n_faces, *_), *rows = [row.split() for row in text.partition("OFF")[2].splitlines() if row.strip()]
     faces = rows[int(n_vertices) :][: int(n_faces)]
@@ -198,7 +198,8 @@ def test_texture_seams_do_not_split_vertices(tmp_path: Path) -> None:
     lines += [f"f {a + 1}/{i % 4 + 1} {b + 1}/2 {c + 1}/3" for i, (a, b, c) in enumerate(FACES)]
     (tmp_path / "seams.obj").write_text("\n".join(lines) + "\n")
     np.testing.assert_allclose(load_mesh(tmp_path / "seams.obj").vertices, TETRAHEDRON)
-    head = f"ply\nformat ascii 1.0\nelement vertex {len(TETRAHEDRON)}\nproperty float x\nproperty float y\nproperty float z\n"
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(TETRAHEDRON)}\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
     head += f"element face {len(FACES)}\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\n"
     rows = [f"{x} {y} {z}" for x, y, z in TETRAHEDRON]
     rows += [f"3 {a} {b} {c} 6 0.{i} 0 1 0.{i} 0.{i} 1" for i, (a, b, c) in enumerate(FACES)]

@@ -32,8 +32,8 @@ def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> 
     Of polygons that cross themselves no ear may be left, and the rest is cut from its first corner. What has fewer than
     three corners has no area, and is left out.
     """
-    kept = n_corners >= 3
-    corners, n_corners = corners[np.repeat(kept, n_corners)], n_corners[kept]
+    has_area = n_corners >= 3
+    corners, n_corners = corners[np.repeat(has_area, n_corners)], n_corners[has_area]
     if n_corners.max(initial=0) < 4 or corners.min() < 0 or corners.max() >= len(vertices):
         return triangles(corners, n_corners)
     starts = np.cumsum(n_corners) - n_corners

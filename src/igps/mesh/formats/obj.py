@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from igps._arrays import Booleans, Integers
+from igps._arrays import Integers
 from igps.mesh.formats._format import Format, RawBody, distinct, text_of
 from igps.mesh.formats._polygons import flat_triangles
 from igps.mesh.options import LoadOptions
@@ -34,11 +34,10 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     vertices = np.loadtxt(places, np.float64, comments="#", usecols=(0, 1, 2), ndmin=2)
     if not polygons:
         return [RawBody(vertices)]
-    corners, n_corners, kept = _corners(polygons, np.array(before, dtype=np.int64))
+    corners, n_corners = _corners(polygons, np.array(before, dtype=np.int64))
     names, owner = _owners(starts, len(polygons)) if options.bodies == "objects" else ([], np.zeros(0))
     if len(names) < 2:
         return [RawBody(vertices, flat_triangles(corners, n_corners, vertices))]
-    owner = owner[kept]
     bodies = []
     for number, name in enumerate(names):
         mine = owner == number
@@ -50,8 +49,8 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     return bodies
 
 
-def _corners(polygons: list[str], before: Integers) -> tuple[Integers, Integers, Booleans]:
-    """The corners of polygons laid end to end, counted from zero; how many each has; and which of all are polygons."""
+def _corners(polygons: list[str], before: Integers) -> tuple[Integers, Integers]:
+    """The corners of polygons laid end to end, counted from zero; and how many each has."""
     text = "\n".join(polygons)
     if "#" in text:
         text = "\n".join(line.partition("#")[0] for line in polygons)
@@ -60,9 +59,7 @@ def _corners(polygons: list[str], before: Integers) -> tuple[Integers, Integers,
     corners = np.array([int(word) for row in rows for word in row], dtype=np.int64)
     if (corners == 0).any():
         raise ValueError("a face refers to vertex 0; vertices are counted from 1")
-    corners = np.where(corners > 0, corners - 1, corners + np.repeat(before, n_corners))
-    kept = n_corners >= 3  # lines and points have no area
-    return corners[np.repeat(kept, n_corners)], n_corners[kept], kept
+    return np.where(corners > 0, corners - 1, corners + np.repeat(before, n_corners)), n_corners
 
 
 def _owners(starts: dict[str, list[tuple[int, str]]], n_polygons: int) -> tuple[list[str], Integers]:
