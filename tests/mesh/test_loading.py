@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from conftest import FACES, TETRAHEDRON
+from igps.mesh.formats import vertex_values
 from igps.mesh.loading import load_mesh, read_surface
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
@@ -199,12 +200,13 @@ def test_texture_seams_do_not_split_vertices(tmp_path: Path) -> None:
     (tmp_path / "seams.obj").write_text("\n".join(lines) + "\n")
     np.testing.assert_allclose(load_mesh(tmp_path / "seams.obj").vertices, TETRAHEDRON)
     head = f"ply\nformat ascii 1.0\nelement vertex {len(TETRAHEDRON)}\n"
-    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += "".join(f"property float {name}\n" for name in ("x", "y", "z", "height"))
     head += f"element face {len(FACES)}\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\n"
-    rows = [f"{x} {y} {z}" for x, y, z in TETRAHEDRON]
+    rows = [f"{x} {y} {z} {z}" for x, y, z in TETRAHEDRON]
     rows += [f"3 {a} {b} {c} 6 0.{i} 0 1 0.{i} 0.{i} 1" for i, (a, b, c) in enumerate(FACES)]
     (tmp_path / "seams.ply").write_text(head + "end_header\n" + "\n".join(rows) + "\n")
     np.testing.assert_allclose(load_mesh(tmp_path / "seams.ply", LoadOptions(mend="never")).vertices, TETRAHEDRON)
+    np.testing.assert_allclose(vertex_values.read(tmp_path / "seams.ply")["height"], np.array(TETRAHEDRON)[:, 2])
 
 
 @pytest.mark.parametrize("away", [0.0, 1e-9])

@@ -10,8 +10,8 @@ from urllib.parse import unquote
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
-from igps._arrays import Floats
 from igps.mesh.formats._format import RawBody, check_unpacked, distinct
 from igps.mesh.options import LoadOptions
 
@@ -63,7 +63,9 @@ def objects(path: Path, options: LoadOptions, content: bytes | None = None, **lo
         if not np.array_equal(matrix, np.eye(4)):
             vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
         if isinstance(geometry, trimesh.PointCloud):
-            bodies.append(RawBody(vertices, part=part, normals=_normals(scene, geometry, len(vertices))))
+            columns = ply_columns(scene)
+            normals = [columns[name].astype(np.float64) for name in ("nx", "ny", "nz") if name in columns]
+            bodies.append(RawBody(vertices, part=part, normals=np.hstack(normals) if len(normals) == 3 else None))
             continue
         faces = np.asarray(geometry.faces, dtype=np.int64)
         turned = faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces
@@ -73,14 +75,8 @@ def objects(path: Path, options: LoadOptions, content: bytes | None = None, **lo
     return bodies
 
 
-def _normals(scene: Any, cloud: Any, n_points: int) -> Floats | None:
-    """The normals (n_points, 3) of a PLY file, which trimesh keeps in its metadata."""
-    for raw in (scene.metadata.get("_ply_raw", {}), cloud.metadata.get("_ply_raw", {})):
-        rows = raw.get("vertex", {}).get("data")
-        try:
-            normals = np.column_stack([np.asarray(rows[name], dtype=np.float64) for name in ("nx", "ny", "nz")])
-        except (KeyError, ValueError, IndexError, TypeError):
-            continue
-        if normals.shape == (n_points, 3):
-            return normals
-    return None
+def ply_columns(scene: trimesh.Scene) -> dict[str, NDArray[Any]]:
+    """(V, C) of every property of the vertices of a PLY file, which trimesh keeps in its metadata."""
+    raws = (thing.metadata.get("_ply_raw", {}) for thing in (scene, *scene.geometry.values()))
+    rows: dict[str, Any] = next((one["vertex"] for one in raws if "data" in one.get("vertex", {})), {"properties": ()})
+    return {name: np.asarray(rows["data"][name]).reshape(rows["length"], -1) for name in rows["properties"]}

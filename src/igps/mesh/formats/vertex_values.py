@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from igps._arrays import Floats, Integers
 from igps.mesh.formats import brains, vtk
+from igps.mesh.formats._trimesh import ply_columns
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
@@ -58,16 +58,10 @@ def chosen(arrays: Arrays, name: str, path: Path) -> Floats:
 
 def _ply(path: Path) -> dict[str, NDArray[np.generic]]:
     """Every property of the vertices, but for places, normals and colours."""
-    scene = trimesh.load_scene(BytesIO(path.read_bytes()), file_type="ply", process=False)
-    (geometry,) = scene.geometry.values()
-    raws = [one.metadata.get("_ply_raw") for one in (scene, geometry)]
-    raw: dict[str, dict[str, Any]] = next((one for one in raws if one), {})
-    rows = raw.get("vertex", {})
+    scene = trimesh.load_scene(BytesIO(path.read_bytes()), file_type="ply", process=False, fix_texture=False)
+    columns = ply_columns(scene).items()
     usual = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha"}
-    values: Any = rows.get("data")
-    names = [name for name in rows.get("properties", ()) if name not in usual]
-    columns = {name: np.asarray(values[name]).reshape(len(geometry.vertices), -1) for name in names}
-    return {name: column[:, 0] if column.shape[1] == 1 else column for name, column in columns.items()}
+    return {name: values[:, 0] if values.shape[1] == 1 else values for name, values in columns if name not in usual}
 
 
 def _freesurfer(path: Path) -> NDArray[np.generic]:
