@@ -67,10 +67,10 @@ def load_mesh(
     return surface_body(raw, BodyRef(Path(path), raw.part), options, least_vertices=least_vertices)
 
 
-def load_bodies(path: str | Path, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> list[Mesh]:
+def load_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[Mesh]:
     """All usable bodies of a file; the others are logged. A MeshError if none is usable."""
     found, faults = [], []
-    for _, body in each_body(path, options, least_vertices=least_vertices):
+    for _, body in each_body(path, options):
         if isinstance(body, MeshError):
             logger.warning("%s", body)
             faults.append(body)

@@ -47,7 +47,7 @@ def screened_potential(molecule: Molecule, points: Floats) -> Floats:
     return potential
 
 
-def residue_means(molecule: Molecule, points: Floats, values: Floats, width: float = WIDTH) -> Floats:
+def residue_means(molecule: Molecule, points: Floats, values: Floats) -> Floats:
     """(P, D) means of the residues' values (R, D) at points (P, 3), Å, by a Gaussian of the distance.
 
     A value that is not known, NaN, does not count; the mean is NaN where none is known near a point.
@@ -58,7 +58,7 @@ def residue_means(molecule: Molecule, points: Floats, values: Floats, width: flo
     for block in _blocks(len(points), len(values)):
         squares = cdist(points[block], molecule.residue_positions, "sqeuclidean")
         # Relative to the nearest, so that far outside it counts alone, rather than nothing.
-        weights = np.exp((squares.min(axis=1, keepdims=True) - squares) / (2 * width**2))
+        weights = np.exp((squares.min(axis=1, keepdims=True) - squares) / (2 * WIDTH**2))
         total = weights @ known.astype(float)
         means[block] = np.where(total > 0, weights @ filled / np.where(total > 0, total, 1), np.nan)
     return means
@@ -87,9 +87,8 @@ def _by_name(table: Mapping[str, float], default: float = np.nan) -> Callable[[M
     """Values (R, 1) of the residues by their names; those of amino acids that the table does not name are `default`."""
 
     def column(molecule: Molecule) -> Floats:
-        return np.array(
-            [[table.get(name, default if name in VOLUMES else np.nan)] for name in molecule.residue_names], dtype=float
-        ).reshape(-1, 1)
+        values = [table.get(name, default if name in VOLUMES else np.nan) for name in molecule.residue_names]
+        return np.array(values, dtype=float)[:, None]
 
     return column
 

@@ -167,7 +167,6 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
     """
     config = (config or SignatureConfig()).resolved()
     mesh = Mesh.of(mesh).numbered_by_faces()  # to rounding, results depend on the numbers
-    unit = mesh.unit
     if config.max_vertices is not None:
         mesh = simplify(mesh, config.max_vertices)
     outer, is_outer = mesh.outer()
@@ -205,7 +204,7 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
         name=mesh.name,
         notes=(*mesh.notes, *notes),
         residual=residual,
-        unit=unit,
+        unit=mesh.unit,
     )
 
 
