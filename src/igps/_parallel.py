@@ -8,6 +8,7 @@ cluster, may do the work instead.
 import errno
 import queue
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -190,42 +191,44 @@ def _by_executor(
 def _by_workers(
     function: Callable[[Job], Result], jobs: Sequence[Job], n_workers: int, limits: Limits
 ) -> Generator[tuple[int, Result | Failed], None, None]:
-    waiting = list(range(len(jobs)))[::-1]
-    deaths = [0] * len(jobs)
-    workers: list[Worker[Job, Result]] = [Worker(limits.seconds, limits.memory) for _ in range(n_workers)]
+    seconds = float("inf") if limits.seconds is None else limits.seconds
+    waiting = deque(range(len(jobs)))
+    deaths: Counter[int] = Counter()
+    workers = [Worker(limits.memory) for _ in range(n_workers)]
+    idle = list(workers)
+    busy: dict[Future[Result], tuple[Worker, int, float]] = {}  # with the number of the job, and when it must be done
     finished = False
     try:
         # All at the same time, as a process takes seconds to import what it needs
         with workers_environment(), ThreadPoolExecutor(n_workers) as starters:
-            list(starters.map(lambda worker: worker.started(), workers))
-        while True:
-            for worker in workers:
-                if worker.future is None and waiting:
-                    number = waiting.pop()
-                    worker.give(number, function, jobs[number])
-            busy = {worker.future: worker for worker in workers if worker.future is not None}
-            if not busy:
-                finished = True
-                return
-            soonest = min(worker.deadline for worker in busy.values())
-            timeout = None if soonest == float("inf") else max(0.0, soonest - time.monotonic())
+            list(starters.map(Worker.started, workers))
+        while waiting or busy:
+            while waiting and idle:
+                worker, number = idle.pop(), waiting.popleft()
+                future = worker.submit(function, jobs[number])
+                busy[future] = worker, number, time.monotonic() + seconds
+            soonest = min(deadline for _, _, deadline in busy.values())
+            timeout = None if limits.seconds is None else max(0.0, soonest - time.monotonic())
             done, _ = wait(busy, timeout=timeout, return_when=FIRST_COMPLETED)
             for future in done:
-                worker = busy[future]
-                worker.future = None
+                worker, number, _ = busy.pop(future)
+                idle.append(worker)
                 try:
-                    yield worker.number, attempt(future.result, limits)
+                    yield number, attempt(future.result, limits)
                 except BrokenExecutor:
                     worker.end()
-                    deaths[worker.number] += 1
-                    if deaths[worker.number] < _MOST_DEATHS:
-                        waiting.insert(0, worker.number)
+                    deaths[number] += 1
+                    if deaths[number] < _MOST_DEATHS:
+                        waiting.append(number)
                     else:
-                        yield worker.number, Failed(_KILLED)
-            for worker in busy.values():
-                if worker.future is not None and time.monotonic() >= worker.deadline:
+                        yield number, Failed(_KILLED)
+            for future, (worker, number, deadline) in list(busy.items()):
+                if time.monotonic() >= deadline:
                     worker.end(kill=True)
-                    yield worker.number, Failed(f"it took longer than the time_limit of {limits.seconds:g} s.")
+                    del busy[future]
+                    idle.append(worker)
+                    yield number, Failed(f"it took longer than the time_limit of {limits.seconds:g} s.")
+        finished = True
     finally:
         for worker in workers:
             worker.end(kill=not finished)

@@ -1,14 +1,13 @@
-"""A worker process, of which it is known which job it has: one that is killed costs no other job its result."""
+"""A worker process, which has one job: if it is killed, that costs no other its result."""
 
 import contextlib
 import multiprocessing
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable, Generator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -28,25 +27,20 @@ class MachineError(RuntimeError):
     """The machine, not a job, is at fault: a full disk, no memory, a library that is missing. What is done is kept."""
 
 
-class Worker(Generic[Job, Result]):
-    """A process, and the job it has, which may take so many seconds of wall time and bytes of data."""
+class Worker:
+    """A process for one job at a time, which may take so many bytes of data."""
 
-    def __init__(self, seconds: float | None, memory: int | None) -> None:
-        self._seconds, self._memory = seconds or float("inf"), memory
+    def __init__(self, memory: int | None) -> None:
+        self._memory = memory
         self._pool: ProcessPoolExecutor | None = None
         self._pid = 0
-        self.number = -1
-        self.future: Future[Result] | None = None
-        self.deadline = float("inf")
 
-    def give(self, number: int, function: Callable[[Job], Result], job: Job) -> None:
+    def submit(self, function: Callable[[Job], Result], job: Job) -> Future[Result]:
         try:
-            self.future = self.started().submit(function, job)
+            return self.started().submit(function, job)
         except BrokenExecutor:  # killed while it waited for a job
             self.end()
-            self.future = self.started().submit(function, job)
-        self.number = number
-        self.deadline = time.monotonic() + self._seconds
+            return self.started().submit(function, job)
 
     def started(self) -> ProcessPoolExecutor:
         """The process, started if there is none."""
@@ -77,7 +71,7 @@ class Worker(Generic[Job, Result]):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self._pid, getattr(signal, "SIGKILL", signal.SIGTERM))
         self._pool.shutdown(wait=True, cancel_futures=True)
-        self._pool, self.future, self.deadline = None, None, float("inf")
+        self._pool = None
 
 
 @contextlib.contextmanager
