@@ -6,13 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
-from igps.cli.reading import signatures, write_notes, write_rows
+from igps.cli.reading import signatures, write_notes
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.sources import Bodies, find_bodies
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
 from igps.report.results import write_sources
+from igps.report.tables import write_rows
 from training.studies.disturbances import DISTURBANCES
 from training.studies.robustness import robustness as measure
 from training.studies.tables import robustness_table

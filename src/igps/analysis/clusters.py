@@ -5,8 +5,10 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import cut_tree, linkage
+from scipy.spatial.distance import squareform
 
-from igps._parameters import check_at_least
+from igps._parameters import check_at_least, check_one_of
 from igps.analysis.map import Values, checked_distances
 
 Joining = Literal["average", "complete", "single"]
@@ -50,8 +52,7 @@ def clusters_of(
     """
     from sklearn.metrics import silhouette_score
 
-    if joining not in get_args(Joining):
-        raise ValueError(f"joining: expected one of {', '.join(get_args(Joining))}, got {joining!r}.")
+    check_one_of(get_args(Joining), joining=joining)
     check_at_least(0, n_resamples=n_resamples)
     found, n = checked_distances(distances), len(distances)
     tree = _tree(found, joining)
@@ -80,15 +81,8 @@ def clusters_of(
 
 
 def _tree(distances: Values, joining: Joining) -> Values:
-    from scipy.cluster.hierarchy import linkage
-    from scipy.spatial.distance import squareform
-
-    found: Values = linkage(squareform(distances, checks=False), joining)
-    return found
+    return linkage(squareform(distances, checks=False), joining)
 
 
 def _cut(tree: Values, n_clusters: int) -> NDArray[np.int64]:
-    from scipy.cluster.hierarchy import cut_tree
-
-    found: NDArray[np.int64] = cut_tree(tree, n_clusters).ravel().astype(np.int64)
-    return found
+    return cut_tree(tree, n_clusters).ravel().astype(np.int64)

@@ -9,7 +9,7 @@ import numpy as np
 
 from igps.analysis.comparison import Result
 from igps.analysis.comparison import compare as compare_descriptors
-from igps.cli.reading import Folder, signatures, sized, with_side, write_notes, write_rows
+from igps.cli.reading import Folder, signatures, sized, with_side, write_notes
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure
@@ -19,7 +19,7 @@ from igps.descriptors.individual import Mirror, Size
 from igps.nn.description import fit_centres
 from igps.report.answers import precision_recall
 from igps.report.results import write_sources
-from igps.report.tables import comparison_table
+from igps.report.tables import comparison_table, write_rows
 from igps.retrieval import precision_recall_curve
 
 

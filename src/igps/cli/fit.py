@@ -7,11 +7,12 @@ from typing import Any
 from igps.analysis.fitting import Goal, HeadName
 from igps.analysis.fitting import classify as classify_bodies
 from igps.analysis.fitting import fit as fit_head
-from igps.cli.reading import Folder, files_or_folder, print_failures, signatures, write_rows
+from igps.cli.reading import Folder, files_or_folder, print_failures, signatures
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors import load
 from igps.nn.descriptor import Descriptor
+from igps.report.tables import write_rows
 
 _TITLES = {
     "nn": "NN",

@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from igps._parallel import MachineError
-from igps.cli.reading import Folder, chosen_dataset, limits_of, print_failures, signatures, write_rows
+from igps.cli.reading import Folder, chosen_dataset, limits_of, print_failures, signatures
 from igps.data.pipeline import version
 from igps.data.requirements import Requirements
 from igps.descriptors import descriptor as descriptor_of
+from igps.report.tables import write_rows
 
 # Seconds until a scheduler that does not answer is taken for missing.
 _ANSWERS_WITHIN = 15

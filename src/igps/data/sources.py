@@ -88,11 +88,7 @@ class Bodies:
         """The values of a column of numbers, such as of "age"; a ValueError of what is no finite number."""
         values = self.column(name)
         for body, value in zip(self.names, values, strict=True):
-            try:
-                is_number = math.isfinite(float(value))
-            except ValueError:
-                is_number = False
-            if not is_number:
+            if not is_number(value):
                 raise ValueError(f"{name}: expected numbers, got {value!r} of {body}. Correct it in {LABELS_FILE}.")
         return [float(value) for value in values]
 
@@ -212,6 +208,14 @@ def file_and_part(path: Path) -> tuple[Path, str | None]:
         if name[at + 1 :] and (file := Path(name[:at])).is_file():
             return file, name[at + 1 :]
     return path, None
+
+
+def is_number(value: str | float | None) -> bool:
+    """Whether it is a finite number, or none."""
+    try:
+        return value is None or math.isfinite(float(value))
+    except ValueError:
+        return False
 
 
 def file_of(name: str, part: str | None) -> str:

@@ -14,11 +14,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from igps.data.dataset import Failure, SignatureDataset
+from igps.data.sources import is_number
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import fingerprint
 from igps.descriptors.registry import is_file
 from igps.gallery.about import KNOWN, Batch, about_of, check_alike, open_table, tables
-from igps.gallery.rows import described_rows, further_columns, is_number
+from igps.gallery.rows import described_rows, further_columns
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
