@@ -21,7 +21,7 @@ from training.studies.tables import robustness_table
 
 def robustness(
     meshes: list[Path],
-    descriptors: list[str] | None = None,
+    descriptors: list[str] = [*NAMES],  # noqa: B006 (only read)
     gallery: Path | None = None,
     poses: Path | None = None,
     out: Path | None = None,
@@ -37,7 +37,7 @@ def robustness(
 
     Args:
         meshes: the mesh files to disturb.
-        descriptors: names, or package.module:NAME of your own; all of the library if not given.
+        descriptors: names, or package.module:NAME of your own.
         gallery: labelled folder that tells the distance between classes; if not given, each of the meshes is a class.
         poses: folder with meshes of one body, for the movement between any two of them.
         out: folder for robustness.json, meshes.json that tells where the meshes lie, notes.csv of what was done to
@@ -46,7 +46,7 @@ def robustness(
         n_workers: processes that compute; all cores if not given.
     """
     check_report(report, out)
-    chosen = [descriptor_of(name) for name in descriptors or NAMES]
+    chosen = [descriptor_of(name) for name in descriptors]
     reading["n_workers"] = n_workers
     dataset, failures = signatures(meshes, chosen, **reading)
     between, of_poses = None, None

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import cut_tree, linkage
 from scipy.spatial.distance import squareform
 
-from igps._parameters import check_at_least, check_one_of
+from igps._parameters import check_at_least
 from igps.analysis.map import Values, checked_distances
 
 Joining = Literal["average", "complete", "single"]
@@ -52,7 +52,8 @@ def clusters_of(
     """
     from sklearn.metrics import silhouette_score
 
-    check_one_of(get_args(Joining), joining=joining)
+    if joining not in get_args(Joining):
+        raise ValueError(f"joining: expected one of {', '.join(get_args(Joining))}, got {joining!r}.")
     check_at_least(0, n_resamples=n_resamples)
     found, n = checked_distances(distances), len(distances)
     tree = _tree(found, joining)

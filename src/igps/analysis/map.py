@@ -10,8 +10,6 @@ from scipy.linalg import eigh
 from scipy.sparse.linalg import eigsh
 from scipy.spatial.distance import pdist, squareform
 
-from igps._parameters import check_one_of
-
 Values = NDArray[np.float64]
 Layout = Literal["mds", "umap"]
 
@@ -56,7 +54,8 @@ def body_map(distances: Values, layout: Layout = "mds", *, seed: int = 0) -> Bod
         ValueError: distances of which no map can be drawn, or another layout.
         ImportError: umap-learn is not installed.
     """
-    check_one_of(get_args(Layout), layout=layout)
+    if layout not in get_args(Layout):
+        raise ValueError(f"layout: expected one of {', '.join(get_args(Layout))}, got {layout!r}.")
     wanted = checked_distances(distances)
     points = _classical(wanted) if layout == "mds" else _umap(wanted, seed)
     if layout == "mds" and (rounds := min(_MOST_ROUNDS, _MOST_ENTRIES // wanted.size)) and wanted.any():

@@ -25,7 +25,7 @@ from igps.retrieval import precision_recall_curve
 
 def compare(
     root: Path,
-    descriptors: list[str] | None = None,
+    descriptors: list[str] = [*NAMES],  # noqa: B006 (only read)
     out: Path | None = None,
     report: bool = False,
     size: Size = "auto",
@@ -41,13 +41,13 @@ def compare(
 
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
-        descriptors: names, or package.module:NAME of your own; all of the library if not given.
+        descriptors: names, or package.module:NAME of your own.
         out: folder for compare.json, distances/NAME.npz, precision_recall.png, meshes.json that tells where the meshes
             lie, and failures.csv if there are any.
         report: make a page of the results in that folder, report.html, see `igps report`
     """
     check_report(report, out)
-    wanted = [with_side(name, mirror) for name in descriptors or NAMES]
+    wanted = [with_side(name, mirror) for name in descriptors]
     chosen = [descriptor_of(name) for name in wanted]
     dataset, failures = signatures(Folder(root, labelled=True), chosen, n_workers=n_workers, strict=strict, **reading)
     chosen = [descriptor_of(sized(name, size, dataset)) for name in wanted]

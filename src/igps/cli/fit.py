@@ -57,7 +57,7 @@ def fit(
     )
     model.save(out, {**model.card, "descriptor": descriptor})
     card = _card(model, out)
-    out.with_suffix(".md").write_text(card)
+    out.with_suffix(".md").write_text(card, encoding="utf-8")
     print(card.partition("\n\n")[2])
     refused = [*unread, *(failures or ())]
     print_failures(refused, len(dataset) - len(failures or ()))

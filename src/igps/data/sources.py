@@ -211,9 +211,9 @@ def file_and_part(path: Path) -> tuple[Path, str | None]:
 
 
 def is_number(value: str | float | None) -> bool:
-    """Whether it is a finite number, or none."""
+    """Whether it is a finite number, or none; words such as 01_02 are none, whatever Python says."""
     try:
-        return value is None or math.isfinite(float(value))
+        return value is None or ("_" not in str(value) and math.isfinite(float(value)))
     except ValueError:
         return False
 
