@@ -101,7 +101,8 @@ def group_test(
     """
     check_at_least(1, n_permutations=n_permutations)
     n = len(vectors)
-    codes_of = [np.unique(np.asarray(one), return_inverse=True)[1] for one in (groups, strata or ["all"] * n)]
+    strata = ["all"] * n if strata is None else strata
+    codes_of = [np.unique(np.asarray(one), return_inverse=True)[1] for one in (groups, strata)]
     known = np.ones((n, 0)) if covariates is None else np.asarray(covariates, dtype=float).reshape(len(covariates), -1)
     for name, found in (("groups", len(groups)), ("strata", len(codes_of[1])), ("covariates", len(known))):
         if found != n:
