@@ -11,7 +11,7 @@ from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 import igps
-from igps.analysis.fitting import classify
+from igps.analysis.fitting import HeadName, classify
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead, KernelHead, WhitenedHead
 from igps.nn.heads.classifier import folds
@@ -106,6 +106,14 @@ def test_a_metric_for_new_classes_is_chosen_by_classes_that_are_held_out(dataset
     assert said[model.card["head"]]["held_out_scores"]["ft"] == pytest.approx(best, abs=0.1)
     with pytest.raises(ValueError, match="model: expected one with a classifier, got interior"):
         classify(dataset, model)
+
+
+@pytest.mark.parametrize("head", ["as_is", "whitened"])
+def test_the_descriptor_that_is_given_stays_as_it_was(dataset: igps.SignatureDataset, head: HeadName) -> None:
+    given = small_interior()
+    model = igps.fit(dataset, given, goal="new", head=head)
+    assert (model.scale, model.card["head"]) == (model.card["scale"], head)
+    assert (given.scale, dict(given.card)) == (None, {})
 
 
 def test_too_little_to_fit_to_is_said(dataset: igps.SignatureDataset) -> None:

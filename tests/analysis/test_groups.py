@@ -61,6 +61,11 @@ def test_the_unit_of_a_covariate_does_not_matter() -> None:
         assert found.permanova_p == usual.permanova_p
 
 
+def test_strata_may_be_an_array() -> None:
+    vectors, strata = np.random.default_rng(4).normal(size=(24, 3)), np.tile(["x", "y"], 12)
+    assert quick(vectors, strata=strata) == quick(vectors, strata=strata.tolist())
+
+
 def test_numbers_that_are_none_are_refused() -> None:
     vectors = np.random.default_rng(0).normal(size=(24, 3))
     with pytest.raises(ValueError, match="n_permutations: expected at least 1, got -3"):

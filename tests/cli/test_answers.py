@@ -86,9 +86,10 @@ def test_a_covariate_may_be_words_but_no_mistyped_number(
 ) -> None:
     rows = table(root / "labels.csv")
     lines = [
-        f"{root / row['file']},{row['label']},{'fmm'[i % 3]},{'5o' if i == 4 else i}" for i, row in enumerate(rows)
+        f"{root / row['file']},{row['label']},{'fmm'[i % 3]},{'5o' if i == 4 else i},{'Paris' if i % 3 else 'Nantes'}"
+        for i, row in enumerate(rows)
     ]
-    (tmp_path / "labels.csv").write_text("\n".join(["file,label,sex,dose", *lines]))
+    (tmp_path / "labels.csv").write_text("\n".join(["file,label,sex,dose,site", *lines]))
     words = ["groups", tmp_path, *OWN, "--n_permutations", "199"]
     igps(monkeypatch, root, *words, "--covariate", "sex", "--json")
     (found,) = json.loads(capsys.readouterr().out)
@@ -99,6 +100,8 @@ def test_a_covariate_may_be_words_but_no_mistyped_number(
     expected = group_test(vectors, [row["label"] for row in rows], covariates=is_f.astype(float), n_permutations=199)
     assert found["permanova_f"] == pytest.approx(expected.permanova_f)
     assert found["permanova_p"] == expected.permanova_p
+    igps(monkeypatch, root, *words, "--covariate", "site", "--json")  # a word that begins as NaN does
+    assert json.loads(capsys.readouterr().out)[0]["permanova_f"] == pytest.approx(expected.permanova_f)
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, root, *words, "--covariate", "dose")
     assert "dose: expected numbers, got '5o'" in capsys.readouterr().err
@@ -131,6 +134,9 @@ def test_outliers_lists_the_short_egg_among_the_long_first(
     assert str(root) not in svg
     assert [float(row["score"]) for row in rows] == sorted((float(row["score"]) for row in rows), reverse=True)
     assert imread(tmp_path / "outliers.png").std() > 0.02
+    igps(monkeypatch, root, "outliers", root, *OWN, "--top", "0", "--out", tmp_path / "none")
+    assert table(tmp_path / "none" / "outliers.csv") == rows
+    assert not (tmp_path / "none" / "outliers.png").exists()
 
 
 @pytest.mark.parametrize("is_group", [False, True])

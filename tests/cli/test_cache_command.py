@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from igps.cli import main
+from igps.data.dataset import SignatureDataset
 from own_descriptors import SMALL, write_egg
 
 INTERIOR = "own_descriptors:small_interior"
@@ -90,3 +91,12 @@ def test_lists_of_files_may_be_one_file_of_signatures_and_what_needs_meshes_says
         with pytest.raises(SystemExit, match="1"):
             call(monkeypatch, *command)
         assert message in capsys.readouterr().err
+
+
+def test_what_joins_a_descriptor_joins_the_one_that_is_computed_for_where_none_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_egg(tmp_path / "eggs" / "0.off", 2.0, subdivisions=2)
+    call(monkeypatch, "precompute", tmp_path / "eggs", "--with", "potential", "--cache_dir", tmp_path, "--n_workers", 1)
+    dataset = SignatureDataset(tmp_path / "eggs", cache_dir=tmp_path, descriptor="pretrained+potential")
+    assert None not in dataset.cached_keys()

@@ -8,6 +8,7 @@ import logging
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from types import MethodType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -468,14 +469,27 @@ def test_a_function_of_body_and_points_is_a_source_that_is_kept(
 def test_a_function_whose_code_does_not_tell_what_it_does_is_refused(tmp_path: Path) -> None:
     write_body(tmp_path / "a.off", 0.8, 0.9)
     factor = 2.0
+    around = SimpleNamespace(factor=2.0)
     without: dict[str, Callable[..., np.ndarray]] = {}
     exec("def written(body, points): return points[:, 0]", without)
     for function, said in (
         (lambda body, points: factor * points[:, 0], "uses variables of what is around it"),
+        (lambda body, points, around=around: around.factor * points[:, 0], "uses variables of what is around it"),
+        (MethodType(lambda around, body, points: around.factor * points[:, 0], around), "uses variables of what is"),
         (without["written"], "the source code of written is not known"),
     ):
         with pytest.raises(ValueError, match=rf"attributes: .*{said}.*cache_tag"):
             SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", attributes={"told": function})
+
+
+def test_what_a_function_is_given_by_default_tells_it_from_others_of_the_same_code(tmp_path: Path) -> None:
+    """Such as functions that are made in a loop."""
+    write_body(tmp_path / "a.off", 0.8, 0.9)
+    for axis in range(3):
+        given = {"along": lambda body, points, axis=axis: points[:, axis]}
+        (item,) = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", attributes=given)
+        samples = item.signature.interior
+        np.testing.assert_allclose(samples.attributes["along"], samples.points[:, axis], atol=1e-5)
 
 
 def test_a_body_of_all_models_has_the_residues_of_all(tmp_path: Path) -> None:

@@ -139,6 +139,14 @@ def test_further_columns_stay_with_their_bodies(root: Path, tmp_path: Path) -> N
     }
 
 
+def test_a_session_is_no_number(root: Path) -> None:
+    """To Python 01_02 is 102."""
+    (root / "labels.csv").write_text("file,session\n1.obj,01_02\n2.obj,03_04\n")
+    bodies = find_bodies(root)
+    with pytest.raises(ValueError, match=r"session: expected numbers, got '01_02' of 1\.obj"):
+        bodies.numbers("session")
+
+
 def test_a_table_of_columns_alone_tells_no_classes(root: Path) -> None:
     (root / "labels.csv").write_text("file,age\n1.obj,30\n2.obj\n")
     bodies = find_bodies(root, OBJECTS)

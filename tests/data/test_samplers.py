@@ -41,3 +41,7 @@ def test_epochs_differ_and_seeds_say_all() -> None:
     assert {frozenset(one) for one in first[0]} != {frozenset(one) for one in first[1]}
     with pytest.raises(ValueError, match="batch_size: expected at least 1"):
         BucketBatchSampler(SIZES, 0)
+
+
+def test_no_shapes_make_no_batch() -> None:
+    assert list(BucketBatchSampler([], 8)) == []

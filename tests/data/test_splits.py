@@ -34,6 +34,11 @@ def test_unseen_split_shares_no_class() -> None:
     assert len(split.train) == 3 * 6
 
 
+def test_a_whole_number_may_be_a_float() -> None:
+    labels = torch.arange(3).repeat_interleave(4)
+    assert split_seen(labels, 3.0, n_validation=1.0) == split_seen(labels, 3, n_validation=1)
+
+
 def test_shares_leave_two_of_each_class_to_validate_and_to_test() -> None:
     labels = torch.arange(3).repeat_interleave(torch.tensor([5, 8, 20]))
     split = split_seen(labels, 0.75, n_validation=0.25)

@@ -214,6 +214,9 @@ def test_what_does_not_fit_is_refused_in_a_sentence(
     monkeypatch.setattr(SignatureConfig, "ALGORITHM_VERSION", SignatureConfig.ALGORITHM_VERSION + 1)
     assert "version" in error_of(monkeypatch, capsys, *query)
     monkeypatch.undo()
+    with pytest.raises(SystemExit, match="2"):
+        command(monkeypatch, "gallery", "update", index, "--where", "volume > 3")
+    assert "required: gallery.update.to" in capsys.readouterr().err
     gone = error_of(monkeypatch, capsys, "gallery", "add", tmp_path / "gone", "--gallery", index)
     assert "gone: no such folder" in gone
     changed = small_interior()

@@ -17,7 +17,7 @@ from training.studies.tables import damage_table
 
 def damage(
     root: Path,
-    descriptors: list[str] | None = None,
+    descriptors: list[str] = ["interior", "rich", "pretrained"],  # noqa: B006 (only read)
     damages: list[str] | None = None,
     mend_by: Mending = "auto",
     every: int = 1,
@@ -33,7 +33,7 @@ def damage(
 
     Args:
         root: labelled folder of clean meshes.
-        descriptors: names, or package.module:NAME of your own; interior, rich and pretrained if not given.
+        descriptors: names, or package.module:NAME of your own.
         damages: which of them; all if not given.
         mend_by: how the damaged meshes are mended.
         every: take every so many of the meshes.
@@ -43,7 +43,7 @@ def damage(
     """
     if every < 1:
         raise ValueError(f"every: expected at least 1, got {every}.")
-    chosen = [descriptor_of(name) for name in descriptors or ("interior", "rich", "pretrained")]
+    chosen = [descriptor_of(name) for name in descriptors]
     files = find_bodies(root, labelled=True)
     files = files.subset(range(0, len(files), every))
     dataset, failures = signatures(files, chosen, n_workers=n_workers, **reading)

@@ -6,13 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
-from igps.cli.reading import signatures, write_notes, write_rows
+from igps.cli.reading import signatures, write_notes
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.sources import Bodies, find_bodies
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
 from igps.report.results import write_sources
+from igps.report.tables import write_rows
 from training.studies.disturbances import DISTURBANCES
 from training.studies.robustness import robustness as measure
 from training.studies.tables import robustness_table
@@ -20,7 +21,7 @@ from training.studies.tables import robustness_table
 
 def robustness(
     meshes: list[Path],
-    descriptors: list[str] | None = None,
+    descriptors: list[str] = [*NAMES],  # noqa: B006 (only read)
     gallery: Path | None = None,
     poses: Path | None = None,
     out: Path | None = None,
@@ -36,7 +37,7 @@ def robustness(
 
     Args:
         meshes: the mesh files to disturb.
-        descriptors: names, or package.module:NAME of your own; all of the library if not given.
+        descriptors: names, or package.module:NAME of your own.
         gallery: labelled folder that tells the distance between classes; if not given, each of the meshes is a class.
         poses: folder with meshes of one body, for the movement between any two of them.
         out: folder for robustness.json, meshes.json that tells where the meshes lie, notes.csv of what was done to
@@ -45,7 +46,7 @@ def robustness(
         n_workers: processes that compute; all cores if not given.
     """
     check_report(report, out)
-    chosen = [descriptor_of(name) for name in descriptors or NAMES]
+    chosen = [descriptor_of(name) for name in descriptors]
     reading["n_workers"] = n_workers
     dataset, failures = signatures(meshes, chosen, **reading)
     between, of_poses = None, None

@@ -5,6 +5,8 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import cut_tree, linkage
+from scipy.spatial.distance import squareform
 
 from igps._parameters import check_at_least
 from igps.analysis.map import Values, checked_distances
@@ -80,15 +82,8 @@ def clusters_of(
 
 
 def _tree(distances: Values, joining: Joining) -> Values:
-    from scipy.cluster.hierarchy import linkage
-    from scipy.spatial.distance import squareform
-
-    found: Values = linkage(squareform(distances, checks=False), joining)
-    return found
+    return linkage(squareform(distances, checks=False), joining)
 
 
 def _cut(tree: Values, n_clusters: int) -> NDArray[np.int64]:
-    from scipy.cluster.hierarchy import cut_tree
-
-    found: NDArray[np.int64] = cut_tree(tree, n_clusters).ravel().astype(np.int64)
-    return found
+    return cut_tree(tree, n_clusters).ravel().astype(np.int64)

@@ -59,5 +59,4 @@ def _averaged(values: Values, points: Values, reach: float) -> Values:
     pairs = tree.sparse_distance_matrix(tree, 2 * reach, output_type="coo_matrix")
     weights = np.exp(-np.square(pairs.data / reach) / 2)
     sums = np.bincount(pairs.row, weights * values[pairs.col], len(points))
-    found: Values = sums / np.bincount(pairs.row, weights, len(points))
-    return found
+    return sums / np.bincount(pairs.row, weights, len(points))

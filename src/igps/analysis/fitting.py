@@ -1,5 +1,6 @@
 """From a labelled collection to a metric or a classifier, and its answers."""
 
+import copy
 import importlib.metadata
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -105,7 +106,7 @@ def fit(
     if isinstance(which, IndividualDescriptor):
         kept, which = {"size": which.keeps_size, "side": which.twists is not None}, which.descriptor
     base, metric = histograms_and_prior(which)
-    metric = metric if prior else None
+    base, metric = copy.deepcopy(base), metric if prior else None  # the given one stays as it is
     histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
     labels, counts = dataset.labels, Counter(dataset.bodies.labels or ())
     least = 2 if goal == "known" else 4

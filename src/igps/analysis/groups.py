@@ -101,7 +101,8 @@ def group_test(
     """
     check_at_least(1, n_permutations=n_permutations)
     n = len(vectors)
-    codes_of = [np.unique(np.asarray(one), return_inverse=True)[1] for one in (groups, strata or ["all"] * n)]
+    strata = ["all"] * n if strata is None else strata
+    codes_of = [np.unique(np.asarray(one), return_inverse=True)[1] for one in (groups, strata)]
     known = np.ones((n, 0)) if covariates is None else np.asarray(covariates, dtype=float).reshape(len(covariates), -1)
     for name, found in (("groups", len(groups)), ("strata", len(codes_of[1])), ("covariates", len(known))):
         if found != n:
@@ -182,17 +183,15 @@ def with_discovery_rates(tests: Sequence[GroupTest]) -> list[GroupTest]:
     """The tests with their q-values, over the bodies that were tested (Benjamini and Hochberg 1995)."""
     from scipy.stats import false_discovery_control
 
-    tested = [one for one in tests if one.refused is None]
+    tested = {i: one for i, one in enumerate(tests) if one.refused is None}
     if not tested:
         return list(tests)
-    of_permanova, of_kernel = (
-        false_discovery_control([getattr(one, name) for one in tested]).tolist() for name in ("permanova_p", "kernel_p")
+    permanova, kernel = (
+        false_discovery_control([getattr(one, name) for one in tested.values()]) for name in ("permanova_p", "kernel_p")
     )
-    rates = iter(zip(of_permanova, of_kernel, strict=True))
-    return [
-        replace(one, **dict(zip(("permanova_q", "kernel_q"), next(rates), strict=True))) if one.refused is None else one
-        for one in tests
-    ]
+    rates = zip(permanova.tolist(), kernel.tolist(), strict=True)
+    found = {i: replace(tests[i], permanova_q=p, kernel_q=q) for i, (p, q) in zip(tested, rates, strict=True)}
+    return [found.get(i, one) for i, one in enumerate(tests)]
 
 
 def _senseless(sizes: Mapping[str, int], group: NDArray[np.int64], stratum: NDArray[np.int64]) -> str | None:
@@ -242,8 +241,7 @@ def _along(matrix: Rows, basis: Rows, orders: NDArray[np.int64]) -> Rows:
     """Traces bᵀ M b of a basis (N, k), its rows in each of several orders (n, N)."""
     count, n = orders.shape
     moved = basis[orders.T].reshape(n, -1)
-    found: Rows = np.einsum("ij,ij->j", matrix @ moved, moved).reshape(count, -1).sum(axis=1)
-    return found
+    return np.einsum("ij,ij->j", matrix @ moved, moved).reshape(count, -1).sum(axis=1)
 
 
 def _probability(values: Rows) -> float:

@@ -6,6 +6,9 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
+from scipy.sparse.linalg import eigsh
+from scipy.spatial.distance import pdist, squareform
 
 Values = NDArray[np.float64]
 Layout = Literal["mds", "umap"]
@@ -66,9 +69,6 @@ def body_map(distances: Values, layout: Layout = "mds", *, seed: int = 0) -> Bod
 
 
 def _classical(distances: Values) -> Values:
-    from scipy.linalg import eigh
-    from scipy.sparse.linalg import eigsh
-
     squares, n = distances**2, len(distances)
     means = squares.mean(axis=0)
     products = (means[:, None] + means - means.mean() - squares) / 2
@@ -76,8 +76,7 @@ def _classical(distances: Values) -> Values:
         values, axes = eigh(products, subset_by_index=(n - 2, n - 1))
     else:
         values, axes = eigsh(products, 2, which="LA", v0=np.sin(np.arange(n) + 1.0))
-    found: Values = axes * np.sqrt(np.maximum(values, 0))
-    return found
+    return axes * np.sqrt(np.maximum(values, 0))
 
 
 def _umap(distances: Values, seed: int) -> Values:
@@ -88,13 +87,10 @@ def _umap(distances: Values, seed: int) -> Values:
     with warnings.catch_warnings():  # of what precomputed distances cannot do afterwards
         warnings.simplefilter("ignore", UserWarning)
         chosen = UMAP(n_neighbors=min(15, len(distances) - 1), metric="precomputed", random_state=seed, n_jobs=1)
-        found: Values = chosen.fit_transform(distances).astype(float)
-    return found
+        return chosen.fit_transform(distances).astype(float)
 
 
 def _stress(wanted: Values, points: Values) -> float:
-    from scipy.spatial.distance import pdist, squareform
-
     one, other = squareform(wanted, checks=False), pdist(points)
     if not one.any():
         return 0.0

@@ -86,9 +86,10 @@ def main(commands: Commands | None = None, program: str = "igps") -> None:
         if parsed.subcommand == "figure" and options.get("out", ...) is None:
             options["out"] = Path("figures")
         if taken_in := "".join(f"+{word}" for word in options.pop("with", None) or ()):
-            name = "descriptors" if "descriptors" in options else "descriptor"
-            given = options[name] or "pretrained"
-            options[name] = given + taken_in if isinstance(given, str) else [one + taken_in for one in given]
+            if "descriptors" in options:
+                options["descriptors"] = [one + taken_in for one in options["descriptors"]]
+            else:
+                options["descriptor"] = (options["descriptor"] or "pretrained") + taken_in
         # With --json, what a reader is told goes where progress goes
         with one_thread(), contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
             found = command(**options)
@@ -153,8 +154,10 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
         positional = place == 0 and parameter.default is parameter.empty
         item = _list_item(kinds[name])
         if positional or item is not None:
-            option = name if positional else f"--{name}"
-            parser.add_argument(option, nargs=item and "+", type=item or kinds[name], help=meanings[name])
+            option, how = (name, {}) if positional else (f"--{name}", {"default": parameter.default})
+            if not positional and parameter.default is parameter.empty:
+                how = {"required": True}
+            parser.add_argument(option, nargs=item and "+", type=item or kinds[name], help=meanings[name], **how)
             by_hand.add(name)
     parser.add_function_arguments(command, skip=by_hand)
     for action in parser._actions:

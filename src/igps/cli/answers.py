@@ -91,7 +91,7 @@ def groups(
 def _numbers(bodies: Bodies, name: str) -> Any:
     """(N, k) the numbers of a column; of one of words alone, which of them each body has."""
     words = bodies.column(name)
-    if any(re.match(r"[-+.\d]|nan|inf", word, re.IGNORECASE) for word in words):
+    if any(re.match(r"[-+.\d]|(nan|inf|infinity)$", word, re.IGNORECASE) for word in words):
         return np.array(bodies.numbers(name))[:, None]
     return np.array([[word == one for one in sorted(set(words))] for word in words], dtype=float)
 
@@ -130,7 +130,7 @@ def outliers(
     print_failures(bodies.failures, len(dataset))
     if out is not None:
         pictured = [(one, dataset.bodies.names[one.body], dataset.mesh(one.body)) for one in found[: min(top, 12)]]
-        write_answer(out, "outliers", rows, outliers_figure(pictured))
+        write_answer(out, "outliers", rows, outliers_figure(pictured) if pictured else None)
         print(f"written to {out}")
     return rows
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from igps.analysis.comparison import Result
 from igps.analysis.comparison import compare as compare_descriptors
-from igps.cli.reading import Folder, signatures, sized, with_side, write_notes, write_rows
+from igps.cli.reading import Folder, signatures, sized, with_side, write_notes
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure
@@ -19,13 +19,13 @@ from igps.descriptors.individual import Mirror, Size
 from igps.nn.description import fit_centres
 from igps.report.answers import precision_recall
 from igps.report.results import write_sources
-from igps.report.tables import comparison_table
+from igps.report.tables import comparison_table, write_rows
 from igps.retrieval import precision_recall_curve
 
 
 def compare(
     root: Path,
-    descriptors: list[str] | None = None,
+    descriptors: list[str] = [*NAMES],  # noqa: B006 (only read)
     out: Path | None = None,
     report: bool = False,
     size: Size = "auto",
@@ -41,13 +41,13 @@ def compare(
 
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
-        descriptors: names, or package.module:NAME of your own; all of the library if not given.
+        descriptors: names, or package.module:NAME of your own.
         out: folder for compare.json, distances/NAME.npz, precision_recall.png, meshes.json that tells where the meshes
             lie, and failures.csv if there are any.
         report: make a page of the results in that folder, report.html, see `igps report`
     """
     check_report(report, out)
-    wanted = [with_side(name, mirror) for name in descriptors or NAMES]
+    wanted = [with_side(name, mirror) for name in descriptors]
     chosen = [descriptor_of(name) for name in wanted]
     dataset, failures = signatures(Folder(root, labelled=True), chosen, n_workers=n_workers, strict=strict, **reading)
     chosen = [descriptor_of(sized(name, size, dataset)) for name in wanted]

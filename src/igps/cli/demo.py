@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from igps.cli.report import check_report, report
+from igps.cli.report import report
 from igps.cli.retrieval import retrieve
 from igps.shapes import ArticulatedShapes
 
@@ -16,7 +16,6 @@ def demo(out: Path = Path("build/demo"), n_workers: int | None = None) -> dict[s
     """
     from igps.report.drawing import ranked_results
 
-    check_report(True, out)
     shapes = ArticulatedShapes(n_classes=8, n_per_class=10)
     shapes.write(out / "shapes", progress=True)
     summary = retrieve(out / "shapes", out=out, cache_dir=out / "cache", n_workers=n_workers)

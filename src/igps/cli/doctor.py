@@ -5,17 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from igps.analysis.doctor import Finding, examine
-from igps.cli.reading import Verdict, limits_of, write_rows
+from igps.cli.reading import Verdict, limits_of
 from igps.data.attribute_sources import attribute_sources
 from igps.data.sources import find_bodies
 from igps.mesh.options import LoadOptions
-from igps.report.tables import findings_table
+from igps.report.tables import findings_table, write_rows
 from igps.signature.signature import SignatureConfig
-
-_HEADER = (
-    "file", "usable", "fault", "mended_by", "notes", "voxels", "pieces", "thinnest", "vertices", "vertices_after",
-    "seconds", "megabytes", "error",
-)  # fmt: skip
 
 
 def doctor(
@@ -44,22 +39,24 @@ def doctor(
     found = examine(bodies, reading, signature, n_workers=n_workers, limits=limits)
     print(findings_table(found))
     if out is not None:
-        write_rows(out, _HEADER, [_row(finding) for finding in found])
+        rows = [_row(finding) for finding in found]
+        write_rows(out, rows[0], [row.values() for row in rows])
         print(f"written to {out}")
     return Verdict([asdict(finding) for finding in found], all(finding.error is None for finding in found))
 
 
-def _row(finding: Finding) -> tuple[Any, ...]:
-    return (
-        finding.id,
-        "no" if finding.error else "yes",
-        finding.fault,
-        " ".join(finding.steps),
-        "; ".join(finding.notes),
-        *(("",) * 3 if finding.voxels is None else astuple(finding.voxels)),
-        finding.n_vertices,
-        finding.n_vertices_after,
-        None if finding.seconds is None else f"{finding.seconds:.1f}",
-        None if finding.memory is None else f"{finding.memory / 1e6:.0f}",
-        finding.error,
-    )
+def _row(finding: Finding) -> dict[str, Any]:
+    voxels = ("", "", "") if finding.voxels is None else astuple(finding.voxels)
+    return {
+        "file": finding.id,
+        "usable": "no" if finding.error else "yes",
+        "fault": finding.fault,
+        "mended_by": " ".join(finding.steps),
+        "notes": "; ".join(finding.notes),
+        **dict(zip(("voxels", "pieces", "thinnest"), voxels, strict=True)),
+        "vertices": finding.n_vertices,
+        "vertices_after": finding.n_vertices_after,
+        "seconds": None if finding.seconds is None else f"{finding.seconds:.1f}",
+        "megabytes": None if finding.memory is None else f"{finding.memory / 1e6:.0f}",
+        "error": finding.error,
+    }

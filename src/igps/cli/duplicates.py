@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from igps.cli.gallery import as_described
-from igps.cli.reading import Folder, signatures, write_rows
+from igps.cli.reading import Folder, signatures
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import Size
@@ -15,6 +15,7 @@ from igps.gallery.calibration import Calibration
 from igps.gallery.duplicates import Duplicates, body_distance
 from igps.gallery.duplicates import duplicates as find_duplicates
 from igps.gallery.gallery import Gallery
+from igps.report.tables import write_rows
 
 DESCRIPTOR = "pretrained"
 """The one whose distances are calibrated."""

@@ -1,6 +1,5 @@
 """Descriptions as a table, for statistics packages: a row for each body, or for each file."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import LABELS_FILE
+from igps.data.sources import LABELS_FILE, file_of
+from igps.report.tables import write_rows
 
 SUFFIXES = (".csv", ".parquet")
 Table = Mapping[str, Sequence[Any]]
@@ -29,7 +29,7 @@ def feature_table(dataset: SignatureDataset, features: np.ndarray) -> tuple[Tabl
     """
     bodies = dataset.bodies
     units, volumes, areas = zip(*((one.unit, one.volume, one.area) for one in dataset.signatures()), strict=True)
-    files = [name.removesuffix(f"#{part}") for name, part in zip(bodies.names, bodies.parts, strict=True)]
+    files = list(map(file_of, bodies.names, bodies.parts))
     own = {"file": files, "part": bodies.parts, "name": bodies.names, "label": bodies.labels or [None] * len(bodies)}
     vectors = features.reshape(len(features), -1)
     measured = {"volume": volumes, "area": areas, **{f"v{i}": list(column) for i, column in enumerate(vectors.T)}}
@@ -72,7 +72,4 @@ def write_table(path: Path, table: Table) -> None:
         arrays = {name: pyarrow.array(list(values)) for name, values in table.items()}
         pyarrow.parquet.write_table(pyarrow.table(arrays), path)
         return
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(table)
-        writer.writerows(zip(*table.values(), strict=True))
+    write_rows(path, table, zip(*table.values(), strict=True))

@@ -7,11 +7,12 @@ from typing import Any
 from igps.analysis.fitting import Goal, HeadName
 from igps.analysis.fitting import classify as classify_bodies
 from igps.analysis.fitting import fit as fit_head
-from igps.cli.reading import Folder, files_or_folder, print_failures, signatures, write_rows
+from igps.cli.reading import Folder, files_or_folder, print_failures, signatures
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors import load
 from igps.nn.descriptor import Descriptor
+from igps.report.tables import write_rows
 
 _TITLES = {
     "nn": "NN",
@@ -56,7 +57,7 @@ def fit(
     )
     model.save(out, {**model.card, "descriptor": descriptor})
     card = _card(model, out)
-    out.with_suffix(".md").write_text(card)
+    out.with_suffix(".md").write_text(card, encoding="utf-8")
     print(card.partition("\n\n")[2])
     refused = [*unread, *(failures or ())]
     print_failures(refused, len(dataset) - len(failures or ()))

@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from igps._parallel import MachineError
-from igps.cli.reading import Folder, chosen_dataset, limits_of, print_failures, signatures, write_rows
+from igps.cli.reading import Folder, chosen_dataset, limits_of, print_failures, signatures
 from igps.data.pipeline import version
 from igps.data.requirements import Requirements
 from igps.descriptors import descriptor as descriptor_of
+from igps.report.tables import write_rows
 
 # Seconds until a scheduler that does not answer is taken for missing.
 _ANSWERS_WITHIN = 15
@@ -22,7 +23,7 @@ _ANSWERS_WITHIN = 15
 
 def precompute(
     root: Path,
-    descriptors: list[str] | None = None,
+    descriptors: list[str] = ["pretrained"],  # noqa: B006 (only read)
     cluster: str | None = None,
     shard: str | None = None,
     failures: Path | None = None,
@@ -37,13 +38,13 @@ def precompute(
     What is there already is not computed again, so that a run that was stopped is finished by another.
 
     Args:
-        descriptors: compute what these require; pretrained if not given.
+        descriptors: compute what these require.
         cluster: address of a Dask scheduler, such as tcp://scheduler:8786, whose workers see folder and cache by the
             same paths as this machine.
         shard: such as 3/64, the third of 64 parts of the meshes, for as many jobs of a batch system.
         failures: a CSV file for the meshes that cannot be used.
     """
-    needs = reduce(or_, (descriptor_of(name).requirements for name in descriptors or ["pretrained"]), Requirements())
+    needs = reduce(or_, (descriptor_of(name).requirements for name in descriptors), Requirements())
     dataset = chosen_dataset(Folder(root), needs, **reading)
     dataset = dataset.subset(of_shard(len(dataset), shard))
     if not len(dataset):
@@ -61,7 +62,7 @@ def precompute(
     print(f"{len(dataset) - len(failed)} of {len(dataset)} signatures{part} are in the cache; {len(failed)} failed")
 
 
-def cache_export(root: Path, out: Path, descriptors: list[str] | None = None, **reading: Any) -> None:
+def cache_export(root: Path, out: Path, descriptors: list[str] = ["pretrained"], **reading: Any) -> None:  # noqa: B006
     """Write the signatures of a folder to one file, which commands take in place of the folder.
 
     The file is read by memory map, runs no code, and holds no path: meshes that cannot be used are left out. Commands
@@ -69,9 +70,9 @@ def cache_export(root: Path, out: Path, descriptors: list[str] | None = None, **
 
     Args:
         out: the file, its name ending in .igps.
-        descriptors: compute what these require; pretrained if not given.
+        descriptors: compute what these require.
     """
-    chosen = [descriptor_of(name) for name in descriptors or ["pretrained"]]
+    chosen = [descriptor_of(name) for name in descriptors]
     dataset, failures = signatures(Folder(root), chosen, **reading)
     out.parent.mkdir(parents=True, exist_ok=True)
     dataset.to_file(out)

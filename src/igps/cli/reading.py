@@ -1,8 +1,7 @@
 """How commands read meshes: the options they share, and the signatures these give."""
 
-import csv
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import or_
@@ -24,6 +23,7 @@ from igps.mesh.mending import repair_steps
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe, fit_centres
 from igps.nn.descriptor import Descriptor
+from igps.report.tables import write_rows
 from igps.signature.signature import SignatureConfig
 
 FLAGS = {
@@ -232,16 +232,6 @@ def mending_summary(dataset: SignatureDataset, n_given: int) -> str:
 
 
 def write_notes(path: Path, dataset: SignatureDataset) -> None:
-    """Write a table of what was done to which mesh; or remove that of an earlier run where nothing was done."""
+    """Write a table of what was done to which mesh."""
     notes = zip(dataset.bodies.names, dataset.all_notes(), strict=True)
     write_rows(path, ("file", "note"), [(name, note) for name, told in notes for note in told])
-
-
-def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a table, or remove the one of an earlier run where there are no rows."""
-    rows = list(rows)
-    path.unlink(missing_ok=True)
-    if rows:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([header, *rows])

@@ -1,7 +1,7 @@
 """`igps retrieve`, `igps extract` and `igps query`."""
 
-import csv
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from tqdm import tqdm
 from igps.analysis.comparison import pair_distances
 from igps.cli.feature_table import SUFFIXES, feature_table, wide_table, write_table
 from igps.cli.gallery import as_described
-from igps.cli.reading import Described, Folder, described, files_or_folder, print_failures, write_notes, write_rows
+from igps.cli.reading import Described, Folder, described, files_or_folder, print_failures, write_notes
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.descriptors import descriptor as descriptor_of
@@ -21,7 +21,7 @@ from igps.gallery.about import is_gallery
 from igps.gallery.gallery import Gallery
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.report.results import write_sources
-from igps.report.tables import scores_table
+from igps.report.tables import scores_table, write_rows
 from igps.retrieval import N_RERANKED, RetrievalScores, rank, rerank_found, retrieval_scores, search
 from igps.retrieval import rerank as reranked_distances
 
@@ -201,13 +201,14 @@ def _write_retrieval(out: Path, found: Described, summary: dict[str, Any], dista
     (out / "scores.json").write_text(json.dumps(summary, indent=2) + "\n")
     arrays: dict[str, Any] = {name: values.numpy() for name, values in distances.items()}
     np.savez_compressed(out / "distances.npz", names=np.array(names), labels=np.array(labels), **arrays)
-    with (out / "ranking.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["query", "rank", "model", "distance", "relevant"])
+
+    def ranking() -> Iterator[tuple[Any, ...]]:
         for i, order in enumerate(tqdm(rank(distances["distances"]), desc="rankings")):
             away = distances["distances"][i].tolist()  # a tensor's entries one by one would take most of the time
             for place, j in enumerate(order[order != i].tolist(), 1):
-                writer.writerow([names[i], place, names[j], f"{away[j]:.6g}", int(labels[i] == labels[j])])
+                yield names[i], place, names[j], f"{away[j]:.6g}", int(labels[i] == labels[j])
+
+    write_rows(out / "ranking.csv", ("query", "rank", "model", "distance", "relevant"), ranking())
     write_rows(out / "failures.csv", ("file", "error"), [(one.id, one.error) for one in found.failures])
     write_notes(out / "notes.csv", found.dataset)
     write_sources(out, found.dataset)

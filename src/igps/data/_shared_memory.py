@@ -10,7 +10,7 @@ import os
 import weakref
 from collections.abc import Sequence
 from multiprocessing.reduction import DupFd, ForkingPickler
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,15 +46,6 @@ class _Block:
     def close(self) -> None:
         self.memory.close()
         os.close(self.handle)
-
-
-class _Place(NamedTuple):
-    """Where a tensor lies in a block."""
-
-    start: int  # bytes
-    dtype: torch.dtype
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
 
 
 _blocks: list[_Block] = []
@@ -95,10 +86,8 @@ def _reduced(batch: SignatureBatch) -> Any:
         return batch.__reduce_ex__(2)
 
     def place(values: Tensor) -> Any:
-        start = values.data_ptr() - block.start
-        if 0 <= start < block.n_bytes:
-            return _Place(start, values.dtype, tuple(values.shape), values.stride())
-        return values
+        start = values.data_ptr() - block.start  # bytes
+        return (start, values.dtype, values.shape, values.stride()) if 0 <= start < block.n_bytes else values
 
     block.memory[0] = 1
     return _rebuilt, (DupFd(block.handle), _ALIGNED + block.n_bytes, vars(batch.map(place)))
@@ -116,7 +105,8 @@ def _rebuilt(handle: Any, n_bytes: int, fields: dict[str, Any]) -> SignatureBatc
     def tensor(place: Any) -> Tensor:
         if isinstance(place, Tensor):
             return place
-        return whole[place.start :].view(place.dtype).as_strided(place.shape, place.strides)
+        start, dtype, shape, strides = place
+        return whole[start:].view(dtype).as_strided(shape, strides)
 
     return SignatureBatch(**fields).map(tensor)
 

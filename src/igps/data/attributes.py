@@ -39,7 +39,7 @@ class FromFiles(Protocol):
 
 @dataclass(frozen=True)
 class FunctionAttribute:
-    """A function `(body, points)` as a source; its name and source code stand for it in the keys of the cache.
+    """A function `(body, points)` as a source; its name, code and defaults stand for it in the keys of the cache.
 
     A ValueError where its source code is not known, or does not tell what it does.
     """
@@ -53,13 +53,16 @@ class FunctionAttribute:
         """Of all bodies the same."""
         name = getattr(self.function, "__qualname__", repr(self.function))
         remedy = "Give an object with this call and a method cache_tag(body), see igps.data.attributes.AttributeSource."
-        if getattr(self.function, "__closure__", None):
+        kept = getattr(self.function, "__defaults__", None), getattr(self.function, "__kwdefaults__", None)
+        defaults = (*(kept[0] or ()), *(kept[1] or {}).values())
+        is_told = all(one is None or isinstance(one, bool | int | float | str) for one in defaults)
+        if getattr(self.function, "__closure__", None) or inspect.ismethod(self.function) or not is_told:
             raise ValueError(f"attributes: {name} uses variables of what is around it, which no key tells. {remedy}")
         try:
             source = inspect.getsource(self.function)
         except (OSError, TypeError) as error:
             raise ValueError(f"attributes: the source code of {name} is not known ({error}). {remedy}") from error
-        return f"function {name} {hashlib.sha256(source.encode()).hexdigest()}"
+        return f"function {name} {hashlib.sha256(source.encode()).hexdigest()}" + (f" {defaults}" if defaults else "")
 
     def __call__(self, body: BodyRef, points: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
         """Its values."""

@@ -254,13 +254,16 @@ def _joined(parts: Sequence[Tensor], padding: float = 0) -> Tensor:
     return joined
 
 
+def attribute_names(samples: Sequence[Samples | SampleBatch], what: str) -> list[str]:
+    """Those that all samples carry; a ValueError that names what they are of where they differ."""
+    names, *others = (sorted(one.attributes) for one in samples)
+    if differing := [one for one in others if one != names]:
+        raise ValueError(f"{what}: all must carry the same sample attributes, got {names} and {differing[0]}.")
+    return names
+
+
 def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:
-    names = sorted(parts[0].attributes)
-    for part in parts:
-        if sorted(part.attributes) != names:
-            raise ValueError(
-                f"batches: all must carry the same sample attributes, got {names} and {sorted(part.attributes)}."
-            )
+    names = attribute_names(parts, "batches")
     points, eigenfunctions, mask = (
         _joined([getattr(part, name) for part in parts]) for name in ("points", "eigenfunctions", "mask")
     )

@@ -8,7 +8,6 @@ import os
 import secrets
 import time
 import zlib
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, ClassVar, Generic, TypeVar
@@ -52,7 +51,7 @@ def content_digest(path: Path, *beside: Path) -> bytes:
     return hashlib.sha256(digest + b"".join(map(content_digest, beside))).digest() if beside else digest
 
 
-class FileCache(ABC, Generic[T]):
+class FileCache(Generic[T]):
     """Values by key, shared safely by any number of processes.
 
     A file is written beside its place and moved there in one step, so that a reader sees all of it or nothing. What a
@@ -64,20 +63,13 @@ class FileCache(ABC, Generic[T]):
 
     what: ClassVar[str]  # the values are, in a word
     folder: ClassVar[str] = ""  # of the values in the directory, "" where they lie in it themselves
+    # A value to arrays and metadata, and back; the latter raises a ValueError, KeyError or TypeError if they make none
+    _encode: Callable[[T], tuple[dict[str, np.ndarray], dict[str, str]]]
+    _decode: Callable[[Mapping[str, np.ndarray], Mapping[str, str]], T]
 
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(directory) / self.folder
         self._format = f"igps-{self.what}-2"
-
-    @staticmethod
-    @abstractmethod
-    def _encode(value: T, /) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        """Arrays and metadata of a value."""
-
-    @staticmethod
-    @abstractmethod
-    def _decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> T:
-        """The value of arrays and metadata; raises a ValueError, KeyError or TypeError if they make none."""
 
     def path(self, key: str) -> Path:
         """The file of a key, in one of 256 folders."""
@@ -209,26 +201,24 @@ class SignatureCache(FileCache[Signature]):
         return self._read(key, lambda file, metadata: json.loads(metadata["unit"]))
 
 
+def _arrays_alone(arrays: dict[str, NDArray[np.float32]]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    return {name: np.ascontiguousarray(one) for name, one in arrays.items()}, {}
+
+
 class AttributeCache(FileCache[dict[str, NDArray[np.float32]]]):
     """Attributes of the samples of one Signature by room, beside the Signatures."""
 
     what, folder = "attribute", "attributes"
+    _encode = staticmethod(_arrays_alone)
     _decode = staticmethod(lambda tensors, metadata: {room: tensors[room] for room in _ROOMS})
-
-    @staticmethod
-    def _encode(value: dict[str, NDArray[np.float32]]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        return {name: np.ascontiguousarray(one) for name, one in value.items()}, {}
 
 
 class DescriptionCache(FileCache[NDArray[np.float32]]):
     """Descriptions by key, beside the Signatures, see `FileCache`."""
 
     what, folder = "description", "descriptions"
+    _encode = staticmethod(lambda value: _arrays_alone({"values": value}))
     _decode = staticmethod(lambda tensors, metadata: tensors["values"])
-
-    @staticmethod
-    def _encode(value: NDArray[np.float32]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        return {"values": np.ascontiguousarray(value)}, {}
 
 
 def _remove_abandoned(partials: Iterable[Path]) -> None:

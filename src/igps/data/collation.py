@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from igps.data._shared_memory import empty_arrays
-from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch
+from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch, attribute_names
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature
 
@@ -44,7 +44,11 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
     labelled = [one if isinstance(one, LabelledSignature) else LabelledSignature(one, -1, one.name) for one in items]
     signatures = [item.signature for item in labelled]
     n_most = max(len(s.eigenvalues) for s in signatures)
-    wanted: list[list[Any]] = [[_lengthened(s.eigenvalues, n_most) for s in signatures]]
+    # Infinite behind the last eigenvalue, so that every spectral weight is zero there
+    missing = [(0, n_most - len(s.eigenvalues)) for s in signatures]
+    wanted: list[list[Any]] = [
+        [np.pad(s.eigenvalues, n, constant_values=np.inf) for s, n in zip(signatures, missing, strict=True)]
+    ]
     wanted += [[np.float64(getattr(s, name)) for s in signatures] for name in ("area", "volume")]
     wanted.append([np.int64(item.label) for item in labelled])
     rooms = [[s.interior for s in signatures], [s.surface for s in signatures]]
@@ -61,21 +65,9 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
     return SignatureBatch(eigenvalues, interior, surface, area, volume, labels, ids, given, units)
 
 
-def _lengthened(eigenvalues: NDArray[np.float64], n: int) -> NDArray[np.float64]:
-    """(n,) of eigenvalues (K,): infinite behind the last, so that every spectral weight is zero there."""
-    found = np.full(n, np.inf)
-    found[: len(eigenvalues)] = eigenvalues
-    return found
-
-
 def _of_samples(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:
     """Points, eigenfunctions, masks, and attributes by their names, of each."""
-    names = sorted(samples[0].attributes)
-    for s in samples:
-        if sorted(s.attributes) != names:
-            raise ValueError(
-                f"items: all must carry the same sample attributes, got {names} and {sorted(s.attributes)}."
-            )
+    names = attribute_names(samples, "items")
     return [
         # Centred before the cast, or a shape far from the origin would lose its digits.
         [(s.points - s.points.mean(axis=0)).astype(np.float32) for s in samples],

@@ -44,15 +44,6 @@ class BodyFile:
     stamp: tuple[int, int, int]  # see `stamp_of`
     digest: bytes  # of its content, and of what is read with it
 
-    @staticmethod
-    def of(path: Path, reading: LoadOptions) -> BodyFile:
-        """What is known of a file; a MeshError where it cannot be read."""
-        try:
-            files = files_read(path, reading)
-            return BodyFile(stamp_of(*files), content_digest(*files))
-        except OSError as error:
-            raise MeshError(f"{path}: cannot be read ({error.strerror}). Check the path.") from error
-
 
 @dataclass(frozen=True)
 class CacheHit:
@@ -98,11 +89,16 @@ class SignaturePipeline:
         return mesh
 
     def _file(self, body: BodyRef) -> BodyFile:
-        if body not in self.meshes:
-            return BodyFile.of(body.path, self.reading)
-        mesh = self.mesh(body)
-        content = mesh.vertices.tobytes(), mesh.faces.tobytes(), repr((mesh.unit, mesh.notes)).encode()
-        return BodyFile((0, 0, 0), b"".join(hashlib.sha256(one).digest() for one in content))
+        """That of a body, or what stands for it in memory; a MeshError where it cannot be read."""
+        if body in self.meshes:
+            mesh = self.mesh(body)
+            content = mesh.vertices.tobytes(), mesh.faces.tobytes(), repr((mesh.unit, mesh.notes)).encode()
+            return BodyFile((0, 0, 0), b"".join(hashlib.sha256(one).digest() for one in content))
+        try:
+            files = files_read(body.path, self.reading)
+            return BodyFile(stamp_of(*files), content_digest(*files))
+        except OSError as error:
+            raise MeshError(f"{body.path}: cannot be read ({error.strerror}). Check the path.") from error
 
     def signature(self, body: BodyRef) -> Signature:
         """The Signature of a body, from the cache where it or a larger one is there, and there afterwards."""
@@ -121,7 +117,7 @@ class SignaturePipeline:
             return [self.hit(bodies[0])]
         if bodies[0] in self.meshes:
             return [attempt(partial(self.hit, body)) for body in bodies]
-        file = BodyFile.of(bodies[0].path, self.reading)
+        file = self._file(bodies[0])
         served = {body: self._lookup(body, file) for body in bodies}
         done: dict[BodyRef, CacheHit | Failed] = {body: hit for body, hit in served.items() if hit is not None}
         missing = {body.part: body for body in bodies if body not in done}
@@ -132,15 +128,16 @@ class SignaturePipeline:
                 if isinstance(mesh, MeshError):
                     done[body] = Failed(str(mesh))
                 else:
-                    done[body] = attempt(partial(self._hit, body, file, mesh))
+                    done[body] = attempt(partial(self.hit, body, file, mesh))
         except MeshError as error:  # of the file: so of each
             done = {**dict.fromkeys(missing.values(), Failed(str(error))), **done}
         # Those that the file does not have are told so one by one.
-        return [done[body] if body in done else attempt(partial(self._hit, body, file)) for body in bodies]
+        return [done[body] if body in done else attempt(partial(self.hit, body, file)) for body in bodies]
 
-    def hit(self, body: BodyRef) -> CacheHit:
+    def hit(self, body: BodyRef, file: BodyFile | None = None, mesh: Mesh | None = None) -> CacheHit:
         """What serves a body, which is in the cache then; a MeshError where it cannot be used."""
-        return self._hit(body, self._file(body))
+        file = file or self._file(body)
+        return self._lookup(body, file) or self._made(body, file, mesh)[0]
 
     def lookup(self, bodies: Sequence[BodyRef]) -> list[CacheHit | None]:
         """What in the cache serves each body of one file, None where nothing does; a MeshError if unreadable."""
@@ -175,9 +172,6 @@ class SignaturePipeline:
         """A Signature's name in the cache, by all that it depends on; a MeshError where the file cannot be read."""
         key = self._key(body, self._file(body), self.config, False)
         return key if self.pre_transform is None else self._changed_key(body, key)
-
-    def _hit(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> CacheHit:
-        return self._lookup(body, file) or self._made(body, file, mesh)[0]
 
     def _lookup(self, body: BodyRef, file: BodyFile) -> CacheHit | None:
         cache = SignatureCache(self.cache_dir)

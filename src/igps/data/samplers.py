@@ -54,7 +54,7 @@ class BucketBatchSampler(Sampler[list[int]]):
             # By size, and those of one size as they were shuffled.
             by_size = bucket[torch.sort(self.sizes[bucket], stable=True).indices]
             batches += [batch.tolist() for batch in by_size.split(self.batch_size)]
-        if self.drop_last:
-            batches = [batch for batch in batches if len(batch) == self.batch_size]
+        least = self.batch_size if self.drop_last else 1
+        batches = [batch for batch in batches if len(batch) >= least]
         for i in torch.randperm(len(batches), generator=self.generator).tolist():
             yield batches[i]

@@ -88,11 +88,7 @@ class Bodies:
         """The values of a column of numbers, such as of "age"; a ValueError of what is no finite number."""
         values = self.column(name)
         for body, value in zip(self.names, values, strict=True):
-            try:
-                is_number = math.isfinite(float(value))
-            except ValueError:
-                is_number = False
-            if not is_number:
+            if not is_number(value):
                 raise ValueError(f"{name}: expected numbers, got {value!r} of {body}. Correct it in {LABELS_FILE}.")
         return [float(value) for value in values]
 
@@ -102,15 +98,13 @@ class Bodies:
             raise ValueError(f"classes: expected 'folder', 'body' or 'file', got {rule!r}.")
         if rule == "folder":
             return self
-        if rule == "body":
-            if all(part is None for part in self.parts):
-                raise ValueError(
-                    f"classes: expected files of several bodies with 'body', but {self.names[0]} is one body."
-                )
-            # A file that cannot be read, such as an empty mask, has no parts; and costs the others nothing
-            words = [path.name.partition(".")[0] for path in self.paths]
-            return replace(self, labels=tuple(part or word for part, word in zip(self.parts, words, strict=True)))
-        return replace(self, labels=tuple(map(file_of, self.names, self.parts)))
+        if rule == "file":
+            return replace(self, labels=tuple(map(file_of, self.names, self.parts)))
+        if all(part is None for part in self.parts):
+            raise ValueError(f"classes: expected files of several bodies with 'body', but {self.names[0]} is one body.")
+        # A file that cannot be read, such as an empty mask, has no parts; and costs the others nothing
+        words = [path.name.partition(".")[0] for path in self.paths]
+        return replace(self, labels=tuple(part or word for part, word in zip(self.parts, words, strict=True)))
 
 
 def find_bodies(
@@ -158,14 +152,14 @@ def _from_folder(root: Path, options: LoadOptions, attributes: Iterable[Attribut
     if alone and nested:
         told = f"{len(alone)} files beside the folders of classes are left out, such as {alone[0].name}"
         logger.warning("%s: %s. Put them into a folder, or list all in a %s.", root, told, LABELS_FILE)
-    rows: list[tuple[Path, str | None]] = [(path, path.relative_to(root).parts[0]) for path in nested]
-    rows = rows or [(path, None) for path in alone]
-    if not rows:
+    found = [(path, path.relative_to(root)) for path in nested or alone]
+    if not found:
         raise FileNotFoundError(
             f"{root}: no mesh found. Expected a folder per class, or mesh files with a {LABELS_FILE} (file,label), "
             f"in one of the formats {', '.join(searched_suffixes())}."
         )
-    return _expanded([(path, path.relative_to(root).as_posix(), label, None) for path, label in rows], options)
+    rows = [(path, name.as_posix(), name.parts[0] if nested else None, None) for path, name in found]
+    return _expanded(rows, options)
 
 
 def given_bodies(
@@ -214,6 +208,14 @@ def file_and_part(path: Path) -> tuple[Path, str | None]:
     return path, None
 
 
+def is_number(value: str | float | None) -> bool:
+    """Whether it is a finite number, or none; words such as 01_02 are none, whatever Python says."""
+    try:
+        return value is None or ("_" not in str(value) and math.isfinite(float(value)))
+    except ValueError:
+        return False
+
+
 def file_of(name: str, part: str | None) -> str:
     """The name of the file of a body, by the name of the body."""
     return name if part is None else name.removesuffix(f"#{part}")
@@ -245,8 +247,7 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
             raise ValueError(f"{file}: a column is named twice in {header}. Give each column a name of its own.")
     if longer := [line for line, row in rows if row.get(None)]:  # under which stands what has no column
         raise ValueError(f"{file}: line {longer[0]} has more values than columns. Put a value with a comma in quotes.")
-    needed = [name for name in ("file", "label") if name in header]
-    incomplete = [line for line, row in rows if not all(row.get(name) for name in needed)]
+    incomplete = [line for line, row in rows if not all(row.get(name) for name in {"file", "label"} & set(header))]
     if not rows or incomplete:
         where = f"line {incomplete[0]} lacks a file or a label" if incomplete else "no rows"
         raise ValueError(f"{file}: {where}. Each line names a mesh file and its class.")

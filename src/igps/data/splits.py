@@ -38,7 +38,7 @@ def split_seen(labels: Tensor, n_train: float, *, n_validation: float = 0, seed:
     for label in labels.unique().tolist():
         members = torch.nonzero(labels == label).flatten()
         n_fit = _count(n_train, len(members), 3, 2)
-        if isinstance(n_train, float) and len(members) < 5:
+        if 0 < n_train < 1 and len(members) < 5:
             raise ValueError(f"n_train: a share expects at least 5 shapes of a class, got {len(members)} of {label}.")
         if len(members) <= n_fit:
             raise ValueError(f"n_train: expected fewer than the {len(members)} shapes of class {label}, got {n_train}.")

@@ -71,7 +71,7 @@ class Coder:
         """Their codes."""
         rest = self.short(descriptions) @ self.turn.T
         codes = np.zeros(len(rest), CODE)
-        codes["centre"] = _nearest(rest, self.centres)
+        codes["centre"] = (np.square(self.centres).sum(axis=1) - 2 * (rest @ self.centres.T)).argmin(axis=1)
         rest -= self.centres[codes["centre"]]
         codes["square"] = np.square(rest).sum(axis=1)
         codes["scale"] = codes["square"] / np.maximum(np.abs(rest).sum(axis=1), _TINY)
@@ -122,10 +122,6 @@ class Codes:
         far = np.full(len(square), np.inf, np.float32)
         _estimate(signs, square, scale, ends[near], ends[near + 1], planes, step, to_centre[near], far)
         return far
-
-
-def _nearest(vectors: Singles, centres: Singles) -> Integers:
-    return np.asarray((np.square(centres).sum(axis=1) - 2 * (vectors @ centres.T)).argmin(axis=1))
 
 
 def _lowest(values: Singles, n: int) -> Integers:

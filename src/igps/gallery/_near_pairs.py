@@ -24,7 +24,7 @@ NearPairs = Iterator[tuple[int, int, float]]
 
 def near_pairs(descriptions: Tensor, distance: Distance, limit: float, progress: bool) -> NearPairs:
     """Pairs i < j of descriptions that are no farther apart, and how far."""
-    with _bar(len(descriptions), progress) as bar:
+    with tqdm(desc="compared", total=len(descriptions), disable=not progress) as bar:
         for start in range(0, len(descriptions), _ROWS):
             rows = descriptions[start : start + _ROWS]
             with torch.inference_mode():
@@ -38,7 +38,7 @@ def near_pairs(descriptions: Tensor, distance: Distance, limit: float, progress:
 def near_in_gallery(gallery: Gallery, limit: float, progress: bool) -> NearPairs:
     """The same of the bodies of a gallery, numbered in order of their ids."""
     numbers = {name: i for i, name in enumerate(sorted(row["id"] for row in gallery.rows("id")))}
-    with _bar(len(gallery), progress) as bar:
+    with tqdm(desc="compared", total=len(gallery), disable=not progress) as bar:
         for some in gallery.table.batches():
             for description, row in zip(*gallery.table.decoded(some), strict=True):
                 top = min(_FIRST_TOP, len(gallery))
@@ -50,10 +50,6 @@ def near_in_gallery(gallery: Gallery, limit: float, progress: bool) -> NearPairs
                     if numbers[row["id"]] < numbers[other["id"]] and distance <= limit:
                         yield numbers[row["id"]], numbers[other["id"]], distance
                 bar.update()
-
-
-def _bar(n_files: int, progress: bool) -> tqdm:
-    return tqdm(desc="compared", total=n_files, disable=not progress)
 
 
 def of_one_size(near: NearPairs, dataset: SignatureDataset) -> NearPairs:

@@ -14,11 +14,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from igps.data.dataset import Failure, SignatureDataset
+from igps.data.sources import is_number
 from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.fingerprint import fingerprint
+from igps.descriptors.fingerprint import fingerprint, name_of
 from igps.descriptors.registry import is_file
 from igps.gallery.about import KNOWN, Batch, about_of, check_alike, open_table, tables
-from igps.gallery.rows import described_rows, further_columns, is_number
+from igps.gallery.rows import described_rows, further_columns
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
@@ -64,12 +65,10 @@ class Gallery:
     ) -> None:
         self.path, self.table = Path(path), open_table(path, version)
         about = self.about
-        by_name = not isinstance(descriptor, Descriptor) and not is_file(descriptor or "")  # a file may have moved
-        if by_name and descriptor is not None:
-            check_alike(path, about, {"descriptor": str(descriptor)})
-        self.descriptor = descriptor_of(about["descriptor"] if descriptor is None else descriptor)
-        if isinstance(descriptor, Descriptor):
-            check_alike(path, about, {"descriptor": descriptor.name})
+        given = about["descriptor"] if descriptor is None else descriptor
+        if isinstance(given, Descriptor) or not is_file(given):  # a file may have moved
+            check_alike(path, about, {"descriptor": name_of(given)})
+        self.descriptor = descriptor_of(given)
         check_alike(path, about, {"model": fingerprint(self.descriptor)})
         here = SignatureConfig.ALGORITHM_VERSION
         if about["signature"]["algorithm_version"] != here:

@@ -1,7 +1,6 @@
 """Bodies become rows of a gallery: described, and with what is known of them."""
 
 import io
-import math
 import os
 import time
 from collections.abc import Iterator, Mapping
@@ -15,7 +14,7 @@ from tqdm import tqdm
 
 from igps.data.cache import stamp_of
 from igps.data.dataset import Failure, SignatureDataset
-from igps.data.sources import LABELS_FILE, Bodies
+from igps.data.sources import LABELS_FILE, Bodies, is_number
 from igps.gallery.about import KNOWN, Batch
 from igps.mesh.formats import files_read
 from igps.mesh.mesh import MeshError
@@ -155,11 +154,3 @@ def _described(
         if failures is None:
             raise
     return torch.zeros(0)
-
-
-def is_number(value: str | float | None) -> bool:
-    """Whether it is a finite number, or none."""
-    try:
-        return value is None or math.isfinite(float(value))
-    except ValueError:
-        return False

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from igps.analysis.outliers import Outlier
 from igps.mesh.mesh import Mesh
 from igps.report.drawing import PALETTE, draw_body, new_figure, paint, save_figure, seen_from_the_front, shown
 from igps.report.page_data import finite
+from igps.report.tables import write_rows
 from igps.retrieval import PrecisionRecallCurve
 
 if TYPE_CHECKING:
@@ -33,10 +33,7 @@ def write_answer(out: Path, name: str, rows: Sequence[Mapping[str, Any]], figure
     """Write NAME.csv, a line a row, NAME.json with the same, and the picture, if any, as NAME.svg and NAME.png."""
     out.mkdir(parents=True, exist_ok=True)
     (out / f"{name}.json").write_text(json.dumps(finite(list(rows)), indent=2) + "\n")
-    with (out / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]) if rows else [])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(out / f"{name}.csv", rows[0] if rows else (), (row.values() for row in rows))
     if figure is not None:
         save_figure(figure, out / f"{name}.svg")
         save_figure(figure, out / f"{name}.png", dpi=150)

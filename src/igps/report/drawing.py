@@ -93,7 +93,7 @@ def ranked_results(root: Path, ranking: Path, out: Path, *, top: int = 8, progre
     `ranking` is the ranking.csv that `igps retrieve` wrote of the meshes below `root`.
     """
     results: dict[str, list[tuple[str, float, bool]]] = {}
-    with ranking.open(newline="") as file:
+    with ranking.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             found = results.setdefault(row["query"], [])
             if len(found) < top:

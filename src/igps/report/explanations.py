@@ -1,26 +1,21 @@
 """Where each body of a folder of results differs from its nearest, for the page."""
 
-import contextlib
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
-from igps._parallel import Failed, one_thread, run
+from igps._parallel import one_thread
 from igps.analysis.explanation import KINDS, Shares, explain, on_surface
 from igps.data.dataset import SignatureDataset
 from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import Descriptor
 from igps.report.drawing import axes_of
 from igps.report.results import System
-from igps.report.surfaces import STEPS, Surface
+from igps.report.surfaces import STEPS, Surface, made
 from igps.signature.signature import Signature
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +43,10 @@ def keep_explanations(
     place = {name: i for i, name in enumerate(dataset.bodies.names)}
     nearest = [system.names[row[0]] for row in system.ranked()] if len(system.names) > 1 else []
     pairs = [pair for pair in zip(system.names, nearest, strict=False) if set(pair) <= surfaces.keys() & place.keys()]
-    jobs = [(descriptor, dataset.subset([place[name] for name in p]), [surfaces[name] for name in p]) for p in pairs]
-    found: dict[str, Painted] = {}
-    with contextlib.closing(run(_painted, jobs, n_workers=n_workers)) as outcomes:
-        for number, outcome in tqdm(outcomes, total=len(jobs), desc="explanations"):
-            name, other = pairs[number]
-            if isinstance(outcome, Failed):
-                logger.warning("%s: no explanation: %s", name, outcome.reason)
-            else:
-                found[name] = Painted(other, *outcome)
+    jobs = {
+        p[0]: (descriptor, dataset.subset([place[name] for name in p]), [surfaces[name] for name in p]) for p in pairs
+    }
+    found = made(_painted, jobs, "explanation", n_workers)
     found = {name: found[name] for name in system.names if name in found}
     both = [np.concatenate(one.values) for one in found.values()]
     np.savez_compressed(
@@ -86,15 +76,13 @@ def read_explanations(path: Path, surfaces: Mapping[str, Surface]) -> dict[str, 
     return found
 
 
-def _painted(
-    job: tuple[Descriptor, SignatureDataset, list[Surface]],
-) -> tuple[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
+def _painted(job: tuple[Descriptor, SignatureDataset, list[Surface]]) -> Painted:
     descriptor, dataset, surfaces = job
     with one_thread():
         found = explain(descriptor, dataset.batch([0]), dataset.batch([1]))
     shares = found.places or found.samples
     one, other = (_values(dataset.mesh(i), dataset[i].signature, shares[i], surfaces[i]) for i in (0, 1))
-    return found.summary(), (one, other)
+    return Painted(dataset.bodies.names[1], found.summary(), (one, other))
 
 
 def _values(mesh: Mesh, signature: Signature, shares: Shares, surface: Surface) -> NDArray[np.uint8]:

@@ -96,7 +96,16 @@ def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str],
     places = np.array([index[name] for name in system.names])
     distances = np.take_along_axis(system.distances.numpy(), near, axis=1)
     scores, curve = system.scores(), system.curve()
-    by_class = None if scores is None else {str(label): _rounded(one) for label, one in scores.per_class().items()}
+    scored: dict[str, Any] = dict.fromkeys(("scores", "per_class", "per_query", "curve", "worst"))
+    if scores is not None and curve is not None:
+        by_class = {str(label): values for label, values in scores.per_class().items()}
+        numbers = {
+            "scores": scores.mean(),
+            "per_class": [by_class.get(name) for name in classes],
+            "per_query": {one: getattr(scores, one).tolist() for one in _OF_QUERIES},
+            "curve": [curve.recall.tolist(), curve.precision.tolist()],
+        }
+        scored = {**finite(numbers, _DECIMALS), "worst": _worst(system, order, scores, places)}
     return {
         "name": system.name,
         "seconds": system.seconds_per_mesh,
@@ -104,12 +113,8 @@ def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str],
         "top": near.shape[1],
         "ranked": letters(places[near].astype("<u4").tobytes()),
         "distances": letters(distances.astype("<f4").tobytes()),
-        "scores": None if scores is None else _rounded(scores.mean()),
-        "per_class": None if by_class is None else [by_class.get(name) for name in classes],
-        "per_query": None if scores is None else {one: _numbers(getattr(scores, one).tolist()) for one in _OF_QUERIES},
-        "curve": None if curve is None else [_numbers(curve.recall.tolist()), _numbers(curve.precision.tolist())],
+        **scored,
         "confusion": None if system.labels is None else _confusion(order, system.labels, classes),
-        "worst": None if scores is None else _worst(system, order, scores, places),
         "map": _map(system),
     }
 
@@ -127,7 +132,7 @@ def _map(system: System) -> dict[str, Any] | None:
         "points": ((found.points - found.points.min(axis=0)) / extent).round(4).tolist(),
         "stress": round(found.stress, 3),
         "cluster": clusters.numbers.tolist(),
-        "stability": _numbers(list(clusters.stability)),
+        "stability": finite(clusters.stability, _DECIMALS),
         "n_stable": sum(one >= STABLE for one in clusters.stability),
         "tree": [[int(one), int(other), _significant(height)] for one, other, height, _ in clusters.tree.tolist()],
     }
@@ -172,22 +177,15 @@ def _worst(
     return found
 
 
-def _rounded(values: Mapping[str, float]) -> dict[str, float | None]:
-    return dict(zip(values, _numbers(list(values.values())), strict=True))
-
-
-def _numbers(values: Sequence[float]) -> list[float | None]:
-    """None in place of what JSON does not know."""
-    return [round(value, _DECIMALS) if math.isfinite(value) else None for value in values]
-
-
-def finite(value: Any) -> Any:
-    """The same with None in place of numbers that JSON does not know, such as of a score that is not defined."""
+def finite(value: Any, decimals: int | None = None) -> Any:
+    """The same, perhaps rounded, with None for numbers that JSON does not know, as of a score that is not defined."""
     if isinstance(value, Mapping):
-        return {name: finite(one) for name, one in value.items()}
+        return {name: finite(one, decimals) for name, one in value.items()}
     if isinstance(value, list | tuple):
-        return [finite(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return [finite(one, decimals) for one in value]
+    if not isinstance(value, float):
+        return value
+    return (value if decimals is None else round(value, decimals)) if math.isfinite(value) else None
 
 
 def _significant(value: float) -> float:

@@ -1,7 +1,8 @@
 """Small surfaces of meshes for the page of results: few vertices, quantised, with the barycentroid potential."""
 
+import contextlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from igps._parallel import Failed, run
+from igps._parallel import Failed, Job, Result, run
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
 from igps.mesh.loading import BodyRef
@@ -69,15 +70,23 @@ def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | Non
     missing = [i for i, name in enumerate(names) if not _is_current(dataset.pipeline, bodies[i], kept.get(name))]
     if missing:
         make = partial(_surface_of_body, dataset.pipeline, fitting_vertices(len(names)))
-        outcomes = run(make, [bodies[i] for i in missing], n_workers=n_workers)
-        for number, outcome in tqdm(outcomes, total=len(missing), desc="pictures"):
-            if isinstance(outcome, Failed):
-                logger.warning("%s: no picture: %s", names[missing[number]], outcome.reason)
-            else:
-                kept[names[missing[number]]] = outcome
+        jobs = {names[i]: bodies[i] for i in missing}
+        kept |= made(make, jobs, "picture", n_workers)
     found = {name: kept[name] for name in names if name in kept}
     if missing:
         write_surfaces(path, found)
+    return found
+
+
+def made(work: Callable[[Job], Result], jobs: Mapping[str, Job], what: str, n_workers: int | None) -> dict[str, Result]:
+    """The results of jobs by name; of one that fails the log tells what there is not."""
+    names, found = list(jobs), dict[str, Result]()
+    with contextlib.closing(run(work, list(jobs.values()), n_workers=n_workers)) as outcomes:
+        for number, outcome in tqdm(outcomes, total=len(jobs), desc=f"{what}s"):
+            if isinstance(outcome, Failed):
+                logger.warning("%s: no %s: %s", names[number], what, outcome.reason)
+            else:
+                found[names[number]] = outcome
     return found
 
 

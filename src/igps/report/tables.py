@@ -1,6 +1,10 @@
-"""Results as tables of text, for a terminal."""
+"""Results as tables: of text, for a terminal, and as files."""
 
-from collections.abc import Sequence
+import csv
+from collections.abc import Iterable, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any
 
 from igps.analysis.comparison import Result
 from igps.analysis.doctor import Finding
@@ -9,6 +13,18 @@ from igps.retrieval import RetrievalScores
 
 TITLES = dict(nn="NN", ft="FT", st="ST", e="E", dcg="DCG", adr="ADR", adr_self="ADR self", map="mAP")  # noqa: C408
 """Column titles of the scores, by name."""
+
+
+def write_rows(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Write a table as CSV, or remove the one of an earlier run where there are no rows."""
+    rows = iter(rows)
+    first = next(rows, None)
+    if first is None:
+        path.unlink(missing_ok=True)
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows(chain([header, first], rows))
 
 
 def scores_table(scores: RetrievalScores) -> str:
