@@ -18,7 +18,7 @@ from igps.nn.histograms import joint_histogram, pair_histogram
 def by_backend(name: str, precision: str) -> Callable[[], None]:
     def change() -> None:
         backend = getattr(torch.backends, name, None) if name else torch.backends
-        owner = backend.matmul if name else backend  # type: ignore[union-attr]
+        owner = getattr(backend, "matmul", None) if name else backend
         if not hasattr(owner, "fp32_precision"):
             pytest.skip("this PyTorch has no precision for each backend")
         owner.fp32_precision = precision  # type: ignore[union-attr]

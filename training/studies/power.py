@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import reduce
+from itertools import product
 from operator import or_
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,8 @@ from igps.mesh.mesh import Mesh
 from igps.report.answers import write_answer
 from igps.signature.signature import SignatureConfig, compute_signature
 
-# Of each proportion of a subject, as a share
+PROPORTIONS = ("width", "depth", "height", "waist")
+# Of each, as a share
 _SCATTER = 0.02
 _N_EIGENVALUES = 30
 _LAPY = "ShapeDNA (LaPy)"
@@ -29,7 +31,7 @@ Rows = NDArray[np.float64]
 def power(
     out: Path = Path("build/power"),
     descriptors: Sequence[str] = ("pretrained", "interior", "shape_dna"),
-    differences: Sequence[float] = (0.0, 0.01, 0.02, 0.03),
+    differences: Sequence[float] = (0.01, 0.02, 0.03),
     n_pool: int = 600,
     n_each: int = 30,
     n_draws: int = 400,
@@ -37,23 +39,26 @@ def power(
 ) -> None:
     """The share of draws in which the tests reject at 5 %.
 
-    Subjects are eggs with a waist, whose height, width, depth and waist each scatter by 2 %. Groups differ in the mean
-    height. The spectrum is LaPy's, of the same surfaces, divided by the first eigenvalue, the size.
+    Subjects are eggs with a waist, whose width, depth, height and waist each scatter by 2 %. Groups differ in the mean
+    of one of them, or in none. The spectrum is LaPy's, of the same surfaces, divided by the first eigenvalue, the size.
 
     Args:
         out: folder for power.csv and power.json.
         descriptors: names.
-        differences: of the mean height, as shares.
+        differences: of the mean of each proportion, as shares.
         n_pool: subjects of each mean; the groups without a difference are drawn from two pools, too.
         n_each: of a group in a draw. Draws share no subject until the pools are used up; then they are mixed anew.
         n_draws: of two groups, for each difference.
         seed: of all.
     """
-    first = pool(0.0, n_pool, descriptors, np.random.default_rng([seed, 0]))
+    first = pool(PROPORTIONS[0], 0, n_pool, descriptors, np.random.default_rng([seed, 0]))
     rows: list[dict[str, Any]] = []
-    for number, difference in enumerate(differences, start=1):
-        second = pool(difference, n_pool, descriptors, np.random.default_rng([seed, number]))
-        rows += [{"difference": difference, **row} for row in shares(first, second, n_each, n_draws, seed)]
+    compared = [(PROPORTIONS[0], 0.0), *product(PROPORTIONS, differences)]
+    for number, (proportion, difference) in enumerate(compared, start=1):
+        second = pool(proportion, difference, n_pool, descriptors, np.random.default_rng([seed, number]))
+        told = {"proportion": proportion if difference else "none", "difference": difference}
+        print(told, flush=True)
+        rows += [{**told, **row} for row in shares(first, second, n_each, n_draws, seed)]
     write_answer(out, "power", rows)
 
 
@@ -84,7 +89,9 @@ def shares(
     return rows
 
 
-def pool(difference: float, n_pool: int, descriptors: Sequence[str], random: np.random.Generator) -> dict[str, Rows]:
+def pool(
+    proportion: str, difference: float, n_pool: int, descriptors: Sequence[str], random: np.random.Generator
+) -> dict[str, Rows]:
     """Vectors (n_pool, D) of subjects, by descriptor, and LaPy's."""
     from lapy import TriaMesh, shapedna  # the extra `studies`
 
@@ -92,7 +99,7 @@ def pool(difference: float, n_pool: int, descriptors: Sequence[str], random: np.
     config = reduce(or_, [one.requirements for one in chosen]).apply_to(SignatureConfig())
     found: dict[str, list[Rows]] = {name: [] for name in (*descriptors, _LAPY)}
     for _ in range(n_pool):
-        mesh = subject(difference, random)
+        mesh = subject(proportion, difference, random)
         batch = collate([compute_signature(mesh, config)])
         for name, one in zip(descriptors, chosen, strict=True):
             found[name].append(vectors_of(one, one(batch).detach())[0])
@@ -101,13 +108,13 @@ def pool(difference: float, n_pool: int, descriptors: Sequence[str], random: np.
     return {name: np.array(rows) for name, rows in found.items()}
 
 
-def subject(difference: float, random: np.random.Generator) -> Mesh:
-    """One of a group whose mean height is larger by a share."""
+def subject(proportion: str, difference: float, random: np.random.Generator) -> Mesh:
+    """One of a group in which the mean of a proportion is larger by a share."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=3)
-    width, depth, height, waist = 1 + _SCATTER * random.normal(size=4)
+    width, depth, height, waist = 1 + _SCATTER * random.normal(size=4) + difference * np.eye(4)[PROPORTIONS.index(proportion)]
     x, y, z = ball.vertices.T
     narrow = 1 - 0.35 * waist * np.exp(-8 * (z - 0.1) ** 2)
-    vertices = np.stack([0.8 * width * narrow * x, 0.6 * depth * narrow * y, 1.6 * (height + difference) * z], axis=1)
+    vertices = np.stack([0.8 * width * narrow * x, 0.6 * depth * narrow * y, 1.6 * height * z], axis=1)
     return Mesh(vertices, ball.faces)

@@ -5,7 +5,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import reduce
-from itertools import islice
+from itertools import accumulate
 from operator import or_
 from pathlib import Path
 from types import MappingProxyType
@@ -204,8 +204,10 @@ class HistogramDescriptor(Descriptor):
     @property
     def parts(self) -> tuple[tuple[DescriptionPart, ...], ...]:
         """The histograms of each part."""
-        histograms = iter([one for one in self.histograms if isinstance(one, DescriptionPart)])
-        return tuple(tuple(islice(histograms, size)) for size in self._sizes or (1,))
+        histograms = [one for one in self.histograms if isinstance(one, DescriptionPart)]
+        sizes = self._sizes or (1,)
+        # By slices: PyTorch 2.6 traces an iterator, taken some at a time, as if it began anew each time
+        return tuple(tuple(histograms[end - size : end]) for size, end in zip(sizes, accumulate(sizes), strict=True))
 
     @property
     def part_cells(self) -> tuple[int, ...]:

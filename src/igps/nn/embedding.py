@@ -10,6 +10,7 @@ from igps._parameters import check_at_least
 from igps.nn.specification import Specified
 
 EmbeddingKind = Literal["commute_time", "diffusion", "biharmonic"]
+_KINDS = get_args(EmbeddingKind)  # here, as older compilers of PyTorch cannot trace it
 
 # λ·area from below the smallest of elongated bodies to beyond the 250th of any (4π·250, Weyl's law).
 _FILTER_RANGE = (2.0, 5000.0)
@@ -148,8 +149,8 @@ def _weigh(eigenfunctions: Tensor, weights: Tensor) -> Tensor:
 
 
 def _check_kind(kind: str, time: float | None) -> None:
-    if kind not in get_args(EmbeddingKind):
-        raise ValueError(f"kind: expected one of {', '.join(get_args(EmbeddingKind))}, got {kind!r}.")
+    if kind not in _KINDS:
+        raise ValueError(f"kind: expected one of {', '.join(_KINDS)}, got {kind!r}.")
     if kind == "diffusion" and (time is None or not 0 < time < math.inf):
         raise ValueError(f"time: expected a positive diffusion time over area for kind='diffusion', got {time}.")
     if kind != "diffusion" and time is not None:
