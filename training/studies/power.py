@@ -113,7 +113,8 @@ def subject(proportion: str, difference: float, random: np.random.Generator) -> 
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=3)
-    width, depth, height, waist = 1 + _SCATTER * random.normal(size=4) + difference * np.eye(4)[PROPORTIONS.index(proportion)]
+    larger = difference * np.eye(len(PROPORTIONS))[PROPORTIONS.index(proportion)]
+    width, depth, height, waist = 1 + larger + _SCATTER * random.normal(size=len(PROPORTIONS))
     x, y, z = ball.vertices.T
     narrow = 1 - 0.35 * waist * np.exp(-8 * (z - 0.1) ** 2)
     vertices = np.stack([0.8 * width * narrow * x, 0.6 * depth * narrow * y, 1.6 * height * z], axis=1)
