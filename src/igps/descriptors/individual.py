@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from igps.data.batch import SignatureBatch
-from igps.mesh.mesh import MILLIMETRES
+from igps.mesh.mesh import MILLIMETRES, millimetres
 from igps.nn.axes import InteriorDistance, PairTwist
 from igps.nn.batch_features import BatchFeatures
 from igps.nn.descriptor import Descriptor
@@ -93,7 +93,7 @@ class IndividualDescriptor(Descriptor):
             odd = (counts - counts.flip(-1))[..., counts.shape[-1] // 2 :] / 2
             parts += [self._unit / _VOLUME * signed_volumes(batch).to(odd), self._unit / _TWIST * odd.flatten(1)]
         if self.keeps_size:
-            lengths = [MILLIMETRES.get(one or "mm", 1.0) for one in batch.units or [None] * len(batch)]
+            lengths = [millimetres(one) for one in batch.units or [None] * len(batch)]
             size = torch.stack([batch.area.log() / 2, batch.volume.log() / 3], dim=1)
             size = size + torch.tensor(lengths, dtype=size.dtype, device=size.device).log()[:, None]
             parts.append(self._unit * _MOST / _HALF * size.to(parts[0].dtype))
