@@ -220,6 +220,10 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path: Path, caps
     SURFACE.export(root / "2/e.off")
     retrieve(root, "shape_dna", **options)
     assert "size is ignored: 1 of 5 bodies have no unit of length" in capsys.readouterr().out
+    query(root / "2/e.off", gallery=tmp_path / "index", cache_dir=tmp_path / "cache")
+    assert "size is kept: 1 of 1 bodies have no unit; their numbers count as millimetres" in capsys.readouterr().out
+    query(root / "2/c.3mf", gallery=tmp_path / "index", cache_dir=tmp_path / "cache")
+    assert "no unit" not in capsys.readouterr().out
 
 
 def test_copies_of_another_size_are_no_duplicates_where_size_counts(tmp_path: Path) -> None:
