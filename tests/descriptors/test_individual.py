@@ -101,6 +101,24 @@ def test_twists_of_a_mirror_image_have_the_other_sign_and_a_symmetric_body_has_n
     assert float(odd["straight"].norm()) < 0.2 * float(odd["body"].norm())
 
 
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_body_that_is_turned_is_far_nearer_than_its_mirror_image(seed: int) -> None:
+    """Of a ball with a dozen smooth bumps and dents, whose sides differ little."""
+    random = np.random.default_rng(seed)
+    ball = SURFACE.vertices
+    middles = random.normal(size=(12, 3))
+    squares = ((ball[:, None] - middles / np.linalg.norm(middles, axis=1)[:, None]) ** 2).sum(axis=2)
+    heights = np.exp(-squares / random.uniform(0.1, 0.5, 12)) @ random.uniform(-0.3, 0.7, 12)
+    body = ball * (1 + heights)[:, None] * [1, 1.3, 0.8]
+    turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    meshes = [Mesh(body @ one, SURFACE.faces) for one in (np.eye(3), turn, -np.eye(3), -turn)]  # turned outwards again
+    descriptor = igps.descriptor("interior+side")
+    found = descriptor(collate([compute_signature(one, CONFIG) for one in meshes]))
+    _, turned, *mirrored = descriptor.distances(found[:1], found)[0].tolist()
+    assert turned < min(mirrored) / 3
+
+
 def bent(mirrored: bool = False, turn: np.ndarray | None = None) -> Mesh:
     """A limb that grows thicker and bends to one side, and to another at its end."""
     x, y, z = SURFACE.vertices.T

@@ -76,7 +76,7 @@ class IndividualDescriptor(Descriptor):
         self._unit = _NEAR.get(descriptor.name, _SHARE * scale)
         embedding = SpectralEmbedding(n_eigenpairs=16)
         axes = [InteriorDistance(6, 3.0), PairTwist()]
-        self.twists = PairHistogram(axes, embedding, n_samples=1000) if side else None
+        self.twists = PairHistogram(axes, embedding) if side else None
         self.name, self.source = descriptor.name + SIDE * side + SIZE * size, descriptor.source
         # "motion" holds reflections
         lost = ["scale"] * size + ["motion"] * side
