@@ -174,6 +174,8 @@ def test_what_cannot_be_weighed_is_refused() -> None:
         igps.descriptor("gps", size="auto")
     with pytest.raises(ValueError, match=r"expected one of interior, .*got 'gps\+colour=red'"):
         igps.descriptor("gps+colour=red")
+    with pytest.raises(ValueError, match=r"expected one of interior, .*got 'gps\+ct=1\.5\.2'"):
+        igps.descriptor("gps+ct=1.5.2")
     with pytest.raises(ValueError, match="expected a descriptor that ignores size by itself, got 'molecular'"):
         igps.descriptor("molecular", size="keep")
     own = igps.descriptor("gps")

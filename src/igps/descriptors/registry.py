@@ -49,7 +49,7 @@ NAMES: tuple[str, ...] = tuple(name for name in _MAKERS if name != "molecular")
 """The names of the library's descriptors of any body."""
 
 _MARK = re.compile(r"\+(?:size|side)(?=\+|$)")
-_WITH = re.compile(r"\+(\w+)(?:=([\d.]+))?")
+_WITH = re.compile(r"\+(\w+)(?:=(\d+\.?\d*|\.\d+))?")
 _WRITTEN = (".yaml", ".yml")
 
 
