@@ -237,6 +237,8 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path: Path, caps
     assert [row["mesh"] for row in found] == ["1/a.3mf", "1/b.3mf"]
     with pytest.raises(ValueError, match=r"descriptor: .*shape_dna"):
         query(root / "1/a.3mf", gallery=tmp_path / "index", size="ignore", cache_dir=tmp_path / "cache")
+    retrieve(root, "own_descriptors:Height", size="keep", **options)
+    assert "size is left to own_descriptors:Height" in capsys.readouterr().out
     SURFACE.export(root / "2/e.off")
     retrieve(root, "shape_dna", **options)
     assert "size is ignored: 1 of 5 bodies have no unit of length" in capsys.readouterr().out

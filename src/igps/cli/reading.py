@@ -166,6 +166,8 @@ def sized(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
     """The name of a descriptor that keeps the size of the bodies, or not, as is asked for; says what is left open."""
     module = descriptor_of(descriptor)
     if SIZE in module.name or "scale" not in module.invariant_to:
+        if size == "keep" and SIZE not in module.name:
+            print(f"size is left to {descriptor}, which does not say of itself that it ignores size (invariant_to)")
         return descriptor
     is_kept, told = keeps_size(size, () if size == "ignore" else dataset.units())
     if is_kept and size == "auto" and scale_of(module) is None:
