@@ -287,5 +287,5 @@ def _check_cavities(vertices: Floats, faces: Integers, name: str) -> None:
         if volumes[k] >= 0 or not lies_inside or any(abs(winding).max() > 0.5 for winding in around.values()):
             raise MeshError(
                 f"{name}: one of {len(surfaces)} closed surfaces is no cavity of the body: it is turned outwards, lies "
-                f"outside the largest, or in another cavity. Read the file with {_REPAIR}, or without cavities."
+                f"outside the largest, or in another cavity. Read the file with {_REPAIR} or without cavities."
             )
