@@ -3,11 +3,12 @@
 import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
+from igps._parameters import check_one_of
 from igps.data.batch import SignatureBatch
 from igps.mesh.mesh import MILLIMETRES, millimetres
 from igps.nn.axes import InteriorDistance, PairTwist
@@ -173,6 +174,7 @@ def keeps_size(size: Size, units: Sequence[str | None]) -> tuple[bool, str]:
         size: "auto" keeps it where all have a unit, and ignores it else.
         units: of the N bodies.
     """
+    check_one_of(get_args(Size), size=size)
     n_known = sum(unit in MILLIMETRES for unit in units)
     if size == "ignore" or n_known == len(units) or (n_known == 0 and size == "auto"):
         return size == "keep" or (size == "auto" and n_known > 0), ""
