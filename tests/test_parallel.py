@@ -117,6 +117,12 @@ def test_a_job_that_needs_too_much_memory_is_named(limited: dict[int, object]) -
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left as they are")
 @pytest.mark.skipif("[always]" in jobs.huge_pages(), reason="the system hands out huge pages, of which there are few")
+@pytest.mark.skipif(not LINUX, reason="Linux alone enforces a memory limit")
+def test_a_limit_below_what_python_itself_takes_is_to_be_raised() -> None:
+    with pytest.raises(MachineError, match="raise the memory_limit"):
+        all_of(jobs.call, [len], n_workers=1, limits=Limits(memory=GIB // 20))
+
+
 def test_a_worker_keeps_the_memory_of_one_body_for_the_next(limited: dict[int, int]) -> None:
     first, second, third = (limited[number] for number in (5, 6, 7))
     assert first > 0.9 * PAGES / mmap.PAGESIZE

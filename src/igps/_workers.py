@@ -58,8 +58,8 @@ class Worker:
                     if starts == _MOST_STARTS:
                         raise MachineError(
                             "no worker process could be started. A script that computes on several processes must call "
-                            "it under `if __name__ == '__main__':`; otherwise look for a want of memory, or pass "
-                            "n_workers=1. What is done is kept."
+                            "it under `if __name__ == '__main__':`; otherwise raise the memory_limit, look for a want "
+                            "of memory, or pass n_workers=1. What is done is kept."
                         ) from error
         return self._pool
 

@@ -147,11 +147,15 @@ def test_measures_are_those_of_the_meshes(tmp_path: object) -> None:
     path = f"{tmp_path}/torus.off"
     torus = trimesh.creation.torus(2.0, 0.7, major_sections=48, minor_sections=24)
     torus.export(path)
-    dataset = SignatureDataset([path, f"{tmp_path}/missing.off"], cache_dir=f"{tmp_path}/cache")
+    torus.copy().apply_scale(1e-3).export(f"{tmp_path}/metres.glb")
+    paths = [path, f"{tmp_path}/missing.off", f"{tmp_path}/metres.glb"]
+    dataset = SignatureDataset(paths, cache_dir=f"{tmp_path}/cache")
     measures = measures_of(dataset, n_workers=1)
     assert measures["handles"][0] == 1
     assert measures["volume"][0] == pytest.approx(np.log(torus.volume))
     assert measures["spacing"][0] == pytest.approx(np.log(torus.area / len(torus.faces)) / 2)
+    for name in ("volume", "spacing"):
+        assert measures[name][2] == pytest.approx(measures[name][0], abs=1e-4)
     assert not measures.pop("overlap").any()
     assert all(np.isnan(values[1]) for values in measures.values())
 

@@ -81,6 +81,26 @@ def test_groups_prints_and_writes_the_tests(
     assert (tmp_path / "groups.svg").read_text().startswith("<?xml")
 
 
+def test_volumes_are_compared_in_one_unit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half of the eggs of each group are in metres."""
+    root, heights = tmp_path / "eggs", {"low": (1.0, 1.02, 1.04, 1.06, 1.08), "high": (2.0, 2.02, 2.04, 2.06, 2.08)}
+    for label, of_each in heights.items():
+        for i, height in enumerate(of_each):
+            write_egg(path := root / label / f"{i}.off", height, subdivisions=2)
+            if i % 2:
+                trimesh.load(path, process=False).apply_scale(1e-3).export(path.with_suffix(".glb"))
+                path.unlink()
+    igps(monkeypatch, root, "groups", root, *OWN, "--size", "--out", tmp_path)
+    assert float(table(tmp_path / "groups.csv")[1]["effect"]) > 0.9
+    igps(monkeypatch, root, "figure", "map", root, *OWN, "--colour", "volume", "--out", tmp_path)
+    found = {row["body"][:-4]: float(row["volume"]) for row in table(tmp_path / "map.csv")}
+    for label, of_each in heights.items():
+        for i, height in enumerate(of_each):
+            assert found[f"{label}/{i}"] == pytest.approx(found["low/0"] * height, rel=1e-5)
+
+
 def test_a_covariate_may_be_words_but_no_mistyped_number(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

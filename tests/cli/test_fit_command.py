@@ -147,3 +147,15 @@ def test_wrong_files_cost_one_sentence(
         told = capsys.readouterr().err.strip().splitlines()[-1]
         assert told.startswith("igps: ")
         assert message in told
+
+
+def test_what_no_file_can_hold_is_refused_before_anything_is_computed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for label in "ab":
+        write_egg(tmp_path / "eggs" / label / "0.off", 1.0)
+    options = ["--descriptor", "own_descriptors:Height", "--out", tmp_path / "mine.safetensors"]
+    with pytest.raises(SystemExit):
+        call(monkeypatch, tmp_path, "fit", tmp_path / "eggs", *options)
+    assert "expected to be made of modules of igps" in capsys.readouterr().err
+    assert not (tmp_path / "cache").exists()

@@ -30,6 +30,7 @@ from igps.data.attributes import FunctionAttribute
 from igps.data.dataset import SignatureDataset
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import MeshError
+from igps.mesh.options import LoadOptions
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
@@ -223,6 +224,39 @@ def test_values_at_vertices_survive_mending(tmp_path: Path) -> None:
     write_ply(tmp_path / "ball.ply", open_ball, linear(open_ball.vertices))
     found = VertexAttribute("{file}#height")(BodyRef(tmp_path / "ball.ply"), INSIDE)
     np.testing.assert_allclose(found, linear(INSIDE), atol=1e-2)
+
+
+def test_values_at_the_vertices_of_a_cavity_count(tmp_path: Path) -> None:
+    """Two on it and one outside: in the wall their means over all directions, by inverse distance, far sides less."""
+    ball, pit = trimesh.creation.icosphere(subdivisions=4), trimesh.creation.icosphere(subdivisions=4, radius=0.5)
+    pit.invert()
+    hollow = trimesh.util.concatenate([ball, pit])
+    hollow.vertex_attributes["heat"] = np.where(np.linalg.norm(hollow.vertices, axis=1) < 0.9, 2.0, 1.0)
+    hollow.export(tmp_path / "ball.ply")
+    (tmp_path / "bodies").mkdir()
+    hollow.export(tmp_path / "bodies" / "ball.off")
+    cosines = np.linspace(-1, 1, 20001)
+
+    def in_wall(radius: float) -> float:
+        across = radius**2 * cosines**2 - radius**2
+        outside = 1 / (-radius * cosines + np.sqrt(across + 1))
+        meets = (cosines < 0) & (across > -0.25)
+        root = np.sqrt(np.where(meets, across + 0.25, 0))
+        near, far = (meets / np.where(meets, -radius * cosines + side * root, 1) for side in (-1, 1))
+        return float((outside + 2 * (near - far)).sum() / (outside + near - far).sum())
+
+    for cavities in ("keep", "fill"):
+        dataset = SignatureDataset(
+            tmp_path / "bodies", SignatureConfig(n_eigenpairs=10), tmp_path / "cache",
+            reading=LoadOptions(cavities=cavities), attributes={"heat": VertexAttribute("{stem}.ply", tmp_path)},
+        )  # fmt: skip
+        inside, surface = dataset[0].signature.interior, dataset[0].signature.surface
+        radii = np.linalg.norm(inside.points, axis=1)
+        expected = [in_wall(radius) if cavities == "keep" else 1.0 for radius in radii]
+        np.testing.assert_allclose(inside.attributes["heat"], expected, atol=0.01)
+        on_cavity = np.linalg.norm(surface.points, axis=1) < 0.9
+        assert on_cavity.any() == (cavities == "keep")
+        np.testing.assert_allclose(surface.attributes["heat"], 1.0 + on_cavity, atol=1e-5)
 
 
 def test_tetrahedra_give_a_linear_function_inside_and_nothing_far_outside(body: BodyRef) -> None:

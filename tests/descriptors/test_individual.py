@@ -101,6 +101,24 @@ def test_twists_of_a_mirror_image_have_the_other_sign_and_a_symmetric_body_has_n
     assert float(odd["straight"].norm()) < 0.2 * float(odd["body"].norm())
 
 
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_body_that_is_turned_is_far_nearer_than_its_mirror_image(seed: int) -> None:
+    """Of a ball with a dozen smooth bumps and dents, whose sides differ little."""
+    random = np.random.default_rng(seed)
+    ball = SURFACE.vertices
+    middles = random.normal(size=(12, 3))
+    squares = ((ball[:, None] - middles / np.linalg.norm(middles, axis=1)[:, None]) ** 2).sum(axis=2)
+    heights = np.exp(-squares / random.uniform(0.1, 0.5, 12)) @ random.uniform(-0.3, 0.7, 12)
+    body = ball * (1 + heights)[:, None] * [1, 1.3, 0.8]
+    turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    meshes = [Mesh(body @ one, SURFACE.faces) for one in (np.eye(3), turn, -np.eye(3), -turn)]  # turned outwards again
+    descriptor = igps.descriptor("interior+side")
+    found = descriptor(collate([compute_signature(one, CONFIG) for one in meshes]))
+    _, turned, *mirrored = descriptor.distances(found[:1], found)[0].tolist()
+    assert turned < min(mirrored) / 3
+
+
 def bent(mirrored: bool = False, turn: np.ndarray | None = None) -> Mesh:
     """A limb that grows thicker and bends to one side, and to another at its end."""
     x, y, z = SURFACE.vertices.T
@@ -154,8 +172,16 @@ def test_names_carry_the_choice() -> None:
 def test_what_cannot_be_weighed_is_refused() -> None:
     with pytest.raises(ValueError, match=r"size: expected .* the units of the bodies beside \"auto\""):
         igps.descriptor("gps", size="auto")
+    with pytest.raises(ValueError, match="mirror: expected one of 'same', 'distinct', got 'different'"):
+        igps.descriptor("gps", mirror="different")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="size: expected one of 'auto', 'keep', 'ignore', got True"):
+        igps.descriptor("gps", size=True)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="size: expected one of 'auto', 'keep', 'ignore', got 'kept'"):
+        keeps_size("kept", ["mm"])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"expected one of interior, .*got 'gps\+colour=red'"):
         igps.descriptor("gps+colour=red")
+    with pytest.raises(ValueError, match=r"expected one of interior, .*got 'gps\+ct=1\.5\.2'"):
+        igps.descriptor("gps+ct=1.5.2")
     with pytest.raises(ValueError, match="expected a descriptor that ignores size by itself, got 'molecular'"):
         igps.descriptor("molecular", size="keep")
     own = igps.descriptor("gps")
@@ -217,9 +243,15 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path: Path, caps
     assert [row["mesh"] for row in found] == ["1/a.3mf", "1/b.3mf"]
     with pytest.raises(ValueError, match=r"descriptor: .*shape_dna"):
         query(root / "1/a.3mf", gallery=tmp_path / "index", size="ignore", cache_dir=tmp_path / "cache")
+    retrieve(root, "own_descriptors:Height", size="keep", **options)
+    assert "size is left to own_descriptors:Height" in capsys.readouterr().out
     SURFACE.export(root / "2/e.off")
     retrieve(root, "shape_dna", **options)
     assert "size is ignored: 1 of 5 bodies have no unit of length" in capsys.readouterr().out
+    query(root / "2/e.off", gallery=tmp_path / "index", cache_dir=tmp_path / "cache")
+    assert "size is kept: 1 of 1 bodies have no unit; their numbers count as millimetres" in capsys.readouterr().out
+    query(root / "2/c.3mf", gallery=tmp_path / "index", cache_dir=tmp_path / "cache")
+    assert "no unit" not in capsys.readouterr().out
 
 
 def test_copies_of_another_size_are_no_duplicates_where_size_counts(tmp_path: Path) -> None:

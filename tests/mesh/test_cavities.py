@@ -59,6 +59,12 @@ def test_a_hidden_part_that_is_turned_outwards_is_turned_for_a_cavity_and_kept_o
     assert repair_steps(hollow.notes) == ("welded",)
 
 
+@pytest.mark.parametrize("inwards", [False, True])
+def test_a_cavity_is_one_though_the_outer_surface_is_inside_out(inwards: bool) -> None:
+    hollow = mend(*joined(ball(1, inwards=True), ball(0.5, inwards=inwards)), cavities="keep")
+    assert hollow.volume == pytest.approx((1 - 0.5**3) * BALL.volume, rel=1e-12)
+
+
 def test_loose_triangles_are_welded_before() -> None:
     vertices, faces = joined(ball(1), ball(0.5))
     hollow = mend(vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), cavities="keep")
@@ -72,7 +78,7 @@ def test_loose_triangles_are_welded_before() -> None:
     ids=["turned outwards", "outside", "across", "in another"],
 )  # fmt: skip
 def test_what_is_no_cavity_is_refused(other: Surface) -> None:
-    with pytest.raises(MeshError, match="closed surfaces is no cavity of the body"):
+    with pytest.raises(MeshError, match=r"closed surfaces is no cavity .*--mend auto, or without cavities"):
         Mesh(*joined(ball(1), other), cavities=True)
     with pytest.raises(MeshError, match="connected components"):
         Mesh(*joined(ball(1), other))

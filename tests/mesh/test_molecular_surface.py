@@ -29,6 +29,7 @@ def test_a_ball_has_its_area_and_volume(kind: SurfaceKind, added: float, radius:
     assert (mesh.area, mesh.volume) == pytest.approx(ball(radius + added), rel=0.01)
     away = np.linalg.norm(mesh.vertices - [0.1, 0.2, 0.3], axis=1)
     np.testing.assert_allclose(away, radius + added, rtol=0.02)
+    assert mesh.unit == "Å"
 
 
 @pytest.mark.parametrize("radii", [(1.7, 1.7), (1.9, 1.5)])

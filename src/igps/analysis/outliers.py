@@ -18,7 +18,7 @@ from igps.data.filling import by_file
 from igps.data.pipeline import SignaturePipeline
 from igps.mesh.formats import RawBody
 from igps.mesh.loading import BodyRef, each_surface, surface_body
-from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.mesh import Mesh, MeshError, millimetres
 from igps.mesh.surface import area_vectors
 
 Values = NDArray[np.float64]
@@ -131,10 +131,11 @@ def outliers(
 def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Values]:
     """What segmentations go wrong in, of each body: NaN where its mesh cannot be read again.
 
-    Of all: "volume" and "spacing", the side of a voxel or else the root of the area of a face, as logarithms. Of
-    meshes: "handles", and "flat", the largest share of the surface that lies in one plane. Of labels: "stray",
-    "cavity", "hole" and "gap", roots of shares of their voxels, and "cut", see `igps.analysis.segmentation`; and
-    "overlap", (N, N), the share of each that lies in each body of another class in the same grid and folder.
+    Of all: "volume" and "spacing", the side of a voxel or else the root of the area of a face, as logarithms, in
+    millimetres where the unit is known. Of meshes: "handles", and "flat", the largest share of the surface that lies in
+    one plane. Of labels: "stray", "cavity", "hole" and "gap", roots of shares of their voxels, and "cut", see
+    `igps.analysis.segmentation`; and "overlap", (N, N), the share of each that lies in each body of another class in
+    the same grid and folder.
     """
     found = np.full((len(dataset), len(_MEASURED)), np.nan)
     places = list[Place | None]([None] * len(dataset))
@@ -180,9 +181,10 @@ def _measures(
 def _of_body(pipeline: SignaturePipeline, body: BodyRef, raw: RawBody) -> tuple[list[float], Place | None]:
     mesh = surface_body(raw, body, pipeline.reading, least_vertices=pipeline.config.n_vertices_read)
     found = dict.fromkeys(_MEASURED, np.nan)
-    found["volume"] = np.log(mesh.volume)
+    length = millimetres(mesh.unit)
+    found["volume"] = np.log(mesh.volume * length**3)
     if raw.voxels is None:
-        found["spacing"] = np.log(mesh.area / len(mesh.faces)) / 2
+        found["spacing"] = np.log(mesh.area * length**2 / len(mesh.faces)) / 2
         found["handles"], found["flat"] = mesh.genus, flat_share(mesh)
         return list(found.values()), None
     voxels = raw.voxels()

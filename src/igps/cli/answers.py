@@ -19,7 +19,7 @@ from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
-from igps.mesh.mesh import Mesh
+from igps.mesh.mesh import Mesh, millimetres
 from igps.nn.description import describe
 from igps.report.answers import explanation_figure, groups_figure, outliers_figure, write_answer
 from igps.report.tables import groups_table
@@ -64,7 +64,7 @@ def groups(
     labels, of_strata, of_covariates = columns(bodies)
     vectors = {"": vectors_of(found.descriptor, found.descriptions)}
     if size:
-        vectors[", size"] = np.log([[one.volume] for one in found.dataset.signatures()])
+        vectors[", size"] = np.log([[one.volume * millimetres(one.unit) ** 3] for one in found.dataset.signatures()])
     members: dict[str, list[int]] = {}
     for i, part in enumerate(bodies.parts):
         members.setdefault(part or "all", []).append(i)

@@ -13,6 +13,7 @@ from igps.analysis.map import Layout, body_map
 from igps.cli.reading import Folder, described, print_failures
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import LABELS_FILE, Bodies
+from igps.mesh.mesh import millimetres
 from igps.report.answers import clusters_figure, map_figure, write_answer
 
 
@@ -77,7 +78,7 @@ def map_bodies(
     """Draw bodies as points in the plane, near to each other where their distances are small.
 
     Args:
-        colour: class, cluster, volume, or a column of labels.csv.
+        colour: class, cluster, volume (in mm³ where the unit is known), or a column of labels.csv.
         layout: mds keeps all distances as well as possible, umap keeps neighbours (needs umap-learn).
         seed: of umap, and of clusters.
         out: folder for map.csv, map.json, map.svg and map.png.
@@ -100,7 +101,7 @@ def map_bodies(
     elif colour == "cluster":
         values = [str(one + 1) for one in clusters_of(distances, n_resamples=0, seed=seed).numbers]
     elif colour == "volume":
-        values = [one.volume for one in dataset.signatures()]
+        values = [one.volume * millimetres(one.unit) ** 3 for one in dataset.signatures()]
     else:
         values = told_of(bodies)
     column = colour if colour not in ("body", "x", "y") else f"{colour} of {LABELS_FILE}"

@@ -80,7 +80,7 @@ def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
     found = body_distance(dataset, DESCRIPTOR, progress=True)
     print(f"{found.distance:.4g} by {DESCRIPTOR}: {found.meaning}")
     told = "the same shape" if found.same else "not the same shape"
-    why = f"at their level of detail, the same up to {found.limit:.3%}" if found.limit else "one has more handles"
+    why = f"at their level of detail, the same up to {found.limit:.3%}" if found.limit else "other handles or vertices"
     print(f"surfaces laid onto each other: {found.surfaces:.3%} of the root of the area apart, {told} ({why})")
     return {"descriptor": DESCRIPTOR, **asdict(found)}
 

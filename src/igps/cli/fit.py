@@ -12,6 +12,7 @@ from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors import load
 from igps.nn.descriptor import Descriptor
+from igps.nn.specification import specification
 from igps.report.tables import write_rows
 
 _TITLES = {
@@ -50,6 +51,7 @@ def fit(
     if out.suffix != ".safetensors":
         raise ValueError(f"out: expected a file ending in .safetensors, got {out}.")
     chosen = descriptor_of(descriptor)
+    specification(chosen)  # refuses what no file can hold before anything is computed
     dataset, unread = signatures(Folder(root, labelled=True), [chosen], n_workers=n_workers, strict=strict, **reading)
     failures: list[Failure] | None = None if strict else []
     model = fit_head(

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from igps.cli.reading import Folder, chosen_dataset, signatures, sized, with_side
+from igps.cli.reading import Folder, chosen_dataset, signatures, sized, tell_units, with_side
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import SIZE, Mirror, Size
@@ -41,6 +41,7 @@ def add(root: Path, gallery: Path, n_workers: int | None = None, strict: bool = 
     opened = Gallery(gallery)
     reading = as_described(opened, reading)
     dataset, unread = signatures(Folder(root), [opened.descriptor], n_workers=n_workers, strict=strict, **reading)
+    tell_units(opened.descriptor, dataset)
     undescribed = opened.add(dataset, n_workers=n_workers, strict=strict, progress=True)
     _print_state(opened, [*unread, *undescribed])
 

@@ -20,6 +20,7 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
 from igps.mesh.mending import repair_steps
+from igps.mesh.mesh import MILLIMETRES
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe, fit_centres
 from igps.nn.descriptor import Descriptor
@@ -165,6 +166,8 @@ def sized(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
     """The name of a descriptor that keeps the size of the bodies, or not, as is asked for; says what is left open."""
     module = descriptor_of(descriptor)
     if SIZE in module.name or "scale" not in module.invariant_to:
+        if size == "keep" and SIZE not in module.name:
+            print(f"size is left to {descriptor}, which does not say of itself that it ignores size (invariant_to)")
         return descriptor
     is_kept, told = keeps_size(size, () if size == "ignore" else dataset.units())
     if is_kept and size == "auto" and scale_of(module) is None:
@@ -172,6 +175,13 @@ def sized(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
     if told:
         print(told)
     return descriptor + SIZE * is_kept
+
+
+def tell_units(descriptor: Descriptor, dataset: SignatureDataset) -> None:
+    """Say how many bodies count as in millimetres because their files tell no unit, where size is kept."""
+    n_unknown = sum(unit not in MILLIMETRES for unit in dataset.units()) if SIZE in descriptor.name else 0
+    if n_unknown:
+        print(f"size is kept: {n_unknown} of {len(dataset)} bodies have no unit; their numbers count as millimetres")
 
 
 def chosen_dataset(

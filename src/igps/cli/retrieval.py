@@ -12,7 +12,15 @@ from tqdm import tqdm
 from igps.analysis.comparison import pair_distances
 from igps.cli.feature_table import SUFFIXES, feature_table, wide_table, write_table
 from igps.cli.gallery import as_described
-from igps.cli.reading import Described, Folder, described, files_or_folder, print_failures, write_notes
+from igps.cli.reading import (
+    Described,
+    Folder,
+    described,
+    files_or_folder,
+    print_failures,
+    tell_units,
+    write_notes,
+)
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.descriptors import descriptor as descriptor_of
@@ -174,6 +182,7 @@ def query(
 def _one(mesh: Path, descriptor: Descriptor, **reading: Any) -> Tensor:
     """The description of the one body of a file, or of the one that is named."""
     found = described([mesh], descriptor, **{**reading, "n_workers": 1})
+    tell_units(descriptor, found.dataset)
     if len(found.dataset) > 1:
         names = ", ".join(found.dataset.bodies.names[:5])
         raise ValueError(

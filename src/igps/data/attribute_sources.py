@@ -101,7 +101,7 @@ class FileAttribute(ABC):
         """The kind of source, the array's name, and the content of the file; a MeshError where there is none."""
         file, name = self.file(body)
         files = files_read(file)
-        return f"{type(self).__name__} 2 {name} {_checksum(*files, stamp=stamp_of(*files))}"
+        return f"{type(self).__name__} 3 {name} {_checksum(*files, stamp=stamp_of(*files))}"
 
     def __call__(self, body: BodyRef, points: Values) -> Values:
         """(P,) or (P, C) at points (P, 3); a MeshError where the file is of no use, or knows too few of them."""
@@ -195,6 +195,8 @@ class VertexAttribute(FileAttribute):
     surface.
     """
 
+    reading: LoadOptions = LoadOptions()
+
     def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
         import igl
 
@@ -204,7 +206,7 @@ class VertexAttribute(FileAttribute):
             counts = f"{len(given)} values, its surface {len(raw.vertices)} vertices"
             raise MeshError(f"{body}: {file} has {counts}. Give the values of this surface.")
         columns = completed(given.reshape(len(given), -1), raw.vertices, str(file))
-        mesh = load_mesh(body.path, part=body.part)
+        mesh = load_mesh(body.path, self.reading, part=body.part)
         vertices = mesh.vertices
         if not np.array_equal(vertices, raw.vertices):
             faces = np.ascontiguousarray(raw.faces)
@@ -251,6 +253,12 @@ def attribute_source(path: str, root: Path | None = None) -> AttributeSource:
     if name.endswith(images.SUFFIXES):
         return ImageAttribute(path, root)
     return (TetAttribute if name.endswith(_TETRAHEDRA) else VertexAttribute)(path, root)
+
+
+def of_bodies_read(source: AttributeSource, options: LoadOptions) -> AttributeSource:
+    """The source for bodies that are read so, with cavities or without; carried inside from closed ones."""
+    closed = replace(options, allow_open=False, mend="auto")
+    return replace(source, reading=closed) if isinstance(source, VertexAttribute) else source
 
 
 def attribute_sources(given: Sequence[str], root: Path | None) -> dict[str, AttributeSource]:

@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from igps._parallel import Failed, MachineError, attempt
+from igps.data.attribute_sources import of_bodies_read
 from igps.data.attributes import ROOMS, AttributeSource, with_attribute
 from igps.data.cache import AttributeCache, SignatureCache, content_digest, stamp_of
 from igps.mesh.formats import files_read
@@ -218,7 +219,7 @@ class SignaturePipeline:
         if values is not None:
             return with_attribute(signature, name, values)
         points = [getattr(signature, room).points for room in ROOMS]
-        rows = self.attributes[name](body, np.concatenate(points))
+        rows = of_bodies_read(self.attributes[name], self.reading)(body, np.concatenate(points))
         found = dict(zip(ROOMS, np.split(rows, [len(points[0])]), strict=True))
         signature = with_attribute(signature, name, found)
         cache.put(key, {room: getattr(signature, room).attributes[name] for room in ROOMS})

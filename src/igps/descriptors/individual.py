@@ -3,13 +3,14 @@
 import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
+from igps._parameters import check_one_of
 from igps.data.batch import SignatureBatch
-from igps.mesh.mesh import MILLIMETRES
+from igps.mesh.mesh import MILLIMETRES, millimetres
 from igps.nn.axes import InteriorDistance, PairTwist
 from igps.nn.batch_features import BatchFeatures
 from igps.nn.descriptor import Descriptor
@@ -76,7 +77,7 @@ class IndividualDescriptor(Descriptor):
         self._unit = _NEAR.get(descriptor.name, _SHARE * scale)
         embedding = SpectralEmbedding(n_eigenpairs=16)
         axes = [InteriorDistance(6, 3.0), PairTwist()]
-        self.twists = PairHistogram(axes, embedding, n_samples=1000) if side else None
+        self.twists = PairHistogram(axes, embedding) if side else None
         self.name, self.source = descriptor.name + SIDE * side + SIZE * size, descriptor.source
         # "motion" holds reflections
         lost = ["scale"] * size + ["motion"] * side
@@ -93,7 +94,7 @@ class IndividualDescriptor(Descriptor):
             odd = (counts - counts.flip(-1))[..., counts.shape[-1] // 2 :] / 2
             parts += [self._unit / _VOLUME * signed_volumes(batch).to(odd), self._unit / _TWIST * odd.flatten(1)]
         if self.keeps_size:
-            lengths = [MILLIMETRES.get(one or "mm", 1.0) for one in batch.units or [None] * len(batch)]
+            lengths = [millimetres(one) for one in batch.units or [None] * len(batch)]
             size = torch.stack([batch.area.log() / 2, batch.volume.log() / 3], dim=1)
             size = size + torch.tensor(lengths, dtype=size.dtype, device=size.device).log()[:, None]
             parts.append(self._unit * _MOST / _HALF * size.to(parts[0].dtype))
@@ -173,6 +174,7 @@ def keeps_size(size: Size, units: Sequence[str | None]) -> tuple[bool, str]:
         size: "auto" keeps it where all have a unit, and ignores it else.
         units: of the N bodies.
     """
+    check_one_of(get_args(Size), size=size)
     n_known = sum(unit in MILLIMETRES for unit in units)
     if size == "ignore" or n_known == len(units) or (n_known == 0 and size == "auto"):
         return size == "keep" or (size == "auto" and n_known > 0), ""

@@ -6,7 +6,9 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import get_args
 
+from igps._parameters import check_one_of
 from igps.descriptors.canonical_form import CanonicalForm
 from igps.descriptors.d2 import D2
 from igps.descriptors.geodesic_spectral import GeodesicSpectral
@@ -49,7 +51,7 @@ NAMES: tuple[str, ...] = tuple(name for name in _MAKERS if name != "molecular")
 """The names of the library's descriptors of any body."""
 
 _MARK = re.compile(r"\+(?:size|side)(?=\+|$)")
-_WITH = re.compile(r"\+(\w+)(?:=([\d.]+))?")
+_WITH = re.compile(r"\+(\w+)(?:=(\d+\.?\d*|\.\d+))?")
 _WRITTEN = (".yaml", ".yml")
 
 
@@ -119,6 +121,8 @@ def descriptor(
     Raises:
         ValueError: no descriptor has this name, or see `load`.
     """
+    check_one_of(get_args(Size), size=size)
+    check_one_of(get_args(Mirror), mirror=mirror)
     if size == "auto" and units is None:
         raise ValueError('size: expected "keep" or "ignore", or the units of the bodies beside "auto", got none.')
     marks = ""

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from igps.data.dataset import SignatureDataset
 from igps.gallery.gallery import Gallery
-from igps.mesh.mesh import MILLIMETRES
+from igps.mesh.mesh import millimetres
 from igps.retrieval.distances import Distance
 
 # Rows of distances in memory at once.
@@ -59,7 +59,7 @@ def of_one_size(near: NearPairs, dataset: SignatureDataset) -> NearPairs:
     def log_length(i: int) -> float:
         if i not in known:
             signature = dataset[i].signature
-            known[i] = math.log(signature.area) / 2 + math.log(MILLIMETRES.get(signature.unit or "mm", 1.0))
+            known[i] = math.log(signature.area) / 2 + math.log(millimetres(signature.unit))
         return known[i]
 
     return (pair for pair in near if abs(log_length(pair[0]) - log_length(pair[1])) < _ONE_SIZE)

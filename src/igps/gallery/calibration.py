@@ -95,7 +95,8 @@ class Calibration:
         """Raise a ValueError unless it belongs to a descriptor (its name, and the module) and to such Signatures."""
         name = name_of(descriptor)
         if name != self.descriptor:
-            raise ValueError(f"descriptor: expected {self.descriptor}, whose distances are calibrated, got {name}.")
+            calibrated = f"expected {self.descriptor}, whose distances are calibrated, got {name}"
+            raise ValueError(f"descriptor: {calibrated}. A gallery is of it if it is built with --size ignore.")
         if fingerprint(module) != self.model:
             raise ValueError(
                 f"{self.descriptor}: its calibration was made for other parameters of it. Make one by "

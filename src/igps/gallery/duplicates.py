@@ -62,7 +62,7 @@ class BodyDistance:
 
     distance: float  # by the descriptor
     surfaces: float  # of their surfaces laid onto each other, root mean square over √area
-    limit: float  # up to which they are of one shape, at their levels of detail; 0 if one has more handles
+    limit: float  # up to which they are of one shape, at their levels of detail; 0 as of `Surfaces.limit`
     meaning: str  # of the distance, in words
     same: bool  # whether they are the same body in the same shape
 

@@ -140,7 +140,7 @@ def without_hidden(vertices: Floats, faces: Integers, notes: list[str], *, cavit
                 continue
             kept.append(cavity)
             hidden[k] = False
-            if signed_volume(*surface) > 0:
+            if signed_volume(*surface) * signed_volume(vertices, faces[part == largest]) > 0:  # which may be inside out
                 notes.append("turned the surface of a cavity towards the inside")
                 faces[own] = faces[own][:, ::-1]
     if hidden.any():

@@ -34,6 +34,12 @@ MILLIMETRES: Mapping[str, float] = {
 }  # fmt: skip
 """In a unit of length, by the names that files and libraries give it."""
 
+
+def millimetres(unit: str | None) -> float:
+    """In a unit of length; 1 where it is not known."""
+    return MILLIMETRES.get(unit or "mm", 1.0)
+
+
 _REPAIR = 'LoadOptions(mend="auto"), on the command line --mend auto,'
 # A closed surface with less volume than this share of its diagonal's cube is a folded sheet, not a body.
 _FLAT = 1e-10
@@ -276,5 +282,5 @@ def _check_cavities(vertices: Floats, faces: Integers, name: str) -> None:
         if volumes[k] >= 0 or not lies_inside or any(abs(winding).max() > 0.5 for winding in around.values()):
             raise MeshError(
                 f"{name}: one of {len(surfaces)} closed surfaces is no cavity of the body: it is turned outwards, lies "
-                f"outside the largest, or in another cavity. Read the file with {_REPAIR}, or without cavities."
+                f"outside the largest, or in another cavity. Read the file with {_REPAIR} or without cavities."
             )

@@ -89,7 +89,7 @@ def molecular_surface(
     vertices, faces = level_surface(field.copy(), molecule.name)
     vertices = _settled(np.where(field == clear, exact, field), vertices, faces)
     vertices, faces = _one_piece(vertices, faces, pieces, max_vertices, notes)
-    return Mesh(vertices * spacing + low, faces, name=molecule.name, notes=(*molecule.notes, *notes))
+    return Mesh(vertices * spacing + low, faces, name=molecule.name, notes=(*molecule.notes, *notes), unit="Å")
 
 
 def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
