@@ -66,6 +66,14 @@ def test_fit_writes_model_and_card(
     assert f"| FT | {100 * card['held_out_scores']['ft']:.1f} |" in page
 
 
+@pytest.mark.parametrize("cavities", ["fill", "keep"])
+def test_bodies_that_are_read_otherwise_than_those_of_the_fit_are_told(
+    root: Path, model: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], cavities: str
+) -> None:
+    call(monkeypatch, root, "classify", root / "eggs", "--model", model, "--cavities", cavities)
+    assert ("read with --cavities fill, not keep" in capsys.readouterr().out) == (cavities == "keep")
+
+
 def test_every_command_takes_the_file(
     root: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

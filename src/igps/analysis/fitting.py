@@ -152,6 +152,7 @@ def fit(
         "classes": {name: counts[name] for name in names},
         "held_out_scores": scores,
         "signature": dataset.config.as_dict(),
+        "reading": dataset.reading.as_dict(),
         "version": importlib.metadata.version("interior-gps"),
     }
     return model

@@ -1,8 +1,8 @@
 """How commands read meshes: the options they share, and the signatures these give."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -107,6 +107,8 @@ def signatures(
     usable = dataset.usable(failures)
     if summary := mending_summary(usable, len(dataset)):
         print(summary)
+    for one in descriptors:
+        tell_reading(one, usable)
     return usable, failures
 
 
@@ -182,6 +184,19 @@ def tell_units(descriptor: Descriptor, dataset: SignatureDataset) -> None:
     n_unknown = sum(unit not in MILLIMETRES for unit in dataset.units()) if SIZE in descriptor.name else 0
     if n_unknown:
         print(f"size is kept: {n_unknown} of {len(dataset)} bodies have no unit; their numbers count as millimetres")
+
+
+def tell_reading(descriptor: Descriptor, dataset: SignatureDataset) -> None:
+    """Say how the bodies that a model was fitted to were read, where these are read otherwise."""
+    fitted = descriptor.card.get("reading")
+    if not isinstance(fitted, Mapping):  # it was not fitted, or before cards told
+        return
+    then, now = ({**asdict(LoadOptions()), **options} for options in (fitted, dataset.reading.as_dict()))
+    names = ("mend", "component", "allow_open", "cavities")
+    if others := [f"--{name} {then[name]}, not {now[name]}" for name in names if then[name] != now[name]]:
+        print(
+            f"{descriptor.name} was fitted to bodies read with {', '.join(others)}: what it says of others may be wrong"
+        )
 
 
 def chosen_dataset(
