@@ -30,7 +30,7 @@ Rows = NDArray[np.float64]
 
 def power(
     out: Path = Path("build/power"),
-    descriptors: Sequence[str] = ("pretrained", "interior", "shape_dna"),
+    descriptors: Sequence[str] = ("pretrained", "rich", "interior", "shape_dna"),
     differences: Sequence[float] = (0.01, 0.02, 0.03),
     n_pool: int = 600,
     n_each: int = 30,
