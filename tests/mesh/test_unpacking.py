@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from igps.mesh.loading import list_bodies, load_mesh, read_surface
+from igps.mesh.loading import each_body, list_bodies, load_mesh, read_surface
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
@@ -137,3 +137,22 @@ def test_a_scene_reads_files_beside_it_and_none_elsewhere(tmp_path: Path) -> Non
         (folder / "a.gltf").write_text(gltf(elsewhere))
         with pytest.raises(MeshError, match=r"a\.gltf: not readable as glTF.*outside of its folder"):
             load_mesh(folder / "a.gltf")
+
+
+@pytest.mark.parametrize("name", ["a.zip", "a.tar.gz"])
+def test_hidden_files_that_a_mac_packs_beside_each_are_passed_over(name: str, tmp_path: Path) -> None:
+    content = {"b.off": BOX, "__MACOSX/._b.off": b"\0\5\x16\7\0\2Mac OS X", ".git/c.off": BOX}
+    (tmp_path / name).write_bytes(packed(content)[name])
+    assert load_mesh(tmp_path / name).volume == pytest.approx(6)
+    assert [body.part for body in list_bodies(tmp_path / name, OBJECTS)] == ["b.off"]
+
+
+def test_a_faulty_file_of_an_archive_leaves_the_others_and_is_missed_in_the_whole(tmp_path: Path) -> None:
+    (tmp_path / "a.zip").write_bytes(zip_of({"bad.off": b"OFF\n8 12 0\n0 0 0\n", "good.off": BOX}))
+    with pytest.raises(MeshError, match=r"a\.zip: bad\.off: not readable as OFF"):
+        load_mesh(tmp_path / "a.zip")
+    (_, bad), (_, good) = each_body(tmp_path / "a.zip", OBJECTS)
+    assert isinstance(bad, MeshError)
+    assert "a.zip: bad.off: not readable as OFF" in str(bad)
+    assert not isinstance(good, MeshError)
+    assert good.volume == pytest.approx(6)
