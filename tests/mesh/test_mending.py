@@ -244,6 +244,12 @@ def test_neighbours_are_turned_alike_in_every_part(blob: Mesh) -> None:
     assert notes == [f"turned {int(chosen.sum())} faces to orient the surface"]
 
 
+def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob: Mesh) -> None:
+    mesh = mend(np.vstack([blob.vertices[:9], [[1e9, 0, 0]], blob.vertices[9:]]), blob.faces + (blob.faces >= 9))
+    assert same_surface(mesh, blob)
+    assert mesh.notes == ("dropped 1 unreferenced vertices",)
+
+
 def test_welding_agrees_with_trimesh(blob: Mesh) -> None:
     vertices, faces = DAMAGES["soup"].apply(blob, 0)
     by_trimesh = trimesh.Trimesh(vertices, faces, process=True)

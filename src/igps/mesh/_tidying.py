@@ -27,6 +27,9 @@ def welded(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
 
     Vertices and faces that stay keep their order. What was done is added to `notes`.
     """
+    n_given = len(vertices)
+    vertices, faces = compact(vertices, faces)  # far from the others an unused one makes coincident all that are near
+    unused = n_given - len(vertices)
     place = places(vertices)
     n_places = len(np.unique(place))
     if n_places < len(vertices):
@@ -40,7 +43,7 @@ def welded(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     if len(once) < len(faces):
         notes.append(f"dropped {len(faces) - len(once)} duplicate faces")
         faces = faces[np.sort(once)]
-    unused = n_places - len(np.unique(faces))
+    unused += n_places - len(np.unique(faces))
     if unused:
         notes.append(f"dropped {unused} unreferenced vertices")
     vertices, faces = compact(vertices, faces)
