@@ -124,6 +124,37 @@ def gltf(uri: str) -> str:
     )
 
 
+@pytest.mark.parametrize("suffix", ["gltf", "glb"])
+@pytest.mark.parametrize("how", [{"normalized": True}, {"sparse": {"count": 1, "indices": {}, "values": {}}}, {}])
+def test_coordinates_that_would_be_taken_for_others_are_refused(
+    how: dict[str, object], suffix: str, tmp_path: Path
+) -> None:
+    """Of a scene whose places are whole numbers, as tools that compress make them."""
+    scene = json.loads(gltf("numbers.bin"))
+    scene["accessors"][0] |= {"componentType": 5122, **how}
+    scene["bufferViews"][0]["byteStride"] = 8
+    rows = np.array([[0, 0, 0, 0], [9, 0, 0, 0], [0, 9, 0, 0], [0, 0, 9, 0]], dtype="<i2")
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype="<u4")
+    numbers = rows.tobytes().ljust(48, b"\0") + faces.tobytes()
+    (tmp_path / "numbers.bin").write_bytes(numbers)
+    if suffix == "glb":
+        del scene["buffers"][0]["uri"]
+    text = json.dumps(scene).encode()
+    if suffix == "glb":
+        text += b" " * (-len(text) % 4)
+        chunks = [
+            len(text).to_bytes(4, "little") + b"JSON" + text,
+            len(numbers).to_bytes(4, "little") + b"BIN\0" + numbers,
+        ]
+        text = b"glTF\2\0\0\0" + (12 + len(b"".join(chunks))).to_bytes(4, "little") + b"".join(chunks)
+    (tmp_path / f"a.{suffix}").write_bytes(text)
+    if how:
+        with pytest.raises(MeshError, match=rf"a\.{suffix}: not readable as glTF.*sparse or normalized"):
+            load_mesh(tmp_path / f"a.{suffix}")
+    else:
+        assert load_mesh(tmp_path / f"a.{suffix}").volume == pytest.approx(9**3 / 6)
+
+
 def test_a_scene_reads_files_beside_it_and_none_elsewhere(tmp_path: Path) -> None:
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype="<f4")
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype="<u4")
