@@ -57,6 +57,16 @@ def places(vertices: Floats) -> Integers:
     return np.asarray(first[index.ravel()])
 
 
+def met(vertices: Floats, faces: Integers) -> Integers:
+    """The faces (F, 3) where they meet in one vertex: those at free edges are one if they are in one place."""
+    ends, edge_of_side = undirected_edges(faces, len(vertices))
+    free = np.unique(ends[np.bincount(edge_of_side) == 1])
+    index = np.arange(len(vertices))
+    if len(free):
+        index[free] = free[places(vertices[free])]
+    return index[faces]
+
+
 def are_specks(areas: Floats) -> Booleans:
     """Which of the parts with these areas are specks; none if all specks together have much area."""
     specks = areas < SPECK * areas.sum()
