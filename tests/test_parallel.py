@@ -185,6 +185,14 @@ def test_an_executor_has_limits_of_its_own() -> None:
         list(run(jobs.square, [1], executor=pool, limits=Limits(seconds=1)))
 
 
+def test_a_caller_that_takes_its_time_costs_no_job_its_result() -> None:
+    found = []
+    for number, result in run(jobs.sleep, [0.1, 0.6], n_workers=2, limits=Limits(seconds=1)):
+        found.append((number, result))
+        time.sleep(1.5)
+    assert found == [(0, 0.1), (1, 0.6)]
+
+
 @pytest.mark.parametrize(("name", "options"), [("time_limit", {"seconds": 0}), ("memory_limit", {"memory": -5})])
 def test_impossible_limits_are_refused(name: str, options: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=f"{name}: expected None or a positive number"):

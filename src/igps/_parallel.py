@@ -223,7 +223,7 @@ def _by_workers(
                     else:
                         yield number, Failed(_KILLED)
             for future, (worker, number, deadline) in list(busy.items()):
-                if time.monotonic() >= deadline:
+                if time.monotonic() >= deadline and not future.done():  # as it may be after a slow caller
                     worker.end(kill=True)
                     del busy[future]
                     idle.append(worker)

@@ -123,6 +123,12 @@ def test_pieces_are_what_is_not_connected_in_the_order_of_the_file(tmp_path: Pat
     bodies = load_bodies(tmp_path / "boxes.ply", PIECES)
     np.testing.assert_allclose([body.volume for body in bodies], [1, 27, 8], rtol=1e-6)
     assert all("left out 1 specks" in body.notes for body in bodies)
+    text = "".join(
+        "v {} {} {}\n".format(*place) for place in [*whole.vertices.tolist(), [1e9, 0, 0]]
+    )  # used by no face
+    text += "".join("f {} {} {}\n".format(*face) for face in (whole.faces + 1).tolist())
+    (tmp_path / "boxes.obj").write_text(text)
+    assert parts(tmp_path / "boxes.obj", PIECES) == ["piece 1", "piece 2", "piece 3"]
     np.savetxt(tmp_path / "cloud.xyz", np.random.default_rng(0).random((20, 3)))
     assert parts(tmp_path / "cloud.xyz", PIECES) == [None]
 

@@ -226,6 +226,8 @@ def test_strips_and_polygons_of_vtk_files(tmp_path: Path) -> None:
 
 
 FAULTY = {
+    "four.off": (b"4" + off().replace("\n3 ", " 2\n3 ").encode(), "4OFF"),
+    "cut.ply": (trimesh.exchange.ply.export_ply(SOLID, encoding="ascii")[:-40], "announced"),
     "cut.vtk": (polydata("3.0")[:4000].encode(), "announced"),
     "huge.vtk": (b"# vtk DataFile Version 3.0\nx\nBINARY\nDATASET POLYDATA\nPOINTS 1000000000000 float\n", "announced"),
     "image.vtk": (b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET STRUCTURED_POINTS\n", "STRUCTURED_POINTS"),

@@ -261,6 +261,17 @@ def test_open_files_are_read_when_allowed(tmp_path: Path) -> None:
     assert len(mesh.faces) == 3
 
 
+def test_the_largest_component_of_loose_triangles_is_what_they_make_together(tmp_path: Path) -> None:
+    small, large = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 2, 3))
+    beside = trimesh.creation.box((1, 1, 1)).apply_translation([0, 1.5, 0])  # it touches the large one
+    vertices = np.concatenate([small.triangles + 9, large.triangles]).reshape(-1, 3)
+    path = write_off(tmp_path / "loose.off", vertices, np.arange(len(vertices)).reshape(-1, 3))
+    assert load_mesh(path, LoadOptions(component="largest")).volume == pytest.approx(6)
+    closed = trimesh.util.concatenate([large, beside])
+    path = write_off(tmp_path / "closed.off", np.asarray(closed.vertices), np.asarray(closed.faces))
+    assert load_mesh(path, LoadOptions(component="largest")).volume == pytest.approx(6)
+
+
 def test_unknown_component_is_refused() -> None:
     with pytest.raises(ValueError, match="component: expected 'largest' or None, got 'smallest'"):
         LoadOptions(component="smallest")  # type: ignore[arg-type]

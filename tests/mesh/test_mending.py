@@ -244,6 +244,24 @@ def test_neighbours_are_turned_alike_in_every_part(blob: Mesh) -> None:
     assert notes == [f"turned {int(chosen.sum())} faces to orient the surface"]
 
 
+def test_a_vertex_that_no_face_uses_does_not_weld_the_others(blob: Mesh) -> None:
+    mesh = mend(np.vstack([blob.vertices[:9], [[1e9, 0, 0]], blob.vertices[9:]]), blob.faces + (blob.faces >= 9))
+    assert same_surface(mesh, blob)
+    assert mesh.notes == ("dropped 1 unreferenced vertices",)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5])
+def test_corners_that_differ_in_the_last_digit_of_single_precision_are_one(blob: Mesh, share: float) -> None:
+    generator = np.random.default_rng(0)
+    corners = blob.vertices[blob.faces].reshape(-1, 3).astype(np.float32)
+    moved = np.nextafter(corners, generator.choice(np.float32([-9, 9]), corners.shape))
+    corners = np.where(generator.random(corners.shape) < share, moved, corners)
+    mesh = mend(corners.astype(np.float64), np.arange(len(corners)).reshape(-1, 3))
+    assert repair_steps(mesh.notes) == ("welded",)
+    assert len(mesh.vertices) == len(blob.vertices)
+    assert mesh.area == pytest.approx(blob.area, rel=1e-5)
+
+
 def test_welding_agrees_with_trimesh(blob: Mesh) -> None:
     vertices, faces = DAMAGES["soup"].apply(blob, 0)
     by_trimesh = trimesh.Trimesh(vertices, faces, process=True)

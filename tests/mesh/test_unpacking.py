@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from igps.mesh.loading import list_bodies, load_mesh, read_surface
+from igps.mesh.loading import each_body, list_bodies, load_mesh, read_surface
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
@@ -124,6 +124,37 @@ def gltf(uri: str) -> str:
     )
 
 
+@pytest.mark.parametrize("suffix", ["gltf", "glb"])
+@pytest.mark.parametrize("how", [{"normalized": True}, {"sparse": {"count": 1, "indices": {}, "values": {}}}, {}])
+def test_coordinates_that_would_be_taken_for_others_are_refused(
+    how: dict[str, object], suffix: str, tmp_path: Path
+) -> None:
+    """Of a scene whose places are whole numbers, as tools that compress make them."""
+    scene = json.loads(gltf("numbers.bin"))
+    scene["accessors"][0] |= {"componentType": 5122, **how}
+    scene["bufferViews"][0]["byteStride"] = 8
+    rows = np.array([[0, 0, 0, 0], [9, 0, 0, 0], [0, 9, 0, 0], [0, 0, 9, 0]], dtype="<i2")
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype="<u4")
+    numbers = rows.tobytes().ljust(48, b"\0") + faces.tobytes()
+    (tmp_path / "numbers.bin").write_bytes(numbers)
+    if suffix == "glb":
+        del scene["buffers"][0]["uri"]
+    text = json.dumps(scene).encode()
+    if suffix == "glb":
+        text += b" " * (-len(text) % 4)
+        chunks = [
+            len(text).to_bytes(4, "little") + b"JSON" + text,
+            len(numbers).to_bytes(4, "little") + b"BIN\0" + numbers,
+        ]
+        text = b"glTF\2\0\0\0" + (12 + len(b"".join(chunks))).to_bytes(4, "little") + b"".join(chunks)
+    (tmp_path / f"a.{suffix}").write_bytes(text)
+    if how:
+        with pytest.raises(MeshError, match=rf"a\.{suffix}: not readable as glTF.*sparse or normalized"):
+            load_mesh(tmp_path / f"a.{suffix}")
+    else:
+        assert load_mesh(tmp_path / f"a.{suffix}").volume == pytest.approx(9**3 / 6)
+
+
 def test_a_scene_reads_files_beside_it_and_none_elsewhere(tmp_path: Path) -> None:
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype="<f4")
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype="<u4")
@@ -137,3 +168,22 @@ def test_a_scene_reads_files_beside_it_and_none_elsewhere(tmp_path: Path) -> Non
         (folder / "a.gltf").write_text(gltf(elsewhere))
         with pytest.raises(MeshError, match=r"a\.gltf: not readable as glTF.*outside of its folder"):
             load_mesh(folder / "a.gltf")
+
+
+@pytest.mark.parametrize("name", ["a.zip", "a.tar.gz"])
+def test_hidden_files_that_a_mac_packs_beside_each_are_passed_over(name: str, tmp_path: Path) -> None:
+    content = {"b.off": BOX, "__MACOSX/._b.off": b"\0\5\x16\7\0\2Mac OS X", ".git/c.off": BOX}
+    (tmp_path / name).write_bytes(packed(content)[name])
+    assert load_mesh(tmp_path / name).volume == pytest.approx(6)
+    assert [body.part for body in list_bodies(tmp_path / name, OBJECTS)] == ["b.off"]
+
+
+def test_a_faulty_file_of_an_archive_leaves_the_others_and_is_missed_in_the_whole(tmp_path: Path) -> None:
+    (tmp_path / "a.zip").write_bytes(zip_of({"bad.off": b"OFF\n8 12 0\n0 0 0\n", "good.off": BOX}))
+    with pytest.raises(MeshError, match=r"a\.zip: bad\.off: not readable as OFF"):
+        load_mesh(tmp_path / "a.zip")
+    (_, bad), (_, good) = each_body(tmp_path / "a.zip", OBJECTS)
+    assert isinstance(bad, MeshError)
+    assert "a.zip: bad.off: not readable as OFF" in str(bad)
+    assert not isinstance(good, MeshError)
+    assert good.volume == pytest.approx(6)

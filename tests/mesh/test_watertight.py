@@ -187,6 +187,15 @@ def test_parts_that_share_an_edge_are_one() -> None:
     assert body.volume == pytest.approx(2, rel=0.02)
 
 
+def test_a_wall_inside_that_lies_on_points_of_the_grid_is_filled() -> None:
+    left = trimesh.creation.box((1, 1, 1)).subdivide().subdivide()
+    right = left.copy().apply_translation([1, 0, 0])  # whose squares in the wall are cut along the other diagonal
+    mesh = watertight(*arrays(left, right))
+    assert mesh.genus == 0
+    assert mesh.area == pytest.approx(10, rel=0.03)
+    assert mesh.volume == pytest.approx(2, rel=0.01)
+
+
 def test_a_sheet_gets_about_a_cell() -> None:
     x, y = (values.ravel() for values in np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5)))
     vertices = np.stack([x, y, np.zeros_like(x)], axis=1)

@@ -127,7 +127,7 @@ def level_set(distance: Singles, nearest: Singles, outside: Booleans, surface: O
         thin = np.stack([index[~solid] for index in at], axis=1)
         inside[tuple(thin[surface.winding(thin) > 0.5].T)] = True
         solid = _has_inside(inside, at, foot, way)
-    field = np.where(inside, -1, 1) * np.minimum(distance, np.float32(_BAND))
+    field = np.where(inside, -1, 1) * np.clip(distance, np.float32(LEAST), np.float32(_BAND))  # zero has no sign
     sheet = tuple(index[~solid] for index in at)
     field[sheet] = distance[sheet] - _HALF_SHEET
     field = np.where(np.abs(field) < LEAST, np.where(field < 0, -LEAST, LEAST), field)

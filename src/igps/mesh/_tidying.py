@@ -4,8 +4,9 @@ from collections import defaultdict
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
-from scipy.spatial import Delaunay
+from scipy.spatial import Delaunay, cKDTree
 
 from igps._arrays import Booleans, Floats, Integers, Surface
 from igps.mesh.mesh import Mesh, MeshError
@@ -14,6 +15,10 @@ from igps.mesh.winding import winding_number
 
 # Vertices closer than this share of the bounding box's diagonal are one.
 _WELD = 1e-8
+# So near are the sides of a crack: corners in single precision that differ in their last digits.
+_CRACK = 1e-6
+# Where more vertices are that near to each, the surface is tiny beside its bounding box, and they are no crack.
+_MOST_NEAR = 50
 # Parts of less than this share of the area are specks, unless all of them together have ten times as much.
 SPECK = 2e-3
 # Fins may have this share of the area.
@@ -27,7 +32,11 @@ def welded(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
 
     Vertices and faces that stay keep their order. What was done is added to `notes`.
     """
+    n_given = len(vertices)
+    vertices, faces = compact(vertices, faces)  # far from the others an unused one makes coincident all that are near
+    unused = n_given - len(vertices)
     place = places(vertices)
+    place = _without_cracks(vertices, place[faces])[place]
     n_places = len(np.unique(place))
     if n_places < len(vertices):
         notes.append(f"welded {len(vertices) - n_places} coincident vertices")
@@ -40,7 +49,7 @@ def welded(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
     if len(once) < len(faces):
         notes.append(f"dropped {len(faces) - len(once)} duplicate faces")
         faces = faces[np.sort(once)]
-    unused = n_places - len(np.unique(faces))
+    unused += n_places - len(np.unique(faces))
     if unused:
         notes.append(f"dropped {unused} unreferenced vertices")
     vertices, faces = compact(vertices, faces)
@@ -52,6 +61,32 @@ def places(vertices: Floats) -> Integers:
     lattice = np.round((vertices - vertices.mean(axis=0)) / (_WELD * max(diagonal(vertices), np.finfo(float).tiny)))
     _, first, index = np.unique(lattice.astype(np.int64), axis=0, return_index=True, return_inverse=True)
     return np.asarray(first[index.ravel()])
+
+
+def met(vertices: Floats, faces: Integers) -> Integers:
+    """The faces (F, 3) where they meet in one vertex: those at free edges are one if they are in one place."""
+    free, index = _at_free_edges(vertices, faces), np.arange(len(vertices))
+    if len(free):
+        index[free] = free[places(vertices[free])]
+    return index[faces]
+
+
+def _without_cracks(vertices: Floats, faces: Integers) -> Integers:
+    """(V,) of each vertex the one that it is, where the sides of a crack are nearer than single precision can tell."""
+    free, index = _at_free_edges(vertices, faces), np.arange(len(vertices))
+    tree, near = cKDTree(vertices[free]), _CRACK * diagonal(vertices)
+    if tree.count_neighbors(tree, near) > _MOST_NEAR * len(free):
+        return index
+    pairs = tree.query_pairs(near, output_type="ndarray")
+    graph = sparse.coo_array((np.ones(len(pairs), dtype=np.int8), tuple(pairs.T)), shape=(len(free), len(free)))
+    _, first, group = np.unique(connected_components(graph, directed=False)[1], return_index=True, return_inverse=True)
+    index[free] = free[first[group]]
+    return index
+
+
+def _at_free_edges(vertices: Floats, faces: Integers) -> Integers:
+    ends, edge_of_side = undirected_edges(faces, len(vertices))
+    return np.unique(ends[np.bincount(edge_of_side, minlength=len(ends)) == 1])
 
 
 def are_specks(areas: Floats) -> Booleans:

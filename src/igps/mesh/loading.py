@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from igps._threads import one_thread
+from igps.mesh._tidying import met
 from igps.mesh.formats import FORMATS, Format, RawBody, format_of
 from igps.mesh.formats._format import faults, joined, pieces
 from igps.mesh.limits import check_memory
@@ -132,7 +133,7 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
     vertices, faces, notes = raw.vertices, raw.faces, raw.notes
     if options.component == "largest" and len(faces):
         check_arrays(vertices, faces, name)
-        owner, areas = face_parts(vertices, faces)
+        owner, areas = face_parts(vertices, faces if options.mend == "never" else met(vertices, faces))
         if len(areas) > 1:
             n_before = len(vertices)
             vertices, faces = compact(vertices, faces[owner == int(np.argmax(areas))])

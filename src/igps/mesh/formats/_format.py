@@ -104,6 +104,7 @@ def pieces(whole: RawBody) -> list[RawBody]:
     if not len(faces):
         return [whole]
     check_arrays(vertices, faces, "the whole")
+    vertices, faces = compact(vertices, faces)  # where others lie is no matter
     owner, areas = face_parts(vertices, places(vertices)[faces])  # loose triangles are connected where they meet
     small = are_specks(areas)
     notes = (*whole.notes, f"left out {int(small.sum())} specks") if small.any() else whole.notes

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
-from igps.mesh.formats._format import Format, RawBody, check_unpacked, joined
+from igps.mesh.formats._format import Format, RawBody, check_unpacked, faults, joined
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 
@@ -26,8 +26,13 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     bodies = []
     with tempfile.TemporaryDirectory() as folder:
         for name, place in _unpacked(path, Path(folder), options):
-            if part in (None, name) and (found := _inside(place, path, options, None)):
-                bodies.append(replace(joined(found), part=name))
+            try:
+                if part in (None, name) and (found := _inside(place, path, options, None)):
+                    bodies.append(replace(joined(found), part=name))
+            except MeshError as fault:
+                if options.bodies != "objects":  # of the whole it would be missing
+                    raise
+                bodies.append(RawBody(part=name, fault=fault))
     if not bodies:
         raise ValueError("no surface in it")
     return bodies
@@ -52,19 +57,20 @@ def _inside(place: Path, path: Path, options: LoadOptions, part: str | None) -> 
     if kind is None or not kind.is_searched:
         return []
     try:
-        return list(kind.read(place, options, part))
+        with faults(place, kind):
+            return list(kind.read(place, options, part))
     except MeshError as error:
         raise MeshError(str(error).replace(str(place), f"{path}: {place.name}")) from error
 
 
 def _unpacked(path: Path, folder: Path, options: LoadOptions) -> list[tuple[str, Path]]:
-    """The names of the files in an archive, and where they are now. Links, and ways out of it, are passed over."""
+    """The names of the files in an archive, and where they are now, but for links, ways out of it and hidden files."""
     found = []
     with _members(path, options) as members:
         for name, stream in members:
             inside = PurePosixPath(name.replace("\\", "/"))
-            if inside.is_absolute() or ".." in inside.parts or not inside.name:
-                continue
+            if inside.is_absolute() or any(one.startswith(".") for one in inside.parts) or not inside.name:
+                continue  # a Mac adds a hidden file of the same suffix to each
             place = folder / inside
             place.parent.mkdir(parents=True, exist_ok=True)
             _copy(stream, place)

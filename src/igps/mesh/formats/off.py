@@ -18,9 +18,12 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     text = text_of(path)
     if "#" in text:
         text = "\n".join(line.partition("#")[0] for line in text.split("\n"))
-    lines = [line for line in text.partition("OFF")[2].splitlines() if line and not line.isspace()]
+    kind, _, rest = text.partition("OFF")
+    lines = [line for line in rest.splitlines() if line and not line.isspace()]
     if not lines:
         raise ValueError("no OFF with the numbers of vertices and faces behind it")
+    if "4" in kind:
+        raise ValueError("four coordinates for each vertex (4OFF), of which three are expected")
     n_vertices, n_faces, *_ = map(int, lines[0].split())
     places, rows = lines[1 : n_vertices + 1], lines[n_vertices + 1 :][:n_faces]
     if min(n_vertices, n_faces) < 0 or len(rows) < n_faces or len(places) < n_vertices:

@@ -70,7 +70,9 @@ def _polygons(head: str, body: bytes) -> Surface | None:
 def _of_text(text: bytes, names: list[str], n_vertices: int, n_faces: int, at: int) -> Polygons | None:
     lines = [line for line in text.splitlines() if line and not line.isspace()]
     places, faces = lines[:n_vertices], lines[n_vertices : n_vertices + n_faces]
-    if len(faces) < n_faces or (at == 0 and all(line.startswith(b"3 ") for line in faces)):
+    if len(faces) < n_faces:  # of which trimesh makes as much as it can
+        raise EOFError(f"{n_vertices} vertices and {n_faces} faces announced, {len(lines)} lines there")
+    if at == 0 and all(line.startswith(b"3 ") for line in faces):
         return None
     rows = [line.split() for line in faces]
     if all(row[at] == b"3" for row in rows):

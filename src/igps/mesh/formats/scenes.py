@@ -8,6 +8,7 @@ import tempfile
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from igps.mesh.formats._format import Format, RawBody, check_unpacked, distinct, pieces
 from igps.mesh.formats._trimesh import Beside, objects
@@ -33,7 +34,22 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
 
 def read_gltf(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The objects of a glTF scene, which is in metres."""
+    scene = _scene(path)
+    for primitive in (one for mesh in scene.get("meshes", []) for one in mesh["primitives"]):
+        used = [primitive["attributes"].get("POSITION"), primitive.get("indices")]
+        arrays = [scene["accessors"][number] for number in used if number is not None]
+        if any("sparse" in one or one.get("normalized") for one in arrays):  # trimesh reads other numbers
+            raise ValueError("its coordinates are sparse or normalized, which is not read; export it uncompressed")
     return [replace(body, unit="m") for body in objects(path, options)]
+
+
+def _scene(path: Path) -> dict[str, Any]:
+    """What a file of glTF says of its numbers: all of a .gltf, the first chunk of a .glb."""
+    with path.open("rb") as file:
+        head = file.read(20)
+        is_binary = head.startswith(b"glTF")
+        found = json.loads(file.read(int.from_bytes(head[12:16], "little")) if is_binary else head + file.read())
+    return dict(found)
 
 
 def _buffers(path: Path, options: LoadOptions) -> list[Path]:
@@ -41,7 +57,7 @@ def _buffers(path: Path, options: LoadOptions) -> list[Path]:
     if path.suffix.lower() != ".gltf":
         return []
     check_memory(path)
-    names = [one.get("uri", "data:") for one in json.loads(path.read_bytes()).get("buffers", [])]
+    names = [one.get("uri", "data:") for one in _scene(path).get("buffers", [])]
     return [Beside(path.parent).place(name) for name in names if not name.startswith("data:")]
 
 
