@@ -104,6 +104,13 @@ def test_nothing_to_do() -> None:
     assert all_of(jobs.square, [], n_workers=4, limits=Limits(seconds=1)) == {}
 
 
+@pytest.mark.parametrize("n_workers", [0, -1])
+def test_fewer_than_one_worker_is_refused(n_workers: int) -> None:
+    """0 took all cores, and -1, which elsewhere stands for all, took one."""
+    with pytest.raises(ValueError, match=rf"n_workers: expected at least 1, got {n_workers}\."):
+        all_of(jobs.square, [1, 2], n_workers=n_workers)
+
+
 def test_one_worker_is_this_process_unless_there_are_limits(limited: dict[int, tuple[int, str]]) -> None:
     assert all_of(jobs.process, [0, 0], n_workers=1)[1][0] == os.getpid()
     assert limited[0][0] == limited[1][0] != os.getpid()

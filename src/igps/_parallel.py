@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TypeVar
 
+from igps._parameters import check_at_least
 from igps._threads import n_cores, one_thread, stay_on_one_thread
 from igps._threads import n_threads as available_threads
 from igps._workers import MachineError, Worker, workers_environment
@@ -90,6 +91,7 @@ def run(
         MachineError: the disk is full, memory runs out without a limit, a library is missing, or no process can be
             started.
     """
+    check_at_least(1, n_workers=n_workers)
     limits = limits or Limits()
     limited = limits != Limits()
     if executor is not None:

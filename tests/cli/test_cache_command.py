@@ -100,3 +100,17 @@ def test_what_joins_a_descriptor_joins_the_one_that_is_computed_for_where_none_i
     call(monkeypatch, "precompute", tmp_path / "eggs", "--with", "potential", "--cache_dir", tmp_path, "--n_workers", 1)
     dataset = SignatureDataset(tmp_path / "eggs", cache_dir=tmp_path, descriptor="pretrained+potential")
     assert None not in dataset.cached_keys()
+
+
+def test_a_mesh_in_place_of_a_folder_is_told_as_such(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was taken for a damaged file of signatures, with the advice to export it again."""
+    write_egg(tmp_path / "egg.off", 2.0, subdivisions=2)
+    for command in (
+        ["retrieve", tmp_path / "egg.off"],
+        ["query", tmp_path / "egg.off", "--gallery", tmp_path / "egg.off"],
+    ):
+        with pytest.raises(SystemExit, match="1"):
+            call(monkeypatch, *command, "--cache_dir", tmp_path / "cache")
+        assert capsys.readouterr().err == f"igps: {tmp_path / 'egg.off'}: a file; a folder expected.\n"

@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 
 import igps
 import igps.data.pipeline as pipeline_module
-from igps._parallel import Failed, Limits
+from igps._parallel import Failed, Limits, MachineError
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import Failure, SignatureDataset
@@ -125,6 +125,13 @@ def test_key_covers_content_and_version_but_not_the_path(
     monkeypatch.setattr(SignatureConfig, "ALGORITHM_VERSION", SignatureConfig.ALGORITHM_VERSION + 1)
     moved[3]
     assert len(counted) == 3
+
+
+@pytest.mark.parametrize("cache", ["file", "file/cache"])
+def test_a_cache_that_cannot_be_made_is_no_fault_of_the_bodies(root: Path, tmp_path: Path, cache: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(MachineError, match=rf"cache_dir: {tmp_path / cache} cannot be made .*Choose a folder"):
+        SignatureDataset(root, CONFIG, tmp_path / cache).precompute(n_workers=1)
 
 
 def test_truncated_file_is_reported_and_computed_again(

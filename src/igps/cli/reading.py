@@ -19,6 +19,7 @@ from igps.data.sources import Bodies, ClassRule, find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
+from igps.mesh.formats import is_searched
 from igps.mesh.mending import repair_steps
 from igps.mesh.mesh import MILLIMETRES
 from igps.mesh.options import LoadOptions
@@ -221,7 +222,7 @@ def chosen_dataset(
     if paper and signature != SignatureConfig():
         raise ValueError("paper: expected no other parameters of the signatures beside it. Leave one out.")
     config, reading = SignatureConfig.paper() if paper else signature, LoadOptions(**options)
-    if isinstance(source, Folder) and source.root.is_file():
+    if isinstance(source, Folder) and source.root.is_file() and not is_searched(source.root.name):
         if config != SignatureConfig() or reading != LoadOptions() or classes is not None or attribute:
             raise ValueError(f"{source.root}: expected no reading options beside a file of signatures. Leave them out.")
         if source.needs_meshes:

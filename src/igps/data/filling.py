@@ -48,6 +48,11 @@ def fill(
     progress: bool, limits: Limits | None,
 ) -> tuple[list[CacheHit | None], list[Failure]]:  # fmt: skip
     """What serves each body, after computing what was missing; and what failed, see `SignatureDataset.precompute`."""
+    try:  # once, or each body would be told to be at fault
+        pipeline.cache_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        told = f"cache_dir: {pipeline.cache_dir} cannot be made ({error.strerror})"
+        raise MachineError(f"{told}. Choose a folder that can be written and run again.") from error
     SignatureCache(pipeline.cache_dir).remove_abandoned()
     known = FileStatCache(pipeline)
     found = hits_in_cache(pipeline, bodies, look=executor is None)

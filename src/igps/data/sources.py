@@ -254,8 +254,8 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
     columns = {name: [row.get(name) or None for _, row in rows] for name in further}
     found = [(root / row["file"], row["file"], row.get("label"), row.get("body") or None) for _, row in rows]
     bodies = _expanded(found, options, columns)
-    twice = sorted(name for name, count in Counter(bodies.names).items() if count > 1)
-    if twice:
+    counts = Counter(places := [(os.path.abspath(body.path), body.part) for body in bodies])  # ./1.off is 1.off
+    if twice := sorted(name for name, place in zip(bodies.names, places, strict=True) if counts[place] > 1):
         raise ValueError(f"{file}: {twice[0]} is listed twice. List each body once.")
     return bodies
 

@@ -67,7 +67,7 @@ class SignatureConfig:
     def __post_init__(self) -> None:
         counts = {"resolution": self.resolution, "n_surface_samples": self.n_surface_samples}
         check_at_least(1, n_eigenpairs=self.n_eigenpairs, **counts)
-        check_at_least(0, min_samples=self.min_samples, least_vertices=self.least_vertices)
+        check_at_least(0, min_samples=self.min_samples, least_vertices=self.least_vertices, seed=self.seed)
         check_one_of(get_args(Backend), backend=self.backend)
         if self.max_vertices is not None and self.max_vertices <= self.n_kept + 1:
             raise ValueError(
