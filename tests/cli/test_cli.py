@@ -90,6 +90,18 @@ def test_retrieve_prints_and_writes_what_python_computes(
     assert not (out / "failures.csv").exists()
 
 
+def test_results_are_written_though_nobody_reads_what_is_printed(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(*words: object) -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr("igps.cli.retrieval.print", gone, raising=False)
+    with pytest.raises(SystemExit):
+        igps(monkeypatch, "retrieve", root, "--descriptor", "d2", "--out", tmp_path / "out", *SMALL)
+    assert (tmp_path / "out" / "scores.json").exists()
+
+
 def test_retrieve_reranks_in_a_table_of_its_own(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -61,15 +61,17 @@ def retrieve(
     distances = {"distances": pair_distances(found.descriptor, found.descriptions, progress=True)}
     scores = retrieval_scores(distances["distances"], labels)
     summary = _summary(found, scores)
-    print(scores_table(scores))
+    told = scores_table(scores)
     if rerank:
         distances["reranked"] = reranked_distances(distances["distances"], progress=True)
         scores = retrieval_scores(distances["reranked"], labels)
         summary["reranked"] = scores.mean()
-        print(f"\nre-ranked by the whole collection, without its labels\n{scores_table(scores)}")
+        told += f"\n\nre-ranked by the whole collection, without its labels\n{scores_table(scores)}"
+    if out is not None:  # before anything is printed: who pipes that into `head` may be gone by then
+        _write_retrieval(out, found, summary, distances)
+    print(told)
     print_failures(found.failures, len(found.dataset))
     if out is not None:
-        _write_retrieval(out, found, summary, distances)
         print(f"written to {out}")
         if report:
             write_report(out, n_workers=reading.get("n_workers"))
