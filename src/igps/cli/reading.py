@@ -195,9 +195,7 @@ def tell_reading(descriptor: Descriptor, dataset: SignatureDataset) -> None:
     then, now = ({**asdict(LoadOptions()), **options} for options in (fitted, dataset.reading.as_dict()))
     names = ("mend", "component", "allow_open", "cavities")
     if others := [f"--{name} {then[name]}, not {now[name]}" for name in names if then[name] != now[name]]:
-        print(
-            f"{descriptor.name} was fitted to bodies read with {', '.join(others)}: what it says of others may be wrong"
-        )
+        print(f"{descriptor.name} was fitted to bodies read with {', '.join(others)}: its answers may be wrong")
 
 
 def chosen_dataset(
