@@ -209,7 +209,7 @@ def file_and_part(path: Path) -> tuple[Path, str | None]:
 
 
 def is_number(value: str | float | None) -> bool:
-    """Whether it is a finite number, or none; words such as 01_02 are none, whatever Python says."""
+    """Whether a value is missing or a finite number; 01_02, a number to Python, is a word."""
     try:
         return value is None or ("_" not in str(value) and math.isfinite(float(value)))
     except ValueError:

@@ -36,7 +36,7 @@ MILLIMETRES: Mapping[str, float] = {
 
 
 def millimetres(unit: str | None) -> float:
-    """In a unit of length; 1 where it is not known."""
+    """How many millimetres a unit of length has; 1 where the unit is not known."""
     return MILLIMETRES.get(unit or "mm", 1.0)
 
 

@@ -12,8 +12,7 @@ from itertools import combinations_with_replacement
 from typing import Any
 
 import torch
-from torch import Tensor
-from torch.library import custom_op
+from torch import Tensor, library
 
 from igps.nn._kernels.count_by_loops import CompiledCount, Layout
 from igps.nn._kernels.count_by_torch import count_by_torch
@@ -77,7 +76,7 @@ def _known(ways: Sequence[int], tensors: list[Tensor]) -> list[PairValues]:
 _ARGUMENTS = "Tensor classes, int n_classes, int[] ways, Tensor mask, Tensor[] tensors"
 
 
-@custom_op("igps::count_pairs", mutates_args=(), schema=f"({_ARGUMENTS}) -> Tensor")
+@library.custom_op("igps::count_pairs", mutates_args=(), schema=f"({_ARGUMENTS}) -> Tensor")
 def _operator(classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, tensors: list[Tensor]) -> Tensor:
     """What `_count` counts; gradients flow to the tensors."""
     return _count(classes, n_classes, _known(ways, tensors), mask, tensors)
@@ -89,7 +88,7 @@ def _(classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, tensors: l
     return classes.new_empty(len(mask), n_classes * (n_classes + 1) // 2, *bins, dtype=torch.float64)
 
 
-@custom_op("igps::count_pairs_backward", mutates_args=(), schema=f"(Tensor upstream, {_ARGUMENTS}) -> Tensor[]")
+@library.custom_op("igps::count_pairs_backward", mutates_args=(), schema=f"(Tensor upstream, {_ARGUMENTS}) -> Tensor[]")
 def _gradients(
     upstream: Tensor, classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, tensors: list[Tensor]
 ) -> list[Tensor]:
