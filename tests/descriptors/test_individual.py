@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ import trimesh
 
 import igps
 from igps import Mesh, SignatureConfig, collate, compute_signature
+from igps.cli.compare import compare
+from igps.cli.gallery import build
 from igps.cli.retrieval import query, retrieve
 from igps.descriptors.fingerprint import cache_tag
 from igps.descriptors.individual import SCALES, IndividualDescriptor, keeps_size, signed_volumes
@@ -278,3 +281,39 @@ def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_
     assert igps.descriptor(f"{tmp_path}/mine.safetensors+size", mirror="distinct").name == loaded.name
     torch.testing.assert_close(loaded(batch), model(batch))
     torch.testing.assert_close(loaded.distances(loaded(batch), loaded(batch)), model.distances(*[model(batch)] * 2))
+
+
+@pytest.mark.parametrize("command", ["retrieve", "compare", "gallery build"])
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("d2+size", {"size": "ignore"}),
+        ("d2+side", {"mirror": "same"}),
+        ("kept.safetensors", {"size": "ignore"}),
+    ],
+)
+def test_a_name_that_contradicts_an_option_is_refused_before_anything_is_computed(
+    command: str, name: str, options: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_3mf(tmp_path / "balls" / "1" / "a.3mf", 1, "inch")
+    igps.descriptor("d2+size").save(tmp_path / "kept.safetensors", {})
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(igps.SignatureDataset, "precompute", None)
+    root = tmp_path / "balls"
+    run = {
+        "retrieve": partial(retrieve, root, name),
+        "compare": partial(compare, root, [name, "shape_dna"]),
+        "gallery build": partial(build, root, tmp_path / "gallery", name),
+    }[command]
+    with pytest.raises(ValueError, match=rf"{next(iter(options))}: expected no .* beside d2\+si[zd]e"):
+        run(**options)
+
+
+def test_a_descriptor_is_compared_with_itself_that_keeps_size(tmp_path: Path) -> None:
+    for name, radius in (("1/a", 1), ("1/b", 1.1), ("2/c", 3), ("2/d", 3.3)):
+        write_3mf(tmp_path / "balls" / f"{name}.3mf", radius, "inch")
+    rows = compare(tmp_path / "balls", ["shape_dna", "shape_dna+size"], cache_dir=tmp_path / "cache", n_workers=1)
+    assert [row["descriptor"] for row in rows] == ["shape_dna", "shape_dna+size"]
+    assert rows[1]["nn"] == 1
+    with pytest.raises(ValueError, match="expected one of each name, got several of shape_dna"):
+        compare(tmp_path / "nowhere", ["shape_dna", "shape_dna+size"], size="keep")

@@ -105,14 +105,18 @@ def compare(
 
 def check_descriptors(descriptors: Sequence[Descriptor], dataset: SignatureDataset) -> None:
     """Raise a ValueError where two have one name, by which results are told apart, or the signatures lack something."""
-    names = [one.name for one in descriptors]
+    check_names([one.name for one in descriptors])
+    for descriptor in descriptors:
+        descriptor.requirements.check_config(dataset.config)
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Raise a ValueError where two descriptors have one name."""
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(
             f"descriptors: expected one of each name, got several of {', '.join(repeated)}. Name each once, and "
             "give those of your own another `name`."
         )
-    for descriptor in descriptors:
-        descriptor.requirements.check_config(dataset.config)
 
 
 def _described(job: tuple[Descriptor, SignatureDataset]) -> _Description:

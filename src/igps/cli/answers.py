@@ -19,6 +19,7 @@ from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
+from igps.descriptors.individual import SIZE, Size
 from igps.mesh.mesh import Mesh, millimetres
 from igps.nn.description import describe
 from igps.report.answers import explanation_figure, groups_figure, outliers_figure, write_answer
@@ -59,7 +60,8 @@ def groups(
         return labels, of_strata, np.hstack([_numbers(bodies, name) for name in covariate]) if covariate else None
 
     folder = Folder(root, labelled=group is None, check=columns)
-    found = described(folder, descriptor, size="ignore", **reading)
+    how: Size = "auto" if SIZE in descriptor_of(descriptor).name else "ignore"  # as its name says
+    found = described(folder, descriptor, size=how, **reading)
     bodies = found.dataset.bodies
     labels, of_strata, of_covariates = columns(bodies)
     vectors = {"": vectors_of(found.descriptor, found.descriptions)}

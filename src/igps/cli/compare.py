@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from igps.analysis.comparison import Result
+from igps.analysis.comparison import Result, check_names
 from igps.analysis.comparison import compare as compare_descriptors
-from igps.cli.reading import Folder, signatures, sized, with_side, write_notes
+from igps.cli.reading import Folder, MirrorOption, check_marks, signatures, sized, with_side, write_notes
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure
 from igps.descriptors import NAMES
 from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.individual import Mirror, Size
+from igps.descriptors.individual import SIZE, Size
 from igps.nn.description import fit_centres
 from igps.report.answers import precision_recall
 from igps.report.results import write_sources
@@ -29,7 +29,7 @@ def compare(
     out: Path | None = None,
     report: bool = False,
     size: Size = "auto",
-    mirror: Mirror = "same",
+    mirror: MirrorOption = "auto",
     n_workers: int | None = None,
     strict: bool = False,
     **reading: Any,
@@ -41,7 +41,8 @@ def compare(
 
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
-        descriptors: names, or package.module:NAME of your own.
+        descriptors: names, or package.module:NAME of your own; where one ends in +size, --size auto leaves the others
+            as they are named.
         out: folder for compare.json, distances/NAME.npz, precision_recall.png, meshes.json that tells where the meshes
             lie, and failures.csv if there are any.
         report: make a page of the results in that folder, report.html, see `igps report`
@@ -49,6 +50,11 @@ def compare(
     check_report(report, out)
     wanted = [with_side(name, mirror) for name in descriptors]
     chosen = [descriptor_of(name) for name in wanted]
+    for one in chosen:
+        check_marks(one.name, size, mirror)
+    if size == "auto" and any(SIZE in one.name for one in chosen):
+        size = "ignore"
+    check_names([one.name.replace(SIZE, "") if size == "keep" else one.name for one in chosen])
     dataset, failures = signatures(Folder(root, labelled=True), chosen, n_workers=n_workers, strict=strict, **reading)
     chosen = [descriptor_of(sized(name, size, dataset)) for name in wanted]
     for one in chosen:

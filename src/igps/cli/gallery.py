@@ -6,10 +6,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from igps.cli.reading import Folder, chosen_dataset, signatures, sized, tell_units, with_side
+from igps.cli.reading import Folder, MirrorOption, check_marks, chosen_dataset, signatures, sized, tell_units, with_side
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.individual import SIZE, Mirror, Size
+from igps.descriptors.individual import SIDE, SIZE, Size
 from igps.gallery.about import about_of, check_alike
 from igps.gallery.gallery import Gallery
 from igps.gallery.sync import sync as sync_folder
@@ -18,7 +18,7 @@ from igps.signature.signature import SignatureConfig
 
 
 def build(
-    root: Path, out: Path, descriptor: str = "pretrained", size: Size = "auto", mirror: Mirror = "same",
+    root: Path, out: Path, descriptor: str = "pretrained", size: Size = "auto", mirror: MirrorOption = "auto",
     n_workers: int | None = None, strict: bool = False, **reading: Any,
 ) -> None:  # fmt: skip
     """Describe the bodies of a folder into a gallery, to be asked by igps query without their files.
@@ -30,6 +30,7 @@ def build(
     """
     descriptor = with_side(descriptor, mirror)
     chosen = descriptor_of(descriptor)
+    check_marks(chosen.name, size, mirror)
     dataset, unread = signatures(Folder(root), [chosen], n_workers=n_workers, strict=strict, **reading)
     descriptor = sized(descriptor, size, dataset)
     gallery, undescribed = Gallery.build(out, dataset, descriptor, n_workers=n_workers, strict=strict, progress=True)
@@ -128,10 +129,11 @@ def restore(gallery: Path, version: int) -> None:
 def as_described(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]:
     """How meshes are read, as it was when the gallery was built; a ValueError where something else is asked for."""
     given, check = dict(reading), partial(check_alike, gallery.path, gallery.about)
-    size, mirror, name = given.pop("size", "auto"), given.pop("mirror", "same"), gallery.about["descriptor"]
+    size, mirror, name = given.pop("size", "auto"), given.pop("mirror", "auto"), gallery.about["descriptor"]
     if size != "auto":
         check({"descriptor": name.replace(SIZE, "") + SIZE * (size == "keep")})
-    check({"descriptor": with_side(name, mirror)})
+    if mirror != "auto":
+        check({"descriptor": with_side(name.replace(SIDE, ""), mirror)})
     config = given.pop("signature", SignatureConfig())
     if given.pop("paper", False):
         config = SignatureConfig.paper()

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from functools import reduce
 from operator import or_
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from torch import Tensor
 
@@ -18,7 +18,7 @@ from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, ClassRule, find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
-from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
+from igps.descriptors.individual import SIDE, SIZE, Size, keeps_size, scale_of
 from igps.mesh.formats import is_searched
 from igps.mesh.mending import repair_steps
 from igps.mesh.mesh import MILLIMETRES
@@ -27,6 +27,8 @@ from igps.nn.description import describe, fit_centres
 from igps.nn.descriptor import Descriptor
 from igps.report.tables import write_rows
 from igps.signature.signature import SignatureConfig
+
+MirrorOption = Literal["auto", "same", "distinct"]
 
 FLAGS = {
     "paper": "use the parameters of Rustamov 2010: as the defaults, but the grid is never refined",
@@ -48,7 +50,7 @@ MEANINGS = {
     "descriptor": "a name (a wrong one lists all), or package.module:NAME of one of your own",
     "gallery": "the gallery",
     "size": "keep lets differences in size count, ignore does not; auto keeps it where all files have a unit of length",
-    "mirror": "distinct tells a body from its mirror image",
+    "mirror": "distinct tells a body from its mirror image, same does not; auto is as the descriptor's name says",
     "n_workers": "processes that compute; all cores if not given",
     "time_limit": "seconds that one body may take; no limit if not given",
     "memory_limit": "gigabytes of memory that one body may take; no limit if not given",
@@ -119,7 +121,7 @@ def described(
     strict: bool = False,
     n_workers: int | None = None,
     size: Size = "auto",
-    mirror: Mirror = "same",
+    mirror: MirrorOption = "auto",
     **reading: Any,
 ) -> Described:
     """The bodies whose signatures are in the cache, and their descriptions; see `signatures`.
@@ -128,6 +130,7 @@ def described(
     """
     if isinstance(descriptor, str):
         descriptor = with_side(descriptor, mirror)
+        check_marks(descriptor_of(descriptor).name, size, mirror)
     dataset, failures = signatures(source, [descriptor_of(descriptor)], strict, n_workers, **reading)
     if isinstance(descriptor, str):
         descriptor = sized(descriptor, size, dataset)
@@ -158,9 +161,16 @@ def print_failures(failures: Sequence[Failure], n_used: int) -> None:
         print(f"{len(failures)} of {n_given} meshes could not be used. The first: {failures[0].error}")
 
 
-def with_side(descriptor: str, mirror: Mirror) -> str:
-    """The name of a descriptor that tells mirror images apart, or not, as is asked for."""
-    if mirror == "same" or SIDE in descriptor:
+def check_marks(name: str, size: Size, mirror: MirrorOption) -> None:
+    """Raise a ValueError where the name of a descriptor contradicts an option."""
+    for option, value, refused, mark in (("size", size, "ignore", SIZE), ("mirror", mirror, "same", SIDE)):
+        if value == refused and mark in name:
+            raise ValueError(f"{option}: expected no {value!r} beside {name}, which is {mark}. Leave one of them out.")
+
+
+def with_side(descriptor: str, mirror: MirrorOption) -> str:
+    """The name of a descriptor that tells mirror images apart, if that is asked for."""
+    if mirror != "distinct" or SIDE in descriptor:
         return descriptor
     return descriptor.replace(SIZE, "") + SIDE + SIZE * (SIZE in descriptor)
 
