@@ -4,9 +4,11 @@ import math
 from collections.abc import Sequence
 
 
-def check_at_least(least: int, **values: float | None) -> None:
-    """Raise a ValueError that names the first of the values that is smaller."""
+def check_at_least(least: int, **values: int | None) -> None:
+    """Raise a ValueError that names the first of the values that is smaller, or no whole number."""
     for name, value in values.items():
+        if value is not None and not hasattr(value, "__index__"):
+            raise ValueError(f"{name}: expected a whole number, got {value!r}.")
         if value is not None and value < least:
             raise ValueError(f"{name}: expected at least {least}, got {value}.")
 

@@ -283,3 +283,12 @@ def test_where_a_job_of_several_bodies_is_lost_each_is_tried_alone(root: Path, t
     with Fragile(1) as executor:
         assert dataset.precompute(executor, n_workers=1, progress=False) == []
     assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 4
+
+
+def test_a_name_that_is_too_long_for_a_file_costs_no_other(tmp_path: Path) -> None:
+    trimesh.creation.icosphere(2).export(tmp_path / "a.off")
+    (tmp_path / "labels.csv").write_text(f"file,label\na.off,one\n{'x' * 300}.off,one\n")
+    dataset = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache")
+    (failure,) = dataset.precompute(n_workers=1)
+    assert failure.id == f"{'x' * 300}.off"
+    assert "File name too long" in failure.error

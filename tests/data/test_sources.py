@@ -55,6 +55,7 @@ def test_meshes_alone_have_no_classes(tmp_path: Path) -> None:
         ("file,label\n1.off,cat\n1.off,dog\n", r"1\.off is listed twice"),
         ("file,label\n1.off,cat\n./1.off,cat\n", r"\./1\.off is listed twice"),
         ("file,label\n1.off,cat\na/../1.off,cat\n", r"1\.off is listed twice"),
+        ("file,label\n1\0.off,cat\n", "line 2 lacks the name of a file"),
         ("file,label,age\n1.off,cat,40,5\n", "line 2 has more values than columns. Put a value with a comma in quotes"),
     ],
 )

@@ -152,3 +152,23 @@ def test_the_larger_the_cavity_the_farther_from_the_ball() -> None:
         descriptions = torch.cat([module(batch) for batch in batches])
         distances = module.distances(descriptions[:1], descriptions)[0]
         assert bool((distances.diff() > 0).all()), (module.name, distances)
+
+
+def test_of_two_cavities_that_meet_at_a_vertex_both_are_turned_inwards() -> None:
+    tip = int(np.argmax(BALL.vertices[:, 0]))
+    one = (BALL.vertices - BALL.vertices[tip]) * 0.25  # reaches from the left to the origin
+    other = one * [-0.8, 0.8, 0.8]  # its mirror image, smaller
+    inwards = BALL.faces[:, ::-1]
+
+    def hollow(second: np.ndarray) -> Mesh:
+        vertices, faces = joined((BALL.vertices, BALL.faces), (one, inwards), (other, second))
+        n = len(BALL.vertices)
+        last = np.delete(np.arange(3 * n), 2 * n + tip)  # the vertex that is there twice
+        number = np.searchsorted(last, np.arange(3 * n))
+        number[2 * n + tip] = n + tip
+        return Mesh(vertices[last], number[faces], cavities=True)
+
+    volume = (1 - 0.25**3 - 0.2**3) * BALL.volume
+    assert hollow(BALL.faces).volume == pytest.approx(volume, rel=1e-12)  # the mirror has turned them
+    with pytest.raises(MeshError, match="is no cavity of the body: it is turned outwards"):
+        hollow(inwards)

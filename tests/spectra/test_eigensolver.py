@@ -436,8 +436,10 @@ def test_what_is_refused(torus_problem: Problem) -> None:
     broken.data[5] = np.nan
     lopsided = stiffness.copy()
     lopsided[0, lopsided.indices[1]] += 0.1
-    with pytest.raises(ValueError, match="n_eigenpairs must be at least 1"):
+    with pytest.raises(ValueError, match="n_eigenpairs: expected at least 1, got 0"):
         eigenpairs(stiffness, mass, 0)
+    with pytest.raises(ValueError, match=r"n_eigenpairs: expected a whole number, got 2\.5\."):
+        eigenpairs(stiffness, mass, 2.5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="ask for fewer eigenpairs"):
         eigenpairs(stiffness, mass, n_vertices - 1)
     with pytest.raises(ValueError, match="stiffness has entries that are not finite"):

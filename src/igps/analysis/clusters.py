@@ -55,6 +55,7 @@ def clusters_of(
     if joining not in get_args(Joining):
         raise ValueError(f"joining: expected one of {', '.join(get_args(Joining))}, got {joining!r}.")
     check_at_least(0, n_resamples=n_resamples)
+    check_at_least(1, n_clusters=n_clusters)
     found, n = checked_distances(distances), len(distances)
     tree = _tree(found, joining)
     if n_clusters is None:

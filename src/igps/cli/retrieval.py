@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 from tqdm import tqdm
 
+from igps._parameters import check_at_least
 from igps.analysis.comparison import pair_distances
 from igps.cli.feature_table import SUFFIXES, feature_table, wide_table, write_table
 from igps.cli.gallery import as_described
@@ -147,8 +148,7 @@ def query(
         rerank: order the nearest 200 by the neighbours they have in common (diffusion and k-reciprocal re-ranking,
             without labels); the distances listed are those of this order.
     """
-    if top < 1:
-        raise ValueError(f"top: expected at least 1, got {top}.")
+    check_at_least(1, top=top)
     if is_gallery(gallery):
         opened = Gallery(gallery, descriptor)
         wanted = _one(mesh, opened.descriptor, **as_described(opened, reading))

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Sampler
 
+from igps._parameters import check_at_least
+
 _BATCHES_IN_A_BUCKET = 20
 
 
@@ -36,8 +38,7 @@ class BucketBatchSampler(Sampler[list[int]]):
         drop_last: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
-        if batch_size < 1:
-            raise ValueError(f"batch_size: expected at least 1, got {batch_size}.")
+        check_at_least(1, batch_size=batch_size)
         self.sizes = torch.as_tensor(sizes)
         self.batch_size = batch_size
         self.drop_last = drop_last

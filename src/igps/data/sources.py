@@ -247,9 +247,9 @@ def _from_labels_file(root: Path, options: LoadOptions) -> Bodies:
             raise ValueError(f"{file}: a column is named twice in {header}. Give each column a name of its own.")
     if longer := [line for line, row in rows if row.get(None)]:  # under which stands what has no column
         raise ValueError(f"{file}: line {longer[0]} has more values than columns. Put a value with a comma in quotes.")
-    incomplete = [line for line, row in rows if not all(row.get(name) for name in {"file", "label"} & set(header))]
-    if not rows or incomplete:
-        where = f"line {incomplete[0]} lacks a file or a label" if incomplete else "no rows"
+    empty = [line for line, row in rows if any("\0" in (row.get(one) or "\0") for one in {"file", "label"} & {*header})]
+    if not rows or empty:
+        where = f"line {empty[0]} lacks the name of a file, or a label" if empty else "no rows"
         raise ValueError(f"{file}: {where}. Each line names a mesh file and its class.")
     columns = {name: [row.get(name) or None for _, row in rows] for name in further}
     found = [(root / row["file"], row["file"], row.get("label"), row.get("body") or None) for _, row in rows]

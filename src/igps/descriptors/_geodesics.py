@@ -13,6 +13,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
 from igps._arrays import Floats, Integers
+from igps._parameters import check_at_least
 from igps.mesh.mesh import Mesh
 from igps.mesh.simplification import simplify
 from igps.mesh.surface import undirected_edges
@@ -94,8 +95,7 @@ def edge_graph(mesh: Mesh, points_per_edge: int = 0) -> sparse.csr_array:
     edges: 7 % and 12 %), measured against exact polyhedral distances (Mitchell, Mount and Papadimitriou 1987) on five
     SHREC'07 models of 1,000 vertices.
     """
-    if points_per_edge < 0:
-        raise ValueError(f"points_per_edge: expected at least 0, got {points_per_edge}.")
+    check_at_least(0, points_per_edge=points_per_edge)
     n, n_vertices, n_faces = points_per_edge, len(mesh.vertices), len(mesh.faces)
     # Side i of a face runs from corner i to corner i + 1.
     edges, edge_of = undirected_edges(mesh.faces, n_vertices)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from igps._parameters import check_at_least
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import is_number
 from igps.descriptors import descriptor as descriptor_of
@@ -125,8 +126,7 @@ class Gallery:
         where: str | None = None,
     ) -> list[list[Match]]:
         """For each of the descriptions (Q, ...) the bodies closest to it, closest first; options as of `query`."""
-        if top < 1:
-            raise ValueError(f"top: expected at least 1, got {top}.")
+        check_at_least(1, top=top)
         matches = []
         for query in descriptions:
             n_near = max(top, N_RERANKED) if rerank else top

@@ -1,6 +1,7 @@
 """A file becomes bodies: which it holds, and each as a closed surface."""
 
 import logging
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -169,7 +170,7 @@ def _bodies(kind: Format, options: LoadOptions) -> BodyKind:
 
 
 def _format(path: Path) -> Format:
-    if not path.is_file():
+    if not os.path.isfile(path):  # False, too, of a name that no file can have
         raise MeshError(f"{path}: no such file. Check the path.")
     if path.stat().st_size == 0:
         raise MeshError(f"{path}: the file is empty (0 bytes). Export it again.")

@@ -19,6 +19,7 @@ from igps.mesh.surface import (
     diagonal,
     directed_edges,
     face_areas,
+    face_patches,
     genus,
     signed_volume,
     undirected_edges,
@@ -273,13 +274,15 @@ def _check_cavities(vertices: Floats, faces: Integers, name: str) -> None:
     surfaces = connected(vertices, faces)
     volumes = [signed_volume(*surface) for surface in surfaces]
     outer = int(np.argmax(volumes))
-    for k, (points, _) in enumerate(surfaces):
+    for k, (points, triangles) in enumerate(surfaces):
         if k == outer:
             continue
+        patch = face_patches(triangles, len(points))[0]  # two that meet at a vertex are one surface
+        is_outward = any(signed_volume(points, triangles[patch == i]) >= 0 for i in range(patch.max() + 1))
         # About a point of a cavity's own surface the winding number of that surface is anything from 0 to 1
         around = {i: winding_number(one[0], one[1], points) for i, one in enumerate(surfaces) if i != k}
         lies_inside = around.pop(outer).min() >= 0.5
-        if volumes[k] >= 0 or not lies_inside or any(abs(winding).max() > 0.5 for winding in around.values()):
+        if is_outward or not lies_inside or any(abs(winding).max() > 0.5 for winding in around.values()):
             raise MeshError(
                 f"{name}: one of {len(surfaces)} closed surfaces is no cavity of the body: it is turned outwards, lies "
                 f"outside the largest, or in another cavity. Read the file with {_REPAIR} or without cavities."

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from igps._arrays import Floats, Integers, Surface
+from igps._parameters import check_at_least
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import longest_side, undirected_edges
 
@@ -16,8 +17,7 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     so that a closed manifold stays one; the result is checked again like any mesh. A MeshError where `max_vertices`
     cannot be reached, or the simplified surface is not a body any more.
     """
-    if max_vertices < 4:
-        raise ValueError(f"max_vertices: expected at least 4, got {max_vertices}.")
+    check_at_least(4, max_vertices=max_vertices)
     surplus = len(mesh.vertices) - max_vertices
     if surplus <= 0:
         return mesh

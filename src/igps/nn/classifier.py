@@ -2,6 +2,7 @@
 
 from torch import Tensor, nn
 
+from igps._parameters import check_at_least
 from igps.data.batch import SignatureBatch
 from igps.nn.descriptor import Descriptor
 from igps.retrieval.distances import square_root
@@ -27,8 +28,7 @@ class Classifier(nn.Module):
 
     def __init__(self, descriptor: Descriptor, n_classes: int, dropout: float = 0.2) -> None:
         super().__init__()
-        if n_classes < 2:
-            raise ValueError(f"n_classes: expected at least 2, got {n_classes}.")
+        check_at_least(2, n_classes=n_classes)
         self.descriptor = descriptor
         n = descriptor.n_features
         # One scale for all cells would leave most of them without weight

@@ -59,9 +59,9 @@ class ArticulatedShapes:
     most_classes: int | None = len(TEMPLATES)
 
     def __init__(self, n_classes: int = 8, n_per_class: int = 10, seed: int = 0, n_vertices: int = 3000) -> None:
-        check_at_least(1, n_classes=operator.index(n_classes), n_per_class=operator.index(n_per_class))
-        check_at_least(0, seed=operator.index(seed))
-        check_at_least(500, n_vertices=operator.index(n_vertices))
+        check_at_least(1, n_classes=n_classes, n_per_class=n_per_class)
+        check_at_least(0, seed=seed)
+        check_at_least(500, n_vertices=n_vertices)
         if self.most_classes is not None and n_classes > self.most_classes:
             raise ValueError(f"n_classes must be at most {self.most_classes}, got {n_classes}")
         self.n_classes, self.n_per_class, self.seed, self.n_vertices = n_classes, n_per_class, seed, n_vertices

@@ -4,6 +4,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from igps._parameters import check_at_least
+
 # Below these, relative to what it came from, a number is rounding, a matrix sloppy
 ROUNDING, SLOPPINESS = 1e-14, 1e-8
 
@@ -47,8 +49,7 @@ def checked_stiffness(
     n_vertices = len(mass)
     if mass.ndim != 1 or stiffness.shape != (n_vertices, n_vertices):
         raise ValueError(f"stiffness must be (V, V) and mass (V,), got {stiffness.shape} and {mass.shape}")
-    if n_eigenpairs < 1:
-        raise ValueError(f"n_eigenpairs must be at least 1, got {n_eigenpairs}")
+    check_at_least(1, n_eigenpairs=n_eigenpairs)
     if n_eigenpairs + 1 >= n_vertices:
         raise ValueError(
             f"n_eigenpairs={n_eigenpairs} needs matrices of more than {n_eigenpairs + 1} rows, these have "

@@ -5,6 +5,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.rnn import pad_sequence
 
+from igps._parameters import check_at_least
 from igps.descriptors.pretrained._merge_tree import MergeTree, merge_tree, merge_trees
 from igps.nn.batch_features import SampleFeatures, SampleKind
 from igps.nn.embedding import SpectralEmbedding
@@ -42,8 +43,7 @@ class BranchHistogram(SampleHistogram):
         n_training_samples: int | None = None,
     ) -> None:
         super().__init__(samples, n_samples, n_training_samples)
-        if n_branches < 2:
-            raise ValueError(f"n_branches: expected at least 2, got {n_branches}.")
+        check_at_least(2, n_branches=n_branches)
         self.embedding = embedding or SpectralEmbedding()
         self.n_branches = n_branches
 

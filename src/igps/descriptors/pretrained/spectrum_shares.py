@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from igps._parameters import check_at_least
 from igps.data.requirements import Requirements
 from igps.nn.batch_features import WEIGHT, BatchFeatures
 from igps.nn.histograms.base import DescriptionPart
@@ -34,8 +35,7 @@ class SpectrumShares(DescriptionPart):
 
     def __init__(self, n_eigenpairs: int = 64) -> None:
         super().__init__()
-        if n_eigenpairs < 3:
-            raise ValueError(f"n_eigenpairs: expected at least 3, got {n_eigenpairs}.")
+        check_at_least(3, n_eigenpairs=n_eigenpairs)
         self.n_eigenpairs = n_eigenpairs
 
     @property

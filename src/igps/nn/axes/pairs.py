@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 
 from torch import Tensor, nn
 
+from igps._parameters import check_at_least
 from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn._kernels.pair_values import PairValues, euclidean_distances, oriented_pairs, pair_twists
 from igps.nn.axes.centres import OrderedCentres, middles
@@ -63,8 +64,7 @@ class PairAxis(Specified, ABC):
 
 
 def _bin_middles(n_bins: int, reach: float) -> Tensor:
-    if n_bins < 2:
-        raise ValueError(f"n_bins: expected at least 2, got {n_bins}.")
+    check_at_least(2, n_bins=n_bins)
     return middles(n_bins, reach, "bins")
 
 

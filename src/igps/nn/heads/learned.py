@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from igps._parameters import check_at_least
 from igps.nn.heads.base import Head, check_cells, square_roots
 from igps.retrieval.distances import Distance, chi_square
 
@@ -29,8 +30,7 @@ class ProjectionHead(Head):
 
     def __init__(self, width: int = 64, n_hidden: int = 256, dropout: float = 0.5, cell_dropout: float = 0.2) -> None:
         super().__init__()
-        if width < 1:
-            raise ValueError(f"width: expected at least 1, got {width}.")
+        check_at_least(1, width=width)
         self.register_buffer("mean", torch.zeros(0))
         self.register_buffer("scale", torch.ones(()))
         layers: list[nn.Module] = [nn.Dropout(cell_dropout), nn.LazyLinear(n_hidden or width)]
