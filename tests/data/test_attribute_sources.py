@@ -88,6 +88,13 @@ def test_an_image_gives_a_linear_function_wherever_it_lies(
     np.testing.assert_allclose(source(body, INSIDE), linear(INSIDE), atol=1e-5)
 
 
+def test_an_image_may_have_the_whole_name_of_the_body(tmp_path: Path) -> None:
+    (tmp_path / "ct").mkdir()
+    write_nifti(tmp_path / "ct" / "egg.nii.gz", image())
+    source = attribute_source("ct/{file}", tmp_path)
+    np.testing.assert_allclose(source(BodyRef(tmp_path / "egg.nii.gz", "1"), INSIDE), linear(INSIDE), atol=1e-5)
+
+
 @pytest.mark.parametrize("suffix", [".dx", ".mrc"])
 def test_a_grid_gives_a_linear_function(body: BodyRef, suffix: str) -> None:
     grids = pytest.importorskip("gridData")

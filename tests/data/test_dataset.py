@@ -77,6 +77,12 @@ def test_functions_of_position_become_attributes(root: Path, tmp_path: Path) -> 
         broken[0]
 
 
+def test_the_name_of_an_attribute_is_no_source(root: Path, tmp_path: Path) -> None:
+    told = "attributes: expected functions or sources by name, got 'depth' for h. The library's own are named"
+    with pytest.raises(ValueError, match=told):
+        SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"h": "depth"})  # type: ignore[dict-item]
+
+
 def test_computed_once_then_read(dataset: SignatureDataset, counted: list[str]) -> None:
     first, second = dataset[0].signature, dataset[0].signature
     assert len(counted) == 1

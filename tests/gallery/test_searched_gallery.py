@@ -494,3 +494,28 @@ def test_numbers_stay_as_they_are_written_in_a_column_of_text(root: Path, tmp_pa
     n_versions = len(gallery.versions())
     assert sync(gallery, eggs, root / "egg", n_workers=1) == (0, 0, [])
     assert len(gallery.versions()) == n_versions
+
+
+def test_what_labels_tell_no_more_sync_empties(root: Path, tmp_path: Path) -> None:
+    table, cache = root / "labels.csv", tmp_path / "cache"
+    table.write_text("file,label,age,scanner\nball/0.off,ball,41,A\negg/0.off,egg,3,B\n")
+    gallery, _ = Gallery.build(tmp_path / "g", SignatureDataset(root, CONFIG, cache), small_interior(), n_workers=1)
+    table.write_text("file,label,scanner\nball/0.off,ball,A\negg/0.off,egg,C\n")
+    assert sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1) == (0, 0, [])
+    told = {row["name"]: (row["age"], row["scanner"]) for row in gallery.rows("name", "age", "scanner")}
+    assert told == {"ball/0.off": (None, "A"), "egg/0.off": (None, "C")}
+    n_versions = len(gallery.versions())
+    sync(gallery, SignatureDataset(root, CONFIG, cache), root, n_workers=1)
+    assert len(gallery.versions()) == n_versions
+
+
+def test_galleries_whose_columns_do_not_fit_are_not_merged_by_half(root: Path, tmp_path: Path) -> None:
+    for label, age in (("ball", "41"), ("egg", "old")):
+        (root / label / "labels.csv").write_text(f"file,label,age\n0.off,{label},{age}\n")
+        dataset = SignatureDataset(root / label, CONFIG, tmp_path / "cache")
+        Gallery.build(tmp_path / label, dataset, small_interior(), n_workers=1)
+    with pytest.raises(ValueError, match=r"age: expected numbers as in .*ball, got text\. Correct the labels"):
+        Gallery.merge(tmp_path / "all", [tmp_path / "ball", tmp_path / "egg"], small_interior())
+    assert not (tmp_path / "all").exists()
+    both = Gallery.merge(tmp_path / "all", [tmp_path / "egg", tmp_path / "ball"], small_interior())
+    assert {row["age"] for row in both.rows("age")} == {"old", "41.0"}

@@ -200,6 +200,8 @@ class VertexAttribute(FileAttribute):
     def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
         import igl
 
+        if file.name.lower().endswith(images.SUFFIXES):  # of a pattern that ends in {file}
+            return ImageAttribute(self.path, self.root).values(body, file, name, points)
         raw = read_surface(body.path, LoadOptions(), part=body.part)
         given = vertex_values.chosen(vertex_values.read(file), name, file)
         if len(given) != len(raw.vertices):

@@ -88,6 +88,11 @@ def split_attributes(
     sources: dict[str, AttributeSource] = {}
     functions: dict[str, PointFunction] = {}
     for name, one in given.items():
+        if not callable(one):
+            raise ValueError(
+                f"attributes: expected functions or sources by name, got {one!r} for {name}. The library's own are "
+                "named in SignatureConfig(attributes=...)."
+            )
         if isinstance(one, AttributeSource):
             sources[name] = one
         elif _takes_body(one):

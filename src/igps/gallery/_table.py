@@ -148,9 +148,7 @@ class BodyTable:
         with self.changing():
             self._check_shape(descriptions)
             n_before = len(self)
-            for name, kind in further.items():
-                if self.columns.get(name, kind) not in (kind, str):
-                    raise ValueError(f"{name}: expected numbers as in {self.path}, got text. Correct the labels.")
+            self.check_kinds(further)
             if new := further.keys() - self.columns.keys():
                 self.table.add_columns(pa.schema([(name, _ARROW[further[name]]) for name in sorted(new)]))
                 self._read_head()
@@ -177,6 +175,12 @@ class BodyTable:
             _index(self.table)
             self.table.checkout(self.table.version)
             self._read_head()
+
+    def check_kinds(self, further: Mapping[str, type]) -> None:
+        """Raise a ValueError where a column of numbers would get text."""
+        for name, kind in further.items():
+            if self.columns.get(name, kind) not in (kind, str):
+                raise ValueError(f"{name}: expected numbers as in {self.path}, got text. Correct the labels.")
 
     def _check_shape(self, descriptions: Tensor) -> None:
         if (found := tuple(descriptions.shape[1:])) != self.shape:

@@ -226,6 +226,10 @@ class Gallery:
         first, is_new = opened[0], len(opened) == len(others)
         for one in opened:
             check_alike(one.path, one.about, first.about)
+        owners = {name: one for one in reversed(opened) for name in one.columns}  # the first to have a column
+        for one in opened:
+            for name, kind in one.columns.items():
+                owners[name].check_kinds({name: kind})
         with tqdm(total=sum(map(len, opened[not is_new :])), desc="entries", disable=not progress) as bar:
 
             def batches(table: Any) -> Iterator[Batch]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from igps.data.dataset import Failure, SignatureDataset
+from igps.gallery.about import KNOWN
 from igps.gallery.gallery import Gallery
 from igps.gallery.rows import further_columns, key_of, once, told_of
 
@@ -37,7 +38,8 @@ def sync(
     """
     dataset = once(dataset)
     kinds = further_columns(dataset.bodies, gallery.columns)
-    now = told_of(dataset.bodies, kinds, dataset.reading)
+    empty = dict.fromkeys(gallery.columns.keys() - KNOWN.keys())  # what the folder tells no more
+    now = [{**empty, **row} for row in told_of(dataset.bodies, kinds, dataset.reading)]
     asked = [name for name in ("checksum", *now[0]) if name in gallery.columns]
     known = {one["id"]: one for one in gallery.rows(*asked)}
     new: list[int] = []
