@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from jsonargparse import auto_cli
 
+from igps.cli import faults_in_a_sentence
 from training.studies.classification import classify
 
 if __name__ == "__main__":
-    auto_cli(classify)
+    with faults_in_a_sentence():
+        auto_cli(classify)

@@ -12,7 +12,9 @@ from __future__ import annotations
 
 from jsonargparse import auto_cli
 
+from igps.cli import faults_in_a_sentence
 from training.studies.learning import checkpoint, fitted, splits
 
 if __name__ == "__main__":
-    auto_cli([splits, fitted, checkpoint])
+    with faults_in_a_sentence():
+        auto_cli([splits, fitted, checkpoint])

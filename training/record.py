@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from jsonargparse import auto_cli
 
+from igps.cli import faults_in_a_sentence
 from training.studies.pages import record
 
 if __name__ == "__main__":
-    auto_cli(record)
+    with faults_in_a_sentence():
+        auto_cli(record)

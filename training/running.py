@@ -60,15 +60,13 @@ class Run(LightningCLI):
         for name, (group, key) in _SHORT.items():
             if config[name] is not None:
                 config[group][key] = config[name]
-        if self.subcommand != "fit":
-            return
         last = Path(config.trainer.default_root_dir or ".") / "checkpoints" / "last.ckpt"
-        if config.resume is not None:
+        if self.subcommand == "fit" and config.resume is not None:
             config.ckpt_path = str(last) if config.resume == "last" else config.resume
-            if not Path(config.ckpt_path).is_file():
-                raise FileNotFoundError(f"resume: expected a checkpoint, there is no {config.ckpt_path}.")
-        elif config.ckpt_path is None and last.exists():
+        elif self.subcommand == "fit" and config.ckpt_path is None and last.exists():
             raise FileExistsError(f"out: {last} is of another run. Give --resume last, or another folder.")
+        if config.ckpt_path not in (None, "best", "last", "hpc") and not Path(config.ckpt_path).exists():
+            raise FileNotFoundError(f"resume, ckpt_path: expected a checkpoint, there is no {config.ckpt_path}.")
 
     def before_fit(self) -> None:
         """Checkpoints lie in the folder of the run, whatever the logger."""

@@ -21,7 +21,7 @@ COMMANDS: Commands = {
 
 def main() -> None:
     """Run the study that the words of the command line name."""
-    run(COMMANDS, "python -m training.study")
+    run(COMMANDS, "python -m training.study", dict.fromkeys((pose, potential, topology), (".png",)))
 
 
 if __name__ == "__main__":

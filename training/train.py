@@ -10,7 +10,9 @@ the configuration too: `RetrievalLearner.load_from_checkpoint` and `SignatureDat
 
 from __future__ import annotations
 
+from igps.cli import faults_in_a_sentence
 from training.running import Run
 
 if __name__ == "__main__":
-    Run()
+    with faults_in_a_sentence():
+        Run()

@@ -497,6 +497,57 @@ def test_json_of_two_bodies_and_of_copies(
     assert same == {larger: True, ball: False}
 
 
+def _writing(commands: cli.Commands, words: tuple[str, ...] = ()) -> dict[tuple[str, ...], cli.Command]:
+    """The commands that have `out`, by the words that name them."""
+    found: dict[tuple[str, ...], cli.Command] = {}
+    for name, one in commands.items():
+        if not callable(one):
+            found |= _writing(one, (*words, name))
+        elif "out" in get_type_hints(one):
+            found[*words, name] = one
+    return found
+
+
+@pytest.mark.parametrize("words", _writing(cli.COMMANDS))
+def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
+    words: tuple[str, ...],
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    endings = cli.ENDINGS.get(_writing(cli.COMMANDS)[words])
+    given = [*words, *([] if words == ("demo",) else [root]), *(["--model", "none"] if words == ("classify",) else [])]
+    name = f"there{(endings or ['.csv'])[0]}"
+
+    def told(place: Path) -> str:
+        with pytest.raises(SystemExit, match="1"):
+            igps(monkeypatch, *given, "--out", place)
+        return capsys.readouterr().err.splitlines()[-1]
+
+    monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
+    (tmp_path / "file").touch()
+    assert told(tmp_path / "file" / name) == (
+        f"igps: out: expected a folder, {tmp_path / 'file'} is a file. Name another place."
+    )
+    (tmp_path / name).touch() if endings is None else (tmp_path / name).mkdir()
+    kind, other = ("folder", "file") if endings is None else ("file", "folder")
+    assert told(tmp_path / name) == f"igps: out: expected a {kind}, {tmp_path / name} is a {other}. Name another place."
+    if endings:
+        assert told(tmp_path / "there.zip").startswith("igps: out: expected a file ending in ")
+    monkeypatch.setattr("os.access", lambda *_: False)
+    assert told(tmp_path / "new" / name).startswith(f"igps: out: {tmp_path} may not be written to.")
+
+
+def test_a_list_of_failures_is_no_folder(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
+    with pytest.raises(SystemExit, match="1"):
+        igps(monkeypatch, "precompute", root, "--failures", tmp_path)
+    assert capsys.readouterr().err == f"igps: failures: expected a file, {tmp_path} is a folder. Name another place.\n"
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
 def test_completion_knows_commands_and_options(
     shell: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

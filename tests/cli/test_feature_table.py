@@ -111,7 +111,7 @@ def test_a_body_that_a_file_lacks_has_no_values(root: Path, tmp_path: Path, monk
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [(["out.txt"], "ending in .csv, .parquet, .npz"), (["out.npz", "--wide"], "wide table ending in .csv, .parquet")],
+    [(["out.txt"], "ending in .csv, .parquet, .npz"), (["out.npz", "--wide"], "wide table ending in .csv or .parquet")],
 )
 def test_a_file_of_another_kind_is_refused_before_anything_is_computed(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -167,3 +168,17 @@ def test_what_no_file_can_hold_is_refused_before_anything_is_computed(
         call(monkeypatch, tmp_path, "fit", tmp_path / "eggs", *options)
     assert "expected to be made of modules of igps" in capsys.readouterr().err
     assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.parametrize("goal", ["known", "new"])
+def test_too_few_classes_are_told_before_anything_is_computed(
+    goal: str, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(library.SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
+    folder = tmp_path / "few"
+    for label in ("one", "two")[: 1 + (goal == "new")]:
+        shutil.copytree(next(path for path in (root / "eggs").iterdir() if path.is_dir()), folder / label)
+    monkeypatch.setattr(sys, "argv", ["igps", "fit", f"{folder}", "--goal", goal, "--out", f"{tmp_path}/m.safetensors"])
+    with pytest.raises(SystemExit, match="1"):
+        main()
+    assert f"classes: expected at least {4 if goal == 'new' else 2}, one of them" in capsys.readouterr().err

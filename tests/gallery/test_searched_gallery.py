@@ -519,3 +519,15 @@ def test_galleries_whose_columns_do_not_fit_are_not_merged_by_half(root: Path, t
     assert not (tmp_path / "all").exists()
     both = Gallery.merge(tmp_path / "all", [tmp_path / "egg", tmp_path / "ball"], small_interior())
     assert {row["age"] for row in both.rows("age")} == {"old", "41.0"}
+
+
+def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
+    words = ["gallery", "build", root, "--descriptor", INTERIOR]
+    told = error_of(monkeypatch, capsys, *words, "--out", root)
+    assert "expected a gallery or a new folder, got one with ball" in told
+    with_attribute = ["--out", tmp_path / "g", "--attribute", "ct=ct/{file}.nii.gz", "--with", "ct"]
+    told = error_of(monkeypatch, capsys, *words, *with_attribute)
+    assert "ct: expected centres, got 8 quantiles of no collection" in told

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import runpy
 import sys
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,35 @@ def test_training_stops_when_validation_no_longer_improves(root: Path, tmp_path:
     assert best["epoch"] == 0
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("evaluate checkpoint none.ckpt", "No such file or directory: 'none.ckpt'"),
+        ("evaluate checkpoint text.ckpt", "text.ckpt: expected a checkpoint, got another or a damaged file."),
+        ("train test --root ROOT --ckpt_path none.ckpt", "ckpt_path: expected a checkpoint, there is no none.ckpt."),
+        ("train fit --root ROOT --ckpt_path none.ckpt", "ckpt_path: expected a checkpoint, there is no none.ckpt."),
+        ("classify ROOT --checkpoint none.ckpt", "No such file or directory: 'none.ckpt'"),
+    ],
+)
+def test_scripts_tell_what_is_wrong_with_a_checkpoint_in_one_sentence(
+    words: str,
+    told: str,
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "text.ckpt").write_text("words")
+    script, *given = words.replace("ROOT", str(root)).split()
+    monkeypatch.setattr(sys, "argv", [script, *given])
+    with pytest.raises(SystemExit, match="1"):
+        runpy.run_module(f"training.{script}", run_name="__main__")
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("igps: ")
+    assert last.endswith(told)
+
+
 def test_a_missing_checkpoint_to_resume_is_named(root: Path, tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"resume: .*last\.ckpt"):
+    with pytest.raises(FileNotFoundError, match=r"resume, ckpt_path: .*last\.ckpt"):
         train(root, tmp_path / "none", "--resume", "last")

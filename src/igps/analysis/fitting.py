@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from igps.data.dataset import Failure, SignatureDataset
+from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
 from igps.descriptors.individual import IndividualDescriptor
 from igps.descriptors.molecular import SizedHistograms
-from igps.nn.description import describe
+from igps.nn.description import check_centres, describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead, Head, WhitenedHead
 from igps.nn.heads.classifier import folds
@@ -106,12 +107,12 @@ def fit(
     if isinstance(which, IndividualDescriptor):
         kept, which = {"size": which.keeps_size, "side": which.twists is not None}, which.descriptor
     base, metric = histograms_and_prior(which)
+    check_centres(base)
+    check_classes(dataset.bodies, goal)
     base, metric = copy.deepcopy(base), metric if prior else None  # the given one stays as it is
     histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
-    labels, counts = dataset.labels, Counter(dataset.bodies.labels or ())
-    least = 2 if goal == "known" else 4
-    if len(counts) < least or max(counts.values()) < 2:
-        raise ValueError(f"classes: expected at least {least}, one of them of two bodies, got {dict(counts)}.")
+    check_classes(dataset.bodies, goal)  # those that are left
+    labels, counts = dataset.labels, Counter(dataset.bodies.labels)
     names = tuple(dataset.classes[int(i)] for i in labels.unique())
     cells = base.part_cells if isinstance(base, HistogramDescriptor) else None
 
@@ -156,6 +157,13 @@ def fit(
         "version": importlib.metadata.version("interior-gps"),
     }
     return model
+
+
+def check_classes(bodies: Bodies, goal: Goal) -> None:
+    """Raise a ValueError where there are too few to fit to."""
+    counts, least = Counter(bodies.labels), 2 if goal == "known" else 4
+    if len(counts) < least or max(counts.values()) < 2:
+        raise ValueError(f"classes: expected at least {least}, one of them of two bodies, got {dict(counts)}.")
 
 
 def classify(

@@ -4,8 +4,9 @@ import contextlib
 import inspect
 import json
 import logging
+import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -21,6 +22,7 @@ from igps.cli.compare import compare
 from igps.cli.demo import demo
 from igps.cli.doctor import doctor
 from igps.cli.duplicates import distance, duplicates
+from igps.cli.feature_table import SUFFIXES
 from igps.cli.fit import classify, fit
 from igps.cli.precompute import cache_export, precompute
 from igps.cli.reading import FLAGS, LISTS, MEANINGS, Verdict
@@ -69,17 +71,38 @@ A command that prints a table returns what it tells, for `--json`. Those of `fig
 """
 
 
-def main(commands: Commands | None = None, program: str = "igps") -> None:
+ENDINGS: Mapping[Command, Sequence[str]] = {
+    extract: (*SUFFIXES, ".npz"), fit: (".safetensors",), cache_export: (".igps",), classify: (".csv",),
+    duplicates: (".csv",), doctor: (), report: (),
+}  # fmt: skip
+"""Of the files that commands write as `out`, none where any will do; that of the others is a folder."""
+
+
+@contextlib.contextmanager
+def faults_in_a_sentence() -> Iterator[None]:
+    """Say what is expected of bad input without a traceback, which would bury it, and exit as `main` does."""
+    try:
+        yield
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
+        full = isinstance(error, OSError) and is_machine_error(error)
+        print(f"igps: {machine_error_text(error) if full else error}", file=sys.stderr)  # type: ignore[arg-type]
+        sys.exit(2 if full or isinstance(error, MachineError) else 1)
+
+
+def main(
+    commands: Commands | None = None, program: str = "igps", endings: Mapping[Command, Sequence[str]] = ENDINGS
+) -> None:
     """Run the command that the words of the command line name: status 1 if the input is at fault, 2 if the machine is.
 
     Args:
         commands: by name; those of `igps` if not given.
         program: what the commands follow on the command line.
+        endings: see `ENDINGS`.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     commands = COMMANDS if commands is None else commands
     parser = command_parser(commands, program)
-    try:
+    with faults_in_a_sentence():
         parsed = parser.instantiate(parser.parse_args())
         command, options = _chosen(parsed, commands)
         as_json = options.pop(JSON, False)
@@ -91,18 +114,29 @@ def main(commands: Commands | None = None, program: str = "igps") -> None:
             else:
                 options["descriptor"] = (options["descriptor"] or "pretrained") + taken_in
         # With --json, what a reader is told goes where progress goes
+        check_place("out", options.get("out"), endings.get(command))
+        check_place("failures", options.get("failures"), ())
         with one_thread(), contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
             found = command(**options)
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
-        # Expected of bad input, and said in full by the message; a traceback would bury it.
-        full = isinstance(error, OSError) and is_machine_error(error)
-        print(f"igps: {machine_error_text(error) if full else error}", file=sys.stderr)  # type: ignore[arg-type]
-        sys.exit(2 if full or isinstance(error, MachineError) else 1)
     verdict = found if isinstance(found, Verdict) else Verdict(found, True)
     if as_json:
         print(json.dumps(finite(verdict.told), indent=2))
     if not verdict.is_good:
         sys.exit(1)
+
+
+def check_place(name: str, place: Path | None, endings: Sequence[str] | None) -> None:
+    """Raise a ValueError where a file of these endings, or a folder if None, could not be written."""
+    if place is None:
+        return
+    if endings and place.suffix.lower() not in endings:
+        raise ValueError(f"{name}: expected a file ending in {', '.join(endings)}, got {place}.")
+    there = next(one for one in (place.absolute(), *place.absolute().parents) if one.exists())
+    if there.is_dir() == (there == place.absolute() and endings is not None):
+        kind, other = ("file", "folder") if there.is_dir() else ("folder", "file")
+        raise ValueError(f"{name}: expected a {kind}, {there} is a {other}. Name another place.")
+    if not os.access(there, os.W_OK):
+        raise ValueError(f"{name}: {there} may not be written to. Name another place, or ask for the right.")
 
 
 def command_parser(commands: Commands | None = None, program: str = "igps") -> ArgumentParser:

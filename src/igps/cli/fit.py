@@ -1,16 +1,18 @@
 """`igps fit` and `igps classify`."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from igps.analysis.fitting import Goal, HeadName
+from igps.analysis.fitting import Goal, HeadName, check_classes
 from igps.analysis.fitting import classify as classify_bodies
 from igps.analysis.fitting import fit as fit_head
 from igps.cli.reading import Folder, files_or_folder, print_failures, signatures
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors import load
+from igps.nn.description import check_centres
 from igps.nn.descriptor import Descriptor
 from igps.nn.specification import specification
 from igps.report.tables import write_rows
@@ -48,11 +50,11 @@ def fit(
         head: classifier, whitened, or as_is for the descriptor itself; auto takes the best on held-out bodies.
         no_prior: ignore the descriptor's own metric, and fit to its histograms alone
     """
-    if out.suffix != ".safetensors":
-        raise ValueError(f"out: expected a file ending in .safetensors, got {out}.")
     chosen = descriptor_of(descriptor)
     specification(chosen)  # refuses what no file can hold before anything is computed
-    dataset, unread = signatures(Folder(root, labelled=True), [chosen], n_workers=n_workers, strict=strict, **reading)
+    check_centres(chosen)
+    folder = Folder(root, labelled=True, check=partial(check_classes, goal=goal))
+    dataset, unread = signatures(folder, [chosen], n_workers=n_workers, strict=strict, **reading)
     failures: list[Failure] | None = None if strict else []
     model = fit_head(
         dataset, chosen, goal=goal, head=head, prior=not no_prior, failures=failures, n_workers=n_workers, progress=True

@@ -10,10 +10,11 @@ from igps.cli.reading import Folder, MirrorOption, check_marks, chosen_dataset, 
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import SIDE, SIZE, Size
-from igps.gallery.about import about_of, check_alike
+from igps.gallery.about import about_of, check_alike, tables
 from igps.gallery.gallery import Gallery
 from igps.gallery.sync import sync as sync_folder
 from igps.mesh.options import LoadOptions
+from igps.nn.description import check_centres
 from igps.signature.signature import SignatureConfig
 
 
@@ -31,6 +32,8 @@ def build(
     descriptor = with_side(descriptor, mirror)
     chosen = descriptor_of(descriptor)
     check_marks(chosen.name, size, mirror)
+    check_centres(chosen)
+    tables().check_place(out)
     dataset, unread = signatures(Folder(root), [chosen], n_workers=n_workers, strict=strict, **reading)
     descriptor = sized(descriptor, size, dataset)
     gallery, undescribed = Gallery.build(out, dataset, descriptor, n_workers=n_workers, strict=strict, progress=True)

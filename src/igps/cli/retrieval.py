@@ -102,9 +102,8 @@ def extract(
         wide: write a row for each file, with columns PART.volume, PART.v0 and so on for each of its bodies.
     """
     suffix = out.suffix.lower()
-    if suffix not in (*SUFFIXES, ".npz") or (wide and suffix == ".npz"):
-        suffixes = ", ".join(SUFFIXES if wide else (*SUFFIXES, ".npz"))
-        raise ValueError(f"out: expected a file{' of a wide table' * wide} ending in one of {suffixes}, got {out}.")
+    if wide and suffix == ".npz":
+        raise ValueError(f"out: expected a file of a wide table ending in {' or '.join(SUFFIXES)}, got {out}.")
     chosen = descriptor_of(descriptor)
     plain = chosen.descriptor if isinstance(chosen, IndividualDescriptor) else chosen
     if short and not isinstance(plain, EmbeddedDescriptor):

@@ -60,7 +60,7 @@ def is_file(which: str | Path) -> bool:
     if str(which) in _MAKERS:
         return False
     in_folder = bool(which) and os.path.isfile(os.path.join(which, IN_FOLDER))  # False of what cannot be a path
-    return str(which).endswith((".safetensors", *_WRITTEN)) or in_folder
+    return str(which).lower().endswith((".safetensors", *_WRITTEN)) or in_folder
 
 
 def load(path: str | Path) -> Descriptor:
@@ -80,7 +80,7 @@ def load(path: str | Path) -> Descriptor:
         FileNotFoundError: no such file.
         ValueError: it is another file, or a damaged one.
     """
-    if str(path).endswith(_WRITTEN):
+    if str(path).lower().endswith(_WRITTEN):
         return written(path)
     module, card = load_module(path)
     if not isinstance(module, Descriptor):

@@ -192,6 +192,15 @@ class BodyTable:
         return in_words(f"where: expected a condition on the columns {', '.join(self.columns)}, got {where!r}")
 
 
+def check_place(path: Path) -> None:
+    """Raise a ValueError where no gallery can be made."""
+    if path.is_file():
+        raise ValueError(f"{path}: expected a gallery or a new folder, got a file. Name another.")
+    there = {one.name for one in path.iterdir()} if path.is_dir() else set()
+    if strange := {one for one in there if not one.startswith((_BODIES, _MAP, "lock"))}:
+        raise ValueError(f"{path}: expected a gallery or a new folder, got one with {min(strange)}. Name another.")
+
+
 def write(
     path: Path, about: Row, searched_by: SearchDistance | None, batches: Iterable[Batch], further: Mapping[str, type]
 ) -> None:
@@ -200,11 +209,7 @@ def write(
     Of what its users want to know of it, for JSON, the distance that finds candidates (None: all will be compared), and
     at least one row; the first few thousand should be like the others. Further columns are those beside `KNOWN`.
     """
-    if path.is_file():
-        raise ValueError(f"{path}: expected a gallery or a new folder, got a file. Name another.")
-    there = {one.name for one in path.iterdir()} if path.is_dir() else set()
-    if strange := {one for one in there if not one.startswith((_BODIES, _MAP, "lock"))}:
-        raise ValueError(f"{path}: expected a gallery or a new folder, got one with {min(strange)}. Name another.")
+    check_place(path)
     batches = (batch for batch in batches if len(batch[1]))
     if (first := next(batches, None)) is None:
         raise ValueError("descriptions: expected at least one for the gallery, got none.")

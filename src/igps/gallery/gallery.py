@@ -22,7 +22,7 @@ from igps.descriptors.registry import is_file
 from igps.gallery.about import KNOWN, Batch, about_of, check_alike, open_table, tables
 from igps.gallery.rows import described_rows, further_columns
 from igps.mesh.options import LoadOptions
-from igps.nn.description import describe
+from igps.nn.description import check_centres, describe
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
 from igps.retrieval.ranking import SearchResult
 from igps.retrieval.reranking import N_RERANKED, rerank_found
@@ -172,6 +172,7 @@ class Gallery:
             strict: raise at the first body that cannot be described.
         """
         chosen, failures = descriptor_of(descriptor), list[Failure]()
+        check_centres(chosen)
         # In any order, as short vectors are fitted to the first
         mixed = dataset.subset(np.random.default_rng(0).permutation(len(dataset)).tolist())
         kinds = further_columns(dataset.bodies)

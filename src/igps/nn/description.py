@@ -129,6 +129,13 @@ def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
     return bool(axes)
 
 
+def check_centres(descriptor: nn.Module) -> None:
+    """Raise a ValueError where an axis waits for `fit_centres`."""
+    for one in descriptor.modules():
+        if isinstance(one, Attribute):
+            one.check_fitted()
+
+
 @contextlib.contextmanager
 def evaluation_mode(module: nn.Module) -> Iterator[None]:
     """The module and all in it in evaluation mode; afterwards each in the mode in which it was."""

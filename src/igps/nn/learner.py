@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import IO, Any, Self
 
 import torch
@@ -112,7 +113,10 @@ class RetrievalLearner(LightningModule):
         """
         options.setdefault("map_location", "cpu")
         options.setdefault("weights_only", True)
-        stored = torch.load(checkpoint_path, map_location="cpu", weights_only=True)
+        try:
+            stored = torch.load(checkpoint_path, map_location="cpu", weights_only=True)
+        except (UnpicklingError, EOFError, RuntimeError) as error:
+            raise ValueError(f"{checkpoint_path}: expected a checkpoint, got another or a damaged file.") from error
         allowed = (*_TRUSTED, *trusted)
         for path in _class_paths(stored.get("hyper_parameters", {})):
             if path.partition(".")[0] not in allowed:

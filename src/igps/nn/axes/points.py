@@ -192,17 +192,22 @@ class Attribute(PointAxis):
         self.centres.start.copy_(centres)
         self.fitted.fill_(True)
 
+    def check_fitted(self) -> None:
+        """Raise a ValueError where the centres are still to come."""
+        if not self.is_fitted:
+            raise ValueError(
+                f"{self.name}: expected centres, got {self.quantiles} quantiles of no collection. Call "
+                "igps.nn.fit_centres(descriptor, dataset), or take the file descriptor.safetensors that `igps retrieve "
+                "--out` writes."
+            )
+
     def requirements(self, embedding: nn.Module) -> Requirements:
         """The attribute, if it is one that Signatures are computed with, or one of residues."""
         return attribute_requirements(self.name)
 
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """(N, P) of the attribute; a ValueError if the samples have none of this name, or it is a direction."""
-        if not self.is_fitted:
-            raise ValueError(
-                f"{self.name}: expected centres, got {self.quantiles} quantiles of no collection. Call "
-                "igps.nn.fit_centres(descriptor, dataset), or take the file descriptor.safetensors of its results."
-            )
+        self.check_fitted()
         values = features.attribute(self.name)
         if values.ndim != 2:
             raise ValueError(f"attributes: expected a scalar to split by, but {self.name!r} is a direction.")
