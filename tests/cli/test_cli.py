@@ -539,6 +539,23 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
     assert told(tmp_path / "new" / name).startswith(f"igps: out: {tmp_path} may not be written to.")
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["retrieve", "ROOT", "--descriptor", "d2", "--with", "ct"], "attributes: expected 'ct' of each body"),
+        (["explain", "ROOT", "--level", "2"], "level: expected a number between 0 and 1, got 2.0"),
+        (["groups", "ROOT", "--n_permutations", "0"], "n_permutations: expected at least 1, got 0"),
+    ],
+)
+def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
+    words: list[str], told: str, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
+    with pytest.raises(SystemExit, match="1"):
+        igps(monkeypatch, *(root if word == "ROOT" else word for word in words))
+    assert capsys.readouterr().err.startswith(f"igps: {told}")
+
+
 def test_a_list_of_failures_is_no_folder(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -425,6 +425,8 @@ def test_words_of_the_command_line_become_sources() -> None:
     for wrong in ("ct", "=a.nii", "a b=c.nii", "ct="):
         with pytest.raises(ValueError, match="attribute: expected a pattern such as ct=images"):
             attribute_sources([wrong], None)
+    with pytest.raises(ValueError, match=r"attribute: expected a pattern such as .*, once, got 'ct=b\.nii'"):
+        attribute_sources(["ct=a.nii", "ct=b.nii"], None)
 
 
 def test_an_image_is_added_to_a_cached_collection_without_eigenpairs_and_again_when_it_changes(

@@ -78,9 +78,13 @@ def test_functions_of_position_become_attributes(root: Path, tmp_path: Path) -> 
 
 
 def test_the_name_of_an_attribute_is_no_source(root: Path, tmp_path: Path) -> None:
-    told = "attributes: expected functions or sources by name, got 'depth' for h. The library's own are named"
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match="attributes: expected functions or sources by other names, got h='depth'"):
         SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"h": "depth"})  # type: ignore[dict-item]
+
+
+def test_an_attribute_does_not_stand_in_for_one_of_the_library(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"functions or sources by other names, got depth=.*: the library's"):
+        SignatureDataset(root, CONFIG, tmp_path / "cache", attributes={"depth": lambda points: points[:, 2]})
 
 
 def test_computed_once_then_read(dataset: SignatureDataset, counted: list[str]) -> None:

@@ -113,9 +113,9 @@ def main(
                 options["descriptors"] = [one + taken_in for one in options["descriptors"]]
             else:
                 options["descriptor"] = (options["descriptor"] or "pretrained") + taken_in
-        # With --json, what a reader is told goes where progress goes
         check_place("out", options.get("out"), endings.get(command))
         check_place("failures", options.get("failures"), ())
+        # With --json, what a reader is told goes where progress goes
         with one_thread(), contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
             found = command(**options)
     verdict = found if isinstance(found, Verdict) else Verdict(found, True)
@@ -131,8 +131,9 @@ def check_place(name: str, place: Path | None, endings: Sequence[str] | None) ->
         return
     if endings and place.suffix.lower() not in endings:
         raise ValueError(f"{name}: expected a file ending in {', '.join(endings)}, got {place}.")
-    there = next(one for one in (place.absolute(), *place.absolute().parents) if one.exists())
-    if there.is_dir() == (there == place.absolute() and endings is not None):
+    place = place.absolute()
+    there = next(one for one in (place, *place.parents) if one.exists())
+    if there.is_dir() == (there == place and endings is not None):
         kind, other = ("file", "folder") if there.is_dir() else ("folder", "file")
         raise ValueError(f"{name}: expected a {kind}, {there} is a {other}. Name another place.")
     if not os.access(there, os.W_OK):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from igps._parameters import check_at_least
+from igps._parameters import check_at_least, check_share
 from igps.analysis.explanation import KINDS, Explanation, contents_of, explain_groups, on_surface
 from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, vectors_of, with_discovery_rates
@@ -53,6 +53,9 @@ def groups(
         n_permutations: number of random permutations.
         seed: of the permutations and all else that is random.
     """
+
+    check_at_least(1, n_permutations=n_permutations)
+    check_at_least(0, seed=seed)
 
     def columns(bodies: Bodies) -> tuple[Any, Any, Any]:
         labels = np.array(bodies.labels if group is None else bodies.column(group))
@@ -150,6 +153,7 @@ def explain(
         out: folder for explain.csv, the shares of the histograms; explain_samples.csv, those of the samples; and both
             bodies painted from two sides as explain.svg and explain.png.
     """
+    check_share(level=level)
     source = files_or_folder(meshes)
     contents_of(descriptor_of(descriptor))  # refuses others before anything is computed
     if isinstance(source, Folder):

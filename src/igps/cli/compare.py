@@ -9,7 +9,7 @@ import numpy as np
 
 from igps.analysis.comparison import Result, check_names
 from igps.analysis.comparison import compare as compare_descriptors
-from igps.cli.reading import Folder, MirrorOption, check_marks, signatures, sized, with_side, write_notes
+from igps.cli.reading import Folder, MirrorOption, signatures, sized, with_side, write_notes
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
 from igps.data.dataset import Failure
@@ -48,10 +48,8 @@ def compare(
         report: make a page of the results in that folder, report.html, see `igps report`
     """
     check_report(report, out)
-    wanted = [with_side(name, mirror) for name in descriptors]
+    wanted = [with_side(name, mirror, size) for name in descriptors]
     chosen = [descriptor_of(name) for name in wanted]
-    for one in chosen:
-        check_marks(one.name, size, mirror)
     if size == "auto" and any(SIZE in one.name for one in chosen):
         size = "ignore"
     check_names([one.name.replace(SIZE, "") if size == "keep" else one.name for one in chosen])

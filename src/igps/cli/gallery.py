@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from igps.cli.reading import Folder, MirrorOption, check_marks, chosen_dataset, signatures, sized, tell_units, with_side
+from igps.cli.reading import Folder, MirrorOption, chosen_dataset, signatures, sized, tell_units, with_side
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import SIDE, SIZE, Size
@@ -29,9 +29,8 @@ def build(
     Args:
         out: the gallery, a folder that will be made, such as gallery.igps.
     """
-    descriptor = with_side(descriptor, mirror)
+    descriptor = with_side(descriptor, mirror, size)
     chosen = descriptor_of(descriptor)
-    check_marks(chosen.name, size, mirror)
     check_centres(chosen)
     tables().check_place(out)
     dataset, unread = signatures(Folder(root), [chosen], n_workers=n_workers, strict=strict, **reading)
@@ -135,8 +134,10 @@ def as_described(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]
     size, mirror, name = given.pop("size", "auto"), given.pop("mirror", "auto"), gallery.about["descriptor"]
     if size != "auto":
         check({"descriptor": name.replace(SIZE, "") + SIZE * (size == "keep")})
-    if mirror != "auto":
-        check({"descriptor": with_side(name.replace(SIDE, ""), mirror)})
+    if mirror == "distinct":
+        check({"descriptor": with_side(name, mirror, "auto")})
+    elif mirror == "same":
+        check({"descriptor": name.replace(SIDE, "")})
     config = given.pop("signature", SignatureConfig())
     if given.pop("paper", False):
         config = SignatureConfig.paper()

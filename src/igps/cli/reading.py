@@ -23,7 +23,7 @@ from igps.mesh.formats import is_searched
 from igps.mesh.mending import repair_steps
 from igps.mesh.mesh import MILLIMETRES
 from igps.mesh.options import LoadOptions
-from igps.nn.description import describe, fit_centres
+from igps.nn.description import check_attributes, describe, fit_centres
 from igps.nn.descriptor import Descriptor
 from igps.report.tables import write_rows
 from igps.signature.signature import SignatureConfig
@@ -104,6 +104,8 @@ def signatures(
     """
     needs = reduce(or_, (one.requirements for one in descriptors), Requirements()) if descriptors else None
     dataset = chosen_dataset(source, needs, **reading)
+    for one in descriptors if not isinstance(source, Folder) or source.root.is_dir() else ():  # others are computed
+        check_attributes(one, {*dataset.config.attributes, *dataset.pipeline.attributes})
     failures = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits_of(time_limit, memory_limit))
     if len(failures) == len(dataset):
         raise ValueError(f"none of {len(dataset)} meshes could be used; the first: {failures[0].error}")
@@ -129,8 +131,7 @@ def described(
     Size and mirror are added to a descriptor's name; a descriptor itself stays as it is.
     """
     if isinstance(descriptor, str):
-        descriptor = with_side(descriptor, mirror)
-        check_marks(descriptor_of(descriptor).name, size, mirror)
+        descriptor = with_side(descriptor, mirror, size)
     dataset, failures = signatures(source, [descriptor_of(descriptor)], strict, n_workers, **reading)
     if isinstance(descriptor, str):
         descriptor = sized(descriptor, size, dataset)
@@ -161,15 +162,11 @@ def print_failures(failures: Sequence[Failure], n_used: int) -> None:
         print(f"{len(failures)} of {n_given} meshes could not be used. The first: {failures[0].error}")
 
 
-def check_marks(name: str, size: Size, mirror: MirrorOption) -> None:
-    """Raise a ValueError where the name of a descriptor contradicts an option."""
+def with_side(descriptor: str, mirror: MirrorOption, size: Size) -> str:
+    """The name of a descriptor that tells mirror images apart, if asked for; a ValueError where it says otherwise."""
     for option, value, refused, mark in (("size", size, "ignore", SIZE), ("mirror", mirror, "same", SIDE)):
-        if value == refused and mark in name:
+        if value == refused and mark in (name := descriptor_of(descriptor).name):
             raise ValueError(f"{option}: expected no {value!r} beside {name}, which is {mark}. Leave one of them out.")
-
-
-def with_side(descriptor: str, mirror: MirrorOption) -> str:
-    """The name of a descriptor that tells mirror images apart, if that is asked for."""
     if mirror != "distinct" or SIDE in descriptor:
         return descriptor
     return descriptor.replace(SIZE, "") + SIDE + SIZE * (SIZE in descriptor)

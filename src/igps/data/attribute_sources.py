@@ -264,12 +264,12 @@ def of_bodies_read(source: AttributeSource, options: LoadOptions) -> AttributeSo
 
 
 def attribute_sources(given: Sequence[str], root: Path | None) -> dict[str, AttributeSource]:
-    """Sources by name, of words such as ``ct=images/{stem}.nii.gz``; a ValueError of one without a name or a path."""
+    """Sources by name, of words such as ``ct=images/{stem}.nii.gz``; a ValueError without name or path, or of two."""
     found = {}
     for word in given:
         name, _, path = word.partition("=")
-        if not name.isidentifier() or not path:
-            raise ValueError(f"attribute: expected a pattern such as ct=images/{{stem}}.nii.gz, got {word!r}.")
+        if not name.isidentifier() or not path or name in found:
+            raise ValueError(f"attribute: expected a pattern such as ct=images/{{stem}}.nii.gz, once, got {word!r}.")
         found[name] = attribute_source(path, root)
     return found
 

@@ -5,12 +5,13 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from igps.mesh.loading import BodyRef
+from igps.signature.attributes import AttributeName
 from igps.signature.signature import Signature
 
 ROOMS = ("interior", "surface")
@@ -88,11 +89,9 @@ def split_attributes(
     sources: dict[str, AttributeSource] = {}
     functions: dict[str, PointFunction] = {}
     for name, one in given.items():
-        if not callable(one):
-            raise ValueError(
-                f"attributes: expected functions or sources by name, got {one!r} for {name}. The library's own are "
-                "named in SignatureConfig(attributes=...)."
-            )
+        if not callable(one) or name in get_args(AttributeName):  # which would be given to those who need the own
+            own = f"the library's, {', '.join(get_args(AttributeName))}, are named in SignatureConfig(attributes=...)"
+            raise ValueError(f"attributes: expected functions or sources by other names, got {name}={one!r}: {own}.")
         if isinstance(one, AttributeSource):
             sources[name] = one
         elif _takes_body(one):

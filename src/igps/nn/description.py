@@ -4,7 +4,7 @@ import contextlib
 import hashlib
 import json
 import logging
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -117,16 +117,22 @@ def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
     axes = [one for one in descriptor.modules() if isinstance(one, Attribute) and not one.is_fitted]
     values: list[list[Singles]] = [[] for _ in axes]
     for signature in dataset.signatures() if axes else ():
+        check_attributes(descriptor, signature.interior.attributes)
         for axis, found in zip(axes, values, strict=True):
-            if axis.name not in signature.interior.attributes:
-                raise ValueError(
-                    f"attributes: expected {axis.name!r} of each body, got {sorted(signature.interior.attributes)}. "
-                    f"Give it as --attribute {axis.name}=..., or as SignatureDataset(attributes=...)."
-                )
             found.append(signature.interior.attributes[axis.name][:500])
     for axis, found in zip(axes, values, strict=True):
         axis.fit(torch.from_numpy(np.concatenate(found)))
     return bool(axes)
+
+
+def check_attributes(descriptor: nn.Module, names: Collection[str]) -> None:
+    """Raise a ValueError where an axis is of an attribute that is not among those of these names."""
+    for one in descriptor.modules():
+        if isinstance(one, Attribute) and one.name not in names:
+            raise ValueError(
+                f"attributes: expected {one.name!r} of each body, got {sorted(names)}. Give it as --attribute "
+                f"{one.name}=..., or as SignatureDataset(attributes=...)."
+            )
 
 
 def check_centres(descriptor: nn.Module) -> None:
