@@ -545,11 +545,24 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         (["retrieve", "ROOT", "--descriptor", "d2", "--with", "ct"], "attributes: expected 'ct' of each body"),
         (["explain", "ROOT", "--level", "2"], "level: expected a number between 0 and 1, got 2.0"),
         (["groups", "ROOT", "--n_permutations", "0"], "n_permutations: expected at least 1, got 0"),
+        (["duplicates", "ROOT", "--tolerance", "0.5"], "tolerance: expected 0 to 0.02, got 0.5."),
+        (
+            ["duplicates", "ROOT", "--poses", "--tolerance", "0.01"],
+            "tolerance: expected 0 beside poses, got 0.01.",
+        ),
+        (["classify", "ROOT", "--model", "plain.safetensors"], "model: expected one with a classifier, got d2."),
     ],
 )
 def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
-    words: list[str], told: str, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str],
+    told: str,
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    descriptor("d2").save("plain.safetensors", {})
     monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, *(root if word == "ROOT" else word for word in words))

@@ -184,19 +184,24 @@ def classify(
     Raises:
         ValueError: the model has no classifier.
     """
-    found = descriptor_of(model)
-    found = found.descriptor if isinstance(found, IndividualDescriptor) else found
-    head = found.head if isinstance(found, EmbeddedDescriptor) else None
-    if not isinstance(found, EmbeddedDescriptor) or not isinstance(head, ClassifierHead):
-        raise ValueError(f"model: expected one with a classifier, got {found.name}. Fit one with head='classifier'.")
+    base, head = classifier_of(model)
     names = head.names or tuple(map(str, head.classes.tolist()))
     if len(names) != len(head.classes):
         raise ValueError(f"model: expected names of {len(head.classes)} classes, got {len(names)}. Fit it again.")
-    histograms, dataset = _histograms(dataset, found.descriptor, failures, n_workers, progress)
+    histograms, dataset = _histograms(dataset, base, failures, n_workers, progress)
     strangeness = head.strangeness(histograms)
     return Classification(
         dataset.bodies.names, names, head.probabilities(histograms), strangeness, strangeness > head.strange_from
     )
+
+
+def classifier_of(model: str | Descriptor) -> tuple[Descriptor, ClassifierHead]:
+    """The classifier of a model, and the descriptor that it classifies by; a ValueError where there is none."""
+    found = descriptor_of(model)
+    found = found.descriptor if isinstance(found, IndividualDescriptor) else found
+    if not isinstance(found, EmbeddedDescriptor) or not isinstance(found.head, ClassifierHead):
+        raise ValueError(f"model: expected one with a classifier, got {found.name}. Fit one with head='classifier'.")
+    return found.descriptor, found.head
 
 
 def _histograms(

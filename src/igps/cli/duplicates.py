@@ -15,6 +15,7 @@ from igps.gallery.calibration import Calibration
 from igps.gallery.duplicates import Duplicates, body_distance
 from igps.gallery.duplicates import duplicates as find_duplicates
 from igps.gallery.gallery import Gallery
+from igps.gallery.surfaces import MOST_TOLERATED
 from igps.report.tables import write_rows
 
 DESCRIPTOR = "pretrained"
@@ -39,6 +40,9 @@ def duplicates(
             at most.
         out: a table of the groups, a file ending in .csv.
     """
+    if not 0 <= tolerance <= (0 if poses else MOST_TOLERATED):
+        told = "0 beside poses" if poses else f"0 to {MOST_TOLERATED}"
+        raise ValueError(f"tolerance: expected {told}, got {tolerance}.")
     source: Any
     unread: list[Failure] = []
     if is_gallery(root):

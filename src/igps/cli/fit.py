@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from igps.analysis.fitting import Goal, HeadName, check_classes
+from igps.analysis.fitting import Goal, HeadName, check_classes, classifier_of
 from igps.analysis.fitting import classify as classify_bodies
 from igps.analysis.fitting import fit as fit_head
 from igps.cli.reading import Folder, files_or_folder, print_failures, signatures
@@ -78,6 +78,7 @@ def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading
         out: a table of the probabilities of all classes, a file ending in .csv.
     """
     chosen = load(model)
+    classifier_of(chosen)  # refuses others before anything is computed
     dataset, failures = signatures(files_or_folder(meshes), [chosen], **reading)
     found = classify_bodies(
         dataset, chosen, failures=None if reading.get("strict") else failures, n_workers=reading.get("n_workers")
