@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import inspect
 import logging
+import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -471,6 +472,38 @@ def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path: Path) -> 
         charge(BodyRef(tmp_path / "egg.off"), points)
     with pytest.raises(ValueError, match=r"attribute: expected one of charge, .*, got 'mood'"):
         ResidueAttribute("mood")
+
+
+@pytest.mark.parametrize("name", ["ct.mha", "header.mhd"])  # the latter has its voxels in another file
+def test_an_image_that_has_changed_is_read_again_though_its_time_is_the_same(name: str, tmp_path: Path) -> None:
+    itk = pytest.importorskip("SimpleITK")
+    for value in (1.0, 2.0):
+        itk.WriteImage(itk.GetImageFromArray(np.full((9, 9, 9), value)), str(tmp_path / name))
+        os.utime(tmp_path / name, (1e9, 1e9))
+        found = attribute_source(name)(BodyRef(tmp_path / "egg.off"), np.array([[-2.0, -3.0, 4.0]]))
+        np.testing.assert_allclose(found, value)
+
+
+def test_a_molecule_that_has_changed_is_read_again_though_its_time_is_the_same(tmp_path: Path) -> None:
+    pytest.importorskip("gemmi")
+    body = BodyRef(tmp_path / "one.pdb", "chain A")
+    for name, charge in (("ASP", -1.0), ("LYS", 1.0)):
+        body.path.write_text(f"ATOM      1  CA  {name} A   1       2.000   3.000   4.000  1.00 20.00           C\n")
+        os.utime(body.path, (1e9, 1e9))
+        np.testing.assert_allclose(ResidueAttribute("charge")(body, np.zeros((1, 3))), charge)
+
+
+def test_names_of_blocks_do_not_tell_what_a_body_is(tmp_path: Path) -> None:
+    pytest.importorskip("gemmi")
+    columns = "id type_symbol label_atom_id label_alt_id label_comp_id label_asym_id auth_seq_id"
+    places = ("Cartn_x", "Cartn_y", "Cartn_z", "pdbx_PDB_model_num")
+    loop = "loop_\n" + "".join(f"_atom_site.{one}\n" for one in [*columns.split(), *places])
+    rows = "1 C CA . LYS A 1 0 0 0 1\n2 C CA . ASP A 1 0 0 0 2\n"
+    (tmp_path / "two.cif").write_text("".join(f"data_{name}\n{loop}{rows}" for name in ("chain", "assembly")))
+    for name in ("chain", "assembly"):
+        for number, charge in ((1, 1.0), (2, -1.0)):
+            body = BodyRef(tmp_path / "two.cif", f"{name} model {number}")
+            np.testing.assert_allclose(ResidueAttribute("charge")(body, np.zeros((1, 3))), charge)
 
 
 def stem_and_height(body: BodyRef, points: np.ndarray) -> np.ndarray:

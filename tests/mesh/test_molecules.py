@@ -124,6 +124,18 @@ def test_a_pqr_file_has_its_own_charges_and_radii(tmp_path: Path) -> None:
     assert molecule.notes == ("radii and charges are those of the PQR file",)
 
 
+def test_long_numbers_of_a_pqr_file_leave_no_blank_before_them(tmp_path: Path) -> None:
+    rows = "ATOM   9999  N   ALA A1000       1.000   2.000   3.000  0.1000 1.8500\n"
+    rows += "HETATM10000  O   HOH B1001       9.000   2.000   3.000 -0.8000 1.6000\n"
+    rows += "HETATM10001  CA  ALA B1002A     12.000   2.000   3.000  0.2000 1.9000\n"
+    one, other = read_molecule(written(tmp_path, rows, "made.pqr"))
+    assert [one.name[-7:], one.residue_names, one.radii.round(2).tolist()] == ["chain A", ("ALA",), [1.85]]
+    assert [other.name[-7:], other.residue_names, other.radii.round(2).tolist()] == ["chain B", ("ALA",), [1.9]]
+    fused = written(tmp_path, "ATOM 1 HG11VAL A 1 0.0 0.0 0.0 -0.30 1.85\n", "fused.pqr")
+    with pytest.raises(MeshError, match=r"fused\.pqr: line 1 is no atom .* write it again, with blanks between fields"):
+        read_molecule(fused)
+
+
 def test_charges_are_those_of_residues_at_ph_7(tmp_path: Path) -> None:
     names = {
         "ASP": "OD1 OD2",

@@ -21,8 +21,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from igps.data.attributes import AttributeSource
-from igps.data.cache import content_digest, stamp_of
-from igps.mesh.formats import files_read, images, vertex_values
+from igps.data.cache import content_digest
+from igps.mesh.formats import files_read, images, stamp_of, vertex_values
 from igps.mesh.formats.molecules import Molecule, MoleculeBodies, is_structure, molecules_by_part
 from igps.mesh.loading import BodyRef, load_mesh, read_surface
 from igps.mesh.mesh import MeshError
@@ -69,13 +69,14 @@ class ResidueAttribute:
 
 def _molecule(body: BodyRef) -> Molecule:
     """That whose surface the body is."""
-    part, changed = body.part or "", os.stat(body.path).st_mtime_ns
+    part, changed = body.part or "", stamp_of(body.path)
     words = part.split()  # before them may stand the name of one of several structures
-    how: MoleculeBodies = "chains" if "chain" in words else "assembly" if "assembly" in words else "models"
-    found = molecules_by_part(body.path, changed, how)
-    if part in found:
-        return found[part]
-    models = list(molecules_by_part(body.path, changed, "models").values())  # a body of all of them
+    kinds: dict[str, MoleculeBodies] = {"chain": "chains", "assembly": "assembly"}
+    for how in (*(kinds[word] for word in kinds if word in words), "models"):
+        found = molecules_by_part(body.path, changed, how)
+        if part in found:
+            return found[part]
+    models = list(found.values())  # a body of all of them
     fields = ("positions", "radii", "charges", "residue_positions", "b_factors")
     arrays: dict[str, Any] = {field: np.concatenate([getattr(one, field) for one in models]) for field in fields}
     starts = np.cumsum([0, *(len(one.residue_names) for one in models)])
@@ -168,7 +169,7 @@ class ImageAttribute(FileAttribute):
     """
 
     def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
-        grid, affine = images.read(file, os.stat(file).st_mtime_ns)
+        grid, affine = images.read(file, stamp_of(*files_read(file)))
         at = (points - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
         size = np.array(grid.shape)
         inside = ((at > -0.5) & (at < size - 0.5)).all(axis=1)

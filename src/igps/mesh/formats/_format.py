@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -125,6 +126,13 @@ def distinct(names: Iterable[str]) -> list[str]:
         taken[new] += 1
         found.append(new)
     return found
+
+
+def stamp_of(*paths: Path) -> tuple[int, int, int]:
+    """Bytes of files, and when their content and their names or rights were last changed, in nanoseconds."""
+    found = [os.stat(path) for path in paths]
+    sizes, contents, names = zip(*((one.st_size, one.st_mtime_ns, one.st_ctime_ns) for one in found), strict=True)
+    return sum(sizes), max(contents), max(names)
 
 
 def text_of(path: Path) -> str:
