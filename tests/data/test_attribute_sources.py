@@ -218,6 +218,27 @@ def test_values_at_vertices_give_the_same_linear_function_inside(
         VertexAttribute(name)(body, INSIDE)
 
 
+@pytest.mark.filterwarnings("ignore:Unknown extension code")
+@pytest.mark.parametrize("head", [[2, 0, 20], [20], [2, 1, 20], None])
+def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(tmp_path: Path, head: list[int] | None) -> None:
+    """Its origin is in the middle of the image, and its axes are not the world's, unless the file says otherwise."""
+    nibabel = pytest.importorskip("nibabel")
+    made = nibabel.MGHImage(image().astype(np.float32), AFFINE)
+    nibabel.save(made, tmp_path / "t1.mgz")
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    mdc = made.header["Mdc"]  # rows are the directions of the axes of voxels
+    keys = dict(zip(("xras", "yras", "zras", "cras"), [*mdc, made.header["Pxyz_c"]], strict=True))
+    told = {"head": head, "valid": "1  # volume info valid", "filename": "t1.mgz", "volume": SHAPE, **keys}
+    told["voxelsize"] = made.header["delta"]
+    nibabel.freesurfer.write_geometry(
+        tmp_path / "lh.pial", ball.vertices, ball.faces, volume_info=told if head else None
+    )
+    to_scanner = made.affine @ np.linalg.inv(made.header.get_vox2ras_tkr()) if head in ([2, 0, 20], [20]) else np.eye(4)
+    points = INSIDE @ np.linalg.inv(to_scanner[:3, :3]).T - np.linalg.inv(to_scanner)[:3, :3] @ to_scanner[:3, 3]
+    found = attribute_source("t1.mgz")(BodyRef(tmp_path / "lh.pial"), points)
+    np.testing.assert_allclose(found, linear(INSIDE), atol=1e-4)
+
+
 def test_values_at_vertices_survive_mending(tmp_path: Path) -> None:
     """A ball with a triangle missing: the hole is closed, and a linear function stays one."""
     ball = trimesh.creation.icosphere(subdivisions=3)
@@ -378,13 +399,16 @@ def test_a_body_that_is_a_link_has_the_attribute_of_its_own_name(tmp_path: Path)
         assert found.relative_to(tmp_path / root).as_posix() == f"ct/{path[-3:]}/1.off.nii"
 
 
-@pytest.mark.parametrize(("suffix", "content"), [("dx", b"delta"), ("thickness", b"\xff\xff\xff" + bytes(12))])
+@pytest.mark.parametrize(
+    ("suffix", "content"), [("dx", b"delta"), ("thickness", b"\xff\xff\xff" + bytes(12)), ("nrrd", b"x")]
+)
 def test_what_is_wrong_with_a_file_names_the_body_whose_it_is(body: BodyRef, suffix: str, content: bytes) -> None:
     body.path.with_suffix(f".{suffix}").write_bytes(content)
     with pytest.raises(MeshError) as error:
         attribute_source(f"{{stem}}.{suffix}")(body, INSIDE)
     assert str(error.value).startswith(f"{body}: ")
     assert str(body.path.with_suffix(f".{suffix}")) in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("is_absolute", [False, True])

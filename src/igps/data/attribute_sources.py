@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from igps.data.attributes import AttributeSource
 from igps.data.cache import content_digest
-from igps.mesh.formats import files_read, images, stamp_of, vertex_values
+from igps.mesh.formats import brains, files_read, images, stamp_of, vertex_values
 from igps.mesh.formats.molecules import Molecule, MoleculeBodies, is_structure, molecules_by_part
 from igps.mesh.loading import BodyRef, load_mesh, read_surface
 from igps.mesh.mesh import MeshError
@@ -102,7 +102,7 @@ class FileAttribute(ABC):
         """The kind of source, the array's name, and the content of the file; a MeshError where there is none."""
         file, name = self.file(body)
         files = files_read(file)
-        return f"{type(self).__name__} 3 {name} {_checksum(*files, stamp=stamp_of(*files))}"
+        return f"{type(self).__name__} 4 {name} {_checksum(*files, stamp=stamp_of(*files))}"
 
     def __call__(self, body: BodyRef, points: Values) -> Values:
         """(P,) or (P, C) at points (P, 3); a MeshError where the file is of no use, or knows too few of them."""
@@ -115,8 +115,8 @@ class FileAttribute(ABC):
             raise error if str(body) in str(error) else MeshError(f"{body}: its attribute's file {error}") from error
         except Exception as error:  # readers of many formats raise whatever they like
             raise MeshError(
-                f"{body}: its attribute's file {file} is not readable ({type(error).__name__}: {error}). Check that "
-                "it is complete, and of the format that its name tells."
+                f"{body}: its attribute's file {file} is not readable ({type(error).__name__}: "
+                f"{' '.join(str(error).split())}). Check that it is complete, and of the format that its name tells."
             ) from error
         return completed(values, points, f"{body}: {file}")
 
@@ -170,7 +170,7 @@ class ImageAttribute(FileAttribute):
 
     def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
         grid, affine = images.read(file, stamp_of(*files_read(file)))
-        at = (points - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
+        at = (brains.in_scanner(body.path, points) - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
         size = np.array(grid.shape)
         inside = ((at > -0.5) & (at < size - 0.5)).all(axis=1)
         found = np.full(len(points), np.nan)
