@@ -517,6 +517,16 @@ def test_a_molecule_that_has_changed_is_read_again_though_its_time_is_the_same(t
         np.testing.assert_allclose(ResidueAttribute("charge")(body, np.zeros((1, 3))), charge)
 
 
+def test_what_is_known_of_amino_acids_alone_is_refused_of_nucleotides_in_these_words(tmp_path: Path) -> None:
+    pytest.importorskip("gemmi")
+    atom = "ATOM      1  P    DA A   1       2.000   3.000   4.000  1.00 20.00           P\n"
+    (tmp_path / "dna.pdb").write_text(atom)
+    body = BodyRef(tmp_path / "dna.pdb", "chain A")
+    assert ResidueAttribute("residue_shares")(body, INSIDE).shape == (200, 25)
+    with pytest.raises(MeshError, match=r"dna\.pdb#chain A: 'hydropathy' is known of none of its residues\. Choose"):
+        ResidueAttribute("hydropathy")(body, INSIDE)
+
+
 def test_names_of_blocks_do_not_tell_what_a_body_is(tmp_path: Path) -> None:
     pytest.importorskip("gemmi")
     columns = "id type_symbol label_atom_id label_alt_id label_comp_id label_asym_id auth_seq_id"

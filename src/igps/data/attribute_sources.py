@@ -59,11 +59,11 @@ class ResidueAttribute:
     def __call__(self, body: BodyRef, points: Values) -> Values:
         """(P,) or (P, C) at points (P, 3), Å; a MeshError of what is no molecule, or has no such value."""
         if not is_structure(body.path):
-            raise MeshError(
-                f"{body}: has no atoms, which {self.name!r} is known of. Give a PDB, mmCIF or PQR file, or choose "
-                "another descriptor."
-            )
+            none = f"{body}: has no atoms, which {self.name!r} is known of."
+            raise MeshError(f"{none} Give a PDB, mmCIF or PQR file, or choose another descriptor.")
         values = residue_attribute(_molecule(body), points, self.name)
+        if np.isnan(values).all():
+            raise MeshError(f"{body}: {self.name!r} is known of none of its residues. Choose another descriptor.")
         return completed(values, points, f"{body}: {self.name}")
 
 
