@@ -184,6 +184,15 @@ def test_an_assembly_is_built_by_its_operators(tmp_path: Path) -> None:
     assert alone.notes == ("the file names no assembly: the model was taken as it is",)
 
 
+def test_an_assembly_of_a_chain_that_is_not_there_is_told_with_the_remedy(tmp_path: Path) -> None:
+    rows = "".join(f"REMARK 350   BIOMT{i}   1 {a:9.6f}{b:10.6f}{c:10.6f}        0.00000\n" for i, (a, b, c) in
+                   enumerate(np.eye(3), start=1))  # fmt: skip
+    text = f"REMARK 350 BIOMOLECULE: 1\nREMARK 350 APPLY THE FOLLOWING TO CHAINS: A, Q\n{rows}"
+    path = written(tmp_path, text + residue(1))
+    with pytest.raises(MeshError, match=r"made\.pdb: assembly 1 cannot be made .*no chain Q.*bodies"):
+        read_molecule(path, "assembly")
+
+
 def test_water_is_left_out_and_ligands_as_said(tmp_path: Path) -> None:
     water = line(9, "O", 9, 9, 9, residue="HOH", place=" 101 ", record="HETATM")
     ligand = line(10, "C1", 5, 5, 5, residue="XYZ", place=" 102 ", record="HETATM")

@@ -71,7 +71,11 @@ def parts_of(
                 yield f"{path}#{of}chain {label or 'without name'}", [c for c in model if c.name == label], []
         elif bodies == "assembly" and len(structure.assemblies):
             first = structure.assemblies[0]
-            made = gemmi.make_assembly(first, model, gemmi.HowToNameCopiedChain.AddNumber)
+            try:
+                made = gemmi.make_assembly(first, model, gemmi.HowToNameCopiedChain.AddNumber)
+            except RuntimeError as error:
+                fault = f"{path}: {of}assembly {first.name} cannot be made of the file's chains ({error})."
+                raise MeshError(f"{fault} Take the whole file, or its models or chains as bodies.") from error
             yield f"{path}#{of}assembly {first.name}", list(made), []
         else:
             notes = ["the file names no assembly: the model was taken as it is"] if bodies == "assembly" else []
