@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from igps.data.attribute_sources import _molecule
-from igps.mesh.formats.molecules import is_structure, read_molecule
-from igps.mesh.loading import BodyRef
-from igps.mesh.mesh import MeshError
+from igps.mesh.formats.molecules import Molecule, is_structure, read_molecule
+from igps.mesh.loading import BodyRef, each_body
+from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.molecular_surface import molecular_surface
 from igps.mesh.residues import VOLUMES
 
@@ -292,6 +292,20 @@ def test_a_chain_without_atoms_costs_no_other_chain(tmp_path: Path, caplog: pyte
         (molecule,) = read_molecule(path)
     assert molecule.name == f"{path}#chain A"
     assert f"{path}#chain B: no atoms of a polymer, left out" in caplog.text
+
+
+def test_a_surface_that_fails_in_any_way_costs_no_other_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = written(tmp_path, residue(1) + residue(1, chain="B") + residue(1, chain="C"))
+
+    def faulty(molecule: Molecule) -> Mesh:
+        if "chain B" in molecule.name:
+            raise ValueError("of any kind")
+        return molecular_surface(molecule)
+
+    monkeypatch.setattr("igps.mesh.molecular_surface.molecular_surface", faulty)
+    found = {body.part: mesh for body, mesh in each_body(path)}
+    assert [name for name, mesh in found.items() if isinstance(mesh, Mesh)] == ["chain A", "chain C"]
+    assert str(found["chain B"]).startswith(f"{path}#chain B: not readable as a structure (ValueError: ")
 
 
 def test_b_factors_are_means_over_residues(tmp_path: Path) -> None:

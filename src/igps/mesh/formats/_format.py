@@ -158,8 +158,8 @@ def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
 
 
 @contextmanager
-def faults(path: Path, kind: Format) -> Iterator[None]:
-    """Turn what a reader raises into a MeshError about the file; running out of memory is no fault of it."""
+def faults(path: object, kind: Format) -> Iterator[None]:
+    """Turn what a reader raises into a MeshError about the file, or a body in it; memory that ran out is no fault."""
     try:
         yield
     except (MeshError, MemoryError):
