@@ -544,6 +544,13 @@ def stem_and_height(body: BodyRef, points: np.ndarray) -> np.ndarray:
     return len(body.path.stem) + points[:, 2]
 
 
+FACTOR = 2.0
+
+
+def scaled(body: BodyRef, points: np.ndarray) -> np.ndarray:
+    return FACTOR * points[:, 0]
+
+
 def times(points: np.ndarray, factor: float = 2.0) -> np.ndarray:
     return factor * points[:, 0]
 
@@ -567,6 +574,15 @@ def test_a_function_of_body_and_points_is_a_source_that_is_kept(
     assert FunctionAttribute(stem_and_height).cache_tag(None) != tag
 
 
+def test_a_function_of_the_name_of_a_body_tells_copies_of_a_file_apart(tmp_path: Path) -> None:
+    for name in ("a", "bbb"):
+        write_body(tmp_path / "shapes" / f"{name}.off", 0.8, 0.9)
+    dataset = SignatureDataset(tmp_path / "shapes", CONFIG, tmp_path / "cache", attributes={"told": stem_and_height})
+    for item, n_letters in zip(dataset, (1, 3), strict=True):
+        samples = item.signature.interior
+        np.testing.assert_allclose(samples.attributes["told"], n_letters + samples.points[:, 2], atol=1e-5)
+
+
 def test_a_function_whose_code_does_not_tell_what_it_does_is_refused(tmp_path: Path) -> None:
     write_body(tmp_path / "a.off", 0.8, 0.9)
     factor = 2.0
@@ -581,6 +597,20 @@ def test_a_function_whose_code_does_not_tell_what_it_does_is_refused(tmp_path: P
     ):
         with pytest.raises(ValueError, match=rf"attributes: .*{said}.*cache_tag"):
             SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", attributes={"told": function})
+
+
+def test_constants_that_a_function_uses_tell_it_from_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    def tag() -> str:
+        return FunctionAttribute(scaled).cache_tag(None)
+
+    first = tag()
+    monkeypatch.setitem(globals(), "FACTOR", 3.0)
+    assert tag() != first
+    monkeypatch.setitem(globals(), "FACTOR", 2.0)
+    assert tag() == first
+    monkeypatch.setitem(globals(), "FACTOR", np.ones(3))
+    with pytest.raises(ValueError, match=r"attributes: scaled uses variables of what is around it"):
+        tag()
 
 
 def test_what_a_function_is_given_by_default_tells_it_from_others_of_the_same_code(tmp_path: Path) -> None:
