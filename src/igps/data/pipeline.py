@@ -18,8 +18,8 @@ import numpy as np
 from igps._parallel import Failed, MachineError, attempt
 from igps.data.attribute_sources import of_bodies_read
 from igps.data.attributes import ROOMS, AttributeSource, with_attribute
-from igps.data.cache import AttributeCache, SignatureCache, content_digest, stamp_of
-from igps.mesh.formats import files_read
+from igps.data.cache import AttributeCache, SignatureCache, content_digest
+from igps.mesh.formats import files_read, stamp_of
 from igps.mesh.loading import BodyRef, each_body, load_mesh
 from igps.mesh.mending import MENDING_VERSION, repair_steps
 from igps.mesh.mesh import Mesh, MeshError
