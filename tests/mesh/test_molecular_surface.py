@@ -156,7 +156,7 @@ def test_stray_atoms_are_named_with_the_remedy() -> None:
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"kind": "solvent"}, "kind: expected one of 'excluded'"),
+        ({"kind": "solvent"}, "kind: expected one of excluded"),
         ({"probe": -1.0}, "probe: expected"),
         ({"probe": float("nan")}, "probe: expected"),
         ({"spacing": 0.0}, "spacing: expected"),

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
+from igps._parameters import check_one_of
 from igps.data.attributes import AttributeSource
 from igps.data.cache import content_digest
 from igps.mesh.formats import brains, files_read, images, stamp_of, vertex_values
@@ -49,8 +50,7 @@ class ResidueAttribute:
     name: str
 
     def __post_init__(self) -> None:
-        if self.name not in RESIDUE_ATTRIBUTES:
-            raise ValueError(f"attribute: expected one of {', '.join(RESIDUE_ATTRIBUTES)}, got {self.name!r}.")
+        check_one_of(RESIDUE_ATTRIBUTES, attribute=self.name)
 
     def cache_tag(self, body: BodyRef) -> str:
         """The name alone: the molecule is the body's file."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from igps._arrays import Floats, Integers
+from igps._parameters import check_one_of
 from igps.mesh.formats._format import Format, RawBody, made_later, stamp_of
 from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structures, suffix
 from igps.mesh.mesh import MeshError
@@ -103,8 +104,7 @@ def read_molecule(
         ImportError: gemmi is not installed.
     """
     path = Path(path)
-    if bodies not in get_args(MoleculeBodies):
-        raise ValueError(f"bodies: expected one of {', '.join(get_args(MoleculeBodies))}, got {bodies!r}.")
+    check_one_of(get_args(MoleculeBodies), bodies=bodies)
     parts = list(parts_of(read_structures(path), bodies, path))
     found, left_out = _molecules(parts, ligands, hydrogens, suffix(path) == ".pqr")
     if not found and not ligands:
