@@ -19,11 +19,14 @@ from sklearn.utils.estimator_checks import check_estimator
 from igps.data.dataset import SignatureDataset
 from igps.descriptors.d2 import D2
 from igps.descriptors.interior import interior
+from igps.descriptors.molecular import SizedHistograms
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
+from igps.nn.embedding import SpectralEmbedding
+from igps.nn.histograms.pairs import PairHistogram
 from igps.signature.signature import SignatureConfig
 from igps.sklearn import VolumetricFeatures
 
@@ -122,6 +125,17 @@ def test_descriptions_that_are_no_histograms_are_given_as_they_are(paths: list[P
     features = VolumetricFeatures(D2(), config=CONFIG, cache_dir=tmp_path, n_workers=1)
     expected = describe(SignatureDataset(paths[:2], CONFIG, tmp_path), D2(), n_workers=1)
     np.testing.assert_allclose(features.transform(paths[:2]), expected, atol=1e-6)
+
+
+def test_size_behind_histograms_is_no_histogram(paths: list[Path], tmp_path: Path) -> None:
+    sized = SizedHistograms([PairHistogram(embedding=SpectralEmbedding(n_eigenpairs=20))])
+    options = {"config": CONFIG, "cache_dir": tmp_path, "n_workers": 1}
+    found = VolumetricFeatures(sized, **options).fit(paths)  # type: ignore[arg-type]
+    values = found.transform(paths[:1])
+    assert values.shape == (1, len(found.get_feature_names_out()))
+    ball = trimesh.load(paths[0])
+    np.testing.assert_allclose(values[0, -2:], np.log([ball.area, ball.volume]), rtol=1e-6)
+    np.testing.assert_allclose(np.square(values[0, :-2]).sum(), 1, rtol=1e-5)
 
 
 def test_reading_is_passed_on(paths: list[Path], tmp_path: Path) -> None:

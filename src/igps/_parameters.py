@@ -1,7 +1,7 @@
 """Checks of parameters, in one wording; None, where a parameter may be that, is right."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection
 
 
 def check_at_least(least: int, **values: int | None) -> None:
@@ -27,8 +27,8 @@ def check_share(**values: float | None) -> None:
             raise ValueError(f"{name}: expected a number between 0 and 1, got {value}.")
 
 
-def check_one_of(allowed: Sequence[str], **values: str | None) -> None:
+def check_one_of(allowed: Collection[str], **values: str) -> None:
     """Raise a ValueError that names the first of the values that is not allowed."""
     for name, value in values.items():
-        if value is not None and value not in allowed:
-            raise ValueError(f"{name}: expected one of {', '.join(map(repr, allowed))}, got {value!r}.")
+        if value not in allowed:
+            raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {value!r}.")

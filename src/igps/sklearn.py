@@ -66,7 +66,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         shapes = _checked(X)
         self._name = chosen.name
         if isinstance(chosen, HistogramDescriptor):
-            self._n_features_out = sum(chosen.part_cells)
+            self._n_features_out = chosen.n_features
         else:  # only a description tells
             self._n_features_out = self._features(shapes[:1]).shape[1]
         return self
@@ -108,8 +108,9 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
             tag = cache_tag(chosen)
             features = describe(dataset, chosen, cache_tag=tag, n_workers=self.n_workers)
         cells = features.flatten(1)
-        rooted = self.square_root and isinstance(chosen, HistogramDescriptor)
-        return (cells.sqrt() if rooted else cells).numpy()
+        if self.square_root and isinstance(chosen, HistogramDescriptor):
+            cells[:, : sum(chosen.part_cells)].sqrt_()  # behind them molecules have their size
+        return cells.numpy()
 
     def __sklearn_is_fitted__(self) -> bool:
         return True

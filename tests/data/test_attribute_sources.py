@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import inspect
 import logging
+import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -224,6 +225,27 @@ def test_values_at_vertices_give_the_same_linear_function_inside(
         VertexAttribute(name)(body, INSIDE)
 
 
+@pytest.mark.filterwarnings("ignore:Unknown extension code")
+@pytest.mark.parametrize("head", [[2, 0, 20], [20], [2, 1, 20], None])
+def test_an_image_lies_where_it_does_beside_a_surface_of_freesurfer(tmp_path: Path, head: list[int] | None) -> None:
+    """Its origin is in the middle of the image, and its axes are not the world's, unless the file says otherwise."""
+    nibabel = pytest.importorskip("nibabel")
+    made = nibabel.MGHImage(image().astype(np.float32), AFFINE)
+    nibabel.save(made, tmp_path / "t1.mgz")
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    mdc = made.header["Mdc"]  # rows are the directions of the axes of voxels
+    keys = dict(zip(("xras", "yras", "zras", "cras"), [*mdc, made.header["Pxyz_c"]], strict=True))
+    told = {"head": head, "valid": "1  # volume info valid", "filename": "t1.mgz", "volume": SHAPE, **keys}
+    told["voxelsize"] = made.header["delta"]
+    nibabel.freesurfer.write_geometry(
+        tmp_path / "lh.pial", ball.vertices, ball.faces, volume_info=told if head else None
+    )
+    to_scanner = made.affine @ np.linalg.inv(made.header.get_vox2ras_tkr()) if head in ([2, 0, 20], [20]) else np.eye(4)
+    points = INSIDE @ np.linalg.inv(to_scanner[:3, :3]).T - np.linalg.inv(to_scanner)[:3, :3] @ to_scanner[:3, 3]
+    found = attribute_source("t1.mgz")(BodyRef(tmp_path / "lh.pial"), points)
+    np.testing.assert_allclose(found, linear(INSIDE), atol=1e-4)
+
+
 def test_values_at_vertices_survive_mending(tmp_path: Path) -> None:
     """A ball with a triangle missing: the hole is closed, and a linear function stays one."""
     ball = trimesh.creation.icosphere(subdivisions=3)
@@ -384,13 +406,16 @@ def test_a_body_that_is_a_link_has_the_attribute_of_its_own_name(tmp_path: Path)
         assert found.relative_to(tmp_path / root).as_posix() == f"ct/{path[-3:]}/1.off.nii"
 
 
-@pytest.mark.parametrize(("suffix", "content"), [("dx", b"delta"), ("thickness", b"\xff\xff\xff" + bytes(12))])
+@pytest.mark.parametrize(
+    ("suffix", "content"), [("dx", b"delta"), ("thickness", b"\xff\xff\xff" + bytes(12)), ("nrrd", b"x")]
+)
 def test_what_is_wrong_with_a_file_names_the_body_whose_it_is(body: BodyRef, suffix: str, content: bytes) -> None:
     body.path.with_suffix(f".{suffix}").write_bytes(content)
     with pytest.raises(MeshError) as error:
         attribute_source(f"{{stem}}.{suffix}")(body, INSIDE)
     assert str(error.value).startswith(f"{body}: ")
     assert str(body.path.with_suffix(f".{suffix}")) in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("is_absolute", [False, True])
@@ -482,8 +507,57 @@ def test_residues_come_with_the_molecule_and_a_mesh_has_none(tmp_path: Path) -> 
         ResidueAttribute("mood")
 
 
+@pytest.mark.parametrize("name", ["ct.mha", "header.mhd"])  # the latter has its voxels in another file
+def test_an_image_that_has_changed_is_read_again_though_its_time_is_the_same(name: str, tmp_path: Path) -> None:
+    itk = pytest.importorskip("SimpleITK")
+    for value in (1.0, 2.0):
+        itk.WriteImage(itk.GetImageFromArray(np.full((9, 9, 9), value)), str(tmp_path / name))
+        os.utime(tmp_path / name, (1e9, 1e9))
+        found = attribute_source(name)(BodyRef(tmp_path / "egg.off"), np.array([[-2.0, -3.0, 4.0]]))
+        np.testing.assert_allclose(found, value)
+
+
+def test_a_molecule_that_has_changed_is_read_again_though_its_time_is_the_same(tmp_path: Path) -> None:
+    pytest.importorskip("gemmi")
+    body = BodyRef(tmp_path / "one.pdb", "chain A")
+    for name, charge in (("ASP", -1.0), ("LYS", 1.0)):
+        body.path.write_text(f"ATOM      1  CA  {name} A   1       2.000   3.000   4.000  1.00 20.00           C\n")
+        os.utime(body.path, (1e9, 1e9))
+        np.testing.assert_allclose(ResidueAttribute("charge")(body, np.zeros((1, 3))), charge)
+
+
+def test_what_is_known_of_amino_acids_alone_is_refused_of_nucleotides_in_these_words(tmp_path: Path) -> None:
+    pytest.importorskip("gemmi")
+    atom = "ATOM      1  P    DA A   1       2.000   3.000   4.000  1.00 20.00           P\n"
+    (tmp_path / "dna.pdb").write_text(atom)
+    body = BodyRef(tmp_path / "dna.pdb", "chain A")
+    assert ResidueAttribute("residue_shares")(body, INSIDE).shape == (200, 25)
+    with pytest.raises(MeshError, match=r"dna\.pdb#chain A: 'hydropathy' is known of none of its residues\. Choose"):
+        ResidueAttribute("hydropathy")(body, INSIDE)
+
+
+def test_names_of_blocks_do_not_tell_what_a_body_is(tmp_path: Path) -> None:
+    pytest.importorskip("gemmi")
+    columns = "id type_symbol label_atom_id label_alt_id label_comp_id label_asym_id auth_seq_id"
+    places = ("Cartn_x", "Cartn_y", "Cartn_z", "pdbx_PDB_model_num")
+    loop = "loop_\n" + "".join(f"_atom_site.{one}\n" for one in [*columns.split(), *places])
+    rows = "1 C CA . LYS A 1 0 0 0 1\n2 C CA . ASP A 1 0 0 0 2\n"
+    (tmp_path / "two.cif").write_text("".join(f"data_{name}\n{loop}{rows}" for name in ("chain", "assembly")))
+    for name in ("chain", "assembly"):
+        for number, charge in ((1, 1.0), (2, -1.0)):
+            body = BodyRef(tmp_path / "two.cif", f"{name} model {number}")
+            np.testing.assert_allclose(ResidueAttribute("charge")(body, np.zeros((1, 3))), charge)
+
+
 def stem_and_height(body: BodyRef, points: np.ndarray) -> np.ndarray:
     return len(body.path.stem) + points[:, 2]
+
+
+FACTOR = 2.0
+
+
+def scaled(body: BodyRef, points: np.ndarray) -> np.ndarray:
+    return FACTOR * points[:, 0]
 
 
 def times(points: np.ndarray, factor: float = 2.0) -> np.ndarray:
@@ -509,6 +583,15 @@ def test_a_function_of_body_and_points_is_a_source_that_is_kept(
     assert FunctionAttribute(stem_and_height).cache_tag(None) != tag
 
 
+def test_a_function_of_the_name_of_a_body_tells_copies_of_a_file_apart(tmp_path: Path) -> None:
+    for name in ("a", "bbb"):
+        write_body(tmp_path / "shapes" / f"{name}.off", 0.8, 0.9)
+    dataset = SignatureDataset(tmp_path / "shapes", CONFIG, tmp_path / "cache", attributes={"told": stem_and_height})
+    for item, n_letters in zip(dataset, (1, 3), strict=True):
+        samples = item.signature.interior
+        np.testing.assert_allclose(samples.attributes["told"], n_letters + samples.points[:, 2], atol=1e-5)
+
+
 def test_a_function_whose_code_does_not_tell_what_it_does_is_refused(tmp_path: Path) -> None:
     write_body(tmp_path / "a.off", 0.8, 0.9)
     factor = 2.0
@@ -523,6 +606,20 @@ def test_a_function_whose_code_does_not_tell_what_it_does_is_refused(tmp_path: P
     ):
         with pytest.raises(ValueError, match=rf"attributes: .*{said}.*cache_tag"):
             SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", attributes={"told": function})
+
+
+def test_constants_that_a_function_uses_tell_it_from_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    def tag() -> str:
+        return FunctionAttribute(scaled).cache_tag(None)
+
+    first = tag()
+    monkeypatch.setitem(globals(), "FACTOR", 3.0)
+    assert tag() != first
+    monkeypatch.setitem(globals(), "FACTOR", 2.0)
+    assert tag() == first
+    monkeypatch.setitem(globals(), "FACTOR", np.ones(3))
+    with pytest.raises(ValueError, match=r"attributes: scaled uses variables of what is around it"):
+        tag()
 
 
 def test_what_a_function_is_given_by_default_tells_it_from_others_of_the_same_code(tmp_path: Path) -> None:

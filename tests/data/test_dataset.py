@@ -432,6 +432,21 @@ def test_an_attribute_is_added_to_cached_signatures_without_new_eigenpairs(
     )
 
 
+def test_a_pre_transform_changes_a_copy_of_a_file_alike_whichever_comes_first(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_body(tmp_path / f"{name}.off", 1.1, 1.3)
+    files = [tmp_path / "a.off", tmp_path / "b.off"]
+    found = []
+    for number, order in enumerate((files, files[::-1])):
+        dataset = SignatureDataset(
+            order, CONFIG, tmp_path / f"cache {number}", pre_transform=FewerSamples(n_interior=6, seed=0)
+        )
+        found += [dataset[0].signature, dataset[1].signature]
+    assert [Path(one.name).name for one in found] == ["a.off", "b.off", "b.off", "a.off"]
+    for one in found[1:]:
+        np.testing.assert_array_equal(one.interior.points, found[0].interior.points)
+
+
 def test_a_pre_transform_is_given_the_attributes_and_depends_on_them(root: Path, tmp_path: Path) -> None:
     def changed(slope: float) -> SignatureDataset:
         return SignatureDataset(

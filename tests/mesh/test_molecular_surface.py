@@ -77,6 +77,15 @@ def test_the_accessible_surface_of_two_balls_is_that_of_larger_ones(apart: float
     assert (mesh.area, mesh.volume) == pytest.approx(union_of_two(1.9 + PROBE, 1.5 + PROBE, apart), rel=0.01)
 
 
+def test_a_speck_is_left_out_with_a_note_but_not_what_all_is_made_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = molecular_surface(molecule([[0, 0, 0], [14, 0, 0]], [8.0, 0.9]))
+    assert "left out 1 specks" in found.notes
+    assert found.volume == pytest.approx(4 / 3 * np.pi * 8**3, rel=0.01)
+    monkeypatch.setattr("igps.mesh.molecular_surface.SPECK_VOLUME", 0.2)  # as if there were some hundreds
+    found = molecular_surface(molecule([[9.0 * i, 0, 0] for i in range(6)], [1.7] * 6), spacing=0.5)
+    assert found.volume == pytest.approx(6 * 4 / 3 * np.pi * 1.7**3, rel=0.02)
+
+
 def test_a_ring_of_balls_has_a_hole() -> None:
     n, apart = 8, 4.2
     mesh = molecular_surface(molecule(_ring(n, apart), np.full(n, 1.7)), spacing=0.5)
@@ -147,7 +156,7 @@ def test_stray_atoms_are_named_with_the_remedy() -> None:
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"kind": "solvent"}, "kind: expected one of 'excluded'"),
+        ({"kind": "solvent"}, "kind: expected one of excluded"),
         ({"probe": -1.0}, "probe: expected"),
         ({"probe": float("nan")}, "probe: expected"),
         ({"spacing": 0.0}, "spacing: expected"),

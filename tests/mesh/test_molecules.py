@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from igps.data.attribute_sources import _molecule
-from igps.mesh.formats.molecules import is_structure, read_molecule
-from igps.mesh.loading import BodyRef
-from igps.mesh.mesh import MeshError
+from igps.mesh.formats.molecules import Molecule, is_structure, read_molecule
+from igps.mesh.loading import BodyRef, each_body
+from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.molecular_surface import molecular_surface
 from igps.mesh.residues import VOLUMES
 
@@ -124,6 +124,18 @@ def test_a_pqr_file_has_its_own_charges_and_radii(tmp_path: Path) -> None:
     assert molecule.notes == ("radii and charges are those of the PQR file",)
 
 
+def test_long_numbers_of_a_pqr_file_leave_no_blank_before_them(tmp_path: Path) -> None:
+    rows = "ATOM   9999  N   ALA A1000       1.000   2.000   3.000  0.1000 1.8500\n"
+    rows += "HETATM10000  O   HOH B1001       9.000   2.000   3.000 -0.8000 1.6000\n"
+    rows += "HETATM10001  CA  ALA B1002A     12.000   2.000   3.000  0.2000 1.9000\n"
+    one, other = read_molecule(written(tmp_path, rows, "made.pqr"))
+    assert [one.name[-7:], one.residue_names, one.radii.round(2).tolist()] == ["chain A", ("ALA",), [1.85]]
+    assert [other.name[-7:], other.residue_names, other.radii.round(2).tolist()] == ["chain B", ("ALA",), [1.9]]
+    fused = written(tmp_path, "ATOM 1 HG11VAL A 1 0.0 0.0 0.0 -0.30 1.85\n", "fused.pqr")
+    with pytest.raises(MeshError, match=r"fused\.pqr: line 1 is no atom .* write it again, with blanks between fields"):
+        read_molecule(fused)
+
+
 def test_charges_are_those_of_residues_at_ph_7(tmp_path: Path) -> None:
     names = {
         "ASP": "OD1 OD2",
@@ -170,6 +182,15 @@ def test_an_assembly_is_built_by_its_operators(tmp_path: Path) -> None:
     np.testing.assert_allclose(molecule.positions[5:], one * [-1, -1, 1] + [0, 0, 50], atol=1e-4)
     (alone,) = read_molecule(written(tmp_path, residue(1)), "assembly")
     assert alone.notes == ("the file names no assembly: the model was taken as it is",)
+
+
+def test_an_assembly_of_a_chain_that_is_not_there_is_told_with_the_remedy(tmp_path: Path) -> None:
+    rows = "".join(f"REMARK 350   BIOMT{i}   1 {a:9.6f}{b:10.6f}{c:10.6f}        0.00000\n" for i, (a, b, c) in
+                   enumerate(np.eye(3), start=1))  # fmt: skip
+    text = f"REMARK 350 BIOMOLECULE: 1\nREMARK 350 APPLY THE FOLLOWING TO CHAINS: A, Q\n{rows}"
+    path = written(tmp_path, text + residue(1))
+    with pytest.raises(MeshError, match=r"made\.pdb: assembly 1 cannot be made .*no chain Q.*bodies"):
+        read_molecule(path, "assembly")
 
 
 def test_water_is_left_out_and_ligands_as_said(tmp_path: Path) -> None:
@@ -271,6 +292,20 @@ def test_a_chain_without_atoms_costs_no_other_chain(tmp_path: Path, caplog: pyte
         (molecule,) = read_molecule(path)
     assert molecule.name == f"{path}#chain A"
     assert f"{path}#chain B: no atoms of a polymer, left out" in caplog.text
+
+
+def test_a_surface_that_fails_in_any_way_costs_no_other_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = written(tmp_path, residue(1) + residue(1, chain="B") + residue(1, chain="C"))
+
+    def faulty(molecule: Molecule) -> Mesh:
+        if "chain B" in molecule.name:
+            raise ValueError("of any kind")
+        return molecular_surface(molecule)
+
+    monkeypatch.setattr("igps.mesh.molecular_surface.molecular_surface", faulty)
+    found = {body.part: mesh for body, mesh in each_body(path)}
+    assert [name for name, mesh in found.items() if isinstance(mesh, Mesh)] == ["chain A", "chain C"]
+    assert str(found["chain B"]).startswith(f"{path}#chain B: not readable as a structure (ValueError: ")
 
 
 def test_b_factors_are_means_over_residues(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from batches import N_POINTS, alone, embedded, scaled, two_bodies
-from igps.nn.batch_features import BatchFeatures, SampleFeatures, check_kind, nearest_directions, nearest_neighbours
+from igps.nn.batch_features import BatchFeatures, SampleFeatures, nearest_directions, nearest_neighbours
 from igps.nn.embedding import SpectralEmbedding
 
 
@@ -101,12 +101,6 @@ def test_subsets() -> None:
     features = BatchFeatures(batch, training=True)
     assert features.of("interior", 9, 5) is features.of("interior", None, 5)
     assert features.of("interior", 5, None) is not features.of("interior", 5, 5)
-
-
-def test_a_wrong_kind_says_which_there_are() -> None:
-    check_kind("surface")
-    with pytest.raises(ValueError, match="samples: expected 'interior' or 'surface', got 'volume'"):
-        check_kind("volume")
 
 
 def test_nearest_points_are_those_of_a_loop() -> None:

@@ -229,7 +229,7 @@ def test_too_few_vertices_say_so(blob: Mesh) -> None:
 @pytest.mark.parametrize(
     "field",
     [{"n_eigenpairs": 0}, {"resolution": 0}, {"min_samples": -1}, {"n_surface_samples": 0}, {"backend": "x"},
-     {"max_vertices": 100}, {"accuracy": 2.0}, {"attributes": ("x",)}, {"seed": -1}],
+     {"backend": None}, {"max_vertices": 100}, {"accuracy": 2.0}, {"attributes": ("x",)}, {"seed": -1}],
 )  # fmt: skip
 def test_bad_configuration_is_named(field: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(field))):

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.cluster.hierarchy import cut_tree, linkage
 from scipy.spatial.distance import squareform
 
-from igps._parameters import check_at_least
-from igps.analysis.map import Values, checked_distances
+from igps._arrays import Floats, Integers
+from igps._parameters import check_at_least, check_one_of
+from igps.analysis.map import checked_distances
 
 Joining = Literal["average", "complete", "single"]
 STABLE = 0.75
@@ -21,16 +21,16 @@ _MOST_CLUSTERS = 30
 class Clusters:
     """A hierarchical clustering, cut."""
 
-    numbers: NDArray[np.int64]  # (N,) the cluster of each body, 0 for the largest
+    numbers: Integers  # (N,) the cluster of each body, 0 for the largest
     middles: tuple[int, ...]  # of each cluster, the body with the smallest sum of distances to its others
     # Of each cluster, how much of it comes together again when half of the bodies are clustered alone: mean largest
     # Jaccard index with a cluster of them; NaN where too few were drawn
     stability: tuple[float, ...]
-    tree: Values  # (N − 1, 4) as of `scipy.cluster.hierarchy.linkage`
+    tree: Floats  # (N − 1, 4) as of `scipy.cluster.hierarchy.linkage`
 
 
 def clusters_of(
-    distances: Values,
+    distances: Floats,
     n_clusters: int | None = None,
     *,
     joining: Joining = "average",
@@ -52,8 +52,7 @@ def clusters_of(
     """
     from sklearn.metrics import silhouette_score
 
-    if joining not in get_args(Joining):
-        raise ValueError(f"joining: expected one of {', '.join(get_args(Joining))}, got {joining!r}.")
+    check_one_of(get_args(Joining), joining=joining)
     check_at_least(0, n_resamples=n_resamples)
     check_at_least(1, n_clusters=n_clusters)
     found, n = checked_distances(distances), len(distances)
@@ -82,9 +81,9 @@ def clusters_of(
     return Clusters(numbers, middles, tuple(stability.tolist()), tree)
 
 
-def _tree(distances: Values, joining: Joining) -> Values:
+def _tree(distances: Floats, joining: Joining) -> Floats:
     return linkage(squareform(distances, checks=False), joining)
 
 
-def _cut(tree: Values, n_clusters: int) -> NDArray[np.int64]:
+def _cut(tree: Floats, n_clusters: int) -> Integers:
     return cut_tree(tree, n_clusters).ravel().astype(np.int64)

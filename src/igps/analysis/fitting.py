@@ -11,6 +11,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from igps._parameters import check_one_of
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
@@ -99,9 +100,8 @@ def fit(
     Raises:
         ValueError: no labels, too few of them, or a descriptor without histograms.
     """
-    for name, value, allowed in (("goal", goal, Goal), ("head", head, HeadName)):
-        if value not in get_args(allowed):
-            raise ValueError(f"{name}: expected one of {', '.join(get_args(allowed))}, got {value!r}.")
+    check_one_of(get_args(Goal), goal=goal)
+    check_one_of(get_args(HeadName), head=head)
     which = descriptor_of(descriptor)
     kept = {"size": isinstance(which, SizedHistograms), "side": False}  # they stay beside the head
     if isinstance(which, IndividualDescriptor):

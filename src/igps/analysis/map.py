@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.sparse.linalg import eigsh
 from scipy.spatial.distance import pdist, squareform
 
-Values = NDArray[np.float64]
+from igps._arrays import Floats
+from igps._parameters import check_one_of
+
 Layout = Literal["mds", "umap"]
 
 # Entries of distance matrices that the improvement of a map may go through in all
@@ -21,13 +22,13 @@ _MOST_ENTRIES, _MOST_ROUNDS = 10**9, 300
 class BodyMap:
     """Where bodies lie."""
 
-    points: Values  # (N, 2), in units of the distances for "mds", in none for "umap"
+    points: Floats  # (N, 2), in units of the distances for "mds", in none for "umap"
     # Root of the squared errors of all distances over their squares (Kruskal 1964), after the best scaling: 0 where the
     # map keeps every distance, above 0.2 it distorts much
     stress: float
 
 
-def checked_distances(distances: Values) -> Values:
+def checked_distances(distances: Floats) -> Floats:
     """(N, N) symmetric, zero on the diagonal: the mean of both directions; a ValueError of another shape, or NaN."""
     found = np.asarray(distances, dtype=float)
     if found.ndim != 2 or len(found) != found.shape[-1] or len(found) < 3:
@@ -39,7 +40,7 @@ def checked_distances(distances: Values) -> Values:
     return found
 
 
-def body_map(distances: Values, layout: Layout = "mds", *, seed: int = 0) -> BodyMap:
+def body_map(distances: Floats, layout: Layout = "mds", *, seed: int = 0) -> BodyMap:
     """Lay bodies out in the plane.
 
     Metric multidimensional scaling: the classical solution (Torgerson 1952), improved by SMACOF (de Leeuw 1977), as far
@@ -54,8 +55,7 @@ def body_map(distances: Values, layout: Layout = "mds", *, seed: int = 0) -> Bod
         ValueError: distances of which no map can be drawn, or another layout.
         ImportError: umap-learn is not installed.
     """
-    if layout not in get_args(Layout):
-        raise ValueError(f"layout: expected one of {', '.join(get_args(Layout))}, got {layout!r}.")
+    check_one_of(get_args(Layout), layout=layout)
     wanted = checked_distances(distances)
     points = _classical(wanted) if layout == "mds" else _umap(wanted, seed)
     if layout == "mds" and (rounds := min(_MOST_ROUNDS, _MOST_ENTRIES // wanted.size)) and wanted.any():
@@ -68,7 +68,7 @@ def body_map(distances: Values, layout: Layout = "mds", *, seed: int = 0) -> Bod
     return BodyMap(turned, _stress(wanted, turned))
 
 
-def _classical(distances: Values) -> Values:
+def _classical(distances: Floats) -> Floats:
     squares, n = distances**2, len(distances)
     means = squares.mean(axis=0)
     products = (means[:, None] + means - means.mean() - squares) / 2
@@ -79,7 +79,7 @@ def _classical(distances: Values) -> Values:
     return axes * np.sqrt(np.maximum(values, 0))
 
 
-def _umap(distances: Values, seed: int) -> Values:
+def _umap(distances: Floats, seed: int) -> Floats:
     try:
         from umap import UMAP
     except ImportError as error:
@@ -90,7 +90,7 @@ def _umap(distances: Values, seed: int) -> Values:
         return chosen.fit_transform(distances).astype(float)
 
 
-def _stress(wanted: Values, points: Values) -> float:
+def _stress(wanted: Floats, points: Floats) -> float:
     one, other = squareform(wanted, checks=False), pdist(points)
     if not one.any():
         return 0.0

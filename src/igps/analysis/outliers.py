@@ -71,7 +71,7 @@ class Outlier:
 
     @property
     def is_outlier(self) -> bool:
-        """Whether the score is above what chance explains."""
+        """Whether the score is above `LIMIT`."""
         return self.score > LIMIT
 
 

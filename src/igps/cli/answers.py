@@ -12,7 +12,7 @@ from igps._parameters import check_at_least, check_share
 from igps.analysis.explanation import KINDS, Explanation, contents_of, explain_groups, on_surface
 from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, vectors_of, with_discovery_rates
-from igps.analysis.outliers import measures_of
+from igps.analysis.outliers import LIMIT, measures_of
 from igps.analysis.outliers import outliers as find_outliers
 from igps.cli.reading import Folder, described, files_or_folder, print_failures
 from igps.data.dataset import SignatureDataset
@@ -108,8 +108,8 @@ def outliers(
 
     Each is compared with the others of its class: shape, volume, how coarse it is; of meshes handles, flat sides and
     repairs; of labels what lies apart, cavities, holes, gaps, cut ends, and overlap with other labels. A score is a
-    number of robust standard deviations; above 3.5 it is more than chance. A body that is nearer to another class
-    than to its own is reported.
+    number of robust standard deviations; a body above 3.5 is an outlier. A body that is nearer to another class than
+    to its own is reported.
 
     Args:
         root: folder with one subfolder per class, or with files and a labels.csv (columns file,label).
@@ -131,7 +131,7 @@ def outliers(
     print(f"{'score':>7}  {'body':<{width}}  class: why")
     for row in rows[:top]:
         print(f"{row['score']:>7.1f}  {row['body']:<{width}}  {row['class']}: {row['reason']}")
-    print(f"{sum(one.is_outlier for one in found)} of {len(rows)} bodies have a score above what chance explains")
+    print(f"{sum(one.is_outlier for one in found)} of {len(rows)} bodies are outliers, with a score above {LIMIT}")
     print_failures(bodies.failures, len(dataset))
     if out is not None:
         pictured = [(one, dataset.bodies.names[one.body], dataset.mesh(one.body)) for one in found[: min(top, 12)]]

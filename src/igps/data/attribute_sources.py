@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
+from igps._parameters import check_one_of
 from igps.data.attributes import AttributeSource
-from igps.data.cache import content_digest, stamp_of
-from igps.mesh.formats import files_read, images, vertex_values
+from igps.data.cache import content_digest
+from igps.mesh.formats import brains, files_read, images, stamp_of, vertex_values
 from igps.mesh.formats.molecules import Molecule, MoleculeBodies, is_structure, molecules_by_part
 from igps.mesh.loading import BodyRef, load_mesh, read_surface
 from igps.mesh.mesh import MeshError
@@ -49,8 +50,7 @@ class ResidueAttribute:
     name: str
 
     def __post_init__(self) -> None:
-        if self.name not in RESIDUE_ATTRIBUTES:
-            raise ValueError(f"attribute: expected one of {', '.join(RESIDUE_ATTRIBUTES)}, got {self.name!r}.")
+        check_one_of(RESIDUE_ATTRIBUTES, attribute=self.name)
 
     def cache_tag(self, body: BodyRef) -> str:
         """The name alone: the molecule is the body's file."""
@@ -59,23 +59,24 @@ class ResidueAttribute:
     def __call__(self, body: BodyRef, points: Values) -> Values:
         """(P,) or (P, C) at points (P, 3), Å; a MeshError of what is no molecule, or has no such value."""
         if not is_structure(body.path):
-            raise MeshError(
-                f"{body}: has no atoms, which {self.name!r} is known of. Give a PDB, mmCIF or PQR file, or choose "
-                "another descriptor."
-            )
+            none = f"{body}: has no atoms, which {self.name!r} is known of."
+            raise MeshError(f"{none} Give a PDB, mmCIF or PQR file, or choose another descriptor.")
         values = residue_attribute(_molecule(body), points, self.name)
+        if np.isnan(values).all():
+            raise MeshError(f"{body}: {self.name!r} is known of none of its residues. Choose another descriptor.")
         return completed(values, points, f"{body}: {self.name}")
 
 
 def _molecule(body: BodyRef) -> Molecule:
     """That whose surface the body is."""
-    part, changed = body.part or "", os.stat(body.path).st_mtime_ns
+    part, changed = body.part or "", stamp_of(body.path)
     words = part.split()  # before them may stand the name of one of several structures
-    how: MoleculeBodies = "chains" if "chain" in words else "assembly" if "assembly" in words else "models"
-    found = molecules_by_part(body.path, changed, how)
-    if part in found:
-        return found[part]
-    models = list(molecules_by_part(body.path, changed, "models").values())  # a body of all of them
+    kinds: dict[str, MoleculeBodies] = {"chain": "chains", "assembly": "assembly"}
+    for how in (*(kinds[word] for word in kinds if word in words), "models"):
+        found = molecules_by_part(body.path, changed, how)
+        if part in found:
+            return found[part]
+    models = list(found.values())  # a body of all of them
     fields = ("positions", "radii", "charges", "residue_positions", "b_factors")
     arrays: dict[str, Any] = {field: np.concatenate([getattr(one, field) for one in models]) for field in fields}
     starts = np.cumsum([0, *(len(one.residue_names) for one in models)])
@@ -101,7 +102,7 @@ class FileAttribute(ABC):
         """The kind of source, the array's name, and the content of the file; a MeshError where there is none."""
         file, name = self.file(body)
         files = files_read(file)
-        return f"{type(self).__name__} 3 {name} {_checksum(*files, stamp=stamp_of(*files))}"
+        return f"{type(self).__name__} 4 {name} {_checksum(*files, stamp=stamp_of(*files))}"
 
     def __call__(self, body: BodyRef, points: Values) -> Values:
         """(P,) or (P, C) at points (P, 3); a MeshError where the file is of no use, or knows too few of them."""
@@ -114,8 +115,8 @@ class FileAttribute(ABC):
             raise error if str(body) in str(error) else MeshError(f"{body}: its attribute's file {error}") from error
         except Exception as error:  # readers of many formats raise whatever they like
             raise MeshError(
-                f"{body}: its attribute's file {file} is not readable ({type(error).__name__}: {error}). Check that "
-                "it is complete, and of the format that its name tells."
+                f"{body}: its attribute's file {file} is not readable ({type(error).__name__}: "
+                f"{' '.join(str(error).split())}). Check that it is complete, and of the format that its name tells."
             ) from error
         return completed(values, points, f"{body}: {file}")
 
@@ -139,8 +140,7 @@ class FileAttribute(ABC):
         # As the path says; where folders are called otherwise there, as they are. A file may be a link to anywhere
         ways = ((Path(os.path.abspath(body.path)), Path(os.path.abspath(root))),
                 (body.path.parent.resolve() / body.path.name, root.resolve()))  # fmt: skip
-        below = next((one.relative_to(base).as_posix() for one, base in ways if one.is_relative_to(base)), None)
-        below = below or body.path.name
+        below = next((one.relative_to(at).as_posix() for one, at in ways if one.is_relative_to(at)), body.path.name)
         if Path(pattern).is_absolute():
             root = Path(pattern.partition("{")[0]).parent if "{" in pattern else Path(pattern).parent
         words = {"{stem}": body.path.name.partition(".")[0], "{file}": below, "{part}": body.part or ""}
@@ -168,8 +168,8 @@ class ImageAttribute(FileAttribute):
     """
 
     def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
-        grid, affine = images.read(file, os.stat(file).st_mtime_ns)
-        at = (points - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
+        grid, affine = images.read(file, stamp_of(*files_read(file)))
+        at = (brains.in_scanner(body.path, points) - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
         size = np.array(grid.shape)
         inside = ((at > -0.5) & (at < size - 0.5)).all(axis=1)
         found = np.full(len(points), np.nan)

@@ -1,10 +1,11 @@
 """Attributes of samples that come from elsewhere: an image, a field, a function of position."""
 
+import dis
 import hashlib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Protocol, get_args, runtime_checkable
 
 import numpy as np
@@ -15,6 +16,9 @@ from igps.signature.attributes import AttributeName
 from igps.signature.signature import Signature
 
 ROOMS = ("interior", "surface")
+
+# What a key can tell.
+_Told = bool | int | float | str | PurePath
 
 PointFunction = Callable[..., NDArray[np.floating[Any]]]
 
@@ -40,7 +44,7 @@ class FromFiles(Protocol):
 
 @dataclass(frozen=True)
 class FunctionAttribute:
-    """A function `(body, points)` as a source; its name, code and defaults stand for it in the keys of the cache.
+    """A function `(body, points)` as a source; name, code, defaults and constants stand for it in keys of the cache.
 
     A ValueError where its source code is not known, or does not tell what it does.
     """
@@ -51,23 +55,32 @@ class FunctionAttribute:
         self.cache_tag(None)
 
     def cache_tag(self, body: BodyRef | None) -> str:
-        """Of all bodies the same."""
+        """The function, and the body, whose name it is given."""
         name = getattr(self.function, "__qualname__", repr(self.function))
         remedy = "Give an object with this call and a method cache_tag(body), see igps.data.attributes.AttributeSource."
         kept = getattr(self.function, "__defaults__", None), getattr(self.function, "__kwdefaults__", None)
-        defaults = (*(kept[0] or ()), *(kept[1] or {}).values())
-        is_told = all(one is None or isinstance(one, bool | int | float | str) for one in defaults)
+        used = [*(kept[0] or ()), *(kept[1] or {}).values(), *_constants(self.function)]
+        is_told = all(one is None or isinstance(one, _Told) for one in used)
         if getattr(self.function, "__closure__", None) or inspect.ismethod(self.function) or not is_told:
             raise ValueError(f"attributes: {name} uses variables of what is around it, which no key tells. {remedy}")
         try:
             source = inspect.getsource(self.function)
         except (OSError, TypeError) as error:
             raise ValueError(f"attributes: the source code of {name} is not known ({error}). {remedy}") from error
-        return f"function {name} {hashlib.sha256(source.encode()).hexdigest()}" + (f" {defaults}" if defaults else "")
+        return f"function {name} {hashlib.sha256(source.encode()).hexdigest()} {used} {body}"
 
     def __call__(self, body: BodyRef, points: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
         """Its values."""
         return self.function(body, points)
+
+
+def _constants(function: Callable[..., Any]) -> list[Any]:
+    """The numbers, texts, arrays and the like that a function uses of its module."""
+    if not inspect.isfunction(function):
+        return []
+    names = sorted({one.argval for one in dis.get_instructions(function) if one.opname == "LOAD_GLOBAL"})
+    found = [function.__globals__[name] for name in names if name in function.__globals__]
+    return [one for one in found if isinstance(one, _Told | list | tuple | dict | set | np.ndarray)]
 
 
 def _takes_body(function: Callable[..., Any]) -> bool:

@@ -37,13 +37,6 @@ def default_cache_dir() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "igps"
 
 
-def stamp_of(*paths: Path) -> tuple[int, int, int]:
-    """Bytes of files, and when their content and their names or rights were last changed, in nanoseconds."""
-    found = [os.stat(path) for path in paths]
-    sizes, contents, names = zip(*((one.st_size, one.st_mtime_ns, one.st_ctime_ns) for one in found), strict=True)
-    return sum(sizes), max(contents), max(names)
-
-
 def content_digest(path: Path, *beside: Path) -> bytes:
     """Of what is in a file, and in others that are read with it."""
     with open(path, "rb") as file:

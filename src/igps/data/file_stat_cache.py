@@ -10,9 +10,9 @@ import time
 from collections.abc import Generator, Iterable, Mapping
 from functools import lru_cache
 
-from igps.data.cache import SignatureCache, stamp_of
+from igps.data.cache import SignatureCache
 from igps.data.pipeline import CacheHit, SignaturePipeline
-from igps.mesh.formats import files_read
+from igps.mesh.formats import files_read, stamp_of
 from igps.mesh.loading import BodyRef
 from igps.mesh.mending import MENDING_VERSION
 from igps.mesh.mesh import MeshError

@@ -18,8 +18,8 @@ import numpy as np
 from igps._parallel import Failed, MachineError, attempt
 from igps.data.attribute_sources import of_bodies_read
 from igps.data.attributes import ROOMS, AttributeSource, with_attribute
-from igps.data.cache import AttributeCache, SignatureCache, content_digest, stamp_of
-from igps.mesh.formats import files_read
+from igps.data.cache import AttributeCache, SignatureCache, content_digest
+from igps.mesh.formats import files_read, stamp_of
 from igps.mesh.loading import BodyRef, each_body, load_mesh
 from igps.mesh.mending import MENDING_VERSION, repair_steps
 from igps.mesh.mesh import Mesh, MeshError
@@ -35,7 +35,7 @@ class PreTransform(Protocol):
         """All that the change depends on, in words."""
 
     def __call__(self, signature: Signature) -> Signature:
-        """The changed Signature."""
+        """The changed Signature; the name of the given one is its key in the cache."""
 
 
 @dataclass(frozen=True)
@@ -195,9 +195,10 @@ class SignaturePipeline:
             keys[name] = self._attribute_key(body, key, name)
             signature = self._with_attribute(body, signature, name, keys[name])
         if self.pre_transform is not None:
-            signature = self.pre_transform(signature)
-            mended = bool(repair_steps(signature.notes))
-            key, keys = self._changed_key(body, self._key(body, file, self.config, mended)), {}
+            key = self._key(body, file, self.config, bool(repair_steps(signature.notes)))
+            # What it draws by the name must not depend on which of several copies of a file comes first.
+            signature = replace(self.pre_transform(replace(signature, name=key)), name=signature.name)
+            key, keys = self._changed_key(body, key), {}
             cache.put(key, signature)
         return CacheHit(key, cache.path(key).stat().st_size, tuple(signature.notes), file.stamp, keys), signature
 

@@ -1,7 +1,8 @@
 """Changes of a Signature: as a Dataset's `transform` at each reading, as its `pre_transform` once, before it is cached.
 
-Each takes a seed. With one, a Signature is changed alike at every reading, by seed and name alone; without, by numbers
-that PyTorch's global generator draws, which a DataLoader seeds anew in every worker.
+Each takes a seed. With one, a Signature is changed alike at every reading, by seed and name alone (before it is cached,
+by its key in place of the name, which copies of a file share); without, by numbers that PyTorch's global generator
+draws, which a DataLoader seeds anew in every worker.
 """
 
 import zlib

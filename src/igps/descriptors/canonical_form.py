@@ -72,16 +72,16 @@ class CanonicalForm(BodyDescriptor):
         return torch.stack([euclidean(queries * sign, gallery) for sign in signs]).amin(dim=0)
 
 
-def classical_scaling(distances: Floats, dimension: int = _DIMENSION) -> Floats:
+def classical_scaling(distances: Floats) -> Floats:
     """Points whose inner products come closest to those that distances (P, P) imply (Torgerson 1952).
 
-    They are (P, dimension), centred, along their principal axes, longest first; 0 where the distances span fewer.
+    They are (P, 3), centred, along their principal axes, longest first; 0 where the distances span fewer.
     """
     squared = distances**2
     row = squared.mean(axis=0)
     gram = -(squared - row - row[:, None] + row.mean()) / 2
     values, vectors = np.linalg.eigh(gram)
-    values, vectors = values[::-1][:dimension], vectors[:, ::-1][:, :dimension]
+    values, vectors = values[::-1][:_DIMENSION], vectors[:, ::-1][:, :_DIMENSION]
     return vectors * np.sqrt(np.maximum(values, 0))
 
 

@@ -5,8 +5,6 @@ from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
 
-INVARIANT_TO = ("motion", "scale", "pose")
-
 
 def interior(n_eigenpairs: int = 250) -> HistogramDescriptor:
     """Histograms of the commute-time distances between interior samples, by pairs of potential classes.
@@ -14,4 +12,5 @@ def interior(n_eigenpairs: int = 250) -> HistogramDescriptor:
     Source: Rustamov 2010, sections 3 and 4: 4 classes, 64 bins, 250 eigenpairs, χ².
     """
     histogram = PairHistogram([Potential(4), InteriorDistance(64)], SpectralEmbedding(n_eigenpairs=n_eigenpairs))
-    return HistogramDescriptor(histogram, name="interior", source="Rustamov 2010", invariant_to=INVARIANT_TO)
+    invariant_to = ("motion", "scale", "pose")
+    return HistogramDescriptor(histogram, name="interior", source="Rustamov 2010", invariant_to=invariant_to)

@@ -26,7 +26,7 @@ from igps.gallery._alignment import surface_distance
 from igps.gallery._near_pairs import NearPairs, near_in_gallery, near_pairs, of_one_size
 from igps.gallery.calibration import Calibration
 from igps.gallery.gallery import Gallery
-from igps.gallery.surfaces import Grade, Surfaces
+from igps.gallery.surfaces import MOST_STRETCHED, Grade, Surfaces
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 
@@ -238,8 +238,13 @@ def body_distance(
 
 
 def _profile_distances(one: Tensor, other: Tensor) -> Tensor:
-    """Root mean square differences (M, N) of the quantiles of profiles (M, 3, 64) and (N, 3, 64) that differ most."""
-    return torch.cdist(one.movedim(1, 0), other.movedim(1, 0)).amax(dim=0) / one.shape[2] ** 0.5
+    """Root mean square differences (M, N) of the quantiles that differ most, of profiles as of `Surfaces.profiles`.
+
+    Infinite where the extents tell that two are not the same.
+    """
+    (one, extents), (other, of_other) = ((some[:, :, :-1].movedim(1, 0), some[:, :, -1]) for some in (one, other))
+    apart = torch.cdist(one, other).amax(dim=0) / one.shape[2] ** 0.5
+    return apart.where(torch.cdist(extents, of_other, p=math.inf) <= MOST_STRETCHED, math.inf)
 
 
 def _files_of(gallery: Gallery, cache_dir: str | Path | None) -> SignatureDataset:

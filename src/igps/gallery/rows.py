@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from igps.data.cache import stamp_of
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.sources import LABELS_FILE, Bodies, is_number
 from igps.gallery.about import KNOWN, Batch
-from igps.mesh.formats import files_read
+from igps.mesh.formats import files_read, stamp_of
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.nn.description import describe

@@ -35,10 +35,10 @@ from igps.signature.signature import Signature
 # Samples of surfaces, and surfaces, in memory at once.
 _SURFACES, _TRIANGLES = 512, 64
 _NORMALS: AttributeName = "surface_direction"
-# Copies differ by up to 0.045 in the logarithms of their extents; what differs by more is not laid onto each other.
-_MOST_STRETCHED = 0.1
 # A tenth of this is much between copies.
 _HOPELESS = 0.03
+MOST_STRETCHED = 0.1
+"""Copies differ by up to 0.045 in the logarithms of their extents; what differs by more is not laid onto each other."""
 MOST_TOLERATED = 0.02
 """Over √area: what is farther apart is not looked at closely."""
 
@@ -60,7 +60,7 @@ def distance_if_alike(
     one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, most: float = math.inf
 ) -> float:
     """`surface_distance`, infinite where the extents of the two tell that they are not the same."""
-    if np.abs(np.log(one.extents / other.extents)).max() > _MOST_STRETCHED:
+    if np.abs(np.log(one.extents / other.extents)).max() > MOST_STRETCHED:
         return math.inf
     return surface_distance(one, other, enough=enough, hopeless=_HOPELESS, most=most)
 
@@ -158,11 +158,15 @@ class Surfaces:
         return calibration.limit(max(coarseness, of_other))
 
     def profiles(self, n_workers: int | None = None, progress: bool = False) -> tuple[Tensor, list[Failure]]:
-        """Those (M, 3, 64) of all that can be read, in order, and failures of the others; a MeshError if none can."""
+        """Of all that can be read, in order, (M, 3, 65): profiles, and behind each quantity the logarithm of an extent.
+
+        And the failures of the others; a MeshError if none can be read.
+        """
 
         def profile(i: int) -> NDArray[np.float64] | None:
             with contextlib.suppress(MeshError):  # which is among the failures
-                return self.samples(i).profile
+                samples = self.samples(i)
+                return np.column_stack([samples.profile, np.log(np.maximum(samples.extents, 1e-9))])
             return None
 
         found = on_threads(profile, range(len(self._dataset)), n_workers)

@@ -104,9 +104,14 @@ def each_surface(
     path = Path(path)
     for raw in _read(path, options, parts[0] if parts and len(parts) == 1 else None):
         if parts is None or raw.part in parts:
-            with one_thread(), faults(path, _format(path)):
-                body = raw.made()
-            yield BodyRef(path, raw.part), body
+            ref = BodyRef(path, raw.part)
+            with one_thread():
+                try:
+                    with faults(ref, _format(path)):
+                        body = raw.made()
+                except MeshError as fault:  # leaves the others
+                    body = replace(raw, fault=fault, make=None)
+            yield ref, body
 
 
 def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part: str | None = None) -> RawBody:

@@ -33,6 +33,8 @@ _MOST_CELLS = 2**28
 _STEP = 0.3
 # Share of the area that threads between pieces may add, and of a triangle's sides the most that one takes.
 _THREADS, _MOST_TAKEN = 0.003, 0.5
+# Share of the volume that specks have at most.
+_MOST_SPECKS = 0.05
 # Rounds in which vertices are moved apart along the surface.
 _N_ROUNDS = 2
 
@@ -134,11 +136,15 @@ def _one_piece(
 ) -> Surface:
     """The surface of the largest piece, or of all but specks, joined; each with its share of the vertices."""
     parts = connected(vertices, faces)
-    sizes = [abs(signed_volume(*part)) for part in parts]
+    sizes = np.array([abs(signed_volume(*part)) for part in parts])
+    small = sizes < (sizes.max() if pieces == "largest" else SPECK_VOLUME * sizes.sum())
     if len(parts) > 1 and pieces == "largest":
         notes.append(f"the largest of {len(parts)} pieces was kept")
-    least = max(sizes) if pieces == "largest" else SPECK_VOLUME * sum(sizes)
-    parts = [part for part, size in zip(parts, sizes, strict=True) if size >= least]
+    elif sizes[small].sum() > _MOST_SPECKS * sizes.sum():  # as of a membrane, which is all small molecules
+        small[:] = False
+    elif small.any():
+        notes.append(f"left out {small.sum()} specks")
+    parts = [part for part, is_small in zip(parts, small, strict=True) if not is_small]
     if max_vertices is not None:
         n_vertices = sum(len(points) for points, _ in parts)
         parts = [simplified(*part, max(round(max_vertices * len(part[0]) / n_vertices), 12)) for part in parts]

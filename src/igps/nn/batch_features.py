@@ -1,6 +1,6 @@
 """Features of a batch that histograms share: embeddings, positions, attributes, each computed once."""
 
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -23,12 +23,6 @@ _FAR = 1e18
 _N_NEAREST = 8
 # For graphs of samples: with 12 or more it makes no difference, with 8 limbs fall apart where samples are sparse.
 N_NEIGHBOURS = 16
-
-
-def check_kind(samples: str) -> None:
-    """Raise a ValueError that says which kinds of samples there are, unless this is one."""
-    if samples not in get_args(SampleKind):
-        raise ValueError(f"samples: expected 'interior' or 'surface', got {samples!r}.")
 
 
 class SampleFeatures:

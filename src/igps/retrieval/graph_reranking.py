@@ -70,7 +70,7 @@ def rerank_graph(
     anew = (1 - share) * _jaccard(weights, graph, progress) + share * apart / average
     if keep_nearest:
         anew = _brought_forward(anew, graph, lists[:, 0])
-    ranked = _values(anew, graph, np.repeat(np.arange(n), m), lists.ravel()).reshape(n, m)
+    ranked = _like(graph, anew)[np.repeat(np.arange(n), m), lists.ravel()].reshape(n, m)
     best = np.argsort(ranked, axis=1, kind="stable")
     return SearchResult(*(torch.from_numpy(np.take_along_axis(one, best, axis=1)) for one in (lists, ranked)))
 
@@ -105,8 +105,10 @@ def _neighbourhoods(
     joins.data = (2 / 3 * halves.sum(axis=1)[joins.indices] <= joins.data).astype(np.float64)
     of, to = (members + joins @ halves).nonzero()
     nearest = order[:, 1 : n_neighbours + 1]
-    near = _values(apart, graph, np.repeat(np.arange(n), n_neighbours), nearest.ravel()).reshape(n, -1).mean(axis=1)
-    weight = np.exp(-np.where(of == to, 0.0, _values(apart, graph, of, to)) / np.maximum(near, _TINY)[of])
+    near = _like(graph, apart)[np.repeat(np.arange(n), n_neighbours), nearest.ravel()].reshape(n, -1).mean(axis=1)
+    scale = np.repeat(-np.maximum(near, _TINY), np.diff(graph.indptr))
+    alike = np.exp(np.divide(apart, scale, out=scale), out=scale)
+    weight = np.where(of == to, 1.0, _like(graph, alike)[of, to])
     weights = sparse.csr_array((weight, (of, to)), shape=(n, n))
     weights = _binary(order[:, :n_expanded]) @ sparse.diags_array(1 / (n_expanded * weights.sum(axis=1))) @ weights
     weights = sparse.csr_array(weights)
@@ -128,14 +130,17 @@ def _jaccard(weights: sparse.csr_array, graph: sparse.csr_array, progress: bool)
 def _symmetric(lists: Integers, values: Floats) -> sparse.csr_array:
     """(N, N) of values (N, M) of pairs (i, lists[i]) and of those the other way round; the mean of both where given."""
     n, m = lists.shape
-    given = sparse.csr_array((values.ravel(), lists.ravel(), np.arange(n + 1) * m), shape=(n, n), copy=True)
+    number = np.int32 if 2 * n * m < 2**31 else np.int64
+    places = lists.ravel().astype(number), np.arange(0, n * m + 1, m, dtype=number)
+    given = sparse.csr_array((values.flatten(), *places), shape=(n, n))
     given.sort_indices()
     ones = sparse.csr_array((np.ones(n * m, dtype=np.int8), given.indices, given.indptr), shape=(n, n))
-    pairs = ones + ones.T.tocsr()
-    del ones
-    means = np.empty(pairs.nnz)
-    means_both_ways(pairs.indptr, pairs.indices, given.indptr, given.indices, given.data, means)
-    return sparse.csr_array((means, pairs.indices, pairs.indptr), shape=(n, n))
+    times = ones + ones.T.tocsr()  # how often each pair is given: once or twice, in a byte
+    rows = _rows(times)
+    means = given[rows, times.indices]  # 0 where not given
+    means += given[times.indices, rows]
+    means /= times.data
+    return _like(times, means)
 
 
 def _binary(lists: Integers) -> sparse.csr_array:
@@ -149,55 +154,26 @@ def _reciprocal(lists: Integers) -> sparse.csr_array:
     return ones.multiply(ones.T).tocsr()
 
 
-def _values(values: Floats, graph: sparse.csr_array, rows: Integers, columns: Integers) -> Floats:
-    """Those of pairs of a graph, by place; infinite of others."""
-    found = np.full(len(rows), np.inf)
-    values_of(graph.indptr, graph.indices, values, rows, columns, found)
-    return found
+def _like(graph: sparse.csr_array, values: Floats) -> sparse.csr_array:
+    """Other values of the pairs of a graph."""
+    return sparse.csr_array((values, graph.indices, graph.indptr), shape=graph.shape)
+
+
+def _rows(graph: sparse.csr_array) -> Integers:
+    """The first shape of each pair."""
+    return np.repeat(np.arange(graph.shape[0], dtype=graph.indices.dtype), np.diff(graph.indptr))
 
 
 def _brought_forward(values: Floats, graph: sparse.csr_array, nearest: Integers) -> Floats:
     """The values of pairs, with those of which one is the other's nearest before all others, in their own order."""
     nearest = nearest.astype(graph.indices.dtype)
-    rows = np.repeat(np.arange(graph.shape[0], dtype=nearest.dtype), np.diff(graph.indptr))
+    rows = _rows(graph)
     first = (nearest[rows] == graph.indices) | (nearest[graph.indices] == rows)
     least = values.min(where=~first & (values > 0), initial=np.inf)
     found, forward = values.copy(), graph.data[first]
     # half of the least, so that single precision leaves no tie
     found[first] = 0.5 * (least if np.isfinite(least) else 1.0) * forward / max(forward.max(), _TINY)
     return found
-
-
-@compiled()
-def place_of(starts: Integers, others: Integers, i: int, j: int) -> int:
-    """Where a graph, whose rows are sorted, has a pair; -1 if it has not."""
-    e = starts[i] + np.searchsorted(others[starts[i] : starts[i + 1]], j)
-    return e if e < starts[i + 1] and others[e] == j else -1
-
-
-@compiled()
-def values_of(
-    starts: Integers, others: Integers, values: Floats, rows: Integers, columns: Integers, found: Floats
-) -> None:
-    """Write the values of those of some pairs that a graph has."""
-    for p in range(len(rows)):
-        e = place_of(starts, others, rows[p], columns[p])
-        if e >= 0:
-            found[p] = values[e]
-
-
-@compiled()
-def means_both_ways(
-    starts: Integers, others: Integers, row_starts: Integers, listed: Integers, values: Floats, means: Floats
-) -> None:
-    """Write, of each pair of a graph, the mean of the values that it and its reverse have in another."""
-    for i in range(len(starts) - 1):
-        for e in range(starts[i], starts[i + 1]):
-            there, back = place_of(row_starts, listed, i, others[e]), place_of(row_starts, listed, others[e], i)
-            if there >= 0 and back >= 0:
-                means[e] = (values[there] + values[back]) / 2
-            else:
-                means[e] = values[max(there, back)]
 
 
 @compiled()

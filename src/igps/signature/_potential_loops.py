@@ -10,7 +10,7 @@ from igps._compiled import compiled
 _TINY = math.ulp(1.0) ** 2  # keeps a logarithm finite whose factor is 0
 
 
-@compiled(error_model="numpy")
+@compiled()
 def fill_potentials(
     points: Floats,
     block: int,
@@ -72,7 +72,7 @@ def fill_potentials(
                 add_face(patches[patch], limits[patch], faces[patch], here, far, sums)
 
 
-@compiled(error_model="numpy")
+@compiled()
 def add_series(
     patch: Floats, scale: float, share: float, towards: Floats, points: Floats, far: Floats, sums: Floats
 ) -> None:
@@ -96,7 +96,7 @@ def add_series(
         sums[i] += far[i] * (area + second * (inverse * inverse)) * math.sqrt(inverse)
 
 
-@compiled(error_model="numpy")
+@compiled()
 def add_face(patch: Floats, limit: float, face: Floats, points: Floats, far: Floats, sums: Floats) -> None:
     """Add a face that was opened at points (3, n): by the series of its quarters, or near it in closed form."""
     n_far = 0
@@ -115,7 +115,7 @@ def add_face(patch: Floats, limit: float, face: Floats, points: Floats, far: Flo
         add_series(patch, 0.5, 0.0, face, points, far, sums)
 
 
-@compiled(error_model="numpy")
+@compiled()
 def near_potential(face: Floats, x: float, y: float, z: float) -> float:
     """The potential of a face (25,) at a point: Σ p ln((r + r' + l)/(r + r' − l)) − |h Ω| over its sides.
 
@@ -138,12 +138,12 @@ def near_potential(face: Floats, x: float, y: float, z: float) -> float:
     return potential - 2 * height * math.atan2(height * face[24], denominator)
 
 
-@compiled(error_model="numpy")
+@compiled()
 def dot(p: tuple[float, float, float], q: tuple[float, float, float]) -> float:
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
-@compiled(error_model="numpy")
+@compiled()
 def logarithm(total: float, length: float) -> float:
     """That of a side of this length, the distances of whose ends have this sum."""
     return math.log((total + length) / max(total - length, _TINY))

@@ -25,7 +25,7 @@ _ARCTAN = tuple(
 )
 
 
-@compiled(error_model="numpy")
+@compiled()
 def seen_from(
     low: Floats, high: Floats, centres: Floats, radii: Floats, first: Integers, ratio: float, leaf: int, n_hats: int
 ) -> tuple[Integers, Integers]:
@@ -60,7 +60,7 @@ def seen_from(
     return clusters[:n_clusters], hats[:n_opened]
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def fill_hats(x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: Floats, near: Booleans) -> None:
     """Fill the weights (h, n) of the chosen hats (h,), 0 within `ratio` radii, and which points (h, n) are so near."""
     n = x.shape[1]
@@ -87,7 +87,7 @@ def fill_hats(x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: 
             near[k, i] = squared[i] < limit
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def fill_clusters(x: Floats, chosen: Integers, centres: Floats, radii: Floats, terms: Floats) -> None:
     """Fill the terms (19 c, n) of the chosen clusters (c,): |e|² times e, its products of two, and of three."""
     for k in range(len(chosen)):
@@ -106,7 +106,7 @@ def fill_clusters(x: Floats, chosen: Integers, centres: Floats, radii: Floats, t
             out[14, i], out[15, i], out[16, i], out[17, i], out[18, i] = ac * c, bb * b, bb * c, bc * c, cc * c
 
 
-@compiled(error_model="numpy")
+@compiled()
 def replace_near(x: Floats, chosen: Integers, near: Booleans, surface: Arrays, weights: Floats) -> None:
     """Add the closed form to the weights (…, n), the last rows of which are the chosen hats' (h,).
 
@@ -153,7 +153,7 @@ def replace_near(x: Floats, chosen: Integers, near: Booleans, surface: Arrays, w
                 of_hats[place[faces[touched[i], corner]], i] = shares[i, corner]
 
 
-@compiled(error_model="numpy")
+@compiled()
 def add_faces(
     x: Floats, pairs: Integers, faces: Integers, table: Floats, place: Integers, near: Booleans, weights: Floats,
     touched: Integers, shares: Floats,
@@ -209,7 +209,7 @@ def add_faces(
                 shares[i, corner] = max(areas[corner], 0.0) / whole
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def divide_angles(squares: Floats, cosines: Floats) -> None:
     """Angles over lengths in place of the lengths' squares: arctan2(length, cosine) / length, to rounding."""
     for m in range(len(squares)):
@@ -227,7 +227,7 @@ def divide_angles(squares: Floats, cosines: Floats) -> None:
         squares[m] = (math.pi - angle if cosine < 0 else angle) / y
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def fill_cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats, terms: Singles) -> None:
     """Fill what each hat adds (V, 19) to the sums of its cluster, which is one of `size` consecutive hats.
 

@@ -1,5 +1,7 @@
 """The compiled loops of `_multifrontal`: elimination of fronts, and the two ways through the tree of a solve."""
 
+from typing import Any
+
 import numpy as np
 
 from igps._arrays import Floats
@@ -9,7 +11,7 @@ from igps.spectra._products import COLUMNS, ONE, ROWS, ZERO, product
 from igps.spectra._tree import Nodes, Structure
 
 
-@compiled()
+@compiled(inline="always")
 def assemble(n: int, tree: Structure, values: Floats, shift: float, updates: Floats, room: Room) -> None:
     """Write the upper triangle of a node's front, (S + B, S + B): of the matrix, and its children's complements."""
     first, start, place, front = tree.first, tree.start, room.place, room.front
@@ -89,7 +91,7 @@ def eliminate(
 
 
 @compiled()
-def add_row(into: Floats, at: int, source: Floats, of: int, b: int) -> None:
+def add_row(into: Floats, at: int, source: Floats, of: Any, b: int) -> None:
     """Add row ``of`` of one flat array to row ``at`` of another, rows of b numbers each."""
     # An unsigned index is one that need not be counted from the end.
     begin, origin = np.uint64(at * b), np.uint64(of * b)
@@ -121,7 +123,7 @@ def forward(
             child = children[n, side]
             if child >= 0:
                 source, place = carried[carried_start[child] * b :], start[child]
-                k = 0
+                k = np.int64(0)  # a plain 0 would make a function of its own of `add_row`
                 while k < start[child + 1] - place and parent_row[place + k] < n_own:
                     add_row(own, parent_row[place + k], source, k, b)
                     k += 1

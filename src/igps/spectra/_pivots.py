@@ -26,7 +26,7 @@ AT_ONCE = cast(int, np.int64(COLUMNS))
 MOST_MISSING = 3e-13
 
 
-@compiled()
+@compiled(inline="always")
 def invert_pivot(pivot: np.ndarray, size: int) -> int:
     """Replace a block, rows of AT_ONCE numbers, by its inverse; its negative pivots, -1 if one is 0 or not finite.
 
@@ -52,7 +52,7 @@ def invert_pivot(pivot: np.ndarray, size: int) -> int:
     return n_negative
 
 
-@compiled()
+@compiled(inline="always")
 def invert(matrix: np.ndarray, n: int, width: int, rows: np.ndarray, columns: np.ndarray) -> int:
     """Replace a symmetric matrix (n, width) by its inverse; its negative pivots, -1 if one is 0 or not finite.
 
@@ -101,7 +101,7 @@ def load(matrix: np.ndarray, front: np.ndarray, n: int, front_width: int, width:
             matrix[i * width + j] = 0.0
 
 
-@compiled()
+@compiled(inline="always")
 def missing(matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, room: np.ndarray) -> float:
     """The Frobenius norm of I − A X."""
     whole = (room, ZERO, width)
@@ -116,7 +116,7 @@ def missing(matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, room: n
     return np.sqrt(squares)
 
 
-@compiled()
+@compiled(inline="always")
 def invert_front(room: Room, n: int, front_width: int, width: int) -> int:
     """Write the inverse (n, width) of a front's pivot block; the negative eigenvalues of that, -1 if it cannot tell.
 

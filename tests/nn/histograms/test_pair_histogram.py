@@ -526,7 +526,7 @@ def test_impossible_histograms_are_refused() -> None:
     for axes in ([], ["potential"]):
         with pytest.raises(ValueError, match="axes: expected at least one of pairs, such as 'interior_distance'"):
             PairHistogram(axes)
-    with pytest.raises(ValueError, match="samples: expected 'interior' or 'surface', got 'volume'"):
+    with pytest.raises(ValueError, match="samples: expected one of interior, surface, got 'volume'"):
         PairHistogram(samples="volume")  # type: ignore[arg-type]
 
 

@@ -79,7 +79,7 @@ def test_what_it_cannot_count_is_named() -> None:
     batch = two_bodies()
     with pytest.raises(ValueError, match="samples: expected surface samples, which balls touch, got interior ones"):
         BallRadius().values(SampleFeatures(batch, "interior", batch.interior), SpectralEmbedding())
-    with pytest.raises(ValueError, match="side: expected 'inside' or 'outside', got 'left'"):
+    with pytest.raises(ValueError, match="side: expected one of inside, outside, got 'left'"):
         BallRadius("left")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="expected 0 < smallest < largest"):
         BallRadius("inside", 0.3, 0.2)

@@ -11,12 +11,12 @@ from pathlib import Path
 
 from igps.mesh._label_measures import LabelVoxels, VoxelMeasures
 from igps.mesh.formats import archives, brains, clouds, molecules, obj, off, ply, scenes, stl, threemf, volumes, vtk
-from igps.mesh.formats._format import Format, RawBody, faults
+from igps.mesh.formats._format import Format, RawBody, faults, stamp_of
 from igps.mesh.options import LoadOptions
 
 __all__ = [
     "FORMATS", "Format", "LabelVoxels", "RawBody", "VoxelMeasures", "files_read", "format_of", "is_searched",
-    "searched_suffixes",
+    "searched_suffixes", "stamp_of",
 ]  # fmt: skip
 
 FORMATS: tuple[Format, ...] = (

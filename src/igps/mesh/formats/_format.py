@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -127,6 +128,13 @@ def distinct(names: Iterable[str]) -> list[str]:
     return found
 
 
+def stamp_of(*paths: Path) -> tuple[int, int, int]:
+    """Bytes of files, and when their content and their names or rights were last changed, in nanoseconds."""
+    found = [os.stat(path) for path in paths]
+    sizes, contents, names = zip(*((one.st_size, one.st_mtime_ns, one.st_ctime_ns) for one in found), strict=True)
+    return sum(sizes), max(contents), max(names)
+
+
 def text_of(path: Path) -> str:
     """The text of a file, in UTF-8, or else in Latin-1, which has a letter for any byte; no carriage returns."""
     content = path.read_bytes().replace(b"\r", b"\n")
@@ -150,8 +158,8 @@ def corners_of_rows(rows: Integers) -> tuple[Integers, Integers]:
 
 
 @contextmanager
-def faults(path: Path, kind: Format) -> Iterator[None]:
-    """Turn what a reader raises into a MeshError about the file; running out of memory is no fault of it."""
+def faults(path: object, kind: Format) -> Iterator[None]:
+    """Turn what a reader raises into a MeshError about the file, or a body in it; memory that ran out is no fault."""
     try:
         yield
     except (MeshError, MemoryError):

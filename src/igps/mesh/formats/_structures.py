@@ -25,7 +25,7 @@ _ATOM_LINE = re.compile(rb"^(?:ATOM  |HETATM)[^\r\n]*", re.MULTILINE)
 # Without any of these gemmi reads no atoms.
 _COLUMNS = ("id", "type_symbol", "label_asym_id", "label_alt_id", "Cartn_x", "Cartn_y", "Cartn_z")
 _END_LINE = re.compile(rb"^END[ \t]*$", re.MULTILINE)
-_NUMBER_OF_RESIDUE = re.compile(r"(-?\d+)([A-Za-z]?)")
+_NUMBER_OF_RESIDUE = re.compile(r"([A-Za-z]?)(-?\d+)([A-Za-z]?)")
 
 
 def suffix(path: Path) -> str:
@@ -71,7 +71,11 @@ def parts_of(
                 yield f"{path}#{of}chain {label or 'without name'}", [c for c in model if c.name == label], []
         elif bodies == "assembly" and len(structure.assemblies):
             first = structure.assemblies[0]
-            made = gemmi.make_assembly(first, model, gemmi.HowToNameCopiedChain.AddNumber)
+            try:
+                made = gemmi.make_assembly(first, model, gemmi.HowToNameCopiedChain.AddNumber)
+            except RuntimeError as error:
+                fault = f"{path}: {of}assembly {first.name} cannot be made of the file's chains ({error})."
+                raise MeshError(f"{fault} Take the whole file, or its models or chains as bodies.") from error
             yield f"{path}#{of}assembly {first.name}", list(made), []
         else:
             notes = ["the file names no assembly: the model was taken as it is"] if bodies == "assembly" else []
@@ -135,7 +139,10 @@ def _mark_unknown(block: gemmi.cif.Block) -> None:
 
 
 def _pqr(text: bytes, path: Path) -> gemmi.Structure:
-    """Fields are separated by blanks: type, serial number, atom, residue, [chain,] number, x, y, z, charge, radius."""
+    """Fields are separated by blanks: type, serial number, atom, residue, [chain,] number, x, y, z, charge, radius.
+
+    Where numbers are long, some programs leave no blank between "HETATM" and the serial, or chain and number.
+    """
     gemmi = gemmi_module()
     structure = gemmi.Structure()
     chains: dict[str, list[Any]] = {}
@@ -144,18 +151,19 @@ def _pqr(text: bytes, path: Path) -> gemmi.Structure:
             _add_model(structure, chains)
         if not line.startswith(("ATOM", "HETATM")):
             continue
-        fields = line.split()
+        fields = line.replace("HETATM", "HETATM ", 1).split()
         try:
             x, y, z, charge, radius = map(float, fields[-5:])
             name, residue, *chain, place = fields[2:-5]
             found = _NUMBER_OF_RESIDUE.fullmatch(place)
-            if len(chain) > 1 or found is None or not radius >= 0:
+            if len(name) > 4 or len(chain) > 1 or found is None or not radius >= 0:
                 raise ValueError("10 or 11 fields, the last a radius of at least 0, were expected")
+            chain = chain or [found[1]]
         except ValueError as error:
             fault = f"{path}: line {number} is no atom of a PQR file ({error})."
-            raise MeshError(f"{fault} It may be cut short; write it again.") from error
-        residues = chains.setdefault(chain[0] if chain else "", [])
-        key = gemmi.SeqId(int(found[1]), found[2] or " ")
+            raise MeshError(f"{fault} It may be cut short; write it again, with blanks between fields.") from error
+        residues = chains.setdefault(chain[0], [])
+        key = gemmi.SeqId(int(found[2]), found[3] or " ")
         if not residues or residues[-1].seqid != key or residues[-1].name != residue:
             new = gemmi.Residue()
             new.name, new.seqid, new.het_flag = residue, key, line[0]

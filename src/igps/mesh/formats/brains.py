@@ -1,6 +1,7 @@
 """Surfaces of brains: GIFTI, and FreeSurfer's triangle files (lh.pial, ...). Both are in millimetres."""
 
 import base64
+import re
 from math import prod
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -8,6 +9,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
+from igps._arrays import Floats
 from igps.mesh.formats import _xml
 from igps.mesh.formats._format import Format, RawBody, check_unpacked
 from igps.mesh.options import LoadOptions
@@ -15,6 +17,11 @@ from igps.mesh.options import LoadOptions
 _TYPES = {"NIFTI_TYPE_FLOAT32": "f4", "NIFTI_TYPE_FLOAT64": "f8", "NIFTI_TYPE_INT32": "i4", "NIFTI_TYPE_UINT8": "u1"}
 _POINTS, _TRIANGLES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
 _MAGIC = b"\xff\xff\xfe"
+# A mark of those whose points are in the coordinates of images.
+_IN_SCANNER = np.array([2, 1], ">i4").tobytes()
+# Where the end of a surface file of FreeSurfer tells of the volume that the surface was made of.
+_AXES = re.compile(rb"^[xyzc]ras\s*=\s*(\S+)\s+(\S+)\s+(\S+)", re.MULTILINE)
+_AXES_OF_SURFACES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _SURFACES = ("pial", "white", "inflated", "orig", "smoothwm", "sphere", "sphere.reg")
 
 
@@ -70,6 +77,23 @@ def read_freesurfer(path: Path, options: LoadOptions, part: str | None) -> list[
     vertices = np.frombuffer(content, ">f4", 3 * n_vertices, at + 8).astype(np.float64)
     faces = np.frombuffer(content, ">i4", 3 * n_faces, at + 8 + 12 * n_vertices).astype(np.int64)
     return [RawBody(vertices.reshape(-1, 3), faces.reshape(-1, 3), unit="mm")]
+
+
+def in_scanner(path: Path, points: Floats) -> Floats:
+    """Points (P, 3) of the body of a file in the coordinates of images.
+
+    Others than those of FreeSurfer's triangle files are in them: its own have their origin in the middle of a volume
+    whose place and axes the end of the file tells.
+    """
+    if not path.name.lower().endswith(FREESURFER.suffixes):
+        return points
+    content = path.read_bytes()
+    at = content.find(b"\n\n") + 2
+    tail = content[at + 8 + 12 * int(np.frombuffer(content, ">i4", 2, at).sum()) :]
+    told = np.array(_AXES.findall(tail), dtype=np.float64)
+    if told.shape != (4, 3) or not re.search(rb"valid\s*=\s*1", tail) or tail[:8] == _IN_SCANNER:
+        return points
+    return points @ _AXES_OF_SURFACES.T @ told[:3] + told[3]
 
 
 GIFTI = Format("GIFTI", (".gii",), read_gifti, ignored=(".func.gii", ".label.gii", ".shape.gii", ".time.gii"))

@@ -22,11 +22,11 @@ _MODES = {0: 1, 1: 2, 2: 4, 4: 8, 6: 2, 12: 2}
 
 
 @lru_cache(maxsize=1)
-def read(path: Path, changed: int) -> tuple[NDArray[Any], Floats]:
+def read(path: Path, changed: tuple[int, int, int]) -> tuple[NDArray[Any], Floats]:
     """Values (X, Y, Z) of an image or grid, and the affine (4, 4) from voxels to coordinates.
 
     NIfTI, MGH, NRRD, MetaImage and TIFF are in world coordinates (RAS, millimetres), OpenDX, MRC and CCP4 in ångström.
-    The last file is not read again unless it was `changed` at another time.
+    The last file is not read again while `changed`, its `stamp_of`, is the same.
     """
     if path.name.lower().endswith(_GRIDS):
         return (_dx if path.suffix.lower() == ".dx" else _map)(path)

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from igps._arrays import Floats, Integers
-from igps.mesh.formats._format import Format, RawBody, made_later
+from igps._parameters import check_one_of
+from igps.mesh.formats._format import Format, RawBody, made_later, stamp_of
 from igps.mesh.formats._structures import SUFFIXES, gemmi_module, parts_of, read_structures, suffix
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
@@ -103,8 +104,7 @@ def read_molecule(
         ImportError: gemmi is not installed.
     """
     path = Path(path)
-    if bodies not in get_args(MoleculeBodies):
-        raise ValueError(f"bodies: expected one of {', '.join(get_args(MoleculeBodies))}, got {bodies!r}.")
+    check_one_of(get_args(MoleculeBodies), bodies=bodies)
     parts = list(parts_of(read_structures(path), bodies, path))
     found, left_out = _molecules(parts, ligands, hydrogens, suffix(path) == ".pqr")
     if not found and not ligands:
@@ -118,8 +118,8 @@ def read_molecule(
 
 
 @lru_cache(maxsize=1)
-def molecules_by_part(path: Path, changed: int, bodies: MoleculeBodies) -> dict[str, Molecule]:
-    """The bodies of a structure file by their parts; it is read once, unless it was `changed` at another time."""
+def molecules_by_part(path: Path, changed: tuple[int, int, int], bodies: MoleculeBodies) -> dict[str, Molecule]:
+    """The bodies of a structure file by their parts; read once while `changed`, its `stamp_of`, is the same."""
     found = read_molecule(path, bodies)
     return {molecule.name.removeprefix(str(path)).lstrip("#") or "model": molecule for molecule in found}
 
@@ -282,7 +282,7 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     from igps.mesh.molecular_surface import molecular_surface
 
     how: MoleculeBodies = options.bodies if options.bodies in ("chains", "assembly") else "models"
-    found = molecules_by_part(path, path.stat().st_mtime_ns, how)
+    found = molecules_by_part(path, stamp_of(path), how)
     names = [name for name in found if part in (None, name)]
     return [made_later(partial(molecular_surface, found[name]), name, "Å") for name in names]
 

@@ -49,7 +49,7 @@ class Row(NamedTuple):
     interval: Places
 
 
-@compiled(error_model="numpy")
+@compiled()
 def new_row(axes: Axes, n_columns: int, values: Numbers) -> Row:
     """Room for a row, in the type of the values."""
     return Row(
@@ -60,17 +60,17 @@ def new_row(axes: Axes, n_columns: int, values: Numbers) -> Row:
     )
 
 
-@compiled(error_model="numpy")
+@compiled()
 def whole_vectors(first: int, n_columns: int) -> int:
     """The column from which to work, so that it is by whole vectors: what is left over takes longer than one."""
     return max(0, n_columns - (n_columns - first + _VECTOR - 1) // _VECTOR * _VECTOR)
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def locate_row(values: Numbers, i: int, axes: Axes, point: int, column: int, start: int, found: Row) -> None:
     """Fill in what is found of row i, that of a point, from the column ``start`` on; else see `count_block`."""
     found.cells[start:] = 0
-    k = r = s = 0
+    k = r = s = np.int64(0)  # a plain 0 would make a function of its own of `locate`
     for kind in axes.kinds:
         if kind == COSINES:
             cosines(axes.oriented[s, 0], axes.oriented[s, 1], point, column, start, found.features[s])
@@ -87,7 +87,7 @@ def locate_row(values: Numbers, i: int, axes: Axes, point: int, column: int, sta
         r += 1
 
 
-@compiled(error_model="numpy")
+@compiled()
 def distances(products: Numbers, norm: Any, norms: Numbers) -> None:
     """Turn inner products (n,) of a point with others into distances; from the squared lengths of it and of them."""
     two, none = products.dtype.type(2), products.dtype.type(0)
@@ -95,7 +95,7 @@ def distances(products: Numbers, norm: Any, norms: Numbers) -> None:
         products[j] = np.sqrt(max(norm + norms[j] - two * products[j], none))
 
 
-@compiled(error_model="numpy")
+@compiled()
 def cosines(points: Numbers, directions: Numbers, point: int, column: int, start: int, features: Numbers) -> None:
     """Fill the features (5, J) of a point with those of the columns from a start on.
 
@@ -130,8 +130,8 @@ def cosines(points: Numbers, directions: Numbers, point: int, column: int, start
         here[j], there[j] = max(own[j], other), min(own[j], other)
 
 
-@compiled(error_model="numpy")
-def locate(values: Numbers, axes: Axes, k: int, start: int, found: Row) -> None:
+@compiled()
+def locate(values: Numbers, axes: Axes, k: Any, start: int, found: Row) -> None:
     """Sort values (n,) from a start on into the intervals between the centres of axis k, and refine the cells."""
     centres, inverse = axes.centres[k, : axes.n_centres[k]], axes.inverse[k]
     cell, share, interval = found.cells[start:], found.shares[k, start:], found.interval[start:]

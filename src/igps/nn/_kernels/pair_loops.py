@@ -30,7 +30,7 @@ from igps.nn._kernels.pair_sums import (
 )  # fmt: skip
 
 
-@compiled(error_model="numpy")
+@compiled()
 def count_block(
     values: Numbers, axes: Axes, row: int, column: int, classes: Places, weights: Floats, packs: bool, total: Floats
 ) -> None:
@@ -88,7 +88,7 @@ def count_block(
     flush(by_class, lowest * n_corners, (highest + 1) * n_corners, classes, weights, row + n_rows - 1, total)
 
 
-@compiled(error_model="numpy")
+@compiled()
 def gradient_block(
     values: Numbers, axes: Axes, row: int, column: int, classes: Places, weights: Floats, upstream: Numbers,
     turns: Numbers, by_weights: Floats, by_centres: Floats,
@@ -161,7 +161,7 @@ def gradient_block(
                 r += 1
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def interpolate(upstream: Numbers, begin: Any, shares: Numbers, j: int, weight: float, slopes: Floats) -> float:
     """What is upstream (cells·2^K,) of a pair, by its shares (K, J) between the corners of a cell, from one on.
 
@@ -193,13 +193,13 @@ def interpolate(upstream: Numbers, begin: Any, shares: Numbers, j: int, weight: 
     return mean
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def side(share: Any, beyond: int) -> float:
     """What a corner has along an axis: the share if it lies beyond, or the rest of it."""
     return np.float64(share) if beyond else 1.0 - np.float64(share)
 
 
-@compiled(error_model="numpy")
+@compiled()
 def no_cells(n_cells: int, n_members: int) -> tuple[int, int]:
     """The lowest and the highest cell counted in, before any is.
 

@@ -17,10 +17,10 @@ _SHARE, _PAIR = 2**24, 2**44
 # Pairs that follow each other often fall into the same cell. In turn into so many copies of it, none waits for another.
 LANES = 4
 # Where a product and its sum may be rounded once, not twice.
-_CONTRACTED: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
+_CONTRACTED: dict[str, Any] = {"fastmath": {"contract"}}
 
 
-@compiled(error_model="numpy")
+@compiled()
 def pack_pairs(cell: Places, home: Places, share: Numbers, parts: Places) -> None:
     """Add its home to the cell of each pair (n,), and fill in its share (n,) as an integer."""
     for j in range(len(cell)):
@@ -28,14 +28,14 @@ def pack_pairs(cell: Places, home: Places, share: Numbers, parts: Places) -> Non
         parts[j] = np.int32(share[j] * share.dtype.type(_SHARE))
 
 
-@compiled(error_model="numpy")
+@compiled()
 def add_whole_pairs(cell: Places, parts: Places, packed: Integers) -> None:
     """`add_one_axis` of pairs that weigh 1, into integers (cells·LANES,): one store for both corners, no rounding."""
     for j in range(len(cell)):
         packed[np.uint32(cell[j])] += _PAIR + np.int64(parts[j])
 
 
-@compiled(error_model="numpy")
+@compiled()
 def unpack(packed: Integers, sums: Floats) -> None:
     """Move what was packed to the sums (cells, 2)."""
     for c in range(len(packed) // LANES):
@@ -109,7 +109,7 @@ def add_corners(sums: Floats, cell: Any, at: Any, weight: float, parts: tuple[fl
     sums[cell, at + 3] += weight * parts[3]
 
 
-@compiled(error_model="numpy")
+@compiled()
 def add_axes(cell: Places, home: Places, shares: Numbers, first: int, weights: Floats, sums: Floats) -> None:
     """`add_one_axis` of the shares along any number of axes from two on, (K, n) from the first on."""
     n_outer = len(shares) - 2
@@ -127,14 +127,14 @@ def add_axes(cell: Places, home: Places, shares: Numbers, first: int, weights: F
         add_two_axes(cell, home, shares[n_outer, first:], shares[n_outer + 1, first:], rest, sums, np.int64(4 * corner))
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def pair_row(one: int, other: int, n_classes: int) -> int:
     """The row of a histogram in which pairs of two classes count, see `class_pairs`."""
     a, b = min(one, other), max(one, other)
     return a * n_classes - a * (a - 1) // 2 + b - a
 
 
-@compiled(error_model="numpy")
+@compiled()
 def flush(sums: Floats, lowest: int, highest: int, classes: Places, weights: Floats, point: int, total: Floats) -> None:
     """Add the sums (C, cells·corners) of rows like a point, by its weights (M, P) in its classes, and clear them.
 

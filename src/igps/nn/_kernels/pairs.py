@@ -145,12 +145,10 @@ def check_pairs(pairs: Sequence[PairValues], mask: Tensor) -> None:
         raise ValueError(f"points: expected at least two points to form a pair, got {fewest}.")
     for one in pairs:
         for x in one.inputs:
-            most = torch.finfo(torch.promote_types(x.dtype, torch.float32)).max / 8
+            dtype = torch.promote_types(x.dtype, torch.float32)
+            most = torch.finfo(dtype).max / 8
             # All lengths at once: only where they are too large, or padding holds anything, one by one.
-            if (
-                float(torch.linalg.vector_norm(x.detach(), dtype=torch.promote_types(x.dtype, torch.float32))) ** 2
-                < most
-            ):
+            if float(torch.linalg.vector_norm(x.detach(), dtype=dtype)) ** 2 < most:
                 continue
             real = x.detach()[mask]
             if not bool(torch.isfinite(real).all()):

@@ -7,8 +7,8 @@ from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import one_hot
 
+from igps._parameters import check_one_of
 from igps.data.attribute_sources import ResidueAttribute
 from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn._kernels.located import located
@@ -18,6 +18,9 @@ from igps.nn.embedding import barycentroid_potential
 from igps.nn.specification import Specified
 from igps.signature.attributes import AttributeName
 from igps.signature.residue_attributes import RESIDUE_ATTRIBUTES
+
+Side = Literal["inside", "outside"]
+_SIDES = get_args(Side)
 
 
 class PointAxis(Specified, ABC):
@@ -48,29 +51,27 @@ class PointAxis(Specified, ABC):
     def values(self, features: SampleFeatures, embedding: nn.Module) -> Tensor:
         """(N, P) of the samples."""
 
-    def _check(self, values: Tensor) -> None:
-        # What is traced for `torch.compile` cannot raise.
-        if not torch.compiler.is_compiling() and not torch.isfinite(values).all():
-            raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
-
     def memberships(self, values: Tensor) -> Tensor:
         """(..., P, C) non-negative, rows of sum 1, from (..., P) values; a ValueError if one is not finite."""
-        self._check(values)
-        return soft_memberships(values, self.centres()) if self.soft else _nearest(values, self.centres())
+        classes, weights = self.members(values, torch.ones_like(values, dtype=torch.bool))
+        return weights.new_zeros(*values.shape, self.n_classes).scatter_add(-1, classes, weights)
 
     def members(self, values: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """The classes that points of values (N, P) belong to, and how much: `memberships` without its zeros.
+        """The classes that points of values (..., P) belong to, and how much: `memberships` without its zeros.
 
-        They are (N, P, M) integers and weights of sum 1, M = 2 for soft classes and 1 for hard ones. A ValueError of
+        They are (..., P, M) integers and weights of sum 1, M = 2 for soft classes and 1 for hard ones. A ValueError of
         values that are not finite where the mask is true.
         """
-        self._check(torch.where(mask, values, 0))
+        # What is traced for `torch.compile` cannot raise.
+        if not torch.compiler.is_compiling() and not torch.isfinite(torch.where(mask, values, 0)).all():
+            raise ValueError(f"{type(self).__name__}: expected finite values, got NaN or infinity.")
         centres = self.centres().to(values.dtype)
         if not self.soft or len(centres) == 1:
-            classes = torch.bucketize(values.detach(), _boundaries(centres), right=True).unsqueeze(2)
+            boundaries = (centres.detach()[1:] + centres.detach()[:-1]) / 2
+            classes = torch.bucketize(values.detach(), boundaries, right=True).unsqueeze(-1)
             return classes, torch.ones_like(classes, dtype=values.dtype)
         below, share = located(values, centres)
-        return torch.stack([below, below + 1], dim=2), torch.stack([1 - share, share], dim=2)
+        return torch.stack([below, below + 1], dim=-1), torch.stack([1 - share, share], dim=-1)
 
 
 class Potential(PointAxis):
@@ -119,11 +120,10 @@ class BallRadius(PointAxis):
     """
 
     def __init__(
-        self, side: Literal["inside", "outside"] = "inside", smallest: float = 0.022, largest: float = 0.25,
+        self, side: Side = "inside", smallest: float = 0.022, largest: float = 0.25,
         n_classes: int = 4,
     ) -> None:  # fmt: skip
-        if side not in ("inside", "outside"):
-            raise ValueError(f"side: expected 'inside' or 'outside', got {side!r}.")
+        check_one_of(_SIDES, side=side)
         if not 0 < smallest < largest < math.inf or n_classes < 2:
             raise ValueError(
                 f"smallest, largest, n_classes: expected 0 < smallest < largest, and at least two classes, got "
@@ -140,7 +140,7 @@ class BallRadius(PointAxis):
         """(N, P) logarithms of the radii over √area; a ValueError of interior samples."""
         if features.kind != "surface":
             raise ValueError("samples: expected surface samples, which balls touch, got interior ones.")
-        return features.ball_radii()[..., ("inside", "outside").index(self.side)].log()
+        return features.ball_radii()[..., _SIDES.index(self.side)].log()
 
     def extra_repr(self) -> str:
         return repr(self.side)
@@ -245,13 +245,3 @@ def largest_members(memberships: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         n_members = int((memberships > 0).sum(dim=2).masked_fill(~mask, 1).max())
     weights, classes = memberships.topk(n_members, dim=2)
     return classes, weights
-
-
-def _boundaries(centres: Tensor) -> Tensor:
-    """(C − 1,) values that are as near to one class as to the next."""
-    return (centres.detach()[1:] + centres.detach()[:-1]) / 2
-
-
-def _nearest(values: Tensor, centres: Tensor) -> Tensor:
-    """(..., P, C) memberships, 1 in the class whose centre is nearest."""
-    return one_hot(torch.bucketize(values.detach(), _boundaries(centres), right=True), len(centres)).to(values.dtype)

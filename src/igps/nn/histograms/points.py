@@ -61,7 +61,7 @@ class PointHistogram(AxesHistogram):
             real = mask.view(*mask.shape, *[1] * (values.ndim - 2))
             memberships.append(axis.memberships(torch.where(real, values, 0)))
         first, *others = memberships
-        rest = joint(others) if others else torch.ones_like(first[..., :1])
+        rest = joint([torch.ones_like(first[..., :1]), *others])
         weights = features.weights()
         counts = mask if weights is None else mask * weights
         return counted(first * counts.unsqueeze(2), rest, mask.sum(dim=1)).view(len(mask), *self.shape)
