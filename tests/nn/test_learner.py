@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.datamodule import SignatureDataModule
+from igps.descriptors.molecular import molecular
 from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.description import describe
 from igps.nn.descriptor import HistogramDescriptor
@@ -278,6 +279,12 @@ def test_a_lazy_head_has_its_size_before_the_optimiser_is_made() -> None:
     assert not any(isinstance(one, torch.nn.UninitializedParameter) for one in model.parameters())
     assert model.distance.head.layers[1].in_features == 3 * 16 + 9
     assert model.distance.head.training
+
+
+def test_size_beside_histograms_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"molecular.*size.*without_size"):
+        RetrievalLearner(molecular(), BlendedDistance(WhitenedHead()))
+    RetrievalLearner(molecular().without_size(), BlendedDistance(WhitenedHead()))
 
 
 def test_any_module_describes(items: list[LabelledSignature], tmp_path: Path) -> None:

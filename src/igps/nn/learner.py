@@ -66,6 +66,9 @@ class RetrievalLearner(LightningModule):
         weight_decay: of the head alone.
         miner: embeddings and labels to the pairs or triplets that a loss of `pytorch-metric-learning` is to use; all of
             a batch if None.
+
+    Raises:
+        ValueError: a descriptor with more than histograms, such as `molecular` with size.
     """
 
     def __init__(
@@ -89,6 +92,9 @@ class RetrievalLearner(LightningModule):
         self.bin_rate = bin_rate
         self.weight_decay = weight_decay
         self.part_cells = descriptor.part_cells if isinstance(descriptor, HistogramDescriptor) else None
+        if isinstance(descriptor, HistogramDescriptor) and descriptor.n_features != sum(descriptor.part_cells):
+            found = f"{descriptor.name}, which keeps the size of bodies beside them"
+            raise ValueError(f"descriptor: expected histograms alone, got {found}. Take its without_size().")
         if distance.head is not None and self.part_cells is not None and any(map(is_lazy, distance.parameters())):
             # The optimiser needs parameters that have a size.
             with torch.no_grad():
