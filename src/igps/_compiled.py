@@ -17,6 +17,8 @@ Result = TypeVar("Result")
 
 # For `fastmath`: sums may be taken in any order, so of several terms at once
 SUMS = {"contract", "reassoc", "nsz"}
+# A product and its sum may be rounded once, not twice
+CONTRACTED = {"contract"}
 
 
 class Lazy:

@@ -18,7 +18,7 @@ from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, ClassRule, find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
-from igps.descriptors.individual import SIDE, SIZE, Size, keeps_size, scale_of
+from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
 from igps.mesh.formats import is_searched
 from igps.mesh.mending import repair_steps
 from igps.mesh.mesh import MILLIMETRES
@@ -28,7 +28,7 @@ from igps.nn.descriptor import Descriptor
 from igps.report.tables import write_rows
 from igps.signature.signature import SignatureConfig
 
-MirrorOption = Literal["auto", "same", "distinct"]
+MirrorOption = Literal["auto", Mirror]
 
 FLAGS = {
     "paper": "use the parameters of Rustamov 2010: as the defaults, but the grid is never refined",

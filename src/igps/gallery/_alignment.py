@@ -36,7 +36,7 @@ _ALIKE = 1.5
 # After the fine steps, what is farther than the hopeless distance over this is hopeless. With 0.03 for that, 99 % of
 # copies of generated bodies are within 0.006 then, well below 0.02; the others are found from other starts.
 _FINER = 1.5
-# By the last steps patches come nearer by less, of copies of generated bodies by 0.0001.
+# Over √area: the last steps bring patches nearer by less; those of copies of generated bodies by up to 0.0001.
 _LAST_GAIN = 0.004
 # Neighbouring samples whose offsets are averaged.
 _PATCH = 10

@@ -158,9 +158,9 @@ class Surfaces:
         return calibration.limit(max(coarseness, of_other))
 
     def profiles(self, n_workers: int | None = None, progress: bool = False) -> tuple[Tensor, list[Failure]]:
-        """Of all that can be read, in order, (M, 3, 65): profiles, and behind each quantity the logarithm of an extent.
+        """(M, 3, 65) of all that can be read, in order, and failures of the others; a MeshError if none can be read.
 
-        And the failures of the others; a MeshError if none can be read.
+        The first 64 columns are `SurfaceSamples.profile`, the last has the logarithms of the three `extents`.
         """
 
         def profile(i: int) -> NDArray[np.float64] | None:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from igps._arrays import Booleans, Floats, Integers
-from igps._compiled import compiled
+from igps._compiled import SUMS, compiled
 
 # Least absolute value of a voxel that is wholly inside or outside, in shortest sides (half would be the most that all
 # bodies allow), and weight of second derivatives: of smooth places and of edges. Those of smooth places leave round
@@ -83,7 +83,7 @@ def filled_share(field: Floats) -> tuple[Floats, Floats]:
     return np.clip(share, 0, 1), np.where((share > 0) & (share < 1), 1 / width, 0.0)
 
 
-@compiled(fastmath={"contract", "reassoc", "nsz"})
+@compiled(fastmath=SUMS)
 def _relax(
     field: Floats, laplacian: Floats, nodes: Integers, steps: Integers, weights: Floats, stiffness: Floats,
     target: Floats, inside: Booleans, margin: Floats,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
 from igps._arrays import Booleans, Floats, Integers, Singles
-from igps._compiled import compiled
+from igps._compiled import CONTRACTED, compiled
 
 Arrays = tuple[Integers, Floats, Integers, Integers]
 
@@ -60,7 +60,7 @@ def seen_from(
     return clusters[:n_clusters], hats[:n_opened]
 
 
-@compiled(fastmath={"contract"})
+@compiled(fastmath=CONTRACTED)
 def fill_hats(x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: Floats, near: Booleans) -> None:
     """Fill the weights (h, n) of the chosen hats (h,), 0 within `ratio` radii, and which points (h, n) are so near."""
     n = x.shape[1]
@@ -87,7 +87,7 @@ def fill_hats(x: Floats, chosen: Integers, hats: Floats, ratio: float, weights: 
             near[k, i] = squared[i] < limit
 
 
-@compiled(fastmath={"contract"})
+@compiled(fastmath=CONTRACTED)
 def fill_clusters(x: Floats, chosen: Integers, centres: Floats, radii: Floats, terms: Floats) -> None:
     """Fill the terms (19 c, n) of the chosen clusters (c,): |e|² times e, its products of two, and of three."""
     for k in range(len(chosen)):
@@ -209,7 +209,7 @@ def add_faces(
                 shares[i, corner] = max(areas[corner], 0.0) / whole
 
 
-@compiled(fastmath={"contract"})
+@compiled(fastmath=CONTRACTED)
 def divide_angles(squares: Floats, cosines: Floats) -> None:
     """Angles over lengths in place of the lengths' squares: arctan2(length, cosine) / length, to rounding."""
     for m in range(len(squares)):
@@ -227,7 +227,7 @@ def divide_angles(squares: Floats, cosines: Floats) -> None:
         squares[m] = (math.pi - angle if cosine < 0 else angle) / y
 
 
-@compiled(fastmath={"contract"})
+@compiled(fastmath=CONTRACTED)
 def fill_cluster_terms(hats: Floats, size: int, centres: Floats, radii: Floats, terms: Singles) -> None:
     """Fill what each hat adds (V, 19) to the sums of its cluster, which is one of `size` consecutive hats.
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from igps._arrays import Floats, Integers
-from igps._compiled import compiled
+from igps._compiled import CONTRACTED, compiled
 from igps.nn._kernels.pair_cells import Numbers, Places
 
 # A whole pair and its share in one integer: the shares of 2¹⁸ pairs, the most of a block, do not reach the count, nor
@@ -16,8 +16,6 @@ from igps.nn._kernels.pair_cells import Numbers, Places
 _SHARE, _PAIR = 2**24, 2**44
 # Pairs that follow each other often fall into the same cell. In turn into so many copies of it, none waits for another.
 LANES = 4
-# Where a product and its sum may be rounded once, not twice.
-_CONTRACTED: dict[str, Any] = {"fastmath": {"contract"}}
 
 
 @compiled()
@@ -49,7 +47,7 @@ def unpack(packed: Integers, sums: Floats) -> None:
         pairs[:] = 0
 
 
-@compiled(**_CONTRACTED)
+@compiled(fastmath=CONTRACTED)
 def add_one_axis(cell: Places, home: Places, share: Numbers, weights: Floats, sums: Floats) -> None:
     """Add pairs (n,) of one row to the sums (cells, 2), by the cell below the value and the first of the class.
 
@@ -62,7 +60,7 @@ def add_one_axis(cell: Places, home: Places, share: Numbers, weights: Floats, su
         sums[into, 1] += beyond
 
 
-@compiled(**_CONTRACTED)
+@compiled(fastmath=CONTRACTED)
 def add_two_axes(
     cell: Places, home: Places, first: Numbers, second: Numbers, weights: Floats, sums: Floats, at: Any
 ) -> None:
@@ -76,7 +74,7 @@ def add_two_axes(
         sums[into, at + 3] += d
 
 
-@compiled(**_CONTRACTED)
+@compiled(fastmath=CONTRACTED)
 def quarters(weight: float, first: float, second: float) -> tuple[float, float, float, float]:
     """A weight shared out between the four corners of two axes, none of them less than 0."""
     beyond = weight * first
@@ -85,7 +83,7 @@ def quarters(weight: float, first: float, second: float) -> tuple[float, float, 
     return before - side, side, beyond - corner, corner
 
 
-@compiled(**_CONTRACTED)
+@compiled(fastmath=CONTRACTED)
 def add_four_axes(cell: Places, home: Places, shares: Numbers, first: int, weights: Floats, sums: Floats) -> None:
     """`add_axes` along four, a distance and three cosines, which takes half of the time in one pass."""
     one, two, three, four = shares[0, first:], shares[1, first:], shares[2, first:], shares[3, first:]
@@ -100,7 +98,7 @@ def add_four_axes(cell: Places, home: Places, shares: Numbers, first: int, weigh
         add_corners(sums, into, np.int64(12), outer[3], inner)
 
 
-@compiled(**_CONTRACTED)
+@compiled(fastmath=CONTRACTED)
 def add_corners(sums: Floats, cell: Any, at: Any, weight: float, parts: tuple[float, float, float, float]) -> None:
     """Add a weight to a cell's four corners from one on, in parts."""
     sums[cell, at] += weight * parts[0]

@@ -120,9 +120,8 @@ class BallRadius(PointAxis):
     """
 
     def __init__(
-        self, side: Side = "inside", smallest: float = 0.022, largest: float = 0.25,
-        n_classes: int = 4,
-    ) -> None:  # fmt: skip
+        self, side: Side = "inside", smallest: float = 0.022, largest: float = 0.25, n_classes: int = 4
+    ) -> None:
         check_one_of(_SIDES, side=side)
         if not 0 < smallest < largest < math.inf or n_classes < 2:
             raise ValueError(
