@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 from torch.nn.utils.rnn import pad_sequence
+from torch.utils.flop_counter import FlopCounterMode
 
 from conftest import torch_threads
 from igps import _threads as threads
@@ -199,6 +200,14 @@ def test_a_block_of_pairs_that_all_fall_into_one_bin(spread: float, bin_of_all: 
     assert torch.equal(
         joint_histogram(torch.ones(2400, 1), [euclidean_distances(points, torch.tensor(EQUAL))]), expected
     )
+
+
+def test_pairs_that_are_not_counted_take_no_products() -> None:
+    """Of 1,000 points 499,500 pairs are counted, of 4 flops each in two dimensions."""
+    points = torch.randn(1000, 2, generator=torch.Generator().manual_seed(3))
+    with FlopCounterMode(display=False) as counter:
+        joint_histogram(torch.ones(1000, 1), [euclidean_distances(points, torch.tensor(EQUAL))])
+    assert 499_500 * 4 <= counter.get_total_flops() < 1.15 * 499_500 * 4
 
 
 def test_features_are_those_of_a_loop() -> None:

@@ -23,6 +23,8 @@ Result = TypeVar("Result")
 
 # Pairs of a block, whose values stay in a core's second-level cache; more could overflow the integers of `pair_sums`
 _BLOCK, _MOST_COLUMNS = 2**18, 2048
+# Rows of a block whose inner products are one product of matrices
+_STRIP = 128
 # Of the blocks, which threads count side by side; one where counts of its own for each share would take gigabytes
 _SHARES, _MOST_COUNTS = 4, 2**24
 
@@ -222,7 +224,7 @@ class _Shape:
         into = iter(values)
         for one, centred in zip(self.pairs, self.centred, strict=True):
             if centred is not None:
-                torch.mm(centred[rows], centred[columns].T, out=next(into))
+                _products(centred, rows, columns, next(into))
             elif VALUES in one.kinds:
                 between = one.between([x[None, rows] for x in one.inputs], [x[None, columns] for x in one.inputs])
                 for value in between[0]:
@@ -254,6 +256,17 @@ def _centred(points: Tensor) -> Tensor:
         points = points[:, : int(used[-1]) + 1 if len(used) else 0].contiguous()
         mean = points.mean(dim=0)
     return points - mean
+
+
+def _products(points: Tensor, rows: slice, columns: slice, into: Tensor) -> None:
+    """Write the inner products of some rows and columns, strip by strip from the first pair on that is counted.
+
+    At the diagonal half of a block is no such pair, and the products take more time than the loops.
+    """
+    for row in range(rows.start, rows.stop, _STRIP):
+        end, first = min(row + _STRIP, rows.stop), max(row, columns.start)
+        part = into[row - rows.start : end - rows.start, first - columns.start :]
+        torch.mm(points[row:end], points[first : columns.stop].T, out=part)
 
 
 def _pull(by_squares: Tensor, points: Tensor, rows: slice, columns: slice, into: Tensor) -> None:
