@@ -21,7 +21,7 @@ from igps.descriptors.registry import NAMES
 from igps.nn.axes import EuclideanDistance, InteriorDistance, Potential
 from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
-from igps.nn.heads import WhitenedHead
+from igps.nn.heads import ClassifierHead, WhitenedHead
 from igps.nn.histograms.pairs import PairHistogram
 from igps.nn.specification import specification
 
@@ -145,6 +145,26 @@ def test_a_hostile_file_is_refused_in_a_sentence(what: str, tmp_path: Path) -> N
     with pytest.raises(ValueError, match=r"mine\.safetensors: expected a descriptor") as caught:
         igps.load(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "shape"),
+    [("temperature", (2,)), ("members", (2,)), ("coefficients", (3, 7)), ("whitened.mean", (3,))],
+)
+def test_a_head_whose_sizes_do_not_fit_is_refused(parameter: str, shape: tuple[int, ...], tmp_path: Path) -> None:
+    """Else it shows when all bodies are described, and not which file is at fault."""
+    path = tmp_path / "mine.safetensors"
+    histograms = torch.rand(6, 4, generator=torch.Generator().manual_seed(1))
+    base = HistogramDescriptor(PairHistogram([EuclideanDistance(4)]))
+    model = EmbeddedDescriptor(base, ClassifierHead().fit(histograms, torch.tensor([0, 0, 1, 1, 2, 2])), name="mine")
+    model.save(path)
+    assert torch.equal(igps.load(path).head.state_dict()["coefficients"], model.head.state_dict()["coefficients"])
+    words = {"format": "igps-descriptor-1", "specification": json.dumps(specification(model)), "card": "{}"}
+    state = load_file(path)
+    state[f"head.{parameter}"] = torch.zeros(shape, dtype=state[f"head.{parameter}"].dtype)
+    save_file(state, path, metadata=words)
+    with pytest.raises(ValueError, match=r"mine\.safetensors: expected a (descriptor|head of 4 cells)"):
+        igps.load(path)
 
 
 def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:

@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import get_args
 
+import torch
+
 from igps._parameters import check_one_of
 from igps.descriptors.canonical_form import CanonicalForm
 from igps.descriptors.d2 import D2
@@ -26,7 +28,8 @@ from igps.descriptors.spectral_gw import SpectralGromovWasserstein
 from igps.descriptors.volume_shape_dna import VolumeShapeDNA
 from igps.descriptors.with_attributes import WithAttributes
 from igps.descriptors.written import written
-from igps.nn.descriptor import NAME, Descriptor
+from igps.nn.descriptor import NAME, Descriptor, EmbeddedDescriptor, HistogramDescriptor
+from igps.nn.heads import ClassifierHead
 from igps.nn.specification import IN_FOLDER, load_module
 
 _MAKERS: Mapping[str, Callable[[], Descriptor]] = {
@@ -87,11 +90,26 @@ def load(path: str | Path) -> Descriptor:
         raise ValueError(f"{path}: expected a descriptor, got {type(module).__name__}.")
     if not NAME.fullmatch(module.name):
         raise ValueError(f"{path}: expected a descriptor's name of letters, digits and _, got {module.name[:80]!r}.")
+    _check_heads(module, path)
     module.card = card
     scale = card.get("scale")  # a card of one's own may say anything by this word
     if isinstance(scale, int | float) and 0 < scale < math.inf:
         module.scale = scale
     return module
+
+
+def _check_heads(module: Descriptor, path: str | Path) -> None:
+    """Raise a ValueError where sizes of a head do not fit each other, which else shows when all is described."""
+    for one in module.modules():
+        if not isinstance(one, EmbeddedDescriptor) or not isinstance(one.descriptor, HistogramDescriptor):
+            continue
+        cells = torch.ones(2, one.descriptor.n_features)
+        try:
+            one.head(cells)
+            if isinstance(one.head, ClassifierHead):
+                one.head.strangeness(cells)
+        except (ValueError, RuntimeError, TypeError, LookupError, ArithmeticError) as error:
+            raise ValueError(f"{path}: expected a head of {cells.shape[1]} cells ({error}). Save it again.") from error
 
 
 def descriptor(

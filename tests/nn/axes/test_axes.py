@@ -152,8 +152,9 @@ def test_a_wrong_name_lists_the_axes() -> None:
         (lambda: PairTwist(1), "n_bins: expected at least 2, got 1"),
         (lambda: PairCosines(1), "n_bins: expected at least 2, got 1"),
         (lambda: EmbeddedPairCosines(-3), "n_bins: expected at least 2, got -3"),
-        (lambda: InteriorDistance(reach=0.0), "a positive range"),
-        (lambda: Potential(0), "n_classes=0"),
+        (lambda: InteriorDistance(reach=0.0), "reach: expected a positive number, got 0"),
+        (lambda: Potential(0), "n_classes: expected at least 1, got 0"),
+        (lambda: Potential(2.5), "n_classes: expected a whole number, got 2.5"),  # type: ignore[arg-type]
         (lambda: Attribute("depth", [0.2, 0.1]), "start: expected finite values in ascending order"),
     ],
 )

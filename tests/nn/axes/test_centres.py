@@ -14,7 +14,8 @@ def test_middles_are_those_of_equal_intervals() -> None:
 
 @pytest.mark.parametrize(("n", "largest"), [(0, 1.0), (3, 0.0), (3, float("inf")), (3, float("nan"))])
 def test_impossible_intervals_are_refused(n: int, largest: float) -> None:
-    with pytest.raises(ValueError, match=f"at least one of bins and a positive range, got n_bins={n}"):
+    expected = "n_bins: expected at least 1, got 0" if n == 0 else f"reach: expected a positive number, got {largest}"
+    with pytest.raises(ValueError, match=expected):
         middles(n, largest, "bins")
 
 

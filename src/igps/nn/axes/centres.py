@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from igps._parameters import check_at_least, check_positive
 from igps.nn.specification import Specified
 
 # The part of its start that a learned gap between centres always keeps, so that no interval closes.
@@ -15,8 +16,8 @@ _LEAST_GAP = 1e-3
 
 def middles(n: int, largest: float, name: str) -> Tensor:
     """(n,) middles of n equal intervals of [0, largest]; a ValueError of the argument n_`name` where there are none."""
-    if n < 1 or not 0 < largest < math.inf:
-        raise ValueError(f"expected at least one of {name} and a positive range, got n_{name}={n} and {largest}.")
+    check_at_least(1, **{f"n_{name}": n})
+    check_positive(reach=largest)
     return (torch.arange(n) + 0.5) * (largest / n)
 
 

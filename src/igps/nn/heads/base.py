@@ -54,7 +54,7 @@ class Head(Specified, ABC):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *arguments: Any) -> None:
         for name, buffer in self.named_buffers(recurse=False):
             stored = state_dict.get(prefix + name)
-            if stored is not None and stored.shape != buffer.shape:
+            if stored is not None and stored.shape != buffer.shape and stored.ndim == buffer.ndim:
                 setattr(self, name, buffer.new_zeros(stored.shape))
         super()._load_from_state_dict(state_dict, prefix, *arguments)
 
