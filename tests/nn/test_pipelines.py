@@ -89,6 +89,24 @@ def test_what_is_compiled_does_not_grow_with_the_samples(
     assert nodes[0] == nodes[1]
 
 
+@pytest.mark.parametrize("name", ["hard", "learned", "in space"])
+def test_what_is_compiled_for_some_numbers_of_bodies_serves_all(name: str) -> None:
+    """With fullgraph=True PyTorch compiles eight times and then raises."""
+    descriptor, batch, programs = HistogramDescriptor(MODULES[name]()).eval(), two_bodies(), []
+
+    def backend(program: torch.fx.GraphModule, _: object) -> Callable[..., object]:
+        programs.append(program)
+        return program.forward
+
+    torch.compiler.reset()
+    compiled = torch.compile(descriptor, backend=backend, fullgraph=True)
+    with torch.no_grad():
+        for n in range(2, 6):
+            bodies = SignatureBatch.concatenate([batch] * n)
+            torch.testing.assert_close(compiled(bodies), descriptor(bodies), rtol=0, atol=1e-6)
+    assert len(programs) == 2  # the second time with any number
+
+
 class OfTensors(nn.Module):
     """A descriptor of the tensors of a padded batch, as a program in another language would call it."""
 
@@ -121,6 +139,22 @@ def test_a_description_of_a_padded_batch_is_exported() -> None:
         program = torch.export.export(OfTensors(descriptor, batch), tensors(batch)).module()
         assert not any("igps" in str(node.target) for node in program.graph.nodes if node.op == "call_function")
         for one in (batch, other):
+            torch.testing.assert_close(program(*tensors(one)), descriptor(one), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["hard", "learned", "in space"])
+def test_an_exported_program_takes_any_number_of_bodies_and_samples(name: str) -> None:
+    descriptor, batch = HistogramDescriptor(MODULES[name]()).eval(), two_bodies()
+    fewer = {kind: getattr(batch, kind).map(lambda one: one[:, :30]) for kind in ("interior", "surface")}
+    given = tensors(batch)
+    any_number = {0: torch.export.Dim.AUTO, 1: torch.export.Dim.AUTO}
+    of_samples = {kind: dict.fromkeys(one, any_number) for kind, one in given[2].items()}
+    bodies_alone = {0: torch.export.Dim.AUTO}
+    with torch.no_grad():
+        program = torch.export.export(
+            OfTensors(descriptor, batch), given, dynamic_shapes=(bodies_alone, bodies_alone, of_samples), strict=False
+        ).module()
+        for one in (batch, batch[:1], SignatureBatch.concatenate([batch, batch[1:]]), replace(batch, **fewer)):
             torch.testing.assert_close(program(*tensors(one)), descriptor(one), rtol=0, atol=1e-6)
 
 

@@ -53,7 +53,7 @@ class Requirements:
 
     def check(self, batch: SignatureBatch) -> None:
         """Raise a ValueError that names what the batch lacks, if it lacks anything."""
-        if not len(batch):
+        if not batch.area.shape[0]:
             raise ValueError("batch: expected at least one shape, got none.")
         if self.n_eigenpairs and not torch.compiler.is_compiling():  # what is traced cannot look at numbers
             self._check_eigenpairs(int(torch.isfinite(batch.eigenvalues).sum(dim=1).min()))

@@ -47,8 +47,12 @@ def _count_together(
     bins = [len(centres) for centres in centres_of(pairs)]
     n_cells = n_classes * math.prod(bins)
     total = torch.zeros(n_shapes, n_classes, n_cells, dtype=torch.float64, device=classes.device)
-    n_rows = max(1, _BLOCK // (n_shapes * max(n_cells, n_points * n_members * 2 ** len(bins))))
-    for first in range(0, n_points - 1, n_rows):
+    n_rows, firsts = n_points, range(1)
+    # A program for any number of shapes or points has one block: how many there are would be written into it.
+    if not any(isinstance(n, torch.SymInt) for n in (n_shapes, n_points)):
+        n_rows = max(1, _BLOCK // (n_shapes * max(n_cells, n_points * n_members * 2 ** len(bins))))
+        firsts = range(0, n_points - 1, n_rows)
+    for first in firsts:
         task = partial(_count_rows, first, first + n_rows, classes, n_classes, bins, pairs)
         # What the gradient needs of the pairs is many times what it needs of the points: computed again.
         differentiable = torch.is_grad_enabled()

@@ -14,5 +14,5 @@ def located(values: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
     below = torch.bucketize(values.detach().contiguous(), centres.detach()[1:-1].clone(), right=True)
     # Not centres[below]: on a GPU its gradient adds what goes to the same centre one after the other.
     rows = torch.atleast_2d(below).flatten(0, -2)
-    start, end = (centres.expand(len(rows), -1).gather(1, one).view_as(values) for one in (rows, rows + 1))
+    start, end = (centres.expand(rows.shape[0], -1).gather(1, one).view_as(values) for one in (rows, rows + 1))
     return below, ((values - start) / (end - start)).clamp(0, 1)

@@ -85,7 +85,7 @@ def _operator(classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, te
 @_operator.register_fake
 def _(classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, tensors: list[Tensor]) -> Tensor:
     bins = [len(one) for one in centres_of(_known(ways, tensors))]
-    return classes.new_empty(len(mask), n_classes * (n_classes + 1) // 2, *bins, dtype=torch.float64)
+    return classes.new_empty(mask.shape[0], n_classes * (n_classes + 1) // 2, *bins, dtype=torch.float64)
 
 
 @library.custom_op("igps::count_pairs_backward", mutates_args=(), schema=f"(Tensor upstream, {_ARGUMENTS}) -> Tensor[]")
