@@ -13,7 +13,7 @@ import trimesh
 from matplotlib.image import imread
 
 from igps.analysis.clusters import clusters_of
-from igps.analysis.groups import group_test, vectors_of
+from igps.analysis.groups import group_test
 from igps.analysis.map import body_map
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
@@ -64,7 +64,7 @@ def test_groups_prints_and_writes_the_tests(
     dataset = SignatureDataset(root, CONFIG, root.parent / "cache")
     descriptions = describe(dataset, small_interior())
     expected = group_test(
-        vectors_of(small_interior(), descriptions),
+        descriptions.flatten(1).double().sqrt().numpy(),
         dataset.bodies.labels or (),
         strata=dataset.bodies.column("scanner"),
         covariates=np.array([dataset.bodies.numbers("age")]).T,
@@ -113,9 +113,8 @@ def test_a_covariate_may_be_words_but_no_mistyped_number(
     words = ["groups", tmp_path, *OWN, "--n_permutations", "199"]
     igps(monkeypatch, root, *words, "--covariate", "sex", "--json")
     (found,) = json.loads(capsys.readouterr().out)
-    vectors = vectors_of(
-        small_interior(), describe(SignatureDataset(root, CONFIG, root.parent / "cache"), small_interior())
-    )
+    descriptions = describe(SignatureDataset(root, CONFIG, root.parent / "cache"), small_interior())
+    vectors = descriptions.flatten(1).double().sqrt().numpy()
     is_f = np.arange(13)[:, None] % 3 == 0
     expected = group_test(vectors, [row["label"] for row in rows], covariates=is_f.astype(float), n_permutations=199)
     assert found["permanova_f"] == pytest.approx(expected.permanova_f)

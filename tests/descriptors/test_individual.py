@@ -317,3 +317,12 @@ def test_a_descriptor_is_compared_with_itself_that_keeps_size(tmp_path: Path) ->
     assert rows[1]["nn"] == 1
     with pytest.raises(ValueError, match="expected one of each name, got several of shape_dna"):
         compare(tmp_path / "nowhere", ["shape_dna", "shape_dna+size"], size="keep")
+
+
+def test_coordinates_keep_size_beside_those_of_the_descriptor(signatures: dict[str, Signature]) -> None:
+    sized = igps.descriptor("interior+size")
+    descriptions = sized(collate([signatures["body"], signatures["larger"]]))
+    rows = sized.coordinates(descriptions)
+    form = igps.descriptor("interior")(collate([signatures["body"]])).flatten()
+    torch.testing.assert_close(rows[0, :-2], form.sqrt())
+    assert rows[:, -2:].equal(descriptions[:, -2:])

@@ -284,3 +284,11 @@ def test_a_descriptor_under_a_head_is_compared_by_the_cosine(batch: SignatureBat
     with pytest.raises(ValueError, match=r"expected a head that shortens its embeddings.*WhitenedHead.*300 numbers"):
         descriptor.short(torch.rand(2, 300))
     assert EmbeddedDescriptor(below, descriptor.head, invariant_to=["pose"]).invariant_to == ("pose",)
+
+
+def test_coordinates_of_histograms_are_their_roots(batch: SignatureBatch) -> None:
+    """As Hellinger's distance takes them; those of others are the descriptions."""
+    histograms = paper()(batch)
+    torch.testing.assert_close(paper().coordinates(histograms).square(), histograms.flatten(1))
+    kept = EmbeddedDescriptor(paper(), WhitenedHead())
+    assert kept.coordinates(histograms.flatten(1)).equal(histograms.flatten(1))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.analysis.groups import squared_distances, vectors_of
+from igps.analysis.groups import squared_distances
 from igps.analysis.outliers import Outlier, measures_of, outliers
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
@@ -66,7 +66,8 @@ def outlying(
         path: i
         for i, path in enumerate(p for p, name in zip(paths, whole.bodies.names, strict=True) if name not in gone)
     }
-    distances = squared_distances(vectors_of(chosen, describe(dataset, chosen, progress=True))) ** 0.5
+    described = describe(dataset, chosen, progress=True)
+    distances = squared_distances(chosen.coordinates(described).double().numpy()) ** 0.5
     measures, notes = measures_of(dataset), dataset.all_notes()
 
     def scored(chosen_paths: Sequence[Path], classes: Sequence[str]) -> list[Outlier]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.analysis.groups import group_test, vectors_of
+from igps.analysis.groups import group_test
 from igps.data.collation import collate
 from igps.descriptors import descriptor as descriptor_of
 from igps.mesh.mesh import Mesh
@@ -102,7 +102,7 @@ def pool(
         mesh = subject(proportion, difference, random)
         batch = collate([compute_signature(mesh, config)])
         for name, one in zip(descriptors, chosen, strict=True):
-            found[name].append(vectors_of(one, one(batch).detach())[0])
+            found[name].append(one.coordinates(one(batch).detach(), of_one_kind=True)[0].double().numpy())
         values = shapedna.compute_shapedna(TriaMesh(mesh.vertices, mesh.faces), k=_N_EIGENVALUES)["Eigenvalues"][1:]
         found[_LAPY].append(np.log(values / values[0])[1:])
     return {name: np.array(rows) for name, rows in found.items()}

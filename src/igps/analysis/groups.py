@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from igps._parameters import check_at_least
-from igps.nn.descriptor import Descriptor
 
 FEWEST = 5
 """Of a group, for a test."""
@@ -20,8 +18,9 @@ FEWEST = 5
 _FEWEST_ARRANGEMENTS = 100
 # Numbers that permuted designs hold at once
 _BLOCK = 2**24
-# Over the mean variance of what is left of the vectors; chosen on generated bodies of three families
-_RIDGE = 0.1
+# For each degree of freedom of what is whitened, a usual rule of regression
+_BODIES_EACH = 10
+_MOST_OF_RANK = 0.9
 _ROUNDING = 1e-9
 
 Rows = NDArray[np.float64]
@@ -50,15 +49,6 @@ class GroupTest:
     refused: str | None = None  # why nothing was tested
 
 
-def vectors_of(descriptor: Descriptor, descriptions: Tensor) -> Rows:
-    """(N, D) vectors whose Euclidean distances are meant: square roots of histograms (Hellinger), or as they are.
-
-    A head's own distance may be no Euclidean one; that of `pretrained` hardly tells bodies of one class apart.
-    """
-    rows: Rows = descriptions.flatten(1).double().numpy()
-    return np.sqrt(rows) if descriptor.searched_by == "chi_square" else rows
-
-
 def squared_distances(rows: Rows) -> Rows:
     """(N, N) squared Euclidean distances of rows (N, D)."""
     return _squares((centred := rows - rows.mean(axis=0)) @ centred.T)
@@ -81,10 +71,10 @@ def group_test(
     Covariates and the means of strata are regressed out of the vectors and of the groups; what is left of the vectors
     is permuted within strata (Freedman and Lane 1983; with distances, McArdle and Anderson 2001). PERMANOVA is the
     pseudo-F of these, and sees what is large beside the usual differences. The kernel test also sees what is small: it
-    whitens what is left of the vectors by their covariance, with a tenth of the mean variance as ridge (as Harchaoui,
-    Bach and Moulines 2008; of all bodies, so that permutations share it), and takes a Gaussian kernel with the median
-    distance as its width, over the share of the groups that covariates do not explain. A probability is
-    (1 + permutations as extreme) / (1 + permutations) (Phipson and Smyth 2010).
+    whitens what is left of the vectors by their covariance, with a ridge that leaves a degree of freedom for every ten
+    bodies (as Harchaoui, Bach and Moulines 2008; of all bodies, so that permutations share it), and takes a Gaussian
+    kernel with the median distance as its width, over the share of the groups that covariates do not explain. A
+    probability is (1 + permutations as extreme) / (1 + permutations) (Phipson and Smyth 2010).
 
     Args:
         vectors: (N, D) of N bodies, one of each subject.
@@ -133,8 +123,7 @@ def group_test(
     gram = beside @ whole @ beside
     if np.trace(gram) <= _ROUNDING * np.square(vectors).sum():
         return replace(untested, refused="the vectors do not differ, but for what covariates and strata explain.")
-    ridge = _RIDGE * np.trace(gram) / (n - known.shape[1])
-    whitened = _squares(np.linalg.solve(gram + ridge * np.eye(n), gram))
+    whitened = _squares(_whitened(gram))
     apart = whitened[np.triu_indices(n, 1)]
     width = np.median(apart[apart > _ROUNDING * apart.max()])  # more than half of the pairs may be the same twice
     kernel = beside @ np.exp(-whitened / (2 * width)) @ beside
@@ -219,6 +208,25 @@ def _orthonormal(columns: Rows, least: float) -> Rows:
     columns = columns / np.where(lengths > least, lengths, np.inf)
     left, values, _ = np.linalg.svd(columns, full_matrices=False)
     return left[:, values > least]
+
+
+def _whitened(gram: Rows) -> Rows:
+    """G (G + ρ)⁻¹ of a Gram matrix G; ρ leaves a degree of freedom for every ten bodies, or as the rank allows."""
+    from scipy.optimize import brentq
+
+    values, axes = np.linalg.eigh(gram)
+    kept = values > _ROUNDING * values[-1]
+    values, axes = values[kept], axes[:, kept]
+    freedom = min(len(gram) / _BODIES_EACH, _MOST_OF_RANK * len(values))
+
+    def excess(logarithm: float) -> float:
+        return float((values / (values + np.exp(logarithm))).sum()) - freedom
+
+    # With the first each value counts for at least the share of the rank, with the other all for at most the freedom
+    ridges = values[0] * (1 / _MOST_OF_RANK - 1) / 2, 2 * values.sum() / freedom
+    ridge = np.exp(brentq(excess, *np.log(ridges)))
+    found: Rows = (axes * (values / (values + ridge))) @ axes.T
+    return found
 
 
 def _squares(gram: Rows) -> Rows:

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from igps._parameters import check_at_least, check_share
 from igps.analysis.explanation import KINDS, Explanation, contents_of, explain_groups, on_surface
 from igps.analysis.explanation import explain as explain_pair
-from igps.analysis.groups import group_test, squared_distances, vectors_of, with_discovery_rates
+from igps.analysis.groups import group_test, squared_distances, with_discovery_rates
 from igps.analysis.outliers import LIMIT, measures_of
 from igps.analysis.outliers import outliers as find_outliers
 from igps.cli.reading import Folder, described, files_or_folder, print_failures
@@ -67,7 +67,7 @@ def groups(
     found = described(folder, descriptor, size=how, **reading)
     bodies = found.dataset.bodies
     labels, of_strata, of_covariates = columns(bodies)
-    vectors = {"": vectors_of(found.descriptor, found.descriptions)}
+    vectors = {"": found.coordinates(of_one_kind=True)}
     if size:
         vectors[", size"] = np.log([[one.volume * millimetres(one.unit) ** 3] for one in found.dataset.signatures()])
     members: dict[str, list[int]] = {}
@@ -119,7 +119,7 @@ def outliers(
     check_at_least(0, top=top)
     bodies = described(Folder(root, labelled=True, needs_meshes=True), descriptor, **reading)
     dataset = bodies.dataset
-    distances = squared_distances(vectors_of(bodies.descriptor, bodies.descriptions)) ** 0.5
+    distances = squared_distances(bodies.coordinates()) ** 0.5
     measures = measures_of(dataset, n_workers=reading.get("n_workers"))
     found = find_outliers(distances, dataset.bodies.labels or (), measures, dataset.all_notes())
     rows: list[dict[str, Any]] = [

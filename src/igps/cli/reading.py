@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
+from igps._arrays import Floats
 from igps._parallel import Limits
 from igps.data.attribute_sources import attribute_sources
 from igps.data.collection import is_collection
@@ -86,6 +87,11 @@ class Described:
     failures: list[Failure]  # the other bodies
     descriptor: Descriptor  # that described them
     name: str | None  # by which it is found again; None where its centres are the collection's, which no name tells
+
+    def coordinates(self, *, of_one_kind: bool = False) -> Floats:
+        """(N, D) for statistics, see `Descriptor.coordinates`."""
+        found: Floats = self.descriptor.coordinates(self.descriptions, of_one_kind=of_one_kind).double().numpy()
+        return found
 
 
 def signatures(

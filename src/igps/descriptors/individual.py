@@ -112,6 +112,13 @@ class IndividualDescriptor(Descriptor):
             found = found + _MOST * (found + self._unit) * apart / (1 + apart)
         return found
 
+    def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
+        """(N, D) descriptions to the coordinates of the descriptor, and the numbers of side and size."""
+        form, *others = self.split(descriptions)
+        shape = self.descriptor.description_shape
+        form = self.descriptor.coordinates(form.unflatten(1, shape), of_one_kind=of_one_kind)
+        return torch.cat([form, *others], dim=1)
+
     def short(self, descriptions: Tensor) -> Tensor:
         """(N, D) descriptions to (N, ≤ 256 + 55): those of the descriptor, or a ValueError, and of side and size."""
         form, *others = self.split(descriptions)

@@ -123,6 +123,18 @@ class Descriptor(Specified, ABC):
         """(Q, ...) and (G, ...) descriptions to (Q, G) distances ≥ 0, smaller is closer; χ² unless redefined."""
         return chi_square(queries, gallery)
 
+    def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
+        """(N, ...) descriptions to (N, D) for statistics, which compare by Euclidean distance.
+
+        Square roots of histograms (Hellinger), and others as they are, unless redefined.
+
+        Args:
+            descriptions: of bodies.
+            of_one_kind: whether all bodies are of one kind, such as an organ; what tells kinds apart may be left out.
+        """
+        rows = descriptions.flatten(1)
+        return rows.sqrt() if self.searched_by == "chi_square" else rows
+
     def short(self, descriptions: Tensor) -> Tensor:
         """(N, D) descriptions to (N, ≤ 256), for engines that compare so few by the cosine; or a ValueError."""
         raise ValueError(f"short: expected a descriptor of vectors, such as pretrained, got {self.name!r}.")
@@ -269,6 +281,10 @@ class EmbeddedDescriptor(Descriptor):
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, D) and (G, D) embeddings to (Q, G) distances of the head."""
         return self.head.distances(queries, gallery)
+
+    def coordinates(self, embeddings: Tensor, *, of_one_kind: bool = False) -> Tensor:
+        """(N, D) embeddings as they are, or what tells bodies of one kind apart, see `Head.within_class`."""
+        return self.head.within_class(embeddings) if of_one_kind else embeddings
 
     def short(self, embeddings: Tensor) -> Tensor:
         """(N, D) embeddings to (N, ≤ 256) of length 1: themselves, or those of `Head.short`, which may have none."""

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+import trimesh
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn.functional import normalize
 from training.graded import GradedShapes
 
 import igps
+from igps import Mesh, collate
 from igps.data.dataset import SignatureDataset
 from igps.descriptors.pretrained.descriptor import (
     BODY_PARTS,
@@ -29,7 +32,7 @@ from igps.nn.descriptor import EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
 from igps.retrieval import chi_square, cosine, retrieval_scores
 from igps.shapes import ArticulatedShapes
-from igps.signature.signature import SignatureConfig
+from igps.signature.signature import SignatureConfig, compute_signature
 
 # Of `rich`: six histograms in its first part, two oriented ones.
 CELLS = (25920, 750, 750)
@@ -186,3 +189,24 @@ def test_a_file_of_another_head_is_named(tmp_path: Path) -> None:
         pretrained(path)
     with pytest.raises(FileNotFoundError):
         pretrained(tmp_path / "missing.safetensors")
+
+
+def test_coordinates_tell_a_small_difference_from_other_samples() -> None:
+    """The numbers of the class do not: other samples of one body move them further than a difference of 3 %."""
+    descriptor = igps.descriptor("pretrained")
+    config = descriptor.requirements.apply_to(SignatureConfig())
+    ball = trimesh.creation.icosphere(subdivisions=3)
+
+    def described(width: float, seed: int) -> Tensor:
+        body = Mesh(ball.vertices * [0.8 * width, 0.6, 1.6] + [0.3, 0, 0] * ball.vertices[:, 2:] ** 2, ball.faces)
+        return descriptor(collate([compute_signature(body, replace(config, seed=seed))]))
+
+    descriptions = torch.cat([described(width, seed) for width in (1.0, 1.03) for seed in range(3)])
+    apart = {
+        name: torch.cdist(rows, rows)
+        for name, rows in (("whole", descriptions), ("within", descriptor.coordinates(descriptions, of_one_kind=True)))
+    }
+    same = torch.block_diag(*2 * [torch.ones(3, 3)]).bool()
+    assert apart["within"][same].max() < apart["within"][~same].min()
+    assert descriptor.coordinates(descriptions).equal(descriptions)
+    assert apart["whole"][same].max() > apart["whole"][~same].min()

@@ -44,6 +44,10 @@ class Head(Specified, ABC):
         """(Q, D) and (G, D) embeddings, as `forward` gives them, to (Q, G) distances; the cosine's unless redefined."""
         return cosine(queries, gallery)
 
+    def within_class(self, embeddings: Tensor) -> Tensor:
+        """(N, ≤ D) the numbers of (N, D) embeddings that tell bodies of one class apart; all, unless redefined."""
+        return embeddings
+
     def short(self, embeddings: Tensor) -> Tensor:
         """(N, D) embeddings to (N, ≤ 256) of length 1 whose cosines are nearly theirs; a ValueError if it has none."""
         raise ValueError(

@@ -130,6 +130,13 @@ class TwoLevelHead(Head):
         self.individual_head.fit(descriptions, individuals, part_cells)
         return self
 
+    def within_class(self, embeddings: Tensor) -> Tensor:
+        """The numbers of bodies and individuals in (N, D) embeddings.
+
+        Between bodies that are nearly alike those of classes hold little but the scatter of the samples.
+        """
+        return embeddings[:, self.class_head.n_numbers :]
+
     def short(self, embeddings: Tensor) -> Tensor:
         """(N, D) embeddings to (N, ≤ 256) of length 1, along the principal directions of those of the training shapes.
 
