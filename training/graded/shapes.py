@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from igps._files import whole_file
 from igps._parallel import Failed, run
 from igps.mesh.mesh import Mesh, MeshError
-from igps.shapes.benchmark import is_whole_off, off_text, shapes_folder, write_whole
+from igps.shapes.benchmark import is_whole_off, off_text, shapes_folder
 from igps.shapes.meshing import Faces
 from igps.shapes.solids import Array
 from training.graded.bodies import Body, Pose, draw_body, draw_pose
@@ -308,7 +309,8 @@ def _record_bodies(path: Path, names: list[str]) -> None:
     """Name the body of each file, beside those that are named there already."""
     before = path.read_text(encoding="utf-8").splitlines()[1:] if path.exists() else []
     rows = dict.fromkeys([*before, *(f"{name}.off,{body_of(name)}" for name in names)])
-    write_whole(path, "\n".join(["file,label", *rows]) + "\n")
+    with whole_file(path) as file:
+        file.write(("\n".join(["file,label", *rows]) + "\n").encode())
 
 
 def _write(shapes: GradedShapes, folder: Path, indices: list[int]) -> None:
@@ -322,6 +324,7 @@ def _write(shapes: GradedShapes, folder: Path, indices: list[int]) -> None:
             continue
         path = folder / f"{shape.name}.off"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, off_text(shape.vertices, shape.faces))
+        with whole_file(path) as file:
+            file.write(off_text(shape.vertices, shape.faces).encode())
     if failed is not None:
         raise failed

@@ -15,11 +15,11 @@ from torch import Tensor
 from igps.analysis.correspondence import dissimilarity
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.descriptors.individual import IndividualDescriptor
-from igps.nn.batch_features import WEIGHT, BatchFeatures, SampleKind
+from igps.nn.batch_features import WEIGHT, BatchFeatures
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.histograms.base import DescriptionPart, SampleHistogram
+from igps.signature.signature import SAMPLE_KINDS, SampleKind
 
-KINDS: tuple[SampleKind, ...] = ("interior", "surface")
 # Nodes of the integral along the line between two descriptions, and of what share of the distance it may miss
 _NODES, _MISSED = (16, 64, 256, 1024), 1e-8
 # Samples that a point of the surface takes its value from
@@ -192,7 +192,7 @@ def _shared(
     histograms: HistogramDescriptor, batch: SignatureBatch, units: Tensor, whole: Mapping[str, float]
 ) -> tuple[dict[str, float], Shares]:
     """What each histogram, and each sample, of a body has of the distance; it has half of what is of the whole."""
-    weights = [getattr(batch, kind).attributes[WEIGHT] for kind in KINDS]
+    weights = [getattr(batch, kind).attributes[WEIGHT] for kind in SAMPLE_KINDS]
     totals = [torch.zeros_like(one) for one in weights]
     features, parts, first = BatchFeatures(batch, False), dict[str, float](), 0
     for group in histograms.parts:
@@ -210,7 +210,7 @@ def _shared(
             for total, gradient in zip(totals, found, strict=True):
                 total += 0 if gradient is None else gradient / part.degree
     everywhere = sum(whole.values()) / 4  # half in each body, of that half in each kind of samples
-    samples = {kind: total[0].detach().numpy() for kind, total in zip(KINDS, totals, strict=True)}
+    samples = {kind: total[0].detach().numpy() for kind, total in zip(SAMPLE_KINDS, totals, strict=True)}
     return parts, {kind: values + everywhere / len(values) for kind, values in samples.items()}
 
 

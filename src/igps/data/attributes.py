@@ -13,9 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from igps.mesh.loading import BodyRef
 from igps.signature.attributes import AttributeName
-from igps.signature.signature import Signature
-
-ROOMS = ("interior", "surface")
+from igps.signature.signature import SAMPLE_KINDS, SampleKind, Signature
 
 # What a key can tell.
 _Told = bool | int | float | str | PurePath
@@ -114,10 +112,10 @@ def split_attributes(
     return sources, functions
 
 
-def with_attribute(signature: Signature, name: str, values: Mapping[str, ArrayLike]) -> Signature:
-    """The Signature with an attribute of its samples, by room; a ValueError without one finite row for each."""
+def with_attribute(signature: Signature, name: str, values: Mapping[SampleKind, ArrayLike]) -> Signature:
+    """The Signature with an attribute of its samples, by kind; a ValueError without one finite row for each."""
     try:
-        interior, surface = (getattr(signature, room).with_attributes({name: values[room]}) for room in ROOMS)
+        interior, surface = (getattr(signature, kind).with_attributes({name: values[kind]}) for kind in SAMPLE_KINDS)
     except ValueError as error:
         raise ValueError(f"{signature.name}: attributes: {error}") from error
     return replace(signature, interior=interior, surface=surface)

@@ -12,7 +12,8 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from igps.data.cache import check_checksum, checksum, decode, encode, whole_file
+from igps._files import whole_file
+from igps.data.cache import check_checksum, checksum, decode, encode
 from igps.data.requirements import Requirements
 from igps.data.sources import Bodies, file_of
 from igps.mesh.options import LoadOptions
@@ -57,8 +58,7 @@ class About:
         if not set(labels or ()) <= set(classes) or not all(one is None or isinstance(one, str) for one in words):
             raise ValueError("its labels are none of its classes, or its parts or columns no words")
         try:
-            config = SignatureConfig(**{**told["config"], "attributes": tuple(told["config"]["attributes"])})
-            return About(bodies, classes, keys, LoadOptions(**told["reading"]), config)
+            return About(bodies, classes, keys, LoadOptions(**told["reading"]), SignatureConfig(**told["config"]))
         except (TypeError, KeyError, ValueError) as error:
             raise ValueError(f"parameters of another version: {error}") from error
 

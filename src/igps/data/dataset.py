@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from igps._parallel import Failed, Limits
-from igps.data.attributes import ROOMS, AttributeSource, PointFunction, split_attributes, with_attribute
+from igps.data.attributes import AttributeSource, PointFunction, split_attributes, with_attribute
 from igps.data.batch import LabelledSignature, Several, SignatureBatch, chosen_of, number_of
 from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.collation import collate
@@ -26,7 +26,7 @@ from igps.data.sources import Bodies, ClassRule, bodies_of
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
-from igps.signature.signature import Signature, SignatureConfig
+from igps.signature.signature import SAMPLE_KINDS, Signature, SignatureConfig
 
 
 class SignatureDataset(Dataset[LabelledSignature]):
@@ -151,7 +151,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         found = None if hit is None else self.pipeline.read(hit)
         signature = replace(found or self.pipeline.signature(self.bodies[i]), name=name)
         for attribute, function in self._functions.items():
-            values = {room: function(getattr(signature, room).points) for room in ROOMS}
+            values = {kind: function(getattr(signature, kind).points) for kind in SAMPLE_KINDS}
             signature = with_attribute(signature, attribute, values)
         return signature
 

@@ -17,14 +17,14 @@ import numpy as np
 
 from igps._parallel import Failed, MachineError, attempt
 from igps.data.attribute_sources import of_bodies_read
-from igps.data.attributes import ROOMS, AttributeSource, with_attribute
+from igps.data.attributes import AttributeSource, with_attribute
 from igps.data.cache import AttributeCache, SignatureCache, content_digest
 from igps.mesh.formats import files_read, stamp_of
 from igps.mesh.loading import BodyRef, each_body, load_mesh
 from igps.mesh.mending import MENDING_VERSION, repair_steps
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
-from igps.signature.signature import Signature, SignatureConfig, compute_signature
+from igps.signature.signature import SAMPLE_KINDS, Signature, SignatureConfig, compute_signature
 
 
 class PreTransform(Protocol):
@@ -219,11 +219,11 @@ class SignaturePipeline:
         values = cache.get(key)
         if values is not None:
             return with_attribute(signature, name, values)
-        points = [getattr(signature, room).points for room in ROOMS]
+        points = [getattr(signature, kind).points for kind in SAMPLE_KINDS]
         rows = of_bodies_read(self.attributes[name], self.reading)(body, np.concatenate(points))
-        found = dict(zip(ROOMS, np.split(rows, [len(points[0])]), strict=True))
+        found = dict(zip(SAMPLE_KINDS, np.split(rows, [len(points[0])]), strict=True))
         signature = with_attribute(signature, name, found)
-        cache.put(key, {room: getattr(signature, room).attributes[name] for room in ROOMS})
+        cache.put(key, {kind: getattr(signature, kind).attributes[name] for kind in SAMPLE_KINDS})
         return signature
 
     def _cached(self, body: BodyRef, file: BodyFile) -> Iterator[str]:

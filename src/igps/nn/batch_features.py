@@ -1,7 +1,5 @@
 """Features of a batch that histograms share: embeddings, positions, attributes, each computed once."""
 
-from typing import Literal
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -11,8 +9,7 @@ from igps.nn._kernels.balls import ball_radii
 from igps.nn._kernels.nearest import smallest
 from igps.nn._precision import full_precision
 from igps.nn.embedding import barycentroid_potential
-
-SampleKind = Literal["interior", "surface"]
+from igps.signature.signature import SampleKind
 
 WEIGHT = "weight"
 """An attribute of samples: how much each counts in histograms, all alike where there is none."""

@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
-from igps.data.cache import whole_file
+from igps._files import whole_file
 
 _FORMAT = "igps-descriptor-1"
 # Of a folder that is shared as a whole, beside its card

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._parallel import one_thread
-from igps.analysis.explanation import KINDS, Shares, explain, on_surface
+from igps.analysis.explanation import Shares, explain, on_surface
 from igps.data.dataset import SignatureDataset
 from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import Descriptor
 from igps.report.drawing import axes_of
 from igps.report.results import System
 from igps.report.surfaces import STEPS, Surface, made
-from igps.signature.signature import Signature
+from igps.signature.signature import SAMPLE_KINDS, Signature
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ def _painted(job: tuple[Descriptor, SignatureDataset, list[Surface]]) -> Painted
 def _values(mesh: Mesh, signature: Signature, shares: Shares, surface: Surface) -> NDArray[np.uint8]:
     """At the vertices of a surface, which lies in its cube as the mesh does in its own."""
     axes = axes_of(signature.surface.points)
-    turned = {kind: getattr(signature, kind).points @ axes for kind in KINDS}
+    turned = {kind: getattr(signature, kind).points @ axes for kind in SAMPLE_KINDS}
     corners = mesh.vertices @ axes
     low, high = corners.min(axis=0), corners.max(axis=0)
     points = surface.vertices / STEPS - 0.5

@@ -146,9 +146,8 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
         else:
             paths = tuple(meshes / file_of(name, part) for name, part in zip(names, parts, strict=True))
         columns = {str(name): tuple(values) for name, values in summary.get("columns", {}).items()}
-        signature = {**summary["signature"], "attributes": tuple(summary["signature"]["attributes"])}
         bodies, reading = Bodies(paths, names, None, parts, columns), LoadOptions(**summary["reading"])
-        return SignatureDataset(bodies, SignatureConfig(**signature), summary["cache_dir"], reading=reading)
+        return SignatureDataset(bodies, SignatureConfig(**summary["signature"]), summary["cache_dir"], reading=reading)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the format {_FORMAT} ({error}). Run the command again.") from error
 

@@ -4,7 +4,6 @@ import json
 import logging
 import operator
 import os
-import uuid
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from igps._files import whole_file
 from igps._parameters import check_at_least
 from igps.shapes.meshing import Faces, defect, mesh, roughen
 from igps.shapes.skeleton import Skeleton, pose
@@ -146,7 +146,8 @@ class ArticulatedShapes:
             if not is_whole_off(path):
                 shape = self[index]
                 path.parent.mkdir(parents=True, exist_ok=True)
-                write_whole(path, off_text(shape.vertices, shape.faces))
+                with whole_file(path) as file:
+                    file.write(off_text(shape.vertices, shape.faces).encode())
 
 
 def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
@@ -155,7 +156,8 @@ def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
     manifest = folder / "shapes.json"
     if not manifest.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(manifest, wanted)
+        with whole_file(manifest) as file:
+            file.write(wanted.encode())
     elif (found := manifest.read_text(encoding="utf-8")) != wanted:
         raise ValueError(f"root={str(root)!r} holds shapes of {found}, not of {wanted}; choose another folder")
     return folder
@@ -178,13 +180,3 @@ def is_whole_off(path: Path) -> bool:
     if len(header) < 3 or header[0] != b"OFF":
         return False
     return text.endswith(b"\n") and text.count(b"\n") == 2 + int(header[1]) + int(header[2])
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file under another name and move it into place, so that nobody sees a part of it."""
-    temporary = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
-    try:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

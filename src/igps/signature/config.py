@@ -74,6 +74,7 @@ class SignatureConfig:
                 f"max_vertices: expected more than n_eigenpairs + 1 = {self.n_kept + 1}, got {self.max_vertices}."
             )
         check_share(accuracy=self.accuracy)
+        object.__setattr__(self, "attributes", tuple(self.attributes))  # JSON and YAML have lists
         check_attributes(self.attributes)
 
     @classmethod

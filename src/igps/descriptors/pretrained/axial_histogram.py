@@ -6,9 +6,10 @@ from torch.nn.functional import normalize
 
 from igps.data.requirements import Requirements
 from igps.nn.axes.points import soft_memberships
-from igps.nn.batch_features import SampleFeatures, SampleKind
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential
 from igps.nn.histograms.base import SampleHistogram, counted, joint
+from igps.signature.signature import SampleKind
 
 # The weight of a sample is so great a power of its potential: the trunk decides where the axes lie, limbs hardly
 _POWER = -4

@@ -7,9 +7,10 @@ from torch.nn.utils.rnn import pad_sequence
 
 from igps._parameters import check_at_least
 from igps.descriptors.pretrained._merge_tree import MergeTree, merge_tree, merge_trees
-from igps.nn.batch_features import SampleFeatures, SampleKind
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram
+from igps.signature.signature import SampleKind
 
 
 class BranchHistogram(SampleHistogram):

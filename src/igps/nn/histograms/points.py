@@ -6,9 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from igps.nn.axes.points import PointAxis
-from igps.nn.batch_features import SampleFeatures, SampleKind
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import AxesHistogram, counted, joint
+from igps.signature.signature import SampleKind
 
 
 class PointHistogram(AxesHistogram):
