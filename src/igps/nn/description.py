@@ -4,7 +4,9 @@ import contextlib
 import hashlib
 import json
 import logging
+import time
 from collections.abc import Collection, Generator, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -162,7 +164,7 @@ def _on_threads(
 
     def outcomes(indices: Sequence[int]) -> Sequence[Singles | Failure]:
         try:
-            return list(_described((descriptor, dataset.subset(indices), device)))
+            return list(describe_timed((descriptor, dataset.subset(indices), device))[0])
         except ValueError as error:
             if len(indices) == 1:
                 return [dataset.failure(indices[0], Failed(str(error)))]
@@ -177,21 +179,27 @@ def _on_processes(
 ) -> _Described:
     """The same one by one on processes: a mesh that kills its process costs no other its description."""
     jobs = [(descriptor, dataset.subset([i]), torch.device("cpu")) for i in indices]
-    for number, outcome in run(_described, jobs, n_workers=n_workers):
+    for number, outcome in run(describe_timed, jobs, n_workers=n_workers):
         i = indices[number]
-        yield [i], [dataset.failure(i, outcome) if isinstance(outcome, Failed) else outcome[0]]
+        yield [i], [dataset.failure(i, outcome) if isinstance(outcome, Failed) else outcome[0][0]]
 
 
-def _described(job: tuple[nn.Module, SignatureDataset, torch.device]) -> Singles:
-    """(N, ...) descriptions of all meshes of a dataset at once."""
+def describe_timed(job: tuple[nn.Module, SignatureDataset, torch.device]) -> tuple[Singles, float]:
+    """(N, ...) descriptions of all meshes of a dataset at once, and the seconds of processor time that they took.
+
+    The time includes reading the meshes, where the descriptor needs them, but not the Signatures.
+    """
     descriptor, dataset, device = job
-    meshes = isinstance(descriptor, Descriptor) and descriptor.requirements.mesh
     with one_thread(), torch.inference_mode():  # hold for the thread that enters them
-        batch = dataset.batch(range(len(dataset)), meshes).to(device)
-        values: Singles = descriptor(batch).cpu().numpy()
+        batch = dataset.batch(range(len(dataset)))
+        start = time.process_time()
+        if isinstance(descriptor, Descriptor) and descriptor.requirements.mesh:
+            batch = replace(batch, meshes=tuple(dataset.mesh(i) for i in range(len(dataset))))
+        values: Singles = descriptor(batch.to(device)).cpu().numpy()
+        seconds = time.process_time() - start
     if not np.isfinite(values).all():
         raise MeshError(f"{dataset.bodies.paths[0]}: the description has entries that are not finite.")
-    return values
+    return values, seconds
 
 
 class _Kept:
