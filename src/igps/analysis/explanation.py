@@ -97,7 +97,7 @@ def _placed(body: SignatureBatch, other: SignatureBatch, samples: Shares, distan
 def contents_of(descriptor: Descriptor) -> Descriptor:
     """What describes the cells of a descriptor, and behind them its numbers of side and size; without its head."""
     histograms = _histograms(descriptor)
-    return descriptor.beside(histograms) if isinstance(descriptor, IndividualDescriptor) else histograms
+    return descriptor.wrap(histograms) if isinstance(descriptor, IndividualDescriptor) else histograms
 
 
 def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Tensor, float]:

@@ -14,7 +14,7 @@ from igps._parallel import Failed, run
 from igps._threads import n_cores
 from igps.analysis.segmentation import Place, cavity_root, cut_end, gap_root, hole_root, overlaps, stray_root
 from igps.data.dataset import SignatureDataset
-from igps.data.filling import by_file
+from igps.data.filling import group_by_file
 from igps.data.pipeline import SignaturePipeline
 from igps.mesh.formats import RawBody
 from igps.mesh.loading import BodyRef, each_surface, surface_body
@@ -139,7 +139,7 @@ def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> d
     """
     found = np.full((len(dataset), len(_MEASURED)), np.nan)
     places = list[Place | None]([None] * len(dataset))
-    jobs = by_file(dataset.bodies, range(len(dataset)), -(-len(dataset) // (n_workers or n_cores())))
+    jobs = group_by_file(dataset.bodies, range(len(dataset)), -(-len(dataset) // (n_workers or n_cores())))
     given = [[dataset.bodies[i] for i in job] for job in jobs]
     with contextlib.closing(run(partial(_measures, dataset.pipeline), given, n_workers=n_workers)) as all_:
         for number, outcome in all_:

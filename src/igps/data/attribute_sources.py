@@ -64,7 +64,7 @@ class ResidueAttribute:
         values = residue_attribute(_molecule(body), points, self.name)
         if np.isnan(values).all():
             raise MeshError(f"{body}: {self.name!r} is known of none of its residues. Choose another descriptor.")
-        return completed(values, points, f"{body}: {self.name}")
+        return fill_missing(values, points, f"{body}: {self.name}")
 
 
 def _molecule(body: BodyRef) -> Molecule:
@@ -118,7 +118,7 @@ class FileAttribute(ABC):
                 f"{body}: its attribute's file {file} is not readable ({type(error).__name__}: "
                 f"{' '.join(str(error).split())}). Check that it is complete, and of the format that its name tells."
             ) from error
-        return completed(values, points, f"{body}: {file}")
+        return fill_missing(values, points, f"{body}: {file}")
 
     @abstractmethod
     def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
@@ -207,7 +207,7 @@ class VertexAttribute(FileAttribute):
         if len(given) != len(raw.vertices):
             counts = f"{len(given)} values, its surface {len(raw.vertices)} vertices"
             raise MeshError(f"{body}: {file} has {counts}. Give the values of this surface.")
-        columns = completed(given.reshape(len(given), -1), raw.vertices, str(file))
+        columns = fill_missing(given.reshape(len(given), -1), raw.vertices, str(file))
         mesh = load_mesh(body.path, self.reading, part=body.part)
         vertices = mesh.vertices
         if not np.array_equal(vertices, raw.vertices):
@@ -257,7 +257,7 @@ def attribute_source(path: str, root: Path | None = None) -> AttributeSource:
     return (TetAttribute if name.endswith(_TETRAHEDRA) else VertexAttribute)(path, root)
 
 
-def of_bodies_read(source: AttributeSource, options: LoadOptions) -> AttributeSource:
+def with_load_options(source: AttributeSource, options: LoadOptions) -> AttributeSource:
     """The source for bodies that are read so, with cavities or without; carried inside from closed ones."""
     closed = replace(options, allow_open=False, mend="auto")
     return replace(source, reading=closed) if isinstance(source, VertexAttribute) else source
@@ -274,7 +274,7 @@ def attribute_sources(given: Sequence[str], root: Path | None) -> dict[str, Attr
     return found
 
 
-def completed(values: Values, points: Values, what: str) -> Values:
+def fill_missing(values: Values, points: Values, what: str) -> Values:
     """Values (P,) or (P, C), those that are not known (NaN) taken from the nearest of points (P, 3) that has one.
 
     It is logged of `what` that is; a MeshError where more than a tenth is not known.

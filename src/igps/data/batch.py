@@ -16,7 +16,7 @@ from torch import Tensor
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature
 
-Several = slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
+Indices = slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
 """Some of a batch or dataset: a slice, numbers, a mask, and of a dataset names."""
 
 
@@ -150,14 +150,14 @@ class SignatureBatch:
     @overload
     def __getitem__(self, index: int) -> Body: ...
     @overload
-    def __getitem__(self, index: Several) -> SignatureBatch: ...
-    def __getitem__(self, index: int | Several) -> Body | SignatureBatch:
+    def __getitem__(self, index: Indices) -> SignatureBatch: ...
+    def __getitem__(self, index: int | Indices) -> Body | SignatureBatch:
         """One shape as a `Body` by its number; some as a batch by a slice, numbers, or a mask."""
-        index = number_of(index)
+        index = scalar_index(index)
         if isinstance(index, int | np.integer):
             number = range(len(self))[index]
             return self[number : number + 1].to("cpu")._body(0)
-        chosen = chosen_of(index, len(self))
+        chosen = resolve_indices(index, len(self))
         rows: slice | Tensor = torch.tensor(chosen, dtype=torch.int64, device=self.labels.device)
         if isinstance(index, slice) and (index.step or 1) > 0:  # views; tensors take no slices backwards
             rows = index
@@ -227,12 +227,12 @@ class SignatureBatch:
         return Body(eigenvalues, interior, surface, float(self.area[i]), float(self.volume[i]), self.ids[i], mesh)
 
 
-def number_of(index: Any) -> Any:
+def scalar_index(index: Any) -> Any:
     """The number in an array without dimensions, as permutations give them one by one; any other index as it is."""
     return operator.index(index) if isinstance(index, Tensor | np.ndarray) and index.ndim == 0 else index
 
 
-def chosen_of(index: Several, n: int) -> list[int]:
+def resolve_indices(index: Indices, n: int) -> list[int]:
     """The numbers that a slice, numbers, or a mask choose among n; an IndexError where they do not fit."""
     if isinstance(index, slice):
         return list(range(n))[index]

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from igps._files import whole_file
 from igps.data.cache import check_checksum, checksum, decode, encode
 from igps.data.requirements import Requirements
-from igps.data.sources import Bodies, file_of
+from igps.data.sources import Bodies, file_name_of
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature, SignatureConfig
 
@@ -26,7 +26,7 @@ _KINDS = {"float64": "F64", "float32": "F32"}
 
 
 @dataclass(frozen=True)
-class About:
+class Contents:
     """What a collection tells of itself."""
 
     bodies: Bodies  # without folders
@@ -35,7 +35,7 @@ class About:
     reading: LoadOptions  # how the meshes were read
     config: SignatureConfig  # of the Signatures
 
-    def written(self) -> str:
+    def to_json(self) -> str:
         """All of it as JSON; of the paths, what their names tell."""
         bodies = {name: value for name, value in vars(self.bodies).items() if name != "paths"}
         labels = None if self.bodies.labels is None else list(map(str, self.bodies.labels))  # numbers may be given
@@ -43,13 +43,13 @@ class About:
         return json.dumps({**bodies, **words, "reading": asdict(self.reading), "config": asdict(self.config)})
 
     @staticmethod
-    def read(text: str) -> About:
+    def from_json(text: str) -> Contents:
         """What was written; a ValueError, KeyError or TypeError where it does not fit together."""
         told: dict[str, Any] = json.loads(text)
         names, parts, columns = _words(told["names"]), tuple(told["parts"]), dict(told.get("columns", {}))
         labels = None if told["labels"] is None else _words(told["labels"])
         columns = {name: tuple(values) for name, values in columns.items()}
-        paths = tuple(Path(file_of(name, part)) for name, part in zip(names, parts, strict=True))
+        paths = tuple(Path(file_name_of(name, part)) for name, part in zip(names, parts, strict=True))
         bodies = Bodies(paths, names, labels, parts, columns)
         classes, keys = _words(told["classes"]), _words(told["keys"])
         if len(keys) != len(names) or len(parts) != len(names) or len(set(names)) < len(names):
@@ -58,12 +58,12 @@ class About:
         if not set(labels or ()) <= set(classes) or not all(one is None or isinstance(one, str) for one in words):
             raise ValueError("its labels are none of its classes, or its parts or columns no words")
         try:
-            return About(bodies, classes, keys, LoadOptions(**told["reading"]), SignatureConfig(**told["config"]))
+            return Contents(bodies, classes, keys, LoadOptions(**told["reading"]), SignatureConfig(**told["config"]))
         except (TypeError, KeyError, ValueError) as error:
             raise ValueError(f"parameters of another version: {error}") from error
 
 
-def write_collection(path: Path, about: About, signature: Callable[[int], Signature]) -> None:
+def write_collection(path: Path, about: Contents, signature: Callable[[int], Signature]) -> None:
     """Write a collection, whole or not at all: a safetensors file of the arrays of all Signatures.
 
     A file that is there is replaced. Each Signature is asked for by its number, several times, and not kept.
@@ -86,7 +86,7 @@ def write_collection(path: Path, about: About, signature: Callable[[int], Signat
         kind, shape, n_bytes = arrays[i][name]
         header[f"{i}.{name}"] = {"dtype": _KINDS[kind], "shape": shape, "data_offsets": (end, end + n_bytes)}
         end += n_bytes
-    words = {"format": _FORMAT, "about": about.written(), "signatures": json.dumps(told)}
+    words = {"format": _FORMAT, "about": about.to_json(), "signatures": json.dumps(told)}
     words["checksum"] = checksum({}, {"about": words["about"]})
     text = json.dumps({"__metadata__": words, **header}, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
@@ -125,7 +125,7 @@ class CollectionFile:
             if metadata.get("format") != _FORMAT:
                 raise ValueError(f"its format is {metadata.get('format')!r}")
             check_checksum({}, {"about": metadata["about"], "checksum": metadata["checksum"]})
-            self.about = About.read(metadata["about"])
+            self.about = Contents.from_json(metadata["about"])
             self._told: list[dict[str, str]] = json.loads(metadata["signatures"])
             if len(self._told) != len(self.about.bodies):
                 raise ValueError(f"{len(self.about.bodies)} names for {len(self._told)} signatures")

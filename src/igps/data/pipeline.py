@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from igps._parallel import Failed, MachineError, attempt
-from igps.data.attribute_sources import of_bodies_read
+from igps.data.attribute_sources import with_load_options
 from igps.data.attributes import AttributeSource, with_attribute
 from igps.data.cache import AttributeCache, SignatureCache, content_digest
 from igps.mesh.formats import files_read, stamp_of
@@ -220,7 +220,7 @@ class SignaturePipeline:
         if values is not None:
             return with_attribute(signature, name, values)
         points = [getattr(signature, kind).points for kind in SAMPLE_KINDS]
-        rows = of_bodies_read(self.attributes[name], self.reading)(body, np.concatenate(points))
+        rows = with_load_options(self.attributes[name], self.reading)(body, np.concatenate(points))
         found = dict(zip(SAMPLE_KINDS, np.split(rows, [len(points[0])]), strict=True))
         signature = with_attribute(signature, name, found)
         cache.put(key, {kind: getattr(signature, kind).attributes[name] for kind in SAMPLE_KINDS})

@@ -92,14 +92,14 @@ class Bodies:
                 raise ValueError(f"{name}: expected numbers, got {value!r} of {body}. Correct it in {LABELS_FILE}.")
         return [float(value) for value in values]
 
-    def classed(self, rule: ClassRule) -> Bodies:
+    def with_classes(self, rule: ClassRule) -> Bodies:
         """The same bodies with the classes that a rule gives them; "folder" leaves them as they are."""
         if rule not in get_args(ClassRule):
             raise ValueError(f"classes: expected 'folder', 'body' or 'file', got {rule!r}.")
         if rule == "folder":
             return self
         if rule == "file":
-            return replace(self, labels=tuple(map(file_of, self.names, self.parts)))
+            return replace(self, labels=tuple(map(file_name_of, self.names, self.parts)))
         if all(part is None for part in self.parts):
             raise ValueError(f"classes: expected files of several bodies with 'body', but {self.names[0]} is one body.")
         # A file that cannot be read, such as an empty mask, has no parts; and costs the others nothing
@@ -137,7 +137,8 @@ def find_bodies(
     if not root.is_dir():
         raise FileNotFoundError(f"{root}: {'a file; a folder expected' if root.exists() else 'no such folder'}.")
     table = (root / LABELS_FILE).is_file()
-    bodies = (_from_labels_file(root, options) if table else _from_folder(root, options, attributes)).classed(classes)
+    bodies = _from_labels_file(root, options) if table else _from_folder(root, options, attributes)
+    bodies = bodies.with_classes(classes)
     if labelled and bodies.labels is None:
         raise ValueError(f"{root}: no classes found. Expected one folder per class, or a {LABELS_FILE} (file,label).")
     return bodies
@@ -216,7 +217,7 @@ def is_number(value: str | float | None) -> bool:
         return False
 
 
-def file_of(name: str, part: str | None) -> str:
+def file_name_of(name: str, part: str | None) -> str:
     """The name of the file of a body, by the name of the body."""
     return name if part is None else name.removesuffix(f"#{part}")
 

@@ -117,7 +117,7 @@ class IndividualDescriptor(Descriptor):
         form, *others = self.split(descriptions)
         return torch.cat([self.descriptor.short(form), *others], dim=1)
 
-    def beside(self, descriptor: Descriptor) -> "IndividualDescriptor":
+    def wrap(self, descriptor: Descriptor) -> "IndividualDescriptor":
         """The same numbers of side and size beside another descriptor."""
         kept = {"size": self.keeps_size, "side": self.twists is not None}
         found = IndividualDescriptor(descriptor, scale=self.scale, **kept)

@@ -78,7 +78,7 @@ def describe(
         raise TypeError(f"descriptor: expected a module, got {descriptor!r}. Give {given}.")
     if not len(dataset):
         raise ValueError("dataset: expected at least one mesh to describe, got none.")
-    kept = None if cache_tag is None else _Kept(dataset, cache_tag)
+    kept = None if cache_tag is None else _DescriptionStore(dataset, cache_tag)
     found = {} if kept is None else kept.found()
     failed: dict[int, Failure] = {}
     missing = [i for i in range(len(dataset)) if i not in found]
@@ -202,7 +202,7 @@ def describe_timed(job: tuple[nn.Module, SignatureDataset, torch.device]) -> tup
     return values, seconds
 
 
-class _Kept:
+class _DescriptionStore:
     """The descriptions of a dataset that are in its cache; done without where the cache cannot be written."""
 
     def __init__(self, dataset: SignatureDataset, cache_tag: str) -> None:

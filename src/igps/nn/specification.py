@@ -82,7 +82,7 @@ def specification(module: nn.Module) -> dict[str, Any]:
     return found
 
 
-def made(told: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
+def build_module(told: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
     """The module that a `specification` tells of; none is made that would need many more bytes of parameters.
 
     A ValueError where it tells of something else than modules of the library.
@@ -152,7 +152,7 @@ def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
             words = file.metadata() or {}
             if words.get("format") != _FORMAT:
                 raise ValueError(f"its format is {words.get('format')!r}")
-            module = made(json.loads(words["specification"]), path.stat().st_size)
+            module = build_module(json.loads(words["specification"]), path.stat().st_size)
             module.load_state_dict({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
         if not all(bool(torch.isfinite(one).all()) for one in module.state_dict().values()):
             raise ValueError("a parameter is not finite")

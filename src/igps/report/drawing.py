@@ -82,7 +82,7 @@ def save_figure(figure: Figure, path: Path, dpi: float | None = None) -> None:
         figure.savefig(path, dpi=dpi or "figure", metadata={"Date": None} if path.suffix == ".svg" else None)
 
 
-def shown(name: str) -> str:
+def shortened(name: str) -> str:
     """A name as it is drawn: the middle of a long one is left out, which would leave no room for the picture."""
     return name if len(name) <= _MOST_LETTERS else f"{name[: _MOST_LETTERS // 2]}…{name[1 - _MOST_LETTERS // 2 :]}"
 

@@ -14,7 +14,7 @@ from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import Descriptor
 from igps.report.drawing import axes_of
 from igps.report.results import System
-from igps.report.surfaces import STEPS, Surface, made
+from igps.report.surfaces import STEPS, Surface, run_jobs
 from igps.signature.signature import SAMPLE_KINDS, Signature
 
 
@@ -46,7 +46,7 @@ def keep_explanations(
     jobs = {
         p[0]: (descriptor, dataset.subset([place[name] for name in p]), [surfaces[name] for name in p]) for p in pairs
     }
-    found = made(_painted, jobs, "explanation", n_workers)
+    found = run_jobs(_painted, jobs, "explanation", n_workers)
     found = {name: found[name] for name in system.names if name in found}
     both = [np.concatenate(one.values) for one in found.values()]
     np.savez_compressed(

@@ -131,7 +131,7 @@ def _map(system: System) -> dict[str, Any] | None:
     return {
         "points": ((found.points - found.points.min(axis=0)) / extent).round(4).tolist(),
         "stress": round(found.stress, 3),
-        "cluster": clusters.numbers.tolist(),
+        "cluster": clusters.labels.tolist(),
         "stability": finite(clusters.stability, _DECIMALS),
         "n_stable": sum(one >= STABLE for one in clusters.stability),
         "tree": [[int(one), int(other), _significant(height)] for one, other, height, _ in clusters.tree.tolist()],

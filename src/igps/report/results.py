@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import Bodies, file_of
+from igps.data.sources import Bodies, file_name_of
 from igps.mesh.options import LoadOptions
 from igps.retrieval import PrecisionRecallCurve, RetrievalScores, precision_recall_curve, rank, retrieval_scores
 from igps.signature.signature import SignatureConfig
@@ -144,7 +144,7 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
         if meshes is None:
             paths = tuple(Path(one["path"]) for one in summary["meshes"])
         else:
-            paths = tuple(meshes / file_of(name, part) for name, part in zip(names, parts, strict=True))
+            paths = tuple(meshes / file_name_of(name, part) for name, part in zip(names, parts, strict=True))
         columns = {str(name): tuple(values) for name, values in summary.get("columns", {}).items()}
         bodies, reading = Bodies(paths, names, None, parts, columns), LoadOptions(**summary["reading"])
         return SignatureDataset(bodies, SignatureConfig(**summary["signature"]), summary["cache_dir"], reading=reading)

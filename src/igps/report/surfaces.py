@@ -71,15 +71,17 @@ def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | Non
     if missing:
         make = partial(_surface_of_body, dataset.pipeline, fitting_vertices(len(names)))
         jobs = {names[i]: bodies[i] for i in missing}
-        kept |= made(make, jobs, "picture", n_workers)
+        kept |= run_jobs(make, jobs, "picture", n_workers)
     found = {name: kept[name] for name in names if name in kept}
     if missing:
         write_surfaces(path, found)
     return found
 
 
-def made(work: Callable[[Job], Result], jobs: Mapping[str, Job], what: str, n_workers: int | None) -> dict[str, Result]:
-    """The results of jobs by name; of one that fails the log tells what there is not."""
+def run_jobs(
+    work: Callable[[Job], Result], jobs: Mapping[str, Job], what: str, n_workers: int | None
+) -> dict[str, Result]:
+    """The results of jobs by name; a job that fails is logged as lacking `what`, and left out."""
     names, found = list(jobs), dict[str, Result]()
     with contextlib.closing(run(work, list(jobs.values()), n_workers=n_workers)) as outcomes:
         for number, outcome in tqdm(outcomes, total=len(jobs), desc=f"{what}s"):

@@ -31,7 +31,7 @@ _MOST_BYTES, _MOST = 100_000, 10_000
 _ABOUT = ("name", "source", "invariant_to", "scale")
 
 
-def written(path: str | Path) -> HistogramDescriptor:
+def load_yaml(path: str | Path) -> HistogramDescriptor:
     """The descriptor that a YAML file tells of, in evaluation mode.
 
     Its `parts` are histograms, or lists of histograms, with one share each. A histogram has `axes`, each a name or a
