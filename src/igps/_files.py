@@ -14,7 +14,7 @@ PARTIAL = ".partial"
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[IO[bytes]]:
     """A file to write beside its place, which is moved there in one step, whole or not at all."""
-    # By an ordinary open: files that tempfile or safetensors make are for their owner alone, whatever the umask.
+    # By an ordinary open: tempfile and safetensors make files that only their owner can read, whatever the umask.
     partial = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(8)}{PARTIAL}")
     try:
         with open(partial, "xb") as file:

@@ -105,7 +105,7 @@ def compare(
 
 
 def check_descriptors(descriptors: Sequence[Descriptor], dataset: SignatureDataset) -> None:
-    """Raise a ValueError where two have one name, by which results are told apart, or the signatures lack something."""
+    """Raise a ValueError where two have one name, which identifies results, or the signatures lack something."""
     check_names([one.name for one in descriptors])
     for descriptor in descriptors:
         descriptor.requirements.check_config(dataset.config)

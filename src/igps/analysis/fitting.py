@@ -71,7 +71,7 @@ def fit(
     n_workers: int | None = None,
     progress: bool = False,
 ) -> Descriptor:
-    """The descriptor under a head that is fitted to the classes of a dataset, with what that is worth in its `card`.
+    """The descriptor under a head that is fitted to the classes of a dataset, with its held-out scores in its `card`.
 
     Held-out scores are of folds that neither the fit nor the choice of the head has seen; the head that is returned is
     fitted to all bodies.
@@ -242,7 +242,7 @@ def _scores(
     chosen: Callable[[Tensor, Tensor], HeadName],
     fitted: Callable[..., Head | None],
 ) -> dict[str, float]:
-    """Means over held-out folds: of retrieval, and of a classifier what it is worth as such."""
+    """Means over held-out folds: scores of retrieval, and of classification if the head is a classifier."""
     from torchmetrics.functional.classification import binary_auroc, multiclass_calibration_error
 
     found: list[dict[str, float]] = []

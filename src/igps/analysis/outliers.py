@@ -219,7 +219,7 @@ def _nearness(distances: Values, codes: NDArray[np.int64]) -> tuple[Values, Valu
 
 
 def _deviations(values: Values, codes: NDArray[np.int64], name: str) -> tuple[Values, Values]:
-    """How many robust standard deviations values are above what is usual, and what that is.
+    """By how many robust standard deviations values exceed the usual value, and the usual value.
 
     Usual is what the others of the class have; of a class of one, other classes. Where less is as odd as more, a body
     of a class of two or three is as far away as from both, whatever is less: other classes tell which of the two is

@@ -56,7 +56,7 @@ MEANINGS = {
     "memory_limit": "gigabytes of memory that one body may take; no limit if not given",
     "cache_dir": "folder where computed signatures are kept; the user's cache directory if not given",
 }
-"""What options mean where the docstring of a command does not say it."""
+"""The help of options that the docstring of a command leaves out."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Described:
     descriptions: Tensor  # (N, ...)
     failures: list[Failure]  # the other bodies
     descriptor: Descriptor  # that described them
-    name: str | None  # by which it is found again; None where its centres are the collection's, which no name tells
+    name: str | None  # by which it can be loaded again; None where its centres were fitted to the collection
 
 
 def signatures(

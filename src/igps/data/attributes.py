@@ -15,8 +15,8 @@ from igps.mesh.loading import BodyRef
 from igps.signature.attributes import AttributeName
 from igps.signature.signature import SAMPLE_KINDS, SampleKind, Signature
 
-# What a key can tell.
-_Told = bool | int | float | str | PurePath
+# Values that a key of the cache can hold
+_Keyable = bool | int | float | str | PurePath
 
 PointFunction = Callable[..., NDArray[np.floating[Any]]]
 
@@ -58,7 +58,7 @@ class FunctionAttribute:
         remedy = "Give an object with this call and a method cache_tag(body), see igps.data.attributes.AttributeSource."
         kept = getattr(self.function, "__defaults__", None), getattr(self.function, "__kwdefaults__", None)
         used = [*(kept[0] or ()), *(kept[1] or {}).values(), *_constants(self.function)]
-        is_told = all(one is None or isinstance(one, _Told) for one in used)
+        is_told = all(one is None or isinstance(one, _Keyable) for one in used)
         if getattr(self.function, "__closure__", None) or inspect.ismethod(self.function) or not is_told:
             raise ValueError(f"attributes: {name} uses variables of what is around it, which no key tells. {remedy}")
         try:
@@ -78,7 +78,7 @@ def _constants(function: Callable[..., Any]) -> list[Any]:
         return []
     names = sorted({one.argval for one in dis.get_instructions(function) if one.opname == "LOAD_GLOBAL"})
     found = [function.__globals__[name] for name in names if name in function.__globals__]
-    return [one for one in found if isinstance(one, _Told | list | tuple | dict | set | np.ndarray)]
+    return [one for one in found if isinstance(one, _Keyable | list | tuple | dict | set | np.ndarray)]
 
 
 def _takes_body(function: Callable[..., Any]) -> bool:
@@ -100,7 +100,7 @@ def split_attributes(
     sources: dict[str, AttributeSource] = {}
     functions: dict[str, PointFunction] = {}
     for name, one in given.items():
-        if not callable(one) or name in get_args(AttributeName):  # which would be given to those who need the own
+        if not callable(one) or name in get_args(AttributeName):  # it would take the place of the library's own
             own = f"the library's, {', '.join(get_args(AttributeName))}, are named in SignatureConfig(attributes=...)"
             raise ValueError(f"attributes: expected functions or sources by other names, got {name}={one!r}: {own}.")
         if isinstance(one, AttributeSource):

@@ -146,7 +146,7 @@ class SignatureBatch:
     def __len__(self) -> int:
         return len(self.ids)
 
-    # No __iter__, by which Lightning would look for the size of a batch in its bodies: numbers iterate too.
+    # No __iter__: Lightning would infer the batch size from the bodies. Indexing by numbers iterates too.
     @overload
     def __getitem__(self, index: int) -> Body: ...
     @overload

@@ -46,12 +46,12 @@ class FileCache(Generic[T]):
 
     A file is written beside its place and moved there in one step, so that a reader sees all of it or nothing. What a
     killed run leaves of one is removed a day later, see `remove_abandoned`. Two processes that compute the same value
-    write the same bytes. Who may read folders and files is for the umask to say.
+    write the same bytes. Permissions follow the umask.
 
     The directory is made if it is missing.
     """
 
-    what: ClassVar[str]  # the values are, in a word
+    what: ClassVar[str]  # one word for the values, in messages
     folder: ClassVar[str] = ""  # of the values in the directory, "" where they lie in it themselves
     # A value to arrays and metadata, and back; the latter raises a ValueError, KeyError or TypeError if they make none
     _encode: Callable[[T], tuple[dict[str, np.ndarray], dict[str, str]]]
@@ -84,7 +84,7 @@ class FileCache(Generic[T]):
     def _read(self, key: str, read: Callable[[Any, Mapping[str, str]], Read]) -> Read | None:
         path = self.path(key)
         try:
-            with safe_open(path, framework="pt") as file:  # in NumPy's words it would copy every array
+            with safe_open(path, framework="pt") as file:  # framework="numpy" would copy every array
                 metadata = file.metadata() or {}
                 if metadata.get("format") != self._format or metadata.get("key") != key:
                     raise ValueError(f"not a {self._format} file of this key")
@@ -113,7 +113,7 @@ class FileCache(Generic[T]):
         except OSError as error:
             if error.errno is None or error.filename is not None:
                 raise
-            # That of a full disk does not say which.
+            # The error of a full disk names no file
             raise OSError(error.errno, error.strerror, str(path)) from error
 
     def remove_abandoned(self) -> None:
@@ -201,7 +201,7 @@ def _remove_abandoned(partials: Iterable[Path]) -> None:
         try:
             if time.time() - partial.stat().st_mtime > _ABANDONED:
                 partial.unlink()
-        except OSError:  # another process was first, or may and we may not
+        except OSError:  # another process was first, or only another user may
             continue
 
 
@@ -216,7 +216,7 @@ def _ordered(content: bytes) -> bytes:
 
 
 def checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
-    """Of all that a value is read from, in hexadecimal; it reads memory as fast as that can be read.
+    """Of all that a value is read from, in hexadecimal, as fast as memory can be read.
 
     The arrays enter by the sums of their columns, where each is seen as rows of 512 words of eight bytes.
     """

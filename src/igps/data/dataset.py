@@ -98,7 +98,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         self.config, self.reading = config.resolved(), reading
         self.pipeline = SignaturePipeline(self.config, reading, directory, sources, pre_transform, meshes)
         self.transform = transform
-        # What serves each body, once `precompute` has seen to it; Signatures that need no cache, and whose each is
+        # The cache entries that `precompute` found; Signatures outside of the cache, and each body's number among them
         self._hits: tuple[CacheHit | None, ...] = (None,) * len(self.bodies)
         self._loaded: CollectionFile | list[Signature] | None = None
         self._numbers: tuple[int, ...] = tuple(range(len(self.bodies)))
@@ -289,7 +289,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         return failures
 
     def _found(self) -> list[CacheHit | None]:
-        """What serves each body, as far as something does."""
+        """The cache entry of each body, None where there is none."""
         if self._loaded is not None or None not in self._hits:
             return list(self._hits)
         found = find_cached(self.pipeline, self.bodies)

@@ -33,7 +33,7 @@ _TABLE = (
 class FileStatCache:
     """The bodies of one pipeline, by path, part, size and times of change, in a small database beside its cache.
 
-    It may be removed at any time, and where it cannot be read or written, it is done without.
+    It may be removed at any time, and nothing fails where it cannot be read or written.
     """
 
     def __init__(self, pipeline: SignaturePipeline) -> None:

@@ -1,4 +1,4 @@
-"""The cache is filled: what it has of many bodies serves, the rest is computed by processes here or elsewhere."""
+"""Fill the cache: what it lacks of many bodies is computed by processes, here or elsewhere."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def fill(
     progress: bool, limits: Limits | None,
 ) -> tuple[list[CacheHit | None], list[Failure]]:  # fmt: skip
     """What serves each body, after computing what was missing; and what failed, see `SignatureDataset.precompute`."""
-    try:  # once, or each body would be told to be at fault
+    try:  # once here, or every body would be reported as a failure
         pipeline.cache_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         told = f"cache_dir: {pipeline.cache_dir} cannot be made ({error.strerror})"

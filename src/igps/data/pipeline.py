@@ -40,7 +40,7 @@ class PreTransform(Protocol):
 
 @dataclass(frozen=True)
 class BodyFile:
-    """What a key needs to know of a file."""
+    """What the key of a Signature depends on of a file."""
 
     stamp: tuple[int, int, int]  # see `stamp_of`
     digest: bytes  # of its content, and of what is read with it
@@ -132,7 +132,7 @@ class SignaturePipeline:
                     done[body] = attempt(partial(self.hit, body, file, mesh))
         except MeshError as error:  # of the file: so of each
             done = {**dict.fromkeys(missing.values(), Failed(str(error))), **done}
-        # Those that the file does not have are told so one by one.
+        # A body that the file lacks fails by itself
         return [done[body] if body in done else attempt(partial(self.hit, body, file)) for body in bodies]
 
     def hit(self, body: BodyRef, file: BodyFile | None = None, mesh: Mesh | None = None) -> CacheHit:

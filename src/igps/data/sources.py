@@ -129,10 +129,10 @@ def find_bodies(
 
     Raises:
         FileNotFoundError: the folder does not exist, or holds no file that may be a body.
-        ValueError: `labels.csv` cannot be understood, or no classes are told where they must be.
+        ValueError: `labels.csv` cannot be understood, or it has no classes where they are needed.
     """
     root, options = Path(root), options or LoadOptions()
-    if not _is_told(root.absolute()):
+    if not _is_utf8(root.absolute()):
         raise ValueError(f"{os.fsencode(root)!r}: a name in UTF-8 expected. Rename the folder.")
     if not root.is_dir():
         raise FileNotFoundError(f"{root}: {'a file; a folder expected' if root.exists() else 'no such folder'}.")
@@ -173,7 +173,7 @@ def given_bodies(
     files = [file_and_part(Path(path)) for path in paths]
     if not files:
         raise ValueError("paths: expected at least one mesh file, got none.")
-    if unknown := [file for file, _ in files if not _is_told(file.absolute())]:
+    if unknown := [file for file, _ in files if not _is_utf8(file.absolute())]:
         raise ValueError(f"paths: expected names in UTF-8, got {os.fsencode(unknown[0])!r}. Rename the file.")
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
@@ -280,22 +280,22 @@ def _expanded(
 def _files_in(folder: Path) -> list[Path]:
     """Files that may be bodies, but for hidden ones; of links those too that lead nowhere, which reading them says."""
 
-    def untold(error: OSError) -> None:
+    def warn(error: OSError) -> None:
         logger.warning(
             "%s: left out with all that is in it (%s). Ask for the right to read it.", error.filename, error.strerror
         )
 
     found = []
-    for place, folders, names in os.walk(folder, onerror=untold):
+    for place, folders, names in os.walk(folder, onerror=warn):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for path in (Path(place, name) for name in names if not name.startswith(".") and is_searched(name)):
-            if not _is_told(path):
+            if not _is_utf8(path):
                 logger.warning("%s: left out, its name is not UTF-8. Rename it.", os.fsencode(path))
             elif os.path.isfile(path) or not os.path.exists(path):  # of a pipe reading might wait for ever
                 found.append(path)
     return found
 
 
-def _is_told(path: Path) -> bool:
-    """Whether the name of a file can be printed and written: those of other systems may be bytes without meaning."""
+def _is_utf8(path: Path) -> bool:
+    """Whether the name of a file is text: names from other systems may be bytes that are not UTF-8."""
     return str(path).encode(errors="ignore").decode() == str(path)

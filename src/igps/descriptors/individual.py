@@ -87,7 +87,7 @@ class IndividualDescriptor(Descriptor):
             self.requirements |= self.twists.requirements
 
     def describe(self, batch: SignatureBatch) -> Tensor:
-        """(N, D + 53 + 2), of which side and size are there if they are told."""
+        """(N, D + 53 + 2); without the numbers of side or of size where these are not kept."""
         parts = [self.descriptor(batch).flatten(1)]
         if self.twists is not None:
             counts = self.twists(BatchFeatures(batch, self.training))

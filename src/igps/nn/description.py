@@ -203,7 +203,7 @@ def describe_timed(job: tuple[nn.Module, SignatureDataset, torch.device]) -> tup
 
 
 class _DescriptionStore:
-    """The descriptions of a dataset that are in its cache; done without where the cache cannot be written."""
+    """The descriptions of a dataset in its cache; a cache that cannot be written is no error."""
 
     def __init__(self, dataset: SignatureDataset, cache_tag: str) -> None:
         self._dataset, self._tag = dataset, cache_tag

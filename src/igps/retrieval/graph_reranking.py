@@ -165,7 +165,7 @@ def _rows(graph: sparse.csr_array) -> Integers:
 
 
 def _brought_forward(values: Floats, graph: sparse.csr_array, nearest: Integers) -> Floats:
-    """The values of pairs, with those of which one is the other's nearest before all others, in their own order."""
+    """The values of pairs; those of pairs of nearest neighbours made smaller than all others, in their own order."""
     nearest = nearest.astype(graph.indices.dtype)
     rows = _rows(graph)
     first = (nearest[rows] == graph.indices) | (nearest[graph.indices] == rows)

@@ -74,7 +74,7 @@ class AxialHistogram(SampleHistogram):
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, 3, ...) histograms of some samples of N shapes."""
         mask, potential = features.samples.mask, barycentroid_potential(features.embedded(self.embedding))
-        # What is padded may be anything, and counts nowhere.
+        # Padding may hold anything, and counts nowhere
         points, directions, potential, own = (
             one.masked_fill(~mask.view(*mask.shape, *[1] * (one.ndim - 2)), 0)
             for one in (

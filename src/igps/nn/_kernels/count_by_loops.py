@@ -31,7 +31,7 @@ Blocks = Sequence[tuple[int, int]]
 
 
 class Layout(NamedTuple):
-    """What a count has no gradient by, see `count_pairs`."""
+    """The arguments of a count without gradients, see `count_pairs`."""
 
     classes: Tensor
     n_classes: int
