@@ -120,7 +120,7 @@ def main(
             found = command(**options)
     verdict = found if isinstance(found, Verdict) else Verdict(found, True)
     if as_json:
-        print(json.dumps(finite(verdict.told), indent=2))
+        print(json.dumps(finite(verdict.result), indent=2))
     if not verdict.is_good:
         sys.exit(1)
 

@@ -71,9 +71,9 @@ class Folder:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a command tells, and whether its exit status is 0."""
+    """The result of a command, and whether its exit status is 0."""
 
-    told: Any
+    result: Any
     is_good: bool
 
 

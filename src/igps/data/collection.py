@@ -126,18 +126,18 @@ class CollectionFile:
                 raise ValueError(f"its format is {metadata.get('format')!r}")
             check_checksum({}, {"about": metadata["about"], "checksum": metadata["checksum"]})
             self.about = Contents.from_json(metadata["about"])
-            self._told: list[dict[str, str]] = json.loads(metadata["signatures"])
-            if len(self._told) != len(self.about.bodies):
-                raise ValueError(f"{len(self.about.bodies)} names for {len(self._told)} signatures")
+            self._metadata: list[dict[str, str]] = json.loads(metadata["signatures"])
+            if len(self._metadata) != len(self.about.bodies):
+                raise ValueError(f"{len(self.about.bodies)} names for {len(self._metadata)} signatures")
             names = set(self._file.keys())
         except (SafetensorError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(
                 f"{self.path}: expected a collection in the format {_FORMAT} ({error}). Export it again."
             ) from error
-        self._arrays: list[list[str]] = [[] for _ in self._told]
+        self._arrays: list[list[str]] = [[] for _ in self._metadata]
         for name in sorted(names):
             number, _, array = name.partition(".")
-            if number.isdecimal() and int(number) < len(self._told):
+            if number.isdecimal() and int(number) < len(self._metadata):
                 self._arrays[int(number)].append(array)
 
     def __reduce__(self) -> tuple[type[CollectionFile], tuple[Path]]:
@@ -145,7 +145,7 @@ class CollectionFile:
 
     def __getitem__(self, index: int) -> Signature:
         """A Signature by its number, its arrays views of the file; a ValueError where it is damaged, or out of date."""
-        metadata = self._told[index]
+        metadata = self._metadata[index]
         try:
             tensors = {name: self._file.get_tensor(f"{index}.{name}").numpy() for name in self._arrays[index]}
             check_checksum(tensors, metadata)
@@ -163,7 +163,7 @@ class CollectionFile:
 
     def notes(self, index: int) -> tuple[str, ...]:
         """What was done to the mesh of a Signature, in words."""
-        return tuple(json.loads(self._told[index]["notes"]))
+        return tuple(json.loads(self._metadata[index]["notes"]))
 
 
 def _words(values: Sequence[object]) -> tuple[str, ...]:

@@ -106,7 +106,7 @@ class SignaturePipeline:
         file = self._file(body)
         hit = self._lookup(body, file)
         found = None if hit is None else self.read(hit)
-        return self._made(body, file)[1] if found is None else found
+        return self._compute(body, file)[1] if found is None else found
 
     def fill(self, bodies: Sequence[BodyRef]) -> list[CacheHit | Failed]:
         """Put the Signatures of bodies of one file into the cache; they are not returned, to spare the way back.
@@ -138,7 +138,7 @@ class SignaturePipeline:
     def hit(self, body: BodyRef, file: BodyFile | None = None, mesh: Mesh | None = None) -> CacheHit:
         """What serves a body, which is in the cache then; a MeshError where it cannot be used."""
         file = file or self._file(body)
-        return self._lookup(body, file) or self._made(body, file, mesh)[0]
+        return self._lookup(body, file) or self._compute(body, file, mesh)[0]
 
     def lookup(self, bodies: Sequence[BodyRef]) -> list[CacheHit | None]:
         """What in the cache serves each body of one file, None where nothing does; a MeshError if unreadable."""
@@ -186,10 +186,10 @@ class SignaturePipeline:
         hit = CacheHit(key, cache.path(key).stat().st_size, cache.notes(key), file.stamp)
         return self.with_attributes(body, hit)
 
-    def _made(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> tuple[CacheHit, Signature]:
+    def _compute(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> tuple[CacheHit, Signature]:
         """The Signature of a body, with what serves it from now on."""
         cache = SignatureCache(self.cache_dir)
-        key, signature = self._plain(body, file, mesh)
+        key, signature = self._compute_plain(body, file, mesh)
         keys = {}
         for name in self.attributes:
             keys[name] = self._attribute_key(body, key, name)
@@ -202,7 +202,7 @@ class SignaturePipeline:
             cache.put(key, signature)
         return CacheHit(key, cache.path(key).stat().st_size, tuple(signature.notes), file.stamp, keys), signature
 
-    def _plain(self, body: BodyRef, file: BodyFile, mesh: Mesh | None) -> tuple[str, Signature]:
+    def _compute_plain(self, body: BodyRef, file: BodyFile, mesh: Mesh | None) -> tuple[str, Signature]:
         """The Signature as it is computed, and its key in the cache, where it is then."""
         cache = SignatureCache(self.cache_dir)
         for key in self._cached(body, file):

@@ -82,18 +82,18 @@ def specification(module: nn.Module) -> dict[str, Any]:
     return found
 
 
-def build_module(specified: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
+def build_module(spec: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
     """The module of a `specification`; none is made that would need many more bytes of parameters.
 
     A ValueError where it specifies anything but modules of the library.
     """
     known: list[nn.Module] = []
 
-    def module(told: Mapping[str, Any]) -> nn.Module:
-        if set(told) == {"same_as"}:
-            return known[told["same_as"]]
-        path, arguments = told["class_path"], told.get("init_args", {})
-        if not set(told) <= {"class_path", "init_args"} or not _CLASS.fullmatch(path) or len(known) >= _MOST_MODULES:
+    def module(spec: Mapping[str, Any]) -> nn.Module:
+        if set(spec) == {"same_as"}:
+            return known[spec["same_as"]]
+        path, arguments = spec["class_path"], spec.get("init_args", {})
+        if not set(spec) <= {"class_path", "init_args"} or not _CLASS.fullmatch(path) or len(known) >= _MOST_MODULES:
             raise ValueError(f"{path!r} is no module of igps, or one of too many")
         room, _, name = path.rpartition(".")
         kind = getattr(importlib.import_module(room), name, None)
@@ -107,12 +107,12 @@ def build_module(specified: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
         known[place] = kind(**{name: value(one) for name, one in arguments.items()})
         return known[place]
 
-    def value(told: Any) -> Any:
-        if isinstance(told, Mapping):
-            return module(told)
-        return tuple(map(value, told)) if isinstance(told, list | tuple) else told
+    def value(spec: Any) -> Any:
+        if isinstance(spec, Mapping):
+            return module(spec)
+        return tuple(map(value, spec)) if isinstance(spec, list | tuple) else spec
 
-    return module(specified)
+    return module(spec)
 
 
 def _numbers(values: Any) -> Iterator[int]:
