@@ -13,12 +13,11 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from igps._arrays import Floats, Integers
 from igps._files import whole_file
 from igps._parallel import Failed, run
 from igps.mesh.mesh import Mesh, MeshError
 from igps.shapes.benchmark import is_whole_off, off_text, shapes_folder
-from igps.shapes.meshing import Faces
-from igps.shapes.solids import Array
 from training.graded.bodies import Body, Pose, draw_body, draw_pose
 from training.graded.individuals import individual
 from training.graded.kinds import LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, BodyClass, body_classes
@@ -45,13 +44,13 @@ class GradedShape:
     notes: what was done to the surface, in words.
     """
 
-    vertices: Array
-    faces: Faces
+    vertices: Floats
+    faces: Integers
     label: str
     body: str
     name: str
     genus: int
-    motion: Array
+    motion: Floats
     notes: tuple[str, ...]
 
 

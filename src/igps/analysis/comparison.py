@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from igps._arrays import Singles
 from igps._parallel import Failed, one_thread, run
 from igps.data.dataset import Failure, SignatureDataset
 from igps.mesh.mesh import MeshError
@@ -23,7 +23,7 @@ from igps.retrieval.scores import SCORE_NAMES, RetrievalScores, retrieval_scores
 logger = logging.getLogger(__name__)
 
 # A description (1, ...), and the seconds that it took
-_Description = tuple[NDArray[np.float32], float]
+_Description = tuple[Singles, float]
 # Entries of the triples (query, gallery, entry of a description) that one block of distances may hold at once.
 _BLOCK_ENTRIES = 2**26
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from igps._arrays import Floats
 from igps.analysis.correspondence import dissimilarity
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.descriptors.individual import IndividualDescriptor
@@ -25,7 +25,7 @@ _NODES, _MISSED = (16, 64, 256, 1024), 1e-8
 # Samples that a point of the surface takes its value from
 _NEIGHBOURS = 12
 
-Shares = Mapping[SampleKind, NDArray[np.float64]]
+Shares = Mapping[SampleKind, Floats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,7 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
     return torch.cat([units, gradient[n:]]), distance
 
 
-def on_surface(shares: Shares, samples: Mapping[SampleKind, NDArray[np.float64]], points: NDArray[np.float64]) -> Any:
+def on_surface(shares: Shares, samples: Mapping[SampleKind, Floats], points: Floats) -> Any:
     """(V,) what the body has of the difference about each point: 1 where it is as everywhere, if the sum were 1.
 
     Of the samples of each kind, shares (P,) and places (P, 3); and points (V, 3), such as vertices.

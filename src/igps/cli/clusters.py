@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats
 from igps.analysis.clusters import STABLE, Linkage, clusters_of
 from igps.analysis.comparison import pair_distances
 from igps.analysis.map import Layout, body_map
@@ -116,9 +116,7 @@ def map_bodies(
     return rows
 
 
-def _compared(
-    folder: Folder, descriptor: str, **reading: Any
-) -> tuple[SignatureDataset, NDArray[np.float64], list[str]]:
+def _compared(folder: Folder, descriptor: str, **reading: Any) -> tuple[SignatureDataset, Floats, list[str]]:
     """The bodies, their distances, and the class of each, "" where that is not known."""
     found = described(folder, descriptor, **reading)
     print_failures(found.failures, len(found.dataset))

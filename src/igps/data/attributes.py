@@ -11,6 +11,7 @@ from typing import Any, Protocol, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from igps._arrays import Floats
 from igps.mesh.loading import BodyRef
 from igps.signature.attributes import AttributeName
 from igps.signature.signature import SAMPLE_KINDS, SampleKind, Signature
@@ -28,7 +29,7 @@ class AttributeSource(Protocol):
     def cache_tag(self, body: BodyRef) -> str:
         """All that the values depend on beside the points, such as a checksum of the image."""
 
-    def __call__(self, body: BodyRef, points: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
+    def __call__(self, body: BodyRef, points: Floats) -> NDArray[np.floating[Any]]:
         """Values (P,) or (P, C) at points (P, 3) in the coordinates of the body's file."""
 
 
@@ -47,7 +48,7 @@ class FunctionAttribute:
     A ValueError where its source code is not known, or does not tell what it does.
     """
 
-    function: Callable[[BodyRef, NDArray[np.float64]], NDArray[np.floating[Any]]]
+    function: Callable[[BodyRef, Floats], NDArray[np.floating[Any]]]
 
     def __post_init__(self) -> None:
         self.cache_tag(None)
@@ -67,7 +68,7 @@ class FunctionAttribute:
             raise ValueError(f"attributes: the source code of {name} is not known ({error}). {remedy}") from error
         return f"function {name} {hashlib.sha256(source.encode()).hexdigest()} {used} {body}"
 
-    def __call__(self, body: BodyRef, points: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
+    def __call__(self, body: BodyRef, points: Floats) -> NDArray[np.floating[Any]]:
         """Its values."""
         return self.function(body, points)
 

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from igps._arrays import Floats, Singles
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature
 
@@ -93,7 +94,7 @@ _START_OF_ZERO = _start(0)
 class Body:
     """One shape of a batch, without padding, as arrays."""
 
-    eigenvalues: NDArray[np.float64]  # (K,) ascending, 1/length²
+    eigenvalues: Floats  # (K,) ascending, 1/length²
     interior: Samples  # their points measured from their centre
     surface: Samples  # likewise
     area: float  # of the surface, length²
@@ -274,7 +275,7 @@ def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:
 def _samples_of(batch: SampleBatch, i: int, n_eigenpairs: int) -> Samples:
     real = batch.mask[i]
 
-    def array(values: Tensor) -> NDArray[np.float32]:
+    def array(values: Tensor) -> Singles:
         return values[i, real].numpy()
 
     return Samples(

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from igps._arrays import Singles
 from igps._files import PARTIAL, whole_file
 from igps.signature.signature import SAMPLE_KINDS, SampleKind, Samples, Signature, SignatureConfig
 
@@ -176,11 +176,11 @@ class SignatureCache(FileCache[Signature]):
         return self._read(key, lambda file, metadata: json.loads(metadata["unit"]))
 
 
-def _arrays_alone(arrays: Mapping[Any, NDArray[np.float32]]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+def _arrays_alone(arrays: Mapping[Any, Singles]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     return {name: np.ascontiguousarray(one) for name, one in arrays.items()}, {}
 
 
-class AttributeCache(FileCache[dict[SampleKind, NDArray[np.float32]]]):
+class AttributeCache(FileCache[dict[SampleKind, Singles]]):
     """Attributes of the samples of one Signature by kind, beside the Signatures."""
 
     what, folder = "attribute", "attributes"
@@ -188,7 +188,7 @@ class AttributeCache(FileCache[dict[SampleKind, NDArray[np.float32]]]):
     _decode = staticmethod(lambda tensors, metadata: {kind: tensors[kind] for kind in SAMPLE_KINDS})
 
 
-class DescriptionCache(FileCache[NDArray[np.float32]]):
+class DescriptionCache(FileCache[Singles]):
     """Descriptions by key, beside the Signatures, see `FileCache`."""
 
     what, folder = "description", "descriptions"

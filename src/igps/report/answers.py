@@ -9,8 +9,8 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats
 from igps.analysis.clusters import STABLE, Clusters
 from igps.analysis.groups import GroupTest
 from igps.analysis.map import BodyMap
@@ -72,7 +72,7 @@ def outliers_figure(pictured: Sequence[tuple[Outlier, str, Mesh]]) -> Figure:
     return figure
 
 
-def explanation_figure(painted: Sequence[tuple[str, Mesh, NDArray[np.float64]]]) -> Figure:
+def explanation_figure(painted: Sequence[tuple[str, Mesh, Floats]]) -> Figure:
     """Named bodies from the front and from behind, in red what each face (F,) has of the difference, blue if less."""
     figure = new_figure(7, 3.4 * len(painted))
     all_axes = figure.subplots(len(painted), 2, squeeze=False)

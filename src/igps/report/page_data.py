@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Integers
 from igps.analysis.clusters import STABLE, clusters_of
 from igps.analysis.map import body_map
 from igps.report.explanations import Painted
@@ -138,9 +138,7 @@ def _map(system: System) -> dict[str, Any] | None:
     }
 
 
-def _confusion(
-    order: NDArray[np.int64], labels: Sequence[str], classes: Sequence[str]
-) -> dict[str, list[list[int]]] | None:
+def _confusion(order: Integers, labels: Sequence[str], classes: Sequence[str]) -> dict[str, list[list[int]]] | None:
     """(C, C) how many shapes of a class (row) have their nearest in a class (column), and so for their first tiers."""
     if not order.size:
         return None
@@ -153,9 +151,7 @@ def _confusion(
     return {"nearest": nearest.tolist(), "tier": tier.tolist()}
 
 
-def _worst(
-    system: System, order: NDArray[np.int64], scores: RetrievalScores, places: NDArray[np.int64]
-) -> list[dict[str, Any]]:
+def _worst(system: System, order: Integers, scores: RetrievalScores, places: Integers) -> list[dict[str, Any]]:
     """The queries whose rankings are most wrong, at most twenty, the worst first; ranks count from 1.
 
     The later the first shape of the query's class comes, the worse; then the lower the first tier; then by name. So a

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from igps._arrays import Integers
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies, file_name_of
 from igps.mesh.options import LoadOptions
@@ -46,7 +46,7 @@ class System:
         """Precision and recall; None where there are no scores."""
         return precision_recall_curve(self.distances, self.labels or ()) if self.is_scored else None
 
-    def ranked(self) -> NDArray[np.int64]:
+    def ranked(self) -> Integers:
         """(N, N − 1) the other meshes, nearest first, ties in the order of the meshes."""
         n = len(self.names)
         order = rank(self.distances)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
+from igps._arrays import Floats, Integers
 from igps._parallel import Failed, Job, Result, run
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
@@ -170,9 +171,7 @@ def _is_current(pipeline: SignaturePipeline, body: BodyRef, kept: Surface | None
         return True
 
 
-def clustered(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], n_vertices: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def clustered(vertices: Floats, faces: Integers, n_vertices: int) -> tuple[Floats, Integers]:
     """At most `n_vertices` vertices, each the mean of those in a cell of a grid (Rossignac and Borrel 1993).
 
     Handles and gaps may close, so that the result is good to look at and for nothing else.

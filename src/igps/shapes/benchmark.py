@@ -11,11 +11,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from igps._arrays import Floats, Integers
 from igps._files import whole_file
 from igps._parameters import check_at_least
-from igps.shapes.meshing import Faces, defect, mesh, roughen
+from igps.shapes.meshing import defect, mesh, roughen
 from igps.shapes.skeleton import Skeleton, pose
-from igps.shapes.solids import Array
 from igps.shapes.templates import TEMPLATES
 
 _VERSION = 1  # raised whenever the same arguments would give other meshes
@@ -27,12 +27,12 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class GeneratedShape:
-    vertices: Array  # (V,3) float64, in units of about half the height of a figure
-    faces: Faces  # (F,3) int64, outward
+    vertices: Floats  # (V,3) float64, in units of about half the height of a figure
+    faces: Integers  # (F,3) int64, outward
     label: str  # name of the class
     name: str  # class and running number, such as ``biped/00``
     genus: int  # number of handles of the surface; V − E + F = 2 − 2 genus
-    rotation: Array  # (3,3) what turned it out of its upright frame; ``vertices @ rotation`` stands upright again
+    rotation: Floats  # (3,3) what turned it out of its upright frame; ``vertices @ rotation`` stands upright again
 
 
 class ArticulatedShapes:
@@ -163,7 +163,7 @@ def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
     return folder
 
 
-def off_text(vertices: Array, faces: Faces) -> str:
+def off_text(vertices: Floats, faces: Integers) -> str:
     """A mesh in the Object File Format; 17 digits give the same float64 values back."""
     lines = [f"OFF\n{len(vertices)} {len(faces)} 0"]
     lines += [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in vertices.tolist()]
