@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,14 +12,12 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from igps._arrays import Booleans, Floats
-from igps._threads import ALONE, Team
+from igps._threads import ALONE, Result, Team
 from igps.nn._kernels.count_by_torch import count_by_torch
 from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES, Axes, Numbers, Places
 from igps.nn._kernels.pair_loops import count_block, gradient_block
 from igps.nn._kernels.pair_values import PairValues, centres_of, cosine_factors, with_tensors
 from igps.nn._precision import full_precision
-
-Result = TypeVar("Result")
 
 # Pairs of a block, whose values stay in a core's second-level cache; more could overflow the integers of `pair_sums`
 _BLOCK, _MOST_COLUMNS = 2**18, 2048
