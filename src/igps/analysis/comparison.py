@@ -131,7 +131,7 @@ def _result(
     try:
         if not found:
             raise ValueError("no mesh could be described.")
-        values = torch.from_numpy(np.concatenate([one for one, _ in found]))
+        values = torch.from_numpy(np.stack([one[0] for one, _ in found]))
         distances = pair_distances(descriptor, values, progress=progress)
         scores = retrieval_scores(distances, labels)
     except Exception as reason:  # the other descriptors go on
