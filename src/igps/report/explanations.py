@@ -14,7 +14,7 @@ from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import Descriptor
 from igps.report.drawing import axes_of
 from igps.report.results import System
-from igps.report.surfaces import STEPS, Surface, run_jobs
+from igps.report.surfaces import STEPS, PageSurface, run_jobs
 from igps.signature.signature import SAMPLE_KINDS, Signature
 
 
@@ -32,7 +32,7 @@ def keep_explanations(
     system: System,
     dataset: SignatureDataset,
     descriptor: Descriptor,
-    surfaces: Mapping[str, Surface],
+    surfaces: Mapping[str, PageSurface],
     *,
     n_workers: int | None = None,
 ) -> dict[str, Painted]:
@@ -61,7 +61,7 @@ def keep_explanations(
     return found
 
 
-def read_explanations(path: Path, surfaces: Mapping[str, Surface]) -> dict[str, Painted]:
+def read_explanations(path: Path, surfaces: Mapping[str, PageSurface]) -> dict[str, Painted]:
     """What `keep_explanations` wrote, by name, as far as the surfaces are still those; nothing without a file."""
     if not path.is_file():
         return {}
@@ -76,7 +76,7 @@ def read_explanations(path: Path, surfaces: Mapping[str, Surface]) -> dict[str, 
     return found
 
 
-def _painted(job: tuple[Descriptor, SignatureDataset, list[Surface]]) -> Painted:
+def _painted(job: tuple[Descriptor, SignatureDataset, list[PageSurface]]) -> Painted:
     descriptor, dataset, surfaces = job
     with one_thread():
         found = explain(descriptor, dataset.batch([0]), dataset.batch([1]))
@@ -85,7 +85,7 @@ def _painted(job: tuple[Descriptor, SignatureDataset, list[Surface]]) -> Painted
     return Painted(dataset.bodies.names[1], found.summary(), (one, other))
 
 
-def _values(mesh: Mesh, signature: Signature, shares: Shares, surface: Surface) -> NDArray[np.uint8]:
+def _values(mesh: Mesh, signature: Signature, shares: Shares, surface: PageSurface) -> NDArray[np.uint8]:
     """At the vertices of a surface, which lies in its cube as the mesh does in its own."""
     axes = axes_of(signature.surface.points)
     turned = {kind: getattr(signature, kind).points @ axes for kind in SAMPLE_KINDS}

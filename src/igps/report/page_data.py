@@ -13,7 +13,7 @@ from igps.analysis.clusters import STABLE, clusters_of
 from igps.analysis.map import body_map
 from igps.report.explanations import Painted
 from igps.report.results import Results, System
-from igps.report.surfaces import Surface
+from igps.report.surfaces import PageSurface
 from igps.retrieval import RetrievalScores
 
 N_WORST = 20
@@ -27,7 +27,7 @@ _LEAST_MAPPED, _MOST_MAPPED = 3, 3000
 
 
 def data_of(
-    results: Results, surfaces: Mapping[str, Surface], explanations: Mapping[str, Painted] | None = None
+    results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, Painted] | None = None
 ) -> dict[str, Any]:
     """All numbers of the page but the surfaces themselves; for `shapes` see `_shapes`, for `systems` `_of_system`."""
     classes = sorted(set(results.labels or ()))
@@ -50,7 +50,7 @@ def letters(content: bytes) -> str:
 
 
 def _shapes(
-    results: Results, surfaces: Mapping[str, Surface], classes: Sequence[str], explanations: Mapping[str, Painted]
+    results: Results, surfaces: Mapping[str, PageSurface], classes: Sequence[str], explanations: Mapping[str, Painted]
 ) -> list[dict[str, Any]]:
     """Of each body its name, class, notes and surface: place among the surfaces and numbers of vertices and faces.
 

@@ -35,7 +35,7 @@ _NEIGHBOURS = 4  # samples that a vertex takes its potential from
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class PageSurface:
     """What is shown of a body."""
 
     vertices: NDArray[np.uint16]  # (V, 3) in a cube around it, the longest principal axis along y, the next along x
@@ -60,7 +60,7 @@ def fitting_vertices(n_shapes: int) -> int:
     return int(np.clip(_MOST_BYTES / _BYTES_A_VERTEX / max(n_shapes, 1), _LEAST_VERTICES, _MOST_VERTICES))
 
 
-def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Surface]:
+def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, PageSurface]:
     """The surfaces of meshes by name: read from an archive those that are there, computed and written the others.
 
     A mesh file that has changed since is read again; of one that is gone, what was kept serves. A mesh that cannot be
@@ -93,11 +93,11 @@ def run_jobs(
     return found
 
 
-def _surface_of_body(pipeline: SignaturePipeline, n_vertices: int, body: BodyRef) -> Surface:
+def _surface_of_body(pipeline: SignaturePipeline, n_vertices: int, body: BodyRef) -> PageSurface:
     return surface_of(pipeline.mesh(body), pipeline.signature(body), n_vertices, pipeline.key(body))
 
 
-def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "") -> Surface:
+def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "") -> PageSurface:
     """The surface of a mesh with at most `n_vertices` vertices; its potential is from samples of the Signature."""
     try:
         small = simplify(mesh, n_vertices)
@@ -114,14 +114,14 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
     turned = vertices @ axes_of(samples)
     lowest, highest = turned.min(axis=0), turned.max(axis=0)
     in_cube = (turned - (lowest + highest) / 2) / (highest - lowest).max() + 0.5
-    return Surface(
+    return PageSurface(
         np.rint(STEPS * in_cube).astype(np.uint16), faces.astype(np.uint16),
         np.rint(255 * (values - low) / ((high - low) or 1)).astype(np.uint8), (low, high),
         len(mesh.vertices), len(mesh.faces), mesh.area, mesh.volume, key, mesh.unit,
     )  # fmt: skip
 
 
-def write_surfaces(path: Path, surfaces: Mapping[str, Surface]) -> None:
+def write_surfaces(path: Path, surfaces: Mapping[str, PageSurface]) -> None:
     """Write surfaces as a NumPy archive: the arrays of all behind each other, with the numbers that tell them apart."""
     many = list(surfaces.values())
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -140,7 +140,7 @@ def write_surfaces(path: Path, surfaces: Mapping[str, Surface]) -> None:
     )
 
 
-def read_surfaces(path: Path) -> dict[str, Surface]:
+def read_surfaces(path: Path) -> dict[str, PageSurface]:
     """What `write_surfaces` wrote, by name; nothing where there is no file; a ValueError of another kind of file."""
     if not path.is_file():
         return {}
@@ -154,14 +154,14 @@ def read_surfaces(path: Path) -> dict[str, Surface]:
     ]
     columns += [arrays[name].tolist() for name in ("names", "measures", "mesh_counts", "keys", "units")]
     return {
-        name: Surface(vertices, faces, potential, (low, high), n_v, n_f, area, volume, key, unit or None)
+        name: PageSurface(vertices, faces, potential, (low, high), n_v, n_f, area, volume, key, unit or None)
         for vertices, faces, potential, name, (low, high, area, volume), (n_v, n_f), key, unit in zip(
             *columns, strict=True
         )
     }
 
 
-def _is_current(pipeline: SignaturePipeline, body: BodyRef, kept: Surface | None) -> bool:
+def _is_current(pipeline: SignaturePipeline, body: BodyRef, kept: PageSurface | None) -> bool:
     """Whether the file is gone, or the one that the surface was made from."""
     if kept is None:
         return False
