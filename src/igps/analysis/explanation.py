@@ -101,7 +101,7 @@ def contents_of(descriptor: Descriptor) -> Descriptor:
 
 
 def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Tensor, float]:
-    """What a unit of each cell's contents counts, positive in the one and negative in the other body, and the distance.
+    """The share of a unit of each cell's contents in the distance, positive in the first body, and the distance itself.
 
     The descriptor is in double precision, see `explain`; its contents are (cells,), see `contents_of`, whose numbers of
     side and size come apart as they are and not as roots.
@@ -169,7 +169,7 @@ def _n_cells(descriptor: Descriptor) -> int:
 
 
 def _of_the_whole(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
-    """What side and size have of the distance, by the shares of all contents; without those that are not told."""
+    """The shares of side and size in the distance, where the descriptor keeps them, from those of all contents."""
     form, side, size = (shares[None], *shares.new_empty(2, 1, 0))
     if isinstance(descriptor, IndividualDescriptor):
         form, side, size = descriptor.split(shares[None])
@@ -191,7 +191,7 @@ def _doubled(batch: SignatureBatch) -> SignatureBatch:
 def _shared(
     histograms: HistogramDescriptor, batch: SignatureBatch, units: Tensor, whole: Mapping[str, float]
 ) -> tuple[dict[str, float], Shares]:
-    """What each histogram, and each sample, of a body has of the distance; it has half of what is of the whole."""
+    """The shares of each histogram and of each sample of a body in the distance; half of `whole` is the body's."""
     weights = [getattr(batch, kind).attributes[WEIGHT] for kind in SAMPLE_KINDS]
     totals = [torch.zeros_like(one) for one in weights]
     features, parts, first = BatchFeatures(batch, False), dict[str, float](), 0

@@ -229,7 +229,7 @@ def _has_pair(labels: Tensor) -> bool:
 
 
 def _retrieved(head: Head | None, histograms: Tensor, labels: Tensor) -> dict[str, float]:
-    """Scores among some bodies, those of whose class is no other left out."""
+    """Retrieval scores among some bodies, without those that are alone in their class."""
     vectors = histograms if head is None else head(histograms)
     distances = (chi_square if head is None else head.distances)(vectors, vectors)
     return retrieval_scores(distances, labels.tolist()).mean()

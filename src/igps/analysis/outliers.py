@@ -197,7 +197,7 @@ def _of_body(pipeline: SignaturePipeline, body: BodyRef, raw: RawBody) -> tuple[
 
 
 def _nearness(distances: Floats, codes: Integers) -> tuple[Floats, Floats, Integers]:
-    """Logarithms of mean distances to the nearest of the own class and of the nearest other, and which that is."""
+    """Logarithms of mean distances to the nearest of the own class and of the nearest other class, and its number."""
     n, n_classes = len(codes), int(codes.max()) + 1
     own, other, nearest = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, dtype=np.int64)
     members = [np.flatnonzero(codes == one) for one in range(n_classes)]

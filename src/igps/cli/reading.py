@@ -163,7 +163,7 @@ def print_failures(failures: Sequence[Failure], n_used: int) -> None:
 
 
 def with_side(descriptor: str, mirror: MirrorOption, size: Size) -> str:
-    """The name of a descriptor that tells mirror images apart, if asked for; a ValueError where it says otherwise."""
+    """The name with +side where mirror images are to be told apart; a ValueError where it contradicts the options."""
     for option, value, refused, mark in (("size", size, "ignore", SIZE), ("mirror", mirror, "same", SIDE)):
         if value == refused and mark in (name := descriptor_of(descriptor).name):
             raise ValueError(f"{option}: expected no {value!r} beside {name}, which is {mark}. Leave one of them out.")
@@ -173,7 +173,7 @@ def with_side(descriptor: str, mirror: MirrorOption, size: Size) -> str:
 
 
 def sized(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
-    """The name of a descriptor that keeps the size of the bodies, or not, as is asked for; says what is left open."""
+    """The name with or without +size, as the option and the units of the bodies say; prints what they leave open."""
     module = descriptor_of(descriptor)
     if SIZE in module.name or "scale" not in module.invariant_to:
         if size == "keep" and SIZE not in module.name:
@@ -215,7 +215,7 @@ def chosen_dataset(
     attribute: list[str] | None = None,
     **options: Any,
 ) -> SignatureDataset:
-    """The dataset that the options tell; nothing is computed.
+    """The dataset that the options select; nothing is computed.
 
     Args:
         signature: parameters of the signatures.

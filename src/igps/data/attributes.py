@@ -74,7 +74,7 @@ class FunctionAttribute:
 
 
 def _constants(function: Callable[..., Any]) -> list[Any]:
-    """The numbers, texts, arrays and the like that a function uses of its module."""
+    """The numbers, texts, arrays and the like that a function uses from its module."""
     if not inspect.isfunction(function):
         return []
     names = sorted({one.argval for one in dis.get_instructions(function) if one.opname == "LOAD_GLOBAL"})

@@ -40,7 +40,7 @@ class SampleBatch:
     attributes: Mapping[str, Tensor]  # by name, each (N, P) or (N, P, C) float32; a direction has C = 3
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SampleBatch:
-        """The batch of what a function makes of each of its tensors."""
+        """The batch with a function applied to each of its tensors."""
         attributes = {name: function(values) for name, values in self.attributes.items()}
         return SampleBatch(function(self.points), function(self.eigenfunctions), function(self.mask), attributes)
 
@@ -175,7 +175,7 @@ class SignatureBatch:
         return self.area.device
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SignatureBatch:
-        """The batch of what a function makes of each of its tensors."""
+        """The batch with a function applied to each of its tensors."""
         return replace(
             self,
             eigenvalues=function(self.eigenvalues),

@@ -35,7 +35,7 @@ def default_cache_dir() -> Path:
 
 
 def content_digest(path: Path, *beside: Path) -> bytes:
-    """Of what is in a file, and in others that are read with it."""
+    """A digest of the content of a file, and of others that are read with it."""
     with open(path, "rb") as file:
         digest = hashlib.file_digest(file, "sha256").digest()
     return hashlib.sha256(digest + b"".join(map(content_digest, beside))).digest() if beside else digest

@@ -27,7 +27,7 @@ _KINDS = {"float64": "F64", "float32": "F32"}
 
 @dataclass(frozen=True)
 class Contents:
-    """What a collection tells of itself."""
+    """What a collection holds beside the Signatures."""
 
     bodies: Bodies  # without folders
     classes: tuple[str, ...]  # all names of classes, in the order of their numbers
@@ -36,7 +36,7 @@ class Contents:
     config: SignatureConfig  # of the Signatures
 
     def to_json(self) -> str:
-        """All of it as JSON; of the paths, what their names tell."""
+        """All of it as JSON, but for the paths."""
         bodies = {name: value for name, value in vars(self.bodies).items() if name != "paths"}
         labels = None if self.bodies.labels is None else list(map(str, self.bodies.labels))  # numbers may be given
         words = {"labels": labels, "classes": list(map(str, self.classes)), "keys": self.keys}

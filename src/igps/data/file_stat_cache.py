@@ -47,7 +47,7 @@ class FileStatCache:
         self._is_useful = not (pipeline.attributes and pipeline.pre_transform)
 
     def ready(self, bodies: Iterable[BodyRef]) -> dict[BodyRef, CacheHit]:
-        """Those of the bodies whose files have not changed since, and whose Signature is there in full."""
+        """The bodies whose files have not changed since, and whose Signatures are complete in the cache."""
         found: dict[BodyRef, CacheHit] = {}
         if not self._path.exists() or not self._is_useful:
             return found

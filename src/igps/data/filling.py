@@ -110,7 +110,7 @@ def compute(
     limits: Limits,
     at_once: int | None = None,
 ) -> Generator[tuple[int, CacheHit | Failed], None, None]:
-    """Compute Signatures into the cache, and tell of each body by its number what serves it, or why it failed.
+    """Compute Signatures into the cache, and yield of each body, by number, its cache entry, or why it failed.
 
     The bodies of one file are computed in chunks, for each of which it is read once. Where one of a chunk loses its
     process, each of the chunk is tried again alone. With limits, which are of one body, every body is. A chunk has at
@@ -154,7 +154,7 @@ def wait_until_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
 
 
 def group_by_file(bodies: Bodies, numbers: Iterable[int], most: int | None = None) -> list[list[int]]:
-    """The numbers of bodies, those of one file together, so many at most."""
+    """The numbers of bodies in groups of one file each, at most so many in a group."""
     groups: dict[Path, list[int]] = {}
     for i in numbers:
         groups.setdefault(bodies.paths[i], []).append(i)

@@ -90,7 +90,7 @@ class SignaturePipeline:
         return mesh
 
     def _file(self, body: BodyRef) -> BodyFile:
-        """That of a body, or what stands for it in memory; a MeshError where it cannot be read."""
+        """The file of a body, or what stands for one in memory; a MeshError where it cannot be read."""
         if body in self.meshes:
             mesh = self.mesh(body)
             content = mesh.vertices.tobytes(), mesh.faces.tobytes(), repr((mesh.unit, mesh.notes)).encode()
@@ -146,7 +146,7 @@ class SignaturePipeline:
         return [self._lookup(body, self._file(body) if body in self.meshes else file) for body in bodies]
 
     def with_attributes(self, body: BodyRef, hit: CacheHit) -> CacheHit | None:
-        """What serves a body whose Signature in the cache is known, with its attributes; None if one is missing."""
+        """The cache entry of a body whose Signature is known, with its attributes; None if one is missing."""
         if not self.attributes or self.pre_transform is not None:
             return hit
         try:

@@ -46,7 +46,7 @@ class Compose:
 
     @property
     def cache_tag(self) -> str:
-        """Those of all."""
+        """The tags of all changes."""
         return "; ".join(one.cache_tag for one in self.transforms)  # type: ignore[attr-defined]
 
     def __call__(self, signature: Signature) -> Signature:

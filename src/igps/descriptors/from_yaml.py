@@ -32,7 +32,7 @@ _ABOUT = ("name", "source", "invariant_to", "scale")
 
 
 def load_yaml(path: str | Path) -> HistogramDescriptor:
-    """The descriptor that a YAML file tells of, in evaluation mode.
+    """The descriptor that a YAML file specifies, in evaluation mode.
 
     Its `parts` are histograms, or lists of histograms, with one share each. A histogram has `axes`, each a name or a
     name with its options; `eigenpairs` of its embedding, which an axis may have of its own; `samples`, `n_samples`, and

@@ -125,7 +125,7 @@ class IndividualDescriptor(Descriptor):
         return found
 
     def split(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(N, D) descriptions to those of the descriptor, and the numbers of side and of size, of which may be none."""
+        """(N, D) descriptions split into the descriptor's own, and the numbers of side and of size, perhaps none."""
         n_volumes = math.comb(_N_VECTORS, 3)
         n_size, n_side = 2 * self.keeps_size, 0 if self.twists is None else n_volumes + self.twists.n_cells // 2
         n_form = descriptions.shape[1] - n_side - n_size

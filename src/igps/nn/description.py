@@ -111,7 +111,7 @@ def describe(
 
 
 def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
-    """Give axes whose centres are quantiles those of a collection's samples; whether there were any.
+    """Fit the centres of axes by quantiles to the samples of a collection; whether there were such axes.
 
     What has its centres keeps them. Of each body as many samples count, the first 500. A ValueError where the samples
     have no such attribute.
@@ -128,7 +128,7 @@ def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
 
 
 def check_attributes(descriptor: nn.Module, names: Collection[str]) -> None:
-    """Raise a ValueError where an axis is of an attribute that is not among those of these names."""
+    """Raise a ValueError where an axis needs an attribute that is not among these names."""
     for one in descriptor.modules():
         if isinstance(one, Attribute) and one.name not in names:
             raise ValueError(
@@ -146,7 +146,7 @@ def check_centres(descriptor: nn.Module) -> None:
 
 @contextlib.contextmanager
 def evaluation_mode(module: nn.Module) -> Iterator[None]:
-    """The module and all in it in evaluation mode; afterwards each in the mode in which it was."""
+    """Put a module, and all in it, into evaluation mode, and afterwards back into the mode of before."""
     modes = [(one, one.training) for one in module.modules()]
     module.eval()
     try:
@@ -217,7 +217,7 @@ class _DescriptionStore:
         return {i: one for i, one in values.items() if one is not None}
 
     def keep(self, i: int, values: Singles) -> None:
-        """Keep a description, if the file is the one that it was before it was described."""
+        """Keep a description, unless its file has changed meanwhile."""
         key = self._keys[i]
         if key is None or not self._is_writable or self._dataset.subset([i]).cached_keys() != [key]:
             return

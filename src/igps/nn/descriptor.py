@@ -83,7 +83,7 @@ class Descriptor(Specified, ABC):
 
     @property
     def n_features(self) -> int:
-        """Numbers of a description; of a descriptor that does not know, those of a ball that is described for it."""
+        """The size of a description; found by describing a ball where a descriptor does not define it."""
         import trimesh
 
         ball = trimesh.creation.icosphere(subdivisions=3)

@@ -62,7 +62,7 @@ def keep_explanations(
 
 
 def read_explanations(path: Path, surfaces: Mapping[str, PageSurface]) -> dict[str, Painted]:
-    """What `keep_explanations` wrote, by name, as far as the surfaces are still those; nothing without a file."""
+    """What `keep_explanations` wrote, by name, where the surfaces are unchanged; nothing without a file."""
     if not path.is_file():
         return {}
     with np.load(path) as archive:

@@ -36,7 +36,7 @@ _NEIGHBOURS = 4  # samples that a vertex takes its potential from
 
 @dataclass(frozen=True, eq=False)
 class PageSurface:
-    """What is shown of a body."""
+    """The small surface of a body, for the page."""
 
     vertices: NDArray[np.uint16]  # (V, 3) in a cube around it, the longest principal axis along y, the next along x
     faces: NDArray[np.uint16]  # (F, 3), counter-clockwise seen from outside
@@ -162,7 +162,7 @@ def read_surfaces(path: Path) -> dict[str, PageSurface]:
 
 
 def _is_current(pipeline: SignaturePipeline, body: BodyRef, kept: PageSurface | None) -> bool:
-    """Whether the file is gone, or the one that the surface was made from."""
+    """Whether the file is gone, or unchanged since the surface was made."""
     if kept is None:
         return False
     try:

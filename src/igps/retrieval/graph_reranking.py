@@ -149,7 +149,7 @@ def _binary(lists: Integers) -> sparse.csr_array:
 
 
 def _reciprocal(lists: Integers) -> sparse.csr_array:
-    """Ones of the pairs of which each lies in the other's list."""
+    """Ones for the pairs that lie in each other's lists."""
     ones = _binary(lists)
     return ones.multiply(ones.T).tocsr()
 

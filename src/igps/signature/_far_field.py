@@ -97,7 +97,7 @@ def _hats(
     thirds: Floats,
     squared_sides: Floats,
 ) -> Floats:
-    """`Surface.hats`; thirds (F, 1) are those of the areas, and `at_vertex` (V, 3 F) sums over corners.
+    """`HatSurface.hats`; thirds (F, 1) are those of the areas, and `at_vertex` (V, 3 F) sums over corners.
 
     Over a face with corners v, a, b and t = v + a + b the hat of v has the mean (v + t)/4 and the second moment
     (2vvᵀ + vtᵀ + tvᵀ + ttᵀ + aaᵀ + bbᵀ + vvᵀ)/20.

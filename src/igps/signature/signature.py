@@ -128,11 +128,11 @@ class Signature:
         return self.interior.points[int(np.argmin(potential))]
 
     def map_samples(self, change: Callable[[Samples], Samples]) -> Signature:
-        """The Signature of what a function makes of its interior and its surface samples."""
+        """The Signature with a function applied to its interior and to its surface samples."""
         return replace(self, interior=change(self.interior), surface=change(self.surface))
 
     def truncated(self, config: SignatureConfig) -> Signature:
-        """The Signature of a configuration of which this one's is one of the larger, see `SignatureConfig.larger`."""
+        """The Signature of a smaller configuration: this one's is among its `SignatureConfig.larger`."""
 
         def cut(samples: Samples) -> Samples:
             attributes = samples.attributes.items()

@@ -75,7 +75,7 @@ class BranchHistogram(SampleHistogram):
 
 
 def _limbs(tree: MergeTree, longest: Tensor, heights: Tensor, neighbours: Tensor, mask: Tensor) -> Tensor:
-    """(B, P) which samples each of the longest branches has: those of the piece that joins no other yet."""
+    """(B, P) the samples of each of the longest branches: those of its piece before it joins another."""
     kept = longest[longest < len(tree.peaks)]
     order = heights.masked_fill(~mask, -torch.inf).argsort(descending=True, stable=True)
     above = order.argsort()[tree.saddles[kept]].clamp_min(1)

@@ -84,7 +84,7 @@ class CompiledCount(torch.autograd.Function):
 
 
 def _of_shapes(task: Callable[[int, Team], Result], n_shapes: int) -> list[Result]:
-    """What a task finds of each shape: of as many side by side as there are threads, or else with a team for each."""
+    """The result of a task for each shape: shapes side by side if there are as many as threads, else with a team."""
     with full_precision(), Team() as team:
         if n_shapes >= team.n_threads:
             return team.each(lambda number: task(number, ALONE), range(n_shapes))

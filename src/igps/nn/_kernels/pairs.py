@@ -68,7 +68,7 @@ def _count(classes: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: T
 
 
 def _known(ways: Sequence[int], tensors: list[Tensor]) -> list[PairValues]:
-    """Those of `WAYS` by their numbers, of tensors that follow the weights."""
+    """The `WAYS` of these numbers, with the tensors that follow the weights."""
     return with_tensors([WAYS[k] for k in ways], tensors[1:])
 
 
