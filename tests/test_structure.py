@@ -13,7 +13,7 @@ import igps
 PACKAGE = Path(igps.__file__).parent
 # From the ground up. A room imports only from the floors below its own, and itself; a new room is one more name here.
 FLOORS = (
-    ("_arrays", "_parameters", "_threads", "_compiled", "_workers"),
+    ("_arrays", "_files", "_parameters", "_threads", "_compiled", "_workers"),
     ("spectra", "retrieval", "_parallel"),
     ("mesh",),
     ("signature",),
@@ -27,7 +27,7 @@ FLOORS = (
     ("cli", "sklearn"),
 )
 # Rooms that are one file.
-FILES = ("_arrays", "_compiled", "_parallel", "_parameters", "_threads", "_workers", "sklearn")
+FILES = ("_arrays", "_compiled", "_files", "_parallel", "_parameters", "_threads", "_workers", "sklearn")
 
 
 def imported_rooms(path: Path) -> set[str]:

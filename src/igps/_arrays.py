@@ -1,5 +1,7 @@
 """Names of array types, for signatures."""
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,3 +10,4 @@ Singles = NDArray[np.float32]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 Surface = tuple[Floats, Integers]  # vertices (V, 3) and faces (F, 3)
+Real = TypeVar("Real", np.float32, np.float64)  # of arrays in single or in double precision

@@ -21,15 +21,11 @@ from concurrent.futures import (
 )
 from dataclasses import dataclass
 from itertools import islice
-from typing import TypeVar
 
 from igps._parameters import check_at_least
-from igps._threads import n_cores, one_thread, stay_on_one_thread
+from igps._threads import Job, Result, n_cores, one_thread, stay_on_one_thread
 from igps._threads import n_threads as available_threads
 from igps._workers import MachineError, Worker, workers_environment
-
-Job = TypeVar("Job")
-Result = TypeVar("Result")
 
 # A job whose process died is tried once more: an administrator or another program may have been the cause.
 _MOST_DEATHS = 2

@@ -36,10 +36,10 @@ def n_cores() -> int:
 
 def n_threads() -> int:
     """Threads of Python that this call may use: as many as cores, but no more than torch had before the call."""
-    if _present.most is not None:
-        return _present.most
+    if _state.most is not None:
+        return _state.most
     most = _get_torch_threads()
-    return min(n_cores(), most) if most > 1 else most  # files tell how many cores there are
+    return min(n_cores(), most) if most > 1 else most  # counting cores means reading files
 
 
 @contextlib.contextmanager
@@ -49,8 +49,8 @@ def one_thread() -> Iterator[None]:
     Other threads of the process keep their torch threads, and those started meanwhile get what they would have got.
     NumPy and SciPy have one setting for all threads: the last thread to leave restores it.
     """
-    outside = _present.most
-    _present.most = n_threads()
+    outside = _state.most
+    _state.most = n_threads()
     before = _get_torch_threads()
     try:
         with _blas_on_one_thread():
@@ -58,12 +58,12 @@ def one_thread() -> Iterator[None]:
             yield
     finally:
         _set_torch_threads(before)
-        _present.most = outside
+        _state.most = outside
 
 
 def stay_on_one_thread() -> None:
     """As `one_thread`, but for the rest of this thread's life, and with no other beside it."""
-    _present.most = 1
+    _state.most = 1
     _set_torch_threads(1)
 
 
@@ -120,13 +120,13 @@ class Team:
 ALONE = Team(1)
 
 
-class _Present(threading.local):
-    """What holds for the calls of one thread."""
+class _ThreadState(threading.local):
+    """Settings of one thread."""
 
     most: int | None = None  # `n_threads` inside `one_thread`; None outside
 
 
-_present = _Present()
+_state = _ThreadState()
 
 
 def _at_fork(**hooks: Callable[[], object]) -> None:
@@ -255,27 +255,27 @@ _new_threads = _NewThreads()
 
 @lru_cache(maxsize=1)
 def _libraries(n_modules: int) -> threadpoolctl.ThreadpoolController:
-    """Those that are loaded. Looking for them takes as long as a small product, and only an import brings others."""
+    """The loaded libraries. Finding them takes as long as a small product, and only an import adds to them."""
     return threadpoolctl.ThreadpoolController()
 
 
 def _blas_to_one_thread() -> Callable[[], None]:
     """For NumPy's and SciPy's products; returns what restores their threads.
 
-    As long as a thread is alive that has set a limit, threadpoolctl lets no other lift it; so who has set one lets go.
+    As long as the thread that set a limit is alive, threadpoolctl lets no other lift it: so it gives up its claim.
     """
     limits = _libraries(len(sys.modules)).limit(limits=1, user_api="blas")
-    _let_go()
+    _release_control()
 
     def restore() -> None:
         limits.restore_original_limits()
-        _let_go()
+        _release_control()
 
     return restore
 
 
-def _let_go() -> None:
-    """Threadpoolctl before 3.8 lets every thread set and lift limits, and has nothing to let go of."""
+def _release_control() -> None:
+    """Threadpoolctl before 3.8 lets every thread set and lift limits, and has no claim to give up."""
     clear = getattr(getattr(threadpoolctl, "OpenBLASController", None), "clear_controlling_thread", None)
     if clear is not None:
         clear()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.utils.validation import check_is_fitted
 
+from igps._arrays import Singles
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor as descriptor_of
@@ -71,7 +72,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
             self._n_features_out = self._features(shapes[:1]).shape[1]
         return self
 
-    def transform(self, X: Sequence[str | Path | Mesh]) -> NDArray[np.float32]:
+    def transform(self, X: Sequence[str | Path | Mesh]) -> Singles:
         """(N, cells) features of N mesh files or N meshes.
 
         Raises:
@@ -92,7 +93,7 @@ class VolumetricFeatures(TransformerMixin, BaseEstimator):
         check_is_fitted(self, "_n_features_out")
         return np.array([f"{self._name}{i}" for i in range(self._n_features_out)], dtype=object)
 
-    def _features(self, shapes: list[Any]) -> NDArray[np.float32]:
+    def _features(self, shapes: list[Any]) -> Singles:
         chosen = descriptor_of(self.descriptor)
         if isinstance(shapes[0], Mesh):
             config = chosen.requirements.apply_to(self.config or SignatureConfig())

@@ -81,37 +81,37 @@ def test_words_and_numbers_that_are_none_are_refused() -> None:
     with pytest.raises(ValueError, match="mds, umap"):
         body_map(np.ones((4, 4)), "tsne")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="average"):
-        clusters_of(np.ones((4, 4)), joining="ward")  # type: ignore[arg-type]
+        clusters_of(np.ones((4, 4)), linkage="ward")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="1 to 4, got 9"):
         clusters_of(np.ones((4, 4)), 9)
     with pytest.raises(ValueError, match="n_resamples: expected at least 0, got -1"):
         clusters_of(np.ones((4, 4)), n_resamples=-1)
 
 
-@pytest.mark.parametrize("joining", ["average", "complete", "single"])
-def test_clusters_that_were_put_in_are_found_and_stable(joining: str) -> None:
+@pytest.mark.parametrize("linkage", ["average", "complete", "single"])
+def test_clusters_that_were_put_in_are_found_and_stable(linkage: str) -> None:
     points = np.concatenate([blobs(20, [[0, 0, 0]], 0.4), blobs(12, [[9, 0, 0], [0, 9, 0]], 0.4, seed=1)])
-    found = clusters_of(cdist(points, points), joining=joining)  # type: ignore[arg-type]
-    assert found.numbers[:20].tolist() == [0] * 20
-    assert sorted(found.numbers[20:].tolist()) == [1] * 12 + [2] * 12
-    assert np.ptp(found.numbers[20:32]) == np.ptp(found.numbers[32:]) == 0
+    found = clusters_of(cdist(points, points), linkage=linkage)  # type: ignore[arg-type]
+    assert found.labels[:20].tolist() == [0] * 20
+    assert sorted(found.labels[20:].tolist()) == [1] * 12 + [2] * 12
+    assert np.ptp(found.labels[20:32]) == np.ptp(found.labels[32:]) == 0
     assert min(found.stability) > 0.99
-    for number, middle in enumerate(found.middles):
-        own = points[found.numbers == number]
+    for number, middle in enumerate(found.medoids):
+        own = points[found.labels == number]
         assert np.allclose(points[middle], own[cdist(own, own).sum(axis=1).argmin()])
 
 
 def test_bodies_that_are_alike_are_one_cluster() -> None:
     for apart in (0.0, 1.0):  # all of them, or each from each other by the same
         for n in (3, 4, 6):
-            assert clusters_of(apart * (np.ones((n, n)) - np.eye(n))).numbers.tolist() == [0] * n
+            assert clusters_of(apart * (np.ones((n, n)) - np.eye(n))).labels.tolist() == [0] * n
 
 
 def test_clusters_of_one_cloud_are_told_unstable() -> None:
     random, found = np.random.default_rng(3), []
     for _ in range(5):
         points = random.normal(size=(80, 5))
-        found += clusters_of(cdist(points, points), 6, joining="complete").stability
+        found += clusters_of(cdist(points, points), 6, linkage="complete").stability
     assert len(found) == 30
     assert np.mean(np.array(found) >= STABLE) < 0.05
 
@@ -123,7 +123,7 @@ def test_stability_is_the_mean_largest_jaccard_index_of_halves() -> None:
 
     points = np.random.default_rng(4).normal(size=(30, 2)) * [4, 1]
     found = clusters_of(cdist(points, points), 3, n_resamples=20, seed=5)
-    first = [set(np.flatnonzero(found.numbers == one).tolist()) for one in range(3)]
+    first = [set(np.flatnonzero(found.labels == one).tolist()) for one in range(3)]
     random, shares = np.random.default_rng(5), [[], [], []]  # type: ignore[var-annotated]
     for _ in range(20):
         drawn = np.sort(random.choice(30, 15, replace=False))

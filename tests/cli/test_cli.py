@@ -158,7 +158,7 @@ def test_a_second_run_describes_nothing_and_leaves_the_same_table(
     def described(job: object) -> None:
         raise AssertionError("described again")
 
-    monkeypatch.setattr("igps.nn.description._described", described)
+    monkeypatch.setattr("igps.nn.description.describe_timed", described)
     assert run("second") == first
 
 

@@ -25,7 +25,7 @@ from igps.data.attribute_sources import (
     VertexAttribute,
     attribute_source,
     attribute_sources,
-    completed,
+    fill_missing,
 )
 from igps.data.attributes import FunctionAttribute
 from igps.data.dataset import SignatureDataset
@@ -310,7 +310,7 @@ def test_what_is_missing_is_taken_from_beside_and_told_or_refused(caplog: pytest
         given = values.copy()
         given[[10, 39]] = fill
         with caplog.at_level(logging.WARNING):
-            found = completed(given, points, "here")
+            found = fill_missing(given, points, "here")
         assert found[39] == 38
         assert found[10] in (9, 11)
         np.testing.assert_array_equal(np.delete(found, [10, 39]), np.delete(values, [10, 39]))
@@ -319,7 +319,7 @@ def test_what_is_missing_is_taken_from_beside_and_told_or_refused(caplog: pytest
         with pytest.raises(
             MeshError, match=r"here: has no value at 7 of 40 places .* from \(0, 0, 0\) to \(39, 0, 0\)"
         ):
-            completed(given, points, "here")
+            fill_missing(given, points, "here")
 
 
 def test_voxels_without_a_value_do_not_leak_into_their_neighbours(body: BodyRef) -> None:

@@ -121,7 +121,7 @@ def test_further_columns_stay_with_their_bodies(root: Path, tmp_path: Path) -> N
     (root / "labels.csv").write_text(table)
     bodies = find_bodies(root, OBJECTS)
     assert bodies.columns == {"age": ("30", "41.5", "41.5"), "scanner": ("A", None, None)}
-    assert bodies.classed("body").columns == bodies.columns
+    assert bodies.with_classes("body").columns == bodies.columns
     assert bodies.numbers("age") == [30, 41.5, 41.5]
     assert bodies.subset([0]).column("scanner") == ("A",)
     with pytest.raises(ValueError, match=r"scanner: 2 of 3 bodies have no value, such as 1\.obj#liver"):

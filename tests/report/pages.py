@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from igps.mesh.mesh import Mesh
-from igps.report.surfaces import Surface, surface_of
+from igps.report.surfaces import PageSurface, surface_of
 from igps.signature.signature import SignatureConfig, compute_signature
 
 EVIL = "<script>window.ran = 1</script>"
@@ -128,7 +128,7 @@ def robustness_folder(folder: Path) -> Path:
     return folder
 
 
-def surfaces(mesh: Mesh) -> dict[str, Surface]:
+def surfaces(mesh: Mesh) -> dict[str, PageSurface]:
     """The mesh as a picture for all but the last but one of the names."""
     config = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=200)
     one = surface_of(mesh, compute_signature(mesh, config), 300)

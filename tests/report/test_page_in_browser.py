@@ -322,7 +322,7 @@ def test_the_map_is_coloured(answers: Visit, colour: str, legend: list[str] | No
     if legend is None:
         found = clusters_of(distances_of(0), n_resamples=50)
         legend = [
-            f"cluster {i + 1}" + f", stability {one:.2f}" * bool(np.isfinite(one)) + f" {(found.numbers == i).sum()}"
+            f"cluster {i + 1}" + f", stability {one:.2f}" * bool(np.isfinite(one)) + f" {(found.labels == i).sum()}"
             for i, one in enumerate(found.stability)
         ]
     assert entries == legend

@@ -122,7 +122,7 @@ def test_kept_surfaces_follow_their_files(tmp_path: Path, caplog: pytest.LogCapt
         surface.export(file)
     kept = tmp_path / "surfaces.npz"
 
-    def keep() -> dict[str, surfaces.Surface]:
+    def keep() -> dict[str, surfaces.PageSurface]:
         dataset = SignatureDataset(files, CONFIG, tmp_path / "cache")
         return {Path(name).name: one for name, one in keep_surfaces(kept, dataset, n_workers=1).items()}
 

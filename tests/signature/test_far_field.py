@@ -16,7 +16,7 @@ from conftest import with_slivers
 from igps.mesh import mesh as geometry
 from igps.signature import _far_field as far_field
 from igps.signature import mean_value as coordinates
-from igps.signature._far_field import Clusters, Surface
+from igps.signature._far_field import HatClusters, HatSurface
 from igps.signature._weight_loops import fill_hats
 from igps.signature.laplacian import laplacian
 from igps.signature.mean_value import Extension, extend
@@ -60,7 +60,7 @@ def test_approximation_tends_to_the_exact_result() -> None:
     assert all(after < before / 4 for before, after in itertools.pairwise(errors))
 
 
-def all_weights(surface: Surface, x: np.ndarray, ratio: float) -> np.ndarray:
+def all_weights(surface: HatSurface, x: np.ndarray, ratio: float) -> np.ndarray:
     """(V, n) at points (3, n): series with a ratio of 0, the closed form with an infinite one."""
     weights = np.empty((len(surface.hats), x.shape[1]))
     surface.weights(x, np.arange(len(weights)), ratio, weights)
@@ -75,7 +75,7 @@ def test_far_rule_error_falls_with_the_third_power_in_a_flat_hat_and_the_second_
     ring = np.array([[1.0, 0, 0.2], [0.2, 1.1, 0], [-0.9, 0.4, 0.3], [-0.5, -0.8, -0.1], [0.6, -0.9, 0.1]])
     vertices = np.concatenate([[[0.1, 0, 0.4]], ring]) * [1, 1, bend]
     faces = np.array([[0, i + 1, (i + 1) % 5 + 1] for i in range(5)])
-    surface = Surface(vertices, faces)
+    surface = HatSurface(vertices, faces)
     assert sorted(surface.order) == [0, 1, 2, 3, 4, 5]
     errors = []
     for distance in (10.0, 20.0, 40.0):
@@ -153,10 +153,10 @@ def test_spatial_order_is_one_for_any_number(n: int) -> None:
     np.testing.assert_array_equal(np.sort(order), np.arange(n))
 
 
-def scaled_surface(mesh: Mesh) -> tuple[Surface, np.ndarray]:
+def scaled_surface(mesh: Mesh) -> tuple[HatSurface, np.ndarray]:
     """The surface, and its vertices (V, 3) in its own axes and order."""
     vertices, faces, _ = coordinates._scaled(*mesh, np.zeros((0, 3)))
-    surface = Surface(vertices, faces)
+    surface = HatSurface(vertices, faces)
     return surface, (vertices @ surface.axes)[surface.order]
 
 
@@ -164,7 +164,7 @@ def scaled_surface(mesh: Mesh) -> tuple[Surface, np.ndarray]:
 def test_a_box_sees_each_hat_once_and_none_that_is_near_in_a_cluster(ratio: float) -> None:
     surface, vertices = scaled_surface(torus(160, 60))
     n_hats = len(vertices)
-    tree = Clusters.of(surface.hats, vertices)
+    tree = HatClusters.of(surface.hats, vertices)
     sizes = [32 * 4**level for level in range(len(tree.first) - 1)]
     members = [np.arange(n_hats)[i : i + size] for size in sizes for i in range(0, n_hats, size)]
     assert len(sizes) > 2
@@ -220,7 +220,7 @@ def test_clusters_of_point_elements_leave_an_error_of_third_order() -> None:
         axis=1,
     )  # fmt: skip
     functions = rng.normal(size=(50, 3))
-    tree = Clusters.of(hats, functions)
+    tree = HatClusters.of(hats, functions)
     clusters = np.arange(2)
     errors = []
     for distance in (200.0, 400.0, 800.0):
@@ -241,7 +241,7 @@ def test_cluster_error_falls_with_the_third_power() -> None:
     """All clusters of one level together, seen from ever farther away, against the closed form of all faces."""
     surface, vertices = scaled_surface(bumpy_sphere(3))
     functions = smooth_functions(vertices)
-    tree = Clusters.of(surface.hats, functions)
+    tree = HatClusters.of(surface.hats, functions)
     clusters = np.arange(tree.first[1])
     errors = []
     for distance in (2.0, 4.0, 8.0, 16.0):

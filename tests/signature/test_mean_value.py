@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from bodies import Mesh, bumpy_sphere, cube, exterior_points, interior_points, smooth_functions, torus
 from igps.signature import _weight_loops as loops
 from igps.signature import mean_value as coordinates
-from igps.signature._far_field import Surface
+from igps.signature._far_field import HatSurface
 from igps.signature.mean_value import extend, mean_value_coordinates
 
 pytestmark = pytest.mark.usefixtures("approximate_small_meshes")
@@ -178,12 +178,12 @@ def test_weights_stay_within_their_memory(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(coordinates, "_BLOCK_BYTES", 7 * 8 * len(mesh[0]))
     sizes = []
 
-    def weights(surface: Surface, x: np.ndarray, hats: np.ndarray, ratio: float, out: np.ndarray) -> None:
+    def weights(surface: HatSurface, x: np.ndarray, hats: np.ndarray, ratio: float, out: np.ndarray) -> None:
         sizes.append(out.shape)
         original(surface, x, hats, ratio, out)
 
-    original = Surface.weights
-    monkeypatch.setattr(Surface, "weights", weights)
+    original = HatSurface.weights
+    monkeypatch.setattr(HatSurface, "weights", weights)
     mean_value_coordinates(*mesh, interior_points(mesh, 40))
     assert sizes == [(162, 7)] * 5 + [(162, 5)]
 

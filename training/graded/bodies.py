@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from igps._arrays import Floats, Integers
 from igps.mesh.surface import longest_side
-from igps.shapes.meshing import Faces, defect, mesh, roughen
+from igps.shapes.meshing import defect, mesh, roughen
 from igps.shapes.skeleton import Placed
-from igps.shapes.solids import Array
 from training.graded.crossing import crossing_faces
 from training.graded.kinds import BodyClass, Motion
 from training.graded.plates import Plate
@@ -38,10 +38,10 @@ class Warp:
     waves: (W,3) wave vectors; steps: (W,3) amplitudes; phases: (W,).
     """
 
-    stretch: Array
-    waves: Array
-    steps: Array
-    phases: Array
+    stretch: Floats
+    waves: Floats
+    steps: Floats
+    phases: Floats
 
     @classmethod
     def draw(cls, rng: np.random.Generator, size: float, strength: float) -> Warp:
@@ -50,7 +50,7 @@ class Warp:
         steps = rng.normal(size=(3, 3)) * (strength / np.sqrt(3.0)) / np.linalg.norm(waves, axis=1, keepdims=True)
         return cls(np.exp(strength * rng.uniform(-1.0, 1.0, 3)), waves, steps, rng.uniform(0.0, 2.0 * np.pi, 3))
 
-    def __call__(self, points: Array) -> Array:
+    def __call__(self, points: Floats) -> Floats:
         moved = points * self.stretch
         for wave, step, phase in zip(self.waves, self.steps, self.phases, strict=True):
             moved = moved + np.sin((points * wave).sum(axis=1) + phase)[:, None] * step
@@ -73,14 +73,14 @@ class Body:
     rig: Rig
     genus: int
     motion: Motion
-    warp: Callable[[Array], Array]
+    warp: Callable[[Floats], Floats]
     relief: tuple[float, float, int]
 
     @property
     def placed(self) -> list[Placed]:
         return [bone.placed for bone in self.bones]
 
-    def surface(self, target: int, rotation: Array) -> tuple[Array, Faces]:
+    def surface(self, target: int, rotation: Floats) -> tuple[Floats, Integers]:
         """The surface at rest, before the warp, of about ``target`` vertices on a grid turned by ``rotation``."""
         turned = [
             replace(one, rotation=_product(rotation, one.rotation), offset=(rotation * one.offset).sum(axis=1))
@@ -96,9 +96,9 @@ class Body:
 class Pose:
     """A body in one pose, the vertices at rest beside those bent."""
 
-    rest: Array
-    bent: Array
-    faces: Faces
+    rest: Floats
+    bent: Floats
+    faces: Integers
     gap: float
 
 
@@ -191,7 +191,7 @@ def _drawn(body_class: BodyClass, kin: np.random.Generator, rng: np.random.Gener
     return Body(bones, rig, skeleton.genus, motion, warp, relief)
 
 
-def _meshed(body: Body, rng: np.random.Generator, target: int) -> tuple[Array, Faces, Array]:
+def _meshed(body: Body, rng: np.random.Generator, target: int) -> tuple[Floats, Integers, Floats]:
     """The surface before and after the warp, on the first grid that gives a sound one."""
     found: str | None = None
     for _ in range(_MAX_GRIDS):
@@ -203,14 +203,14 @@ def _meshed(body: Body, rng: np.random.Generator, target: int) -> tuple[Array, F
     raise ValueError(f"no sound surface on {_MAX_GRIDS} grids, the last had {found}")
 
 
-def _fault(vertices: Array, faces: Faces, genus: int, target: int) -> str | None:
+def _fault(vertices: Floats, faces: Integers, genus: int, target: int) -> str | None:
     found = defect(vertices, faces, genus, target, _MIN_ANGLE)
     if found is None and len(crossing_faces(vertices, faces)):
         return "a surface that crosses itself"
     return found
 
 
-def _rig(bones: Sequence[Bone], motion: Motion, direction: Array) -> Rig:
+def _rig(bones: Sequence[Bone], motion: Motion, direction: Floats) -> Rig:
     if motion == "sheet":
         plate = bones[0].solid
         assert isinstance(plate, Plate)
@@ -219,9 +219,9 @@ def _rig(bones: Sequence[Bone], motion: Motion, direction: Array) -> Rig:
     return limbs(bones, hinged=motion == "hinges")
 
 
-def _random_rotation(rng: np.random.Generator) -> Array:
+def _random_rotation(rng: np.random.Generator) -> Floats:
     return np.asarray(Rotation.from_quat(rng.normal(size=4)).as_matrix())
 
 
-def _product(a: Array, b: Array) -> Array:
+def _product(a: Floats, b: Floats) -> Floats:
     return (a[:, :, None] * b[None]).sum(axis=1)

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from igps._arrays import Floats, Integers
 from igps.mesh.surface import face_areas
-from igps.shapes.meshing import Faces
-from igps.shapes.solids import Array
 from training.graded.bodies import Body, Warp
 
 # How far the point that moves most is moved, as a share of the root of the area.
@@ -33,16 +32,16 @@ class Change:
     """
 
     waves: Warp
-    centres: Array
-    axes: Array
-    radii: Array
-    swells: Array
-    grows: Array
-    similarity: Array
+    centres: Floats
+    axes: Floats
+    radii: Floats
+    swells: Floats
+    grows: Floats
+    similarity: Floats
     step: float
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, vertices: Array, faces: Faces) -> Change:
+    def draw(cls, rng: np.random.Generator, vertices: Floats, faces: Integers) -> Change:
         """Draw a change of a surface, its largest step a share of the root of the area between `SHARES`."""
         size = float(np.sqrt(face_areas(vertices, faces).sum()))
         low, high = np.log(_RADII)
@@ -63,7 +62,7 @@ class Change:
         largest = float(np.linalg.norm(change(vertices) - vertices, axis=1).max())
         return replace(change, step=size * float(np.exp(rng.uniform(*np.log(SHARES)))) / largest)
 
-    def __call__(self, points: Array) -> Array:
+    def __call__(self, points: Floats) -> Floats:
         steps = self.waves(points) - points
         for centre, axis, radius, swell, grow in zip(
             self.centres, self.axes, self.radii, self.swells, self.grows, strict=True
@@ -82,10 +81,10 @@ class Change:
 class ChangedWarp:
     """One change after another."""
 
-    first: Callable[[Array], Array]
+    first: Callable[[Floats], Floats]
     second: Change
 
-    def __call__(self, points: Array) -> Array:
+    def __call__(self, points: Floats) -> Floats:
         return self.second(self.first(points))
 
 
@@ -95,7 +94,7 @@ def individual(body: Body, rng: np.random.Generator) -> Body:
     return replace(body, warp=ChangedWarp(body.warp, Change.draw(rng, body.warp(vertices), faces)))
 
 
-def _columns(points: Array) -> Array:
+def _columns(points: Floats) -> Floats:
     """(P,3,7): the steps of points (P,3) in a shift, a small turn and a change of scale."""
     x, y, z = points.T
     zero = np.zeros(len(points))

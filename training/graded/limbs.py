@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from igps._arrays import Floats
 from igps.shapes.skeleton import ORIGIN, UP, Part, aim, circle, limb
-from igps.shapes.solids import Arc, Array, Blob, Box, Cone, Ring, Shell, Solid, Vector
+from igps.shapes.solids import Arc, Blob, Box, Cone, Ring, Shell, Solid, Vector
 from training.graded.polygons import Prism
 
 
-def ending(kind: str, r: float, group: str, at: Vector = ORIGIN, turn: Array | None = None) -> tuple[Part, ...]:
+def ending(kind: str, r: float, group: str, at: Vector = ORIGIN, turn: Floats | None = None) -> tuple[Part, ...]:
     """What sits at the end ``at`` of a limb of radius ``r``, in the frame ``turn`` of the limb (upright if None)."""
     frame = np.eye(3) if turn is None else turn
 

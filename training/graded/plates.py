@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from igps._arrays import Floats
 from igps.shapes.skeleton import Part, Skeleton, circle, turned
-from igps.shapes.solids import Array, Blob, Cone, Ring, Shell, Solid, Vector
+from igps.shapes.solids import Blob, Cone, Ring, Shell, Solid, Vector
 from training.graded.polygons import Prism
 
 Bar = tuple[float, float, float, float, float, float]
@@ -38,8 +39,8 @@ class Plate(Solid):
     def genus(self) -> int:
         return self.loops + len(self.holes)
 
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
-        flat: Array | None = None
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        flat: Floats | None = None
         for x0, y0, x1, y1, start, end in self.bars:
             dx, dy = x1 - x0, y1 - y0
             share = np.clip(((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-12), 0.0, 1.0)
@@ -56,7 +57,7 @@ class Plate(Solid):
         a, b = flat + rounding, np.abs(z) - (0.5 * self.thick - rounding)
         return np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0)) + np.minimum(np.maximum(a, b), 0.0) - rounding
 
-    def box(self) -> tuple[Array, Array]:
+    def box(self) -> tuple[Floats, Floats]:
         ends = [(x, y, r) for x0, y0, x1, y1, r0, r1 in self.bars for x, y, r in ((x0, y0, r0), (x1, y1, r1))]
         x, y, r = np.array(ends).T
         low, high = np.array([(x - r).min(), (y - r).min()]), np.array([(x + r).max(), (y + r).max()])
@@ -70,7 +71,7 @@ class Plate(Solid):
         holes = tuple((x * length, y * length, r * length) for x, y, r in self.holes)
         return Plate(bars, holes, self.thick * thick, self.loops, self.fillet)
 
-    def factors(self, thick: float, length: float) -> Array:
+    def factors(self, thick: float, length: float) -> Floats:
         return np.array([length, length, thick])
 
 
@@ -246,10 +247,10 @@ class _Sleeve(Solid):
 
     tube: Shell
 
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         return self.tube.distance(x, y, z)
 
-    def box(self) -> tuple[Array, Array]:
+    def box(self) -> tuple[Floats, Floats]:
         return self.tube.box()
 
     def stretched(self, thick: float, length: float) -> Solid:
@@ -285,7 +286,7 @@ class Helix(Solid):
             self.radius * float(np.cos(angle)), self.radius * float(np.sin(angle)), self.pitch * self.turns * share
         )  # fmt: skip
 
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         slope = self.pitch / (2.0 * np.pi * self.radius)
         here = np.arctan2(y, x) / (2.0 * np.pi)
         # The turns next above and below; the wire is cut across its direction.
@@ -304,12 +305,12 @@ class Helix(Solid):
             squared = np.minimum(squared, (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2)
         return np.sqrt(squared) - self.tube
 
-    def box(self) -> tuple[Array, Array]:
+    def box(self) -> tuple[Floats, Floats]:
         wide = self.radius + self.tube
         return np.array([-wide, -wide, -self.tube]), np.array([wide, wide, self.pitch * self.turns + self.tube])
 
     def stretched(self, thick: float, length: float) -> Solid:
         return Helix(self.radius * length, self.pitch * length, self.turns, min(self.tube * thick, 0.4 * self.pitch))
 
-    def factors(self, thick: float, length: float) -> Array:
+    def factors(self, thick: float, length: float) -> Floats:
         return np.full(3, length)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from igps.shapes.solids import Array, Solid
+from igps._arrays import Floats
+from igps.shapes.solids import Solid
 
 
 @dataclass(frozen=True)
@@ -18,13 +19,13 @@ class Prism(Solid):
     height: float
     rounding: float
 
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         across, past_corner = _to_polygon(self.sides, self.radius - self.rounding / np.cos(np.pi / self.sides), x, y)
         a = np.where(across > 0.0, np.hypot(across, past_corner), across)
         b = np.abs(z) - (0.5 * self.height - self.rounding)
         return np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0)) + np.minimum(np.maximum(a, b), 0.0) - self.rounding
 
-    def box(self) -> tuple[Array, Array]:
+    def box(self) -> tuple[Floats, Floats]:
         upper = np.array([self.radius, self.radius, 0.5 * self.height])
         return -upper, upper
 
@@ -44,22 +45,22 @@ class Frame(Solid):
     def genus(self) -> int:
         return 1
 
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         across, past_corner = _to_polygon(self.sides, self.radius, x, y)
         return np.sqrt(across * across + past_corner * past_corner + z * z) - self.tube
 
-    def box(self) -> tuple[Array, Array]:
+    def box(self) -> tuple[Floats, Floats]:
         upper = np.array([self.radius + self.tube, self.radius + self.tube, self.tube])
         return -upper, upper
 
     def stretched(self, thick: float, length: float) -> Solid:
         return Frame(self.sides, self.radius * length, self.tube * thick)
 
-    def factors(self, thick: float, length: float) -> Array:
+    def factors(self, thick: float, length: float) -> Floats:
         return np.full(3, length)
 
 
-def _to_polygon(sides: int, radius: float, x: Array, y: Array) -> tuple[Array, Array]:
+def _to_polygon(sides: int, radius: float, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """How far points lie outside the nearest side's line (negative inside), and along it beyond its corner."""
     sector = np.pi / sides
     folded = np.mod(np.arctan2(y, x), 2.0 * sector) - sector

@@ -18,10 +18,10 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from igps._arrays import Floats, Integers
 from igps.mesh import surface
-from igps.shapes.meshing import Faces
 from igps.shapes.skeleton import Part, Placed, Skeleton, turned
-from igps.shapes.solids import Arc, Array, Cone, Solid
+from igps.shapes.solids import Arc, Cone, Solid
 from training.graded.plates import Helix
 from training.graded.skinning import IDENTITY, Motions, after, moved, normalized, turn_about
 
@@ -59,15 +59,15 @@ class Bone:
     part: Part
     placed: Placed
     parent: int
-    origin: Array
-    frame: Array
+    origin: Floats
+    frame: Floats
 
     @property
     def solid(self) -> Solid:
         return self.placed.solid
 
     @property
-    def tip(self) -> Array:
+    def tip(self) -> Floats:
         """The far end of the bone's centre line, (3,)."""
         match self.solid:
             case Cone(length, _, _):
@@ -98,9 +98,9 @@ class Joint:
     """
 
     at: float
-    axes: Array
-    low: Array
-    high: Array
+    axes: Floats
+    low: Floats
+    high: Floats
     is_root: bool
 
 
@@ -120,11 +120,11 @@ class Rod:
 
     parent: int
     held: float
-    points: Array
-    along: Array
-    radii: Array
-    girth: Array
-    sides: Array
+    points: Floats
+    along: Floats
+    radii: Floats
+    girth: Floats
+    sides: Floats
     joints: tuple[Joint, ...] = ()
     curl: float = 0.0
     twist: float = 0.0
@@ -147,8 +147,8 @@ class Rig:
 class Binding:
     """How much each vertex goes with each rod, (V,R), and which element of it, as an arc length, (V,R)."""
 
-    weights: Array
-    along: Array
+    weights: Floats
+    along: Floats
 
 
 def at_rest(skeleton: Skeleton, proportions: dict[str, tuple[float, float]]) -> list[Bone]:
@@ -160,7 +160,7 @@ def at_rest(skeleton: Skeleton, proportions: dict[str, tuple[float, float]]) -> 
     """
     bones: list[Bone] = []
 
-    def place(part: Part, parent: int, frame: Array, origin: Array) -> None:
+    def place(part: Part, parent: int, frame: Floats, origin: Floats) -> None:
         thick, length = proportions.get(part.group, (1.0, 1.0))
         solid, factors = part.solid.stretched(thick, length), part.solid.factors(thick, length)
         placed = Placed(solid, frame, origin + frame[:, 2] * (part.lift * factors[2]), part.blend)
@@ -210,7 +210,7 @@ def _stiffened(rod: Rod, held: float, half: float) -> Rod:
     return replace(rod, girth=np.where(near, np.maximum(rod.girth, 1.5 * half), rod.girth))
 
 
-def strip(bones: Sequence[Bone], direction: Array, axis: Array, thickness: float, curl: float, twist: float) -> Rig:
+def strip(bones: Sequence[Bone], direction: Floats, axis: Floats, thickness: float, curl: float, twist: float) -> Rig:
     """One rod for a whole body, such as a sheet, which is bent about ``axis`` along ``direction``.
 
     Args:
@@ -230,7 +230,7 @@ def strip(bones: Sequence[Bone], direction: Array, axis: Array, thickness: float
     return Rig((rod,), np.zeros(len(bones), dtype=np.int64))
 
 
-def draw_turns(rig: Rig, rng: np.random.Generator, vigour: float, planar: bool = False) -> list[Array]:
+def draw_turns(rig: Rig, rng: np.random.Generator, vigour: float, planar: bool = False) -> list[Floats]:
     """Draw a pose: the turns (n,3), radians, at the points of each rod.
 
     Args:
@@ -261,7 +261,7 @@ def draw_turns(rig: Rig, rng: np.random.Generator, vigour: float, planar: bool =
     return turns
 
 
-def carry(rig: Rig, turns: Sequence[Array]) -> list[Motions]:
+def carry(rig: Rig, turns: Sequence[Floats]) -> list[Motions]:
     """The motions (n,) of the elements of each rod; element j begins at point j."""
     carried: list[Motions] = []
     for rod, turn in zip(rig.rods, turns, strict=True):
@@ -275,7 +275,7 @@ def carry(rig: Rig, turns: Sequence[Array]) -> list[Motions]:
     return carried
 
 
-def bind(vertices: Array, faces: Faces, rig: Rig, placed: Sequence[Placed]) -> Binding:
+def bind(vertices: Floats, faces: Integers, rig: Rig, placed: Sequence[Placed]) -> Binding:
     """The weights of the vertices: of the nearest solid's rod, diffused over the surface by an implicit heat step.
 
     The arc lengths along a rod are diffused with its weights, which continues them smoothly onto its neighbours.
@@ -302,7 +302,7 @@ def bind(vertices: Array, faces: Faces, rig: Rig, placed: Sequence[Placed]) -> B
     return Binding(weights / weights.sum(axis=1, keepdims=True), along)
 
 
-def bend(vertices: Array, rig: Rig, binding: Binding, carried: Sequence[Motions]) -> Array:
+def bend(vertices: Floats, rig: Rig, binding: Binding, carried: Sequence[Motions]) -> Floats:
     """The vertices (V,3) carried by the rods."""
     real, dual = np.zeros((len(vertices), 4)), np.zeros((len(vertices), 4))
     for number, rod in enumerate(rig.rods):
@@ -320,7 +320,7 @@ class Gaps:
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
-    reach: Array
+    reach: Floats
 
     @classmethod
     def of(cls, rig: Rig) -> Gaps:
@@ -406,7 +406,7 @@ def _joints(chain: Sequence[Bone], starts: Sequence[float], rod: Rod, bones: Seq
     return tuple(joints)
 
 
-def _centre_line(chain: Sequence[Bone], is_root: bool) -> tuple[Array, Array, Array, list[int]]:
+def _centre_line(chain: Sequence[Bone], is_root: bool) -> tuple[Floats, Floats, Floats, list[int]]:
     """Points, radii and frames along a chain of bones, and the number of each bone's first point."""
     root = chain[0]
     if isinstance(root.solid, Helix):
@@ -428,9 +428,9 @@ def _centre_line(chain: Sequence[Bone], is_root: bool) -> tuple[Array, Array, Ar
         line = np.stack([root.placed.offset - reach, root.placed.offset + reach])
         frame = np.stack([*root.frame[:, across].T, root.frame[:, longest]], axis=1)
         return line, np.full(2, 0.25 * side[across].sum()), np.tile(frame, (2, 1, 1)), [0]
-    points: list[Array] = []
+    points: list[Floats] = []
     radii: list[float] = []
-    frames: list[Array] = []
+    frames: list[Floats] = []
     starts: list[int] = []
     for bone in chain:
         starts.append(len(points))
@@ -456,7 +456,7 @@ def _centre_line(chain: Sequence[Bone], is_root: bool) -> tuple[Array, Array, Ar
     return np.array(points), np.array(radii), np.array(frames), starts
 
 
-def _limits(bone: Bone, before: Bone | None, hinged: bool) -> tuple[Array, Array]:
+def _limits(bone: Bone, before: Bone | None, hinged: bool) -> tuple[Floats, Floats]:
     """Limits of raise and swing, radians; a knee that is bent at rest bends on to the same side."""
     factor, most = (_ROOT_FACTOR, _ROOT_LIMIT) if before is None else (_INNER_FACTOR, _INNER_LIMIT)
     high = np.radians(np.minimum(factor * np.array(bone.part.bend[:2], dtype=float), most))
@@ -475,7 +475,7 @@ def _limits(bone: Bone, before: Bone | None, hinged: bool) -> tuple[Array, Array
     return low, high
 
 
-def _projected(rod: Rod, points: Array) -> Array:
+def _projected(rod: Rod, points: Floats) -> Floats:
     """Arc lengths (V,) along a rod of the feet of points (V,3)."""
     if len(rod.along) == 1:
         return np.zeros(len(points))
@@ -486,7 +486,7 @@ def _projected(rod: Rod, points: Array) -> Array:
     return np.clip(rod.along[nearest] + np.clip(ahead, -step, step), 0.0, rod.length)
 
 
-def _between(rod: Rod, motions: Motions, along: Array) -> Motions:
+def _between(rod: Rod, motions: Motions, along: Floats) -> Motions:
     """The motions at arc lengths (V,): between those of the two elements whose middles are nearest."""
     if len(rod.along) == 1:
         shape = (*along.shape, 4)
@@ -498,7 +498,7 @@ def _between(rod: Rod, motions: Motions, along: Array) -> Motions:
     return normalized(Motions(*blend))
 
 
-def _bent(rod: Rod, joint: Joint, vector: Array) -> Array:
+def _bent(rod: Rod, joint: Joint, vector: Floats) -> Floats:
     """The turns (n,3) that bend a rod by a rotation vector around a joint, as gently as its thickness asks."""
     turns = np.zeros((len(rod.along), 3))
     angle = float(np.sqrt((vector * vector).sum()))
@@ -528,7 +528,7 @@ def _bent(rod: Rod, joint: Joint, vector: Array) -> Array:
     return np.minimum(share, tightest)[:, None] * vector
 
 
-def _curled(rod: Rod, waves: Array, planar: bool) -> Array:
+def _curled(rod: Rod, waves: Floats, planar: bool) -> Floats:
     """Turns (n,3) of a rod that curls: a constant curvature and two waves about each of its two axes."""
     if rod.curl == 0.0:
         return np.zeros((len(rod.along), 3))
@@ -542,7 +542,7 @@ def _curled(rod: Rod, waves: Array, planar: bool) -> Array:
     return np.einsum("kn,njk->nj", amount, rod.sides)
 
 
-def _twisted(rod: Rod, angle: float) -> Array:
+def _twisted(rod: Rod, angle: float) -> Floats:
     """Turns (n,3) of a rod that is twisted evenly."""
     tangent = surface.unit(np.gradient(rod.points, axis=0))
     share = np.full(len(rod.along), 1.0 / (len(rod.along) - 1))
@@ -550,7 +550,7 @@ def _twisted(rod: Rod, angle: float) -> Array:
     return angle * share[:, None] * tangent
 
 
-def _diffused(vertices: Array, faces: Faces, values: Array, width: Array) -> Array:
+def _diffused(vertices: Floats, faces: Integers, values: Floats, width: Floats) -> Floats:
     """Values (V,C) after two implicit heat steps over the surface, by about ``width`` (V,)."""
     corners = vertices[faces]
     edges = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)

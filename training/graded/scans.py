@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from igps._arrays import Floats
 from igps.mesh import surface
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.simplification import simplify
 from igps.mesh.watertight import watertight
-from igps.shapes.solids import Array
 
 # Shares of the shapes to which each happens.
 _SIMPLIFIED, _NOISY, _MIRRORED, _WATERTIGHT = 0.4, 0.35, 0.25, 0.15
@@ -40,9 +40,9 @@ class Scan:
     noise: float
     is_mirrored: bool
     is_watertight: bool
-    motion: Array
+    motion: Floats
     scale: float
-    offset: Array
+    offset: Floats
 
     @classmethod
     def draw(cls, rng: np.random.Generator, n_vertices: tuple[int, int]) -> Scan:

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from igps._arrays import Floats, Integers
+from igps._files import whole_file
 from igps._parallel import Failed, run
 from igps.mesh.mesh import Mesh, MeshError
-from igps.shapes.benchmark import is_whole_off, off_text, shapes_folder, write_whole
-from igps.shapes.meshing import Faces
-from igps.shapes.solids import Array
+from igps.shapes.benchmark import is_whole_off, off_text, shapes_folder
 from training.graded.bodies import Body, Pose, draw_body, draw_pose
 from training.graded.individuals import individual
 from training.graded.kinds import LOOK_ALIKE_FAMILIES, LOOK_ALIKE_TEMPLATES, BodyClass, body_classes
@@ -44,13 +44,13 @@ class GradedShape:
     notes: what was done to the surface, in words.
     """
 
-    vertices: Array
-    faces: Faces
+    vertices: Floats
+    faces: Integers
     label: str
     body: str
     name: str
     genus: int
-    motion: Array
+    motion: Floats
     notes: tuple[str, ...]
 
 
@@ -308,7 +308,8 @@ def _record_bodies(path: Path, names: list[str]) -> None:
     """Name the body of each file, beside those that are named there already."""
     before = path.read_text(encoding="utf-8").splitlines()[1:] if path.exists() else []
     rows = dict.fromkeys([*before, *(f"{name}.off,{body_of(name)}" for name in names)])
-    write_whole(path, "\n".join(["file,label", *rows]) + "\n")
+    with whole_file(path) as file:
+        file.write(("\n".join(["file,label", *rows]) + "\n").encode())
 
 
 def _write(shapes: GradedShapes, folder: Path, indices: list[int]) -> None:
@@ -322,6 +323,7 @@ def _write(shapes: GradedShapes, folder: Path, indices: list[int]) -> None:
             continue
         path = folder / f"{shape.name}.off"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, off_text(shape.vertices, shape.faces))
+        with whole_file(path) as file:
+            file.write(off_text(shape.vertices, shape.faces).encode())
     if failed is not None:
         raise failed

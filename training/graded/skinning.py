@@ -11,20 +11,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from igps.shapes.solids import Array
+from igps._arrays import Floats
 
 
 class Motions(NamedTuple):
     """Rigid motions: real and dual parts, (..., 4) each; the real parts have length 1."""
 
-    real: Array
-    dual: Array
+    real: Floats
+    dual: Floats
 
 
 IDENTITY = Motions(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4))
 
 
-def turn_about(centre: Array, rotation: Array) -> Motions:
+def turn_about(centre: Floats, rotation: Floats) -> Motions:
     """Rotations by vectors (..., 3), radians, about points (..., 3)."""
     angle = np.sqrt((rotation * rotation).sum(axis=-1, keepdims=True))
     real = np.concatenate([np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2.0 * np.pi)) * rotation], axis=-1)
@@ -32,7 +32,7 @@ def turn_about(centre: Array, rotation: Array) -> Motions:
     return motion(real, centre - _rotated(real, centre))
 
 
-def motion(real: Array, translation: Array) -> Motions:
+def motion(real: Floats, translation: Floats) -> Motions:
     """Turn by unit quaternions (..., 4), then move by (..., 3)."""
     half = np.concatenate([np.zeros_like(translation[..., :1]), 0.5 * translation], axis=-1)
     return Motions(real, product(half, real))
@@ -51,7 +51,7 @@ def normalized(motions: Motions) -> Motions:
     return Motions(motions.real / length, motions.dual / length)
 
 
-def moved(motions: Motions, points: Array) -> Array:
+def moved(motions: Motions, points: Floats) -> Floats:
     """Points (..., 3), each by its motion."""
     # Twice the dual part times the conjugate of the real one is the translation, exactly so where a blend has left a
     # component along the real part too.
@@ -59,13 +59,13 @@ def moved(motions: Motions, points: Array) -> Array:
     return _rotated(motions.real, points) + 2.0 * product(motions.dual, conjugate)[..., 1:]
 
 
-def same_side(motions: Motions, real: Array) -> Motions:
+def same_side(motions: Motions, real: Floats) -> Motions:
     """The same motions with the signs that bring their real parts nearest to ``real`` (..., 4), to be blended."""
     sign = np.where((motions.real * real).sum(axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
     return Motions(sign * motions.real, sign * motions.dual)
 
 
-def product(a: Array, b: Array) -> Array:
+def product(a: Floats, b: Floats) -> Floats:
     """Products of quaternions (..., 4)."""
     aw, ax, ay, az = (a[..., i] for i in range(4))
     bw, bx, by, bz = (b[..., i] for i in range(4))
@@ -80,7 +80,7 @@ def product(a: Array, b: Array) -> Array:
     )
 
 
-def _rotated(real: Array, points: Array) -> Array:
+def _rotated(real: Floats, points: Floats) -> Floats:
     axis = real[..., 1:]
     across = np.cross(axis, points)
     return points + 2.0 * (real[..., :1] * across + np.cross(axis, across))

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from igps.analysis.explanation import KINDS, explain, on_surface
+from igps.analysis.explanation import explain, on_surface
 from igps.data.collation import collate
 from igps.data.requirements import Requirements
 from igps.descriptors import descriptor as descriptor_of
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors
 from igps.report.answers import write_answer
-from igps.signature.signature import SignatureConfig, compute_signature
+from igps.signature.signature import SAMPLE_KINDS, SignatureConfig, compute_signature
 from training.graded.shapes import GradedShapes
 
 ALTERATIONS = ("bump", "dent", "limb", "hole")
@@ -62,7 +62,7 @@ def explaining(
         except (MeshError, ValueError) as error:
             print(f"{shapes.names[2 * place]}: {error}")
             continue
-        samples = {kind: getattr(signatures[1], kind).points for kind in KINDS}
+        samples = {kind: getattr(signatures[1], kind).points for kind in SAMPLE_KINDS}
         points = samples["surface"]
         true = np.linalg.norm(points - centre, axis=1) < reach
         if not 0 < true.sum() < len(true):

@@ -4,14 +4,14 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from scipy.cluster.hierarchy import cut_tree, linkage
+from scipy.cluster import hierarchy
 from scipy.spatial.distance import squareform
 
 from igps._arrays import Floats, Integers
 from igps._parameters import check_at_least, check_one_of
 from igps.analysis.map import checked_distances
 
-Joining = Literal["average", "complete", "single"]
+Linkage = Literal["average", "complete", "single"]
 STABLE = 0.75
 """A cluster whose stability is less is not to be relied on (Hennig 2007)."""
 _MOST_CLUSTERS = 30
@@ -21,8 +21,8 @@ _MOST_CLUSTERS = 30
 class Clusters:
     """A hierarchical clustering, cut."""
 
-    numbers: Integers  # (N,) the cluster of each body, 0 for the largest
-    middles: tuple[int, ...]  # of each cluster, the body with the smallest sum of distances to its others
+    labels: Integers  # (N,) the cluster of each body, 0 for the largest
+    medoids: tuple[int, ...]  # of each cluster, the body with the smallest sum of distances to its others
     # Of each cluster, how much of it comes together again when half of the bodies are clustered alone: mean largest
     # Jaccard index with a cluster of them; NaN where too few were drawn
     stability: tuple[float, ...]
@@ -33,7 +33,7 @@ def clusters_of(
     distances: Floats,
     n_clusters: int | None = None,
     *,
-    joining: Joining = "average",
+    linkage: Linkage = "average",
     n_resamples: int = 100,
     seed: int = 0,
 ) -> Clusters:
@@ -43,7 +43,7 @@ def clusters_of(
         distances: (N, N).
         n_clusters: how many; if None, as many of 2 to 30 as have the largest mean silhouette (Rousseeuw 1987),
             or one where none is above zero.
-        joining: two clusters are as far apart as their bodies are in mean, at most, or at least.
+        linkage: two clusters are as far apart as their bodies are in mean, at most, or at least.
         n_resamples: random halves of the bodies, for the stability (Hennig 2007).
         seed: of these.
 
@@ -52,11 +52,11 @@ def clusters_of(
     """
     from sklearn.metrics import silhouette_score
 
-    check_one_of(get_args(Joining), joining=joining)
+    check_one_of(get_args(Linkage), linkage=linkage)
     check_at_least(0, n_resamples=n_resamples)
     check_at_least(1, n_clusters=n_clusters)
     found, n = checked_distances(distances), len(distances)
-    tree = _tree(found, joining)
+    tree = _tree(found, linkage)
     if n_clusters is None:
         cuts = {k: _cut(tree, k) for k in range(2, min(_MOST_CLUSTERS, n - 1) + 1)}
         scores = {k: silhouette_score(found, cut, metric="precomputed") for k, cut in cuts.items() if cut.max()}
@@ -67,23 +67,23 @@ def clusters_of(
     numbers = _cut(tree, n_clusters)
     _, numbers = np.unique(np.argsort(np.argsort(-np.bincount(numbers), kind="stable"))[numbers], return_inverse=True)
     members = [np.flatnonzero(numbers == one) for one in range(numbers.max() + 1)]
-    middles = tuple(int(own[found[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members)
+    medoids = tuple(int(own[found[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members)
     random, shares = np.random.default_rng(seed), np.full((n_resamples, len(members)), np.nan)
     for row in shares if n > max(3, 2 * len(members)) else ():  # half of three is one body, and no tree
         drawn = np.sort(random.choice(n, n // 2, replace=False))
-        again = np.eye(n, dtype=np.int64)[_cut(_tree(found[np.ix_(drawn, drawn)], joining), len(members))]
+        again = np.eye(n, dtype=np.int64)[_cut(_tree(found[np.ix_(drawn, drawn)], linkage), len(members))]
         first = np.eye(len(members), dtype=np.int64)[numbers[drawn]]
         both = first.T @ again
         either = first.sum(axis=0)[:, None] + again.sum(axis=0) - both
         row[:] = np.where(first.any(axis=0), (both / np.maximum(either, 1)).max(axis=1), np.nan)
     counted = np.isfinite(shares).sum(axis=0)
     stability = np.where(counted, np.nansum(shares, axis=0) / np.maximum(counted, 1), np.nan)
-    return Clusters(numbers, middles, tuple(stability.tolist()), tree)
+    return Clusters(numbers, medoids, tuple(stability.tolist()), tree)
 
 
-def _tree(distances: Floats, joining: Joining) -> Floats:
-    return linkage(squareform(distances, checks=False), joining)
+def _tree(distances: Floats, linkage: Linkage) -> Floats:
+    return hierarchy.linkage(squareform(distances, checks=False), linkage)
 
 
 def _cut(tree: Floats, n_clusters: int) -> Integers:
-    return cut_tree(tree, n_clusters).ravel().astype(np.int64)
+    return hierarchy.cut_tree(tree, n_clusters).ravel().astype(np.int64)

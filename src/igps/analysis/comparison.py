@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -10,20 +9,21 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from igps._arrays import Singles
 from igps._parallel import Failed, one_thread, run
 from igps.data.dataset import Failure, SignatureDataset
 from igps.mesh.mesh import MeshError
+from igps.nn.description import describe_timed
 from igps.nn.descriptor import Descriptor
 from igps.retrieval.scores import SCORE_NAMES, RetrievalScores, retrieval_scores
 
 logger = logging.getLogger(__name__)
 
-# A description, and the seconds that it took
-_Description = tuple[NDArray[np.float32], float]
+# A description (1, ...), and the seconds that it took
+_Description = tuple[Singles, float]
 # Entries of the triples (query, gallery, entry of a description) that one block of distances may hold at once.
 _BLOCK_ENTRIES = 2**26
 
@@ -80,12 +80,13 @@ def compare(
         raise ValueError("dataset: expected meshes with classes, got none. Give labels, or a folder per class.")
     check_descriptors(descriptors, dataset)
     n = len(dataset)
-    jobs = [(descriptor, dataset.subset([i])) for descriptor in descriptors for i in range(n)]
+    cpu = torch.device("cpu")
+    jobs = [(descriptor, dataset.subset([i]), cpu) for descriptor in descriptors for i in range(n)]
     found: dict[int, _Description | Failure] = {}
     n_done = 0
     with (
         tqdm(total=len(jobs), desc="descriptions", disable=not progress) as bar,
-        contextlib.closing(run(_described, jobs, n_workers=n_workers)) as outcomes,
+        contextlib.closing(run(describe_timed, jobs, n_workers=n_workers)) as outcomes,
     ):
         for number, outcome in outcomes:
             bar.update()
@@ -104,7 +105,7 @@ def compare(
 
 
 def check_descriptors(descriptors: Sequence[Descriptor], dataset: SignatureDataset) -> None:
-    """Raise a ValueError where two have one name, by which results are told apart, or the signatures lack something."""
+    """Raise a ValueError where two have one name, which identifies results, or the signatures lack something."""
     check_names([one.name for one in descriptors])
     for descriptor in descriptors:
         descriptor.requirements.check_config(dataset.config)
@@ -119,21 +120,6 @@ def check_names(names: Sequence[str]) -> None:
         )
 
 
-def _described(job: tuple[Descriptor, SignatureDataset]) -> _Description:
-    """The description of the one mesh of a dataset, and the seconds of processor time that it took."""
-    descriptor, dataset = job
-    with one_thread(), torch.inference_mode():
-        batch = dataset.batch([0])
-        start = time.process_time()
-        if descriptor.requirements.mesh:
-            batch = dataset.batch([0], meshes=True)
-        values = descriptor(batch)[0].cpu().numpy()
-        seconds = time.process_time() - start
-    if not np.isfinite(values).all():
-        raise MeshError(f"{dataset.bodies.paths[0]}: the description has entries that are not finite.")
-    return values, seconds
-
-
 def _result(
     descriptor: Descriptor, dataset: SignatureDataset, outcomes: Sequence[_Description | Failure], progress: bool
 ) -> Result:
@@ -145,7 +131,7 @@ def _result(
     try:
         if not found:
             raise ValueError("no mesh could be described.")
-        values = torch.from_numpy(np.stack([one for one, _ in found]))
+        values = torch.from_numpy(np.stack([one[0] for one, _ in found]))
         distances = pair_distances(descriptor, values, progress=progress)
         scores = retrieval_scores(distances, labels)
     except Exception as reason:  # the other descriptors go on

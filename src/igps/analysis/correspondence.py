@@ -1,12 +1,10 @@
 """How unlike the places of a body are to those of another body that correspond to them, whatever the poses."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from igps._arrays import Floats
 from igps.data.batch import SignatureBatch
-
-Values = NDArray[np.float64]
 
 # Times of the heat kernel, over the area: the coarse tell which place this is, the fine what the surface is like there
 _COARSE, _FINE = 0.01 * 2.0 ** np.arange(6), 0.0008 * 2.0 ** np.arange(5)
@@ -18,7 +16,7 @@ _LEAST = 0.1
 _REACH = 0.06
 
 
-def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Values:
+def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Floats:
     """(P,) positive numbers of the surface samples of a body: how unlike they are to what corresponds to them.
 
     Samples of the surface correspond where heat flows alike (Sun, Ovsjanikov and Guibas 2009) over large times, which
@@ -44,7 +42,7 @@ def dissimilarity(body: SignatureBatch, other: SignatureBatch) -> Values:
     return np.exp(found)
 
 
-def _heat_kernels(body: SignatureBatch) -> tuple[Values, Values]:
+def _heat_kernels(body: SignatureBatch) -> tuple[Floats, Floats]:
     """(P, times) logarithms of the heat that stays at each sample of the surface, over that of the whole."""
     area, real = float(body.area[0]), body.surface.mask[0]
     squares = body.surface.eigenfunctions[0][real].double().square().numpy() * area
@@ -53,7 +51,7 @@ def _heat_kernels(body: SignatureBatch) -> tuple[Values, Values]:
     return coarse, fine
 
 
-def _averaged(values: Values, points: Values, reach: float) -> Values:
+def _averaged(values: Floats, points: Floats, reach: float) -> Floats:
     """Means with Gaussian weights of the points around each, no further than twice the reach."""
     tree = cKDTree(points)
     pairs = tree.sparse_distance_matrix(tree, 2 * reach, output_type="coo_matrix")

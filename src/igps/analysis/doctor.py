@@ -9,7 +9,7 @@ from functools import partial
 from tqdm import tqdm
 
 from igps._parallel import Failed, Limits, run
-from igps.data.filling import by_file
+from igps.data.filling import group_by_file
 from igps.data.sources import Bodies, BodyRef
 from igps.mesh.formats import RawBody, VoxelMeasures
 from igps.mesh.loading import each_surface, surface_body
@@ -53,7 +53,7 @@ def examine(
     progress: bool = True,
 ) -> list[Finding]:
     """Read and mend every body as for its signature, and say what was found; limits are of one file."""
-    jobs = by_file(files, range(len(files)))
+    jobs = group_by_file(files, range(len(files)))
     one = partial(_examine, reading or LoadOptions(), config or SignatureConfig())
     outcomes = run(one, [[files[i] for i in job] for job in jobs], n_workers=n_workers, limits=limits)
     found: dict[int, Finding] = {}

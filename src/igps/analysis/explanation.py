@@ -8,24 +8,24 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from igps._arrays import Floats
 from igps.analysis.correspondence import dissimilarity
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.descriptors.individual import IndividualDescriptor
-from igps.nn.batch_features import WEIGHT, BatchFeatures, SampleKind
+from igps.nn.batch_features import WEIGHT, BatchFeatures
 from igps.nn.descriptor import Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.histograms.base import DescriptionPart, SampleHistogram
+from igps.signature.signature import SAMPLE_KINDS, SampleKind
 
-KINDS: tuple[SampleKind, ...] = ("interior", "surface")
 # Nodes of the integral along the line between two descriptions, and of what share of the distance it may miss
 _NODES, _MISSED = (16, 64, 256, 1024), 1e-8
 # Samples that a point of the surface takes its value from
 _NEIGHBOURS = 12
 
-Shares = Mapping[SampleKind, NDArray[np.float64]]
+Shares = Mapping[SampleKind, Floats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +97,11 @@ def _placed(body: SignatureBatch, other: SignatureBatch, samples: Shares, distan
 def contents_of(descriptor: Descriptor) -> Descriptor:
     """What describes the cells of a descriptor, and behind them its numbers of side and size; without its head."""
     histograms = _histograms(descriptor)
-    return descriptor.beside(histograms) if isinstance(descriptor, IndividualDescriptor) else histograms
+    return descriptor.wrap(histograms) if isinstance(descriptor, IndividualDescriptor) else histograms
 
 
 def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Tensor, float]:
-    """What a unit of each cell's contents counts, positive in the one and negative in the other body, and the distance.
+    """The share of a unit of each cell's contents in the distance, positive in the first body, and the distance itself.
 
     The descriptor is in double precision, see `explain`; its contents are (cells,), see `contents_of`, whose numbers of
     side and size come apart as they are and not as roots.
@@ -140,7 +140,7 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
     return torch.cat([units, gradient[n:]]), distance
 
 
-def on_surface(shares: Shares, samples: Mapping[SampleKind, NDArray[np.float64]], points: NDArray[np.float64]) -> Any:
+def on_surface(shares: Shares, samples: Mapping[SampleKind, Floats], points: Floats) -> Any:
     """(V,) what the body has of the difference about each point: 1 where it is as everywhere, if the sum were 1.
 
     Of the samples of each kind, shares (P,) and places (P, 3); and points (V, 3), such as vertices.
@@ -169,7 +169,7 @@ def _n_cells(descriptor: Descriptor) -> int:
 
 
 def _of_the_whole(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
-    """What side and size have of the distance, by the shares of all contents; without those that are not told."""
+    """The shares of side and size in the distance, where the descriptor keeps them, from those of all contents."""
     form, side, size = (shares[None], *shares.new_empty(2, 1, 0))
     if isinstance(descriptor, IndividualDescriptor):
         form, side, size = descriptor.split(shares[None])
@@ -191,8 +191,8 @@ def _doubled(batch: SignatureBatch) -> SignatureBatch:
 def _shared(
     histograms: HistogramDescriptor, batch: SignatureBatch, units: Tensor, whole: Mapping[str, float]
 ) -> tuple[dict[str, float], Shares]:
-    """What each histogram, and each sample, of a body has of the distance; it has half of what is of the whole."""
-    weights = [getattr(batch, kind).attributes[WEIGHT] for kind in KINDS]
+    """The shares of each histogram and of each sample of a body in the distance; half of `whole` is the body's."""
+    weights = [getattr(batch, kind).attributes[WEIGHT] for kind in SAMPLE_KINDS]
     totals = [torch.zeros_like(one) for one in weights]
     features, parts, first = BatchFeatures(batch, False), dict[str, float](), 0
     for group in histograms.parts:
@@ -210,7 +210,7 @@ def _shared(
             for total, gradient in zip(totals, found, strict=True):
                 total += 0 if gradient is None else gradient / part.degree
     everywhere = sum(whole.values()) / 4  # half in each body, of that half in each kind of samples
-    samples = {kind: total[0].detach().numpy() for kind, total in zip(KINDS, totals, strict=True)}
+    samples = {kind: total[0].detach().numpy() for kind, total in zip(SAMPLE_KINDS, totals, strict=True)}
     return parts, {kind: values + everywhere / len(values) for kind, values in samples.items()}
 
 

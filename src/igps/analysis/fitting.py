@@ -71,7 +71,7 @@ def fit(
     n_workers: int | None = None,
     progress: bool = False,
 ) -> Descriptor:
-    """The descriptor under a head that is fitted to the classes of a dataset, with what that is worth in its `card`.
+    """The descriptor under a head that is fitted to the classes of a dataset, with its held-out scores in its `card`.
 
     Held-out scores are of folds that neither the fit nor the choice of the head has seen; the head that is returned is
     fitted to all bodies.
@@ -229,7 +229,7 @@ def _has_pair(labels: Tensor) -> bool:
 
 
 def _retrieved(head: Head | None, histograms: Tensor, labels: Tensor) -> dict[str, float]:
-    """Scores among some bodies, those of whose class is no other left out."""
+    """Retrieval scores among some bodies, without those that are alone in their class."""
     vectors = histograms if head is None else head(histograms)
     distances = (chi_square if head is None else head.distances)(vectors, vectors)
     return retrieval_scores(distances, labels.tolist()).mean()
@@ -242,7 +242,7 @@ def _scores(
     chosen: Callable[[Tensor, Tensor], HeadName],
     fitted: Callable[..., Head | None],
 ) -> dict[str, float]:
-    """Means over held-out folds: of retrieval, and of a classifier what it is worth as such."""
+    """Means over held-out folds: scores of retrieval, and of classification if the head is a classifier."""
     from torchmetrics.functional.classification import binary_auroc, multiclass_calibration_error
 
     found: list[dict[str, float]] = []

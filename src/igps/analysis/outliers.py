@@ -8,20 +8,18 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats, Integers
 from igps._parallel import Failed, run
 from igps._threads import n_cores
 from igps.analysis.segmentation import Place, cavity_root, cut_end, gap_root, hole_root, overlaps, stray_root
 from igps.data.dataset import SignatureDataset
-from igps.data.filling import by_file
+from igps.data.filling import group_by_file
 from igps.data.pipeline import SignaturePipeline
 from igps.mesh.formats import RawBody
 from igps.mesh.loading import BodyRef, each_surface, surface_body
 from igps.mesh.mesh import Mesh, MeshError, millimetres
 from igps.mesh.surface import area_vectors
-
-Values = NDArray[np.float64]
 
 _MEASURED = ("volume", "spacing", "handles", "flat", "stray", "cavity", "hole", "gap", "cut")
 
@@ -76,9 +74,9 @@ class Outlier:
 
 
 def outliers(
-    distances: Values,
+    distances: Floats,
     labels: Sequence[str],
-    measures: Mapping[str, Values] | None = None,
+    measures: Mapping[str, Floats] | None = None,
     notes: Sequence[Sequence[str]] | None = None,
 ) -> list[Outlier]:
     """The bodies by how unlike their class they are, the most unlike first.
@@ -103,7 +101,7 @@ def outliers(
         values["repairs"], rare = _repairs(notes)
         if "stray" in values:  # what is repaired in labels is measured in voxels
             values["repairs"][np.isfinite(values["stray"])] = 0
-    usual: dict[str, Values] = {}
+    usual: dict[str, Floats] = {}
     for name, one in values.items():
         scores[name], usual[name] = _deviations(one, codes, name)
     found = []
@@ -128,7 +126,7 @@ def outliers(
     return sorted(found, key=lambda one: -one.score)
 
 
-def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Values]:
+def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Floats]:
     """What segmentations go wrong in, of each body: NaN where its mesh cannot be read again.
 
     Of all: "volume" and "spacing", the side of a voxel or else the root of the area of a face, as logarithms, in
@@ -139,7 +137,7 @@ def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> d
     """
     found = np.full((len(dataset), len(_MEASURED)), np.nan)
     places = list[Place | None]([None] * len(dataset))
-    jobs = by_file(dataset.bodies, range(len(dataset)), -(-len(dataset) // (n_workers or n_cores())))
+    jobs = group_by_file(dataset.bodies, range(len(dataset)), -(-len(dataset) // (n_workers or n_cores())))
     given = [[dataset.bodies[i] for i in job] for job in jobs]
     with contextlib.closing(run(partial(_measures, dataset.pipeline), given, n_workers=n_workers)) as all_:
         for number, outcome in all_:
@@ -198,8 +196,8 @@ def _of_body(pipeline: SignaturePipeline, body: BodyRef, raw: RawBody) -> tuple[
     return list(found.values()), Place(where, low, mask.shape, int(mask.sum()), np.packbits(mask))
 
 
-def _nearness(distances: Values, codes: NDArray[np.int64]) -> tuple[Values, Values, NDArray[np.int64]]:
-    """Logarithms of mean distances to the nearest of the own class and of the nearest other, and which that is."""
+def _nearness(distances: Floats, codes: Integers) -> tuple[Floats, Floats, Integers]:
+    """Logarithms of mean distances to the nearest of the own class and of the nearest other class, and its number."""
     n, n_classes = len(codes), int(codes.max()) + 1
     own, other, nearest = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, dtype=np.int64)
     members = [np.flatnonzero(codes == one) for one in range(n_classes)]
@@ -218,8 +216,8 @@ def _nearness(distances: Values, codes: NDArray[np.int64]) -> tuple[Values, Valu
     return own, other, nearest
 
 
-def _deviations(values: Values, codes: NDArray[np.int64], name: str) -> tuple[Values, Values]:
-    """How many robust standard deviations values are above what is usual, and what that is.
+def _deviations(values: Floats, codes: Integers, name: str) -> tuple[Floats, Floats]:
+    """By how many robust standard deviations values exceed the usual value, and the usual value.
 
     Usual is what the others of the class have; of a class of one, other classes. Where less is as odd as more, a body
     of a class of two or three is as far away as from both, whatever is less: other classes tell which of the two is
@@ -249,7 +247,7 @@ def _deviations(values: Values, codes: NDArray[np.int64], name: str) -> tuple[Va
     return found, usual
 
 
-def _scatter(values: Values, least: float, tail: bool = True) -> float:
+def _scatter(values: Floats, least: float, tail: bool = True) -> float:
     """The robust standard deviation: of the median, or of the largest tenth, whatever is more."""
     if not len(values):
         return least
@@ -258,7 +256,7 @@ def _scatter(values: Values, least: float, tail: bool = True) -> float:
     return max(least, _NORMAL * float(np.median(away)), float(largest))
 
 
-def _repairs(notes: Sequence[Sequence[str]]) -> tuple[Values, list[list[str]]]:
+def _repairs(notes: Sequence[Sequence[str]]) -> tuple[Floats, list[list[str]]]:
     """Of each body, how many notes it has whose like fewer than a quarter of all have, and these."""
     kinds = [[re.sub(r"[\d.,]+", "n", note) for note in of_body] for of_body in notes]
     counts = Counter(kind for of_body in kinds for kind in set(of_body))

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-Values = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from igps._arrays import Booleans, Floats, Integers
 
 # Of the depth of a body, the radius of the ball that closes it: what is narrower than the body is thick is a gap
 _CLOSING = 0.8
@@ -22,19 +21,19 @@ _CLOSING = 0.8
 _MOST_VOXELS = 1 << 20
 
 
-def stray_root(mask: Mask) -> float:
+def stray_root(mask: Booleans) -> float:
     """The root of the share of the voxels that are connected to the largest piece by no face, edge or corner."""
     pieces, _ = ndimage.label(mask, np.ones((3, 3, 3)))
     return float(np.sqrt(1 - np.bincount(pieces[mask]).max() / np.count_nonzero(mask)))
 
 
-def cavity_root(mask: Mask) -> float:
+def cavity_root(mask: Booleans) -> float:
     """The root of the voxels that the body surrounds, over its own."""
     filled = ndimage.binary_fill_holes(np.pad(mask, 1))
     return float(np.sqrt(np.count_nonzero(filled) / np.count_nonzero(mask) - 1))
 
 
-def hole_root(mask: Mask) -> float:
+def hole_root(mask: Booleans) -> float:
     """The root of the voxels that the body surrounds in a slice across any axis of the grid, over its own."""
     padded, holes = np.pad(mask, 1), np.zeros_like(mask)
     for axis in range(3):
@@ -47,7 +46,7 @@ def hole_root(mask: Mask) -> float:
     return float(np.sqrt(np.count_nonzero(holes) / np.count_nonzero(mask)))
 
 
-def gap_root(mask: Mask, sides: Values) -> float:
+def gap_root(mask: Booleans, sides: Floats) -> float:
     """The root of the voxels that closing adds, over those of the body: its tunnels, notches and clefts.
 
     Closing (Matheron 1975) keeps outside what a ball outside of the body reaches. Its radius is four fifths of that of
@@ -64,7 +63,7 @@ def gap_root(mask: Mask, sides: Values) -> float:
     return float(np.sqrt(np.count_nonzero(~reached & ~padded) / np.count_nonzero(mask)))
 
 
-def cut_end(mask: Mask, at_border: Mask) -> float:
+def cut_end(mask: Booleans, at_border: Booleans) -> float:
     """How flat an end of a body is along an axis of the grid, as if slices were cut off; 0 if all are at the border.
 
     The root of the voxels of its last slice beyond that of two fifths of those of the two slices before it, which is
@@ -83,18 +82,18 @@ class Place:
     """The voxels of a label: the folder and the grid in which they lie, and a box of it in bits."""
 
     grid: tuple[object, ...]
-    low: NDArray[np.int64]
+    low: Integers
     shape: tuple[int, ...]
     n_voxels: int
     bits: NDArray[np.uint8]
 
-    def mask(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.uint8]:
+    def mask(self, low: Integers, high: Integers) -> NDArray[np.uint8]:
         """From one corner of the grid to another."""
         whole = np.unpackbits(self.bits, count=int(np.prod(self.shape))).reshape(self.shape)
         return whole[tuple(map(slice, low - self.low, high - self.low))]
 
 
-def overlaps(places: Sequence[Place | None], labels: Sequence[str] | None = None) -> Values:
+def overlaps(places: Sequence[Place | None], labels: Sequence[str] | None = None) -> Floats:
     """(N, N) shares of the voxels of each that lie in each other one; 0 of one class, which may be many subjects."""
     found = np.zeros((len(places), len(places)))
     grids = defaultdict[tuple[object, ...], list[tuple[int, Place]]](list)

@@ -115,12 +115,12 @@ def main(
                 options["descriptor"] = (options["descriptor"] or "pretrained") + taken_in
         check_place("out", options.get("out"), endings.get(command))
         check_place("failures", options.get("failures"), ())
-        # With --json, what a reader is told goes where progress goes
+        # With --json, text for readers goes to standard error
         with one_thread(), contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
             found = command(**options)
     verdict = found if isinstance(found, Verdict) else Verdict(found, True)
     if as_json:
-        print(json.dumps(finite(verdict.told), indent=2))
+        print(json.dumps(finite(verdict.result), indent=2))
     if not verdict.is_good:
         sys.exit(1)
 
@@ -164,7 +164,7 @@ def _add_commands(parser: ArgumentParser, commands: Commands) -> None:
         else:
             group = ArgumentParser(description=f"One of {', '.join(command)}.")
             added.add_subcommand(name, group, help=", ".join(command))
-            _add_commands(group, command)  # a group takes commands only once it has its own place
+            _add_commands(group, command)  # a group takes commands only after it was added itself
 
 
 def _add_options(parser: ArgumentParser, command: Command) -> None:

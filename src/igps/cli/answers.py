@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from igps._parameters import check_at_least, check_share
-from igps.analysis.explanation import KINDS, Explanation, contents_of, explain_groups, on_surface
+from igps.analysis.explanation import Explanation, contents_of, explain_groups, on_surface
 from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, with_discovery_rates
 from igps.analysis.outliers import LIMIT, measures_of
@@ -24,6 +24,7 @@ from igps.mesh.mesh import Mesh, millimetres
 from igps.nn.description import describe
 from igps.report.answers import explanation_figure, groups_figure, outliers_figure, write_answer
 from igps.report.tables import groups_table
+from igps.signature.signature import SAMPLE_KINDS
 
 
 def groups(
@@ -198,7 +199,7 @@ def _painted(dataset: SignatureDataset, i: int, found: Explanation, place: int) 
     """A body's name and mesh, and what each of its faces has of the difference."""
     mesh, signature = dataset.mesh(i), dataset[i].signature
     centres = mesh.vertices[mesh.faces].mean(axis=1)
-    samples = {kind: getattr(signature, kind).points for kind in KINDS}
+    samples = {kind: getattr(signature, kind).points for kind in SAMPLE_KINDS}
     return dataset.bodies.names[i], mesh, on_surface((found.places or found.samples)[place], samples, centres)
 
 
@@ -214,7 +215,7 @@ def _sample_rows(dataset: SignatureDataset, chosen: list[int], found: Explanatio
         {"body": dataset.bodies.names[i], "samples": kind, **dict(zip("xyz", point, strict=True)),
          "share": float(share), "share_by_place": float(placed)}
         for i, shares, places in zip(chosen, found.samples, found.places or found.samples, strict=True)
-        for kind in KINDS
+        for kind in SAMPLE_KINDS
         for point, share, placed in zip(
             getattr(dataset[i].signature, kind).points.tolist(), shares[kind], places[kind], strict=True
         )

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from igps.analysis.clusters import STABLE, Joining, clusters_of
+from igps._arrays import Floats
+from igps.analysis.clusters import STABLE, Linkage, clusters_of
 from igps.analysis.comparison import pair_distances
 from igps.analysis.map import Layout, body_map
 from igps.cli.reading import Folder, described, print_failures
@@ -21,7 +21,7 @@ def clusters(
     root: Path,
     descriptor: str = "pretrained",
     n_clusters: int | None = None,
-    joining: Joining = "average",
+    linkage: Linkage = "average",
     n_resamples: int = 100,
     seed: int = 0,
     out: Path | None = None,
@@ -35,18 +35,18 @@ def clusters(
 
     Args:
         n_clusters: how many; as many as have the largest mean silhouette if not given.
-        joining: two clusters are as far apart as their bodies are on average (average), at most (complete), or at least
+        linkage: two clusters are as far apart as their bodies are on average (average), at most (complete), or at least
             (single).
         n_resamples: random halves of the bodies, for the stability.
         seed: of the random halves.
         out: folder for clusters.csv and clusters.json, and the tree as clusters.svg and clusters.png.
     """
     dataset, distances, label_of = _compared(Folder(root), descriptor, **reading)
-    found = clusters_of(distances, n_clusters, joining=joining, n_resamples=n_resamples, seed=seed)
+    found = clusters_of(distances, n_clusters, linkage=linkage, n_resamples=n_resamples, seed=seed)
     names, told = dataset.bodies.names, list[dict[str, Any]]()
     print(f"{'cluster':>7}{'bodies':>8}{'stability':>11}  in the middle")
-    for number, (middle, stability) in enumerate(zip(found.middles, found.stability, strict=True)):
-        members = np.flatnonzero(found.numbers == number)
+    for number, (middle, stability) in enumerate(zip(found.medoids, found.stability, strict=True)):
+        members = np.flatnonzero(found.labels == number)
         classes = Counter(label_of[i] for i in members if label_of[i])
         told.append(
             {"cluster": number + 1, "n_bodies": len(members), "stability": stability, "middle": names[middle],
@@ -59,7 +59,7 @@ def clusters(
     if out is not None:
         rows = [
             {"body": name, "class": label_of[i], "cluster": int(number) + 1, "stability": found.stability[number]}
-            for i, (name, number) in enumerate(zip(names, found.numbers, strict=True))
+            for i, (name, number) in enumerate(zip(names, found.labels, strict=True))
         ]
         write_answer(out, "clusters", rows, clusters_figure(found, names))
         print(f"written to {out}")
@@ -84,7 +84,7 @@ def map_bodies(
         out: folder for map.csv, map.json, map.svg and map.png.
     """
 
-    def told_of(bodies: Bodies) -> list[str] | list[float]:
+    def values_of(bodies: Bodies) -> list[str] | list[float]:
         """What labels.csv says; nothing where the colour is something else."""
         if colour in ("class", "cluster", "volume"):
             return []
@@ -93,17 +93,17 @@ def map_bodies(
         except ValueError:  # words
             return list(bodies.column(colour))
 
-    dataset, distances, label_of = _compared(Folder(root, check=told_of), descriptor, **reading)
+    dataset, distances, label_of = _compared(Folder(root, check=values_of), descriptor, **reading)
     found, bodies = body_map(distances, layout, seed=seed), dataset.bodies
     values: list[str] | list[float]
     if colour == "class":
         values = label_of
     elif colour == "cluster":
-        values = [str(one + 1) for one in clusters_of(distances, n_resamples=0, seed=seed).numbers]
+        values = [str(one + 1) for one in clusters_of(distances, n_resamples=0, seed=seed).labels]
     elif colour == "volume":
         values = [one.volume * millimetres(one.unit) ** 3 for one in dataset.signatures()]
     else:
-        values = told_of(bodies)
+        values = values_of(bodies)
     column = colour if colour not in ("body", "x", "y") else f"{colour} of {LABELS_FILE}"
     rows = [
         {"body": name, "x": x, "y": y, "class": label, column: value}
@@ -116,9 +116,7 @@ def map_bodies(
     return rows
 
 
-def _compared(
-    folder: Folder, descriptor: str, **reading: Any
-) -> tuple[SignatureDataset, NDArray[np.float64], list[str]]:
+def _compared(folder: Folder, descriptor: str, **reading: Any) -> tuple[SignatureDataset, Floats, list[str]]:
     """The bodies, their distances, and the class of each, "" where that is not known."""
     found = described(folder, descriptor, **reading)
     print_failures(found.failures, len(found.dataset))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import LABELS_FILE, file_of
+from igps.data.sources import LABELS_FILE, file_name_of
 from igps.report.tables import write_rows
 
 SUFFIXES = (".csv", ".parquet")
@@ -29,7 +29,7 @@ def feature_table(dataset: SignatureDataset, features: np.ndarray) -> tuple[Tabl
     """
     bodies = dataset.bodies
     units, volumes, areas = zip(*((one.unit, one.volume, one.area) for one in dataset.signatures()), strict=True)
-    files = list(map(file_of, bodies.names, bodies.parts))
+    files = list(map(file_name_of, bodies.names, bodies.parts))
     own = {"file": files, "part": bodies.parts, "name": bodies.names, "label": bodies.labels or [None] * len(bodies)}
     vectors = features.reshape(len(features), -1)
     measured = {"volume": volumes, "area": areas, **{f"v{i}": list(column) for i, column in enumerate(vectors.T)}}

@@ -97,7 +97,7 @@ def dask_executor(address: str) -> Iterator[Executor]:
         from distributed import Client
     except ImportError as error:
         raise ImportError('cluster: needs Dask: pip install "interior-gps[cluster]".') from error
-    # A lost scheduler is told in one sentence; Dask adds the tracebacks of its attempts to find it again.
+    # A lost scheduler is one sentence here; Dask would add tracebacks of its attempts to reconnect.
     for name in ("distributed", "distributed.client", "tornado.application"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:

@@ -57,7 +57,7 @@ MEANINGS = {
     "memory_limit": "gigabytes of memory that one body may take; no limit if not given",
     "cache_dir": "folder where computed signatures are kept; the user's cache directory if not given",
 }
-"""What options mean where the docstring of a command does not say it."""
+"""The help of options that the docstring of a command leaves out."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,9 @@ class Folder:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a command tells, and whether its exit status is 0."""
+    """The result of a command, and whether its exit status is 0."""
 
-    told: Any
+    result: Any
     is_good: bool
 
 
@@ -86,7 +86,7 @@ class Described:
     descriptions: Tensor  # (N, ...)
     failures: list[Failure]  # the other bodies
     descriptor: Descriptor  # that described them
-    name: str | None  # by which it is found again; None where its centres are the collection's, which no name tells
+    name: str | None  # by which it can be loaded again; None where its centres were fitted to the collection
 
     def coordinates(self, *, of_one_kind: bool = False) -> Floats:
         """(N, D) for statistics, see `Descriptor.coordinates`."""
@@ -169,7 +169,7 @@ def print_failures(failures: Sequence[Failure], n_used: int) -> None:
 
 
 def with_side(descriptor: str, mirror: MirrorOption, size: Size) -> str:
-    """The name of a descriptor that tells mirror images apart, if asked for; a ValueError where it says otherwise."""
+    """The name with +side where mirror images are to be told apart; a ValueError where it contradicts the options."""
     for option, value, refused, mark in (("size", size, "ignore", SIZE), ("mirror", mirror, "same", SIDE)):
         if value == refused and mark in (name := descriptor_of(descriptor).name):
             raise ValueError(f"{option}: expected no {value!r} beside {name}, which is {mark}. Leave one of them out.")
@@ -179,7 +179,7 @@ def with_side(descriptor: str, mirror: MirrorOption, size: Size) -> str:
 
 
 def sized(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
-    """The name of a descriptor that keeps the size of the bodies, or not, as is asked for; says what is left open."""
+    """The name with or without +size, as the option and the units of the bodies say; prints what they leave open."""
     module = descriptor_of(descriptor)
     if SIZE in module.name or "scale" not in module.invariant_to:
         if size == "keep" and SIZE not in module.name:
@@ -221,7 +221,7 @@ def chosen_dataset(
     attribute: list[str] | None = None,
     **options: Any,
 ) -> SignatureDataset:
-    """The dataset that the options tell; nothing is computed.
+    """The dataset that the options select; nothing is computed.
 
     Args:
         signature: parameters of the signatures.

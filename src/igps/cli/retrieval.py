@@ -68,7 +68,7 @@ def retrieve(
         scores = retrieval_scores(distances["reranked"], labels)
         summary["reranked"] = scores.mean()
         told += f"\n\nre-ranked by the whole collection, without its labels\n{scores_table(scores)}"
-    if out is not None:  # before anything is printed: who pipes that into `head` may be gone by then
+    if out is not None:  # before printing, which a pipe into `head` may end
         _write_retrieval(out, found, summary, distances)
     print(told)
     print_failures(found.failures, len(found.dataset))

@@ -94,7 +94,7 @@ def _reduced(batch: SignatureBatch) -> Any:
 
 
 def _rebuilt(handle: Any, n_bytes: int, fields: dict[str, Any]) -> SignatureBatch:
-    """The batch in the consumer's process; its worker has the memory back when the last of its tensors goes."""
+    """The batch in the consumer's process; its worker gets the memory back when the last tensor is freed."""
     descriptor = handle.detach()
     memory = mmap.mmap(descriptor, n_bytes)
     os.close(descriptor)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
+from igps._arrays import Booleans, Floats
 from igps._parameters import check_one_of
 from igps.data.attributes import AttributeSource
 from igps.data.cache import content_digest
@@ -33,7 +34,6 @@ from igps.signature.residue_attributes import RESIDUE_ATTRIBUTES, residue_attrib
 
 logger = logging.getLogger(__name__)
 
-Values = NDArray[np.float64]
 
 # A value beyond stands for none, such as the 7e18 at the border of some grids.
 _LARGEST = 1e15
@@ -56,7 +56,7 @@ class ResidueAttribute:
         """The name alone: the molecule is the body's file."""
         return f"residues 1 {self.name}"
 
-    def __call__(self, body: BodyRef, points: Values) -> Values:
+    def __call__(self, body: BodyRef, points: Floats) -> Floats:
         """(P,) or (P, C) at points (P, 3), Å; a MeshError of what is no molecule, or has no such value."""
         if not is_structure(body.path):
             none = f"{body}: has no atoms, which {self.name!r} is known of."
@@ -64,7 +64,7 @@ class ResidueAttribute:
         values = residue_attribute(_molecule(body), points, self.name)
         if np.isnan(values).all():
             raise MeshError(f"{body}: {self.name!r} is known of none of its residues. Choose another descriptor.")
-        return completed(values, points, f"{body}: {self.name}")
+        return fill_missing(values, points, f"{body}: {self.name}")
 
 
 def _molecule(body: BodyRef) -> Molecule:
@@ -104,7 +104,7 @@ class FileAttribute(ABC):
         files = files_read(file)
         return f"{type(self).__name__} 4 {name} {_checksum(*files, stamp=stamp_of(*files))}"
 
-    def __call__(self, body: BodyRef, points: Values) -> Values:
+    def __call__(self, body: BodyRef, points: Floats) -> Floats:
         """(P,) or (P, C) at points (P, 3); a MeshError where the file is of no use, or knows too few of them."""
         file, name = self.file(body)
         try:
@@ -118,10 +118,10 @@ class FileAttribute(ABC):
                 f"{body}: its attribute's file {file} is not readable ({type(error).__name__}: "
                 f"{' '.join(str(error).split())}). Check that it is complete, and of the format that its name tells."
             ) from error
-        return completed(values, points, f"{body}: {file}")
+        return fill_missing(values, points, f"{body}: {file}")
 
     @abstractmethod
-    def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
+    def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
         """(P,) or (P, C) at points (P, 3), NaN where they are not known."""
 
     def files(self, paths: Iterable[Path]) -> set[Path]:
@@ -167,7 +167,7 @@ class ImageAttribute(FileAttribute):
     NIfTI, MGH, NRRD and MetaImage in world coordinates (RAS, millimetres); OpenDX, MRC and CCP4 in ångström.
     """
 
-    def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
+    def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
         grid, affine = images.read(file, stamp_of(*files_read(file)))
         at = (brains.in_scanner(body.path, points) - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
         size = np.array(grid.shape)
@@ -197,7 +197,7 @@ class VertexAttribute(FileAttribute):
 
     reading: LoadOptions = LoadOptions()
 
-    def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
+    def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
         import igl
 
         if file.name.lower().endswith(images.SUFFIXES):  # of a pattern that ends in {file}
@@ -207,7 +207,7 @@ class VertexAttribute(FileAttribute):
         if len(given) != len(raw.vertices):
             counts = f"{len(given)} values, its surface {len(raw.vertices)} vertices"
             raise MeshError(f"{body}: {file} has {counts}. Give the values of this surface.")
-        columns = completed(given.reshape(len(given), -1), raw.vertices, str(file))
+        columns = fill_missing(given.reshape(len(given), -1), raw.vertices, str(file))
         mesh = load_mesh(body.path, self.reading, part=body.part)
         vertices = mesh.vertices
         if not np.array_equal(vertices, raw.vertices):
@@ -223,7 +223,7 @@ class VertexAttribute(FileAttribute):
 class TetAttribute(FileAttribute):
     """Values at the points of a mesh of tetrahedra (.vtu), linear in each."""
 
-    def values(self, body: BodyRef, file: Path, name: str, points: Values) -> Values:
+    def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
         vertices, tetrahedra, arrays = vertex_values.read_tetrahedra(file)
         given = vertex_values.chosen(arrays, name, file)
         corners = vertices[tetrahedra]
@@ -257,7 +257,7 @@ def attribute_source(path: str, root: Path | None = None) -> AttributeSource:
     return (TetAttribute if name.endswith(_TETRAHEDRA) else VertexAttribute)(path, root)
 
 
-def of_bodies_read(source: AttributeSource, options: LoadOptions) -> AttributeSource:
+def with_load_options(source: AttributeSource, options: LoadOptions) -> AttributeSource:
     """The source for bodies that are read so, with cavities or without; carried inside from closed ones."""
     closed = replace(options, allow_open=False, mend="auto")
     return replace(source, reading=closed) if isinstance(source, VertexAttribute) else source
@@ -274,7 +274,7 @@ def attribute_sources(given: Sequence[str], root: Path | None) -> dict[str, Attr
     return found
 
 
-def completed(values: Values, points: Values, what: str) -> Values:
+def fill_missing(values: Floats, points: Floats, what: str) -> Floats:
     """Values (P,) or (P, C), those that are not known (NaN) taken from the nearest of points (P, 3) that has one.
 
     It is logged of `what` that is; a MeshError where more than a tenth is not known.
@@ -296,5 +296,5 @@ def completed(values: Values, points: Values, what: str) -> Values:
     return values
 
 
-def _is_known(values: NDArray[Any]) -> NDArray[np.bool_]:
+def _is_known(values: NDArray[Any]) -> Booleans:
     return np.isfinite(values) & (np.abs(values) < _LARGEST)

@@ -11,14 +11,13 @@ from typing import Any, Protocol, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from igps._arrays import Floats
 from igps.mesh.loading import BodyRef
 from igps.signature.attributes import AttributeName
-from igps.signature.signature import Signature
+from igps.signature.signature import SAMPLE_KINDS, SampleKind, Signature
 
-ROOMS = ("interior", "surface")
-
-# What a key can tell.
-_Told = bool | int | float | str | PurePath
+# Values that a key of the cache can hold
+_Keyable = bool | int | float | str | PurePath
 
 PointFunction = Callable[..., NDArray[np.floating[Any]]]
 
@@ -30,7 +29,7 @@ class AttributeSource(Protocol):
     def cache_tag(self, body: BodyRef) -> str:
         """All that the values depend on beside the points, such as a checksum of the image."""
 
-    def __call__(self, body: BodyRef, points: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
+    def __call__(self, body: BodyRef, points: Floats) -> NDArray[np.floating[Any]]:
         """Values (P,) or (P, C) at points (P, 3) in the coordinates of the body's file."""
 
 
@@ -49,7 +48,7 @@ class FunctionAttribute:
     A ValueError where its source code is not known, or does not tell what it does.
     """
 
-    function: Callable[[BodyRef, NDArray[np.float64]], NDArray[np.floating[Any]]]
+    function: Callable[[BodyRef, Floats], NDArray[np.floating[Any]]]
 
     def __post_init__(self) -> None:
         self.cache_tag(None)
@@ -60,7 +59,7 @@ class FunctionAttribute:
         remedy = "Give an object with this call and a method cache_tag(body), see igps.data.attributes.AttributeSource."
         kept = getattr(self.function, "__defaults__", None), getattr(self.function, "__kwdefaults__", None)
         used = [*(kept[0] or ()), *(kept[1] or {}).values(), *_constants(self.function)]
-        is_told = all(one is None or isinstance(one, _Told) for one in used)
+        is_told = all(one is None or isinstance(one, _Keyable) for one in used)
         if getattr(self.function, "__closure__", None) or inspect.ismethod(self.function) or not is_told:
             raise ValueError(f"attributes: {name} uses variables of what is around it, which no key tells. {remedy}")
         try:
@@ -69,18 +68,18 @@ class FunctionAttribute:
             raise ValueError(f"attributes: the source code of {name} is not known ({error}). {remedy}") from error
         return f"function {name} {hashlib.sha256(source.encode()).hexdigest()} {used} {body}"
 
-    def __call__(self, body: BodyRef, points: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
+    def __call__(self, body: BodyRef, points: Floats) -> NDArray[np.floating[Any]]:
         """Its values."""
         return self.function(body, points)
 
 
 def _constants(function: Callable[..., Any]) -> list[Any]:
-    """The numbers, texts, arrays and the like that a function uses of its module."""
+    """The numbers, texts, arrays and the like that a function uses from its module."""
     if not inspect.isfunction(function):
         return []
     names = sorted({one.argval for one in dis.get_instructions(function) if one.opname == "LOAD_GLOBAL"})
     found = [function.__globals__[name] for name in names if name in function.__globals__]
-    return [one for one in found if isinstance(one, _Told | list | tuple | dict | set | np.ndarray)]
+    return [one for one in found if isinstance(one, _Keyable | list | tuple | dict | set | np.ndarray)]
 
 
 def _takes_body(function: Callable[..., Any]) -> bool:
@@ -102,7 +101,7 @@ def split_attributes(
     sources: dict[str, AttributeSource] = {}
     functions: dict[str, PointFunction] = {}
     for name, one in given.items():
-        if not callable(one) or name in get_args(AttributeName):  # which would be given to those who need the own
+        if not callable(one) or name in get_args(AttributeName):  # it would take the place of the library's own
             own = f"the library's, {', '.join(get_args(AttributeName))}, are named in SignatureConfig(attributes=...)"
             raise ValueError(f"attributes: expected functions or sources by other names, got {name}={one!r}: {own}.")
         if isinstance(one, AttributeSource):
@@ -114,10 +113,10 @@ def split_attributes(
     return sources, functions
 
 
-def with_attribute(signature: Signature, name: str, values: Mapping[str, ArrayLike]) -> Signature:
-    """The Signature with an attribute of its samples, by room; a ValueError without one finite row for each."""
+def with_attribute(signature: Signature, name: str, values: Mapping[SampleKind, ArrayLike]) -> Signature:
+    """The Signature with an attribute of its samples, by kind; a ValueError without one finite row for each."""
     try:
-        interior, surface = (getattr(signature, room).with_attributes({name: values[room]}) for room in ROOMS)
+        interior, surface = (getattr(signature, kind).with_attributes({name: values[kind]}) for kind in SAMPLE_KINDS)
     except ValueError as error:
         raise ValueError(f"{signature.name}: attributes: {error}") from error
     return replace(signature, interior=interior, surface=surface)

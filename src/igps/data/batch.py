@@ -13,10 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from igps._arrays import Floats, Singles
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature
 
-Several = slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
+Indices = slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
 """Some of a batch or dataset: a slice, numbers, a mask, and of a dataset names."""
 
 
@@ -39,7 +40,7 @@ class SampleBatch:
     attributes: Mapping[str, Tensor]  # by name, each (N, P) or (N, P, C) float32; a direction has C = 3
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SampleBatch:
-        """The batch of what a function makes of each of its tensors."""
+        """The batch with a function applied to each of its tensors."""
         attributes = {name: function(values) for name, values in self.attributes.items()}
         return SampleBatch(function(self.points), function(self.eigenfunctions), function(self.mask), attributes)
 
@@ -93,7 +94,7 @@ _START_OF_ZERO = _start(0)
 class Body:
     """One shape of a batch, without padding, as arrays."""
 
-    eigenvalues: NDArray[np.float64]  # (K,) ascending, 1/length²
+    eigenvalues: Floats  # (K,) ascending, 1/length²
     interior: Samples  # their points measured from their centre
     surface: Samples  # likewise
     area: float  # of the surface, length²
@@ -146,18 +147,18 @@ class SignatureBatch:
     def __len__(self) -> int:
         return len(self.ids)
 
-    # No __iter__, by which Lightning would look for the size of a batch in its bodies: numbers iterate too.
+    # No __iter__: Lightning would infer the batch size from the bodies. Indexing by numbers iterates too.
     @overload
     def __getitem__(self, index: int) -> Body: ...
     @overload
-    def __getitem__(self, index: Several) -> SignatureBatch: ...
-    def __getitem__(self, index: int | Several) -> Body | SignatureBatch:
+    def __getitem__(self, index: Indices) -> SignatureBatch: ...
+    def __getitem__(self, index: int | Indices) -> Body | SignatureBatch:
         """One shape as a `Body` by its number; some as a batch by a slice, numbers, or a mask."""
-        index = number_of(index)
+        index = scalar_index(index)
         if isinstance(index, int | np.integer):
             number = range(len(self))[index]
             return self[number : number + 1].to("cpu")._body(0)
-        chosen = chosen_of(index, len(self))
+        chosen = resolve_indices(index, len(self))
         rows: slice | Tensor = torch.tensor(chosen, dtype=torch.int64, device=self.labels.device)
         if isinstance(index, slice) and (index.step or 1) > 0:  # views; tensors take no slices backwards
             rows = index
@@ -174,7 +175,7 @@ class SignatureBatch:
         return self.area.device
 
     def map(self, function: Callable[[Tensor], Tensor]) -> SignatureBatch:
-        """The batch of what a function makes of each of its tensors."""
+        """The batch with a function applied to each of its tensors."""
         return replace(
             self,
             eigenvalues=function(self.eigenvalues),
@@ -227,12 +228,12 @@ class SignatureBatch:
         return Body(eigenvalues, interior, surface, float(self.area[i]), float(self.volume[i]), self.ids[i], mesh)
 
 
-def number_of(index: Any) -> Any:
+def scalar_index(index: Any) -> Any:
     """The number in an array without dimensions, as permutations give them one by one; any other index as it is."""
     return operator.index(index) if isinstance(index, Tensor | np.ndarray) and index.ndim == 0 else index
 
 
-def chosen_of(index: Several, n: int) -> list[int]:
+def resolve_indices(index: Indices, n: int) -> list[int]:
     """The numbers that a slice, numbers, or a mask choose among n; an IndexError where they do not fit."""
     if isinstance(index, slice):
         return list(range(n))[index]
@@ -274,7 +275,7 @@ def _joined_samples(parts: Sequence[SampleBatch]) -> SampleBatch:
 def _samples_of(batch: SampleBatch, i: int, n_eigenpairs: int) -> Samples:
     real = batch.mask[i]
 
-    def array(values: Tensor) -> NDArray[np.float32]:
+    def array(values: Tensor) -> Singles:
         return values[i, real].numpy()
 
     return Samples(

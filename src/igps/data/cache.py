@@ -1,30 +1,27 @@
 """A content-addressed store of Signatures and descriptions on disk, one safetensors file each."""
 
-import contextlib
 import hashlib
 import json
 import logging
 import os
-import secrets
 import time
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import IO, Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from igps.signature.signature import Samples, Signature, SignatureConfig
+from igps._arrays import Singles
+from igps._files import PARTIAL, whole_file
+from igps.signature.signature import SAMPLE_KINDS, SampleKind, Samples, Signature, SignatureConfig
 
 logger = logging.getLogger(__name__)
 
-_ROOMS = ("interior", "surface")
 # What a Signature has beside arrays and configuration
 _OTHERS = ("area", "volume", "name", "notes", "residual", "unit")
-_PARTIAL = ".partial"
 # A file still being written after so many seconds was left by a process that was killed: a write takes well below one.
 _ABANDONED = 24 * 3600
 _ROW = 4096  # bytes
@@ -38,7 +35,7 @@ def default_cache_dir() -> Path:
 
 
 def content_digest(path: Path, *beside: Path) -> bytes:
-    """Of what is in a file, and in others that are read with it."""
+    """A digest of the content of a file, and of others that are read with it."""
     with open(path, "rb") as file:
         digest = hashlib.file_digest(file, "sha256").digest()
     return hashlib.sha256(digest + b"".join(map(content_digest, beside))).digest() if beside else digest
@@ -49,12 +46,12 @@ class FileCache(Generic[T]):
 
     A file is written beside its place and moved there in one step, so that a reader sees all of it or nothing. What a
     killed run leaves of one is removed a day later, see `remove_abandoned`. Two processes that compute the same value
-    write the same bytes. Who may read folders and files is for the umask to say.
+    write the same bytes. Permissions follow the umask.
 
     The directory is made if it is missing.
     """
 
-    what: ClassVar[str]  # the values are, in a word
+    what: ClassVar[str]  # one word for the values, in messages
     folder: ClassVar[str] = ""  # of the values in the directory, "" where they lie in it themselves
     # A value to arrays and metadata, and back; the latter raises a ValueError, KeyError or TypeError if they make none
     _encode: Callable[[T], tuple[dict[str, np.ndarray], dict[str, str]]]
@@ -87,7 +84,7 @@ class FileCache(Generic[T]):
     def _read(self, key: str, read: Callable[[Any, Mapping[str, str]], Read]) -> Read | None:
         path = self.path(key)
         try:
-            with safe_open(path, framework="pt") as file:  # in NumPy's words it would copy every array
+            with safe_open(path, framework="pt") as file:  # framework="numpy" would copy every array
                 metadata = file.metadata() or {}
                 if metadata.get("format") != self._format or metadata.get("key") != key:
                     raise ValueError(f"not a {self._format} file of this key")
@@ -104,7 +101,7 @@ class FileCache(Generic[T]):
         path.parent.mkdir(parents=True, exist_ok=True)
         tensors, metadata = self._encode(value)
         metadata["checksum"] = checksum(tensors, metadata)
-        _remove_abandoned(path.parent.glob(f"*{_PARTIAL}"))
+        _remove_abandoned(path.parent.glob(f"*{PARTIAL}"))
         try:
             with whole_file(path) as file:
                 file.write(_ordered(save(tensors, metadata={"format": self._format, "key": key, **metadata})))
@@ -116,38 +113,24 @@ class FileCache(Generic[T]):
         except OSError as error:
             if error.errno is None or error.filename is not None:
                 raise
-            # That of a full disk does not say which.
+            # The error of a full disk names no file
             raise OSError(error.errno, error.strerror, str(path)) from error
 
     def remove_abandoned(self) -> None:
         """Remove what killed processes left of files that they were writing, a day after."""
-        _remove_abandoned(self.directory.glob(f"*/*{_PARTIAL}"))
-
-
-@contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[IO[bytes]]:
-    """A file to write beside its place, which is moved there in one step, whole or not at all."""
-    # By an ordinary open: files that tempfile or safetensors make are for their owner alone, whatever the umask.
-    partial = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(8)}{_PARTIAL}")
-    try:
-        with open(partial, "xb") as file:
-            yield file
-        os.replace(partial, path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+        _remove_abandoned(self.directory.glob(f"*/*{PARTIAL}"))
 
 
 def encode(signature: Signature) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """The arrays of a Signature by name, and all else as JSON."""
     # A file is written as the arrays lie in memory.
     tensors: dict[str, np.ndarray] = {"eigenvalues": np.ascontiguousarray(signature.eigenvalues, np.float64)}
-    for room in _ROOMS:
-        samples: Samples = getattr(signature, room)
-        tensors[f"{room}.points"] = np.ascontiguousarray(samples.points, np.float64)
-        tensors[f"{room}.eigenfunctions"] = np.ascontiguousarray(samples.eigenfunctions, np.float32)
+    for kind in SAMPLE_KINDS:
+        samples: Samples = getattr(signature, kind)
+        tensors[f"{kind}.points"] = np.ascontiguousarray(samples.points, np.float64)
+        tensors[f"{kind}.eigenfunctions"] = np.ascontiguousarray(samples.eigenfunctions, np.float32)
         for name, values in samples.attributes.items():
-            tensors[f"{room}.attributes.{name}"] = np.ascontiguousarray(values, np.float32)
+            tensors[f"{kind}.attributes.{name}"] = np.ascontiguousarray(values, np.float32)
     others = {**{name: getattr(signature, name) for name in _OTHERS}, "config": signature.config.as_dict()}
     return tensors, {name: json.dumps(value) for name, value in others.items()}
 
@@ -157,21 +140,20 @@ def decode(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Si
     config: dict[str, Any] = json.loads(metadata["config"])
     if config.pop("algorithm_version") != SignatureConfig.ALGORITHM_VERSION:
         raise ValueError("made by another version of the algorithm")
-    config["attributes"] = tuple(config["attributes"])
-    eigenvalues, rooms = tensors["eigenvalues"], {}
+    eigenvalues, samples_of = tensors["eigenvalues"], dict[str, Any]()
     _check_array("eigenvalues", eigenvalues, np.float64, (len(eigenvalues),))
-    for room in _ROOMS:
-        prefix = f"{room}.attributes."
+    for kind in SAMPLE_KINDS:
+        prefix = f"{kind}.attributes."
         attributes = {name.removeprefix(prefix): values for name, values in tensors.items() if name.startswith(prefix)}
-        points, eigenfunctions = tensors[f"{room}.points"], tensors[f"{room}.eigenfunctions"]
-        _check_array(f"{room}.points", points, np.float64, (len(points), 3))
-        _check_array(f"{room}.eigenfunctions", eigenfunctions, np.float32, (len(points), len(eigenvalues)))
+        points, eigenfunctions = tensors[f"{kind}.points"], tensors[f"{kind}.eigenfunctions"]
+        _check_array(f"{kind}.points", points, np.float64, (len(points), 3))
+        _check_array(f"{kind}.eigenfunctions", eigenfunctions, np.float32, (len(points), len(eigenvalues)))
         for name, values in attributes.items():
-            _check_array(f"{room}.attributes.{name}", values, np.float32, (len(points), *values.shape[1:]))
-        rooms[room] = Samples(points, eigenfunctions, attributes)
+            _check_array(f"{kind}.attributes.{name}", values, np.float32, (len(points), *values.shape[1:]))
+        samples_of[kind] = Samples(points, eigenfunctions, attributes)
     others: dict[str, Any] = {name: json.loads(metadata[name]) for name in _OTHERS}
     others["notes"] = tuple(others["notes"])
-    return Signature(eigenvalues, rooms["interior"], rooms["surface"], config=SignatureConfig(**config), **others)
+    return Signature(eigenvalues, **samples_of, config=SignatureConfig(**config), **others)
 
 
 def _check_array(name: str, values: np.ndarray, kind: type[np.floating[Any]], shape: tuple[int, ...]) -> None:
@@ -194,19 +176,19 @@ class SignatureCache(FileCache[Signature]):
         return self._read(key, lambda file, metadata: json.loads(metadata["unit"]))
 
 
-def _arrays_alone(arrays: dict[str, NDArray[np.float32]]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+def _arrays_alone(arrays: Mapping[Any, Singles]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     return {name: np.ascontiguousarray(one) for name, one in arrays.items()}, {}
 
 
-class AttributeCache(FileCache[dict[str, NDArray[np.float32]]]):
-    """Attributes of the samples of one Signature by room, beside the Signatures."""
+class AttributeCache(FileCache[dict[SampleKind, Singles]]):
+    """Attributes of the samples of one Signature by kind, beside the Signatures."""
 
     what, folder = "attribute", "attributes"
     _encode = staticmethod(_arrays_alone)
-    _decode = staticmethod(lambda tensors, metadata: {room: tensors[room] for room in _ROOMS})
+    _decode = staticmethod(lambda tensors, metadata: {kind: tensors[kind] for kind in SAMPLE_KINDS})
 
 
-class DescriptionCache(FileCache[NDArray[np.float32]]):
+class DescriptionCache(FileCache[Singles]):
     """Descriptions by key, beside the Signatures, see `FileCache`."""
 
     what, folder = "description", "descriptions"
@@ -219,7 +201,7 @@ def _remove_abandoned(partials: Iterable[Path]) -> None:
         try:
             if time.time() - partial.stat().st_mtime > _ABANDONED:
                 partial.unlink()
-        except OSError:  # another process was first, or may and we may not
+        except OSError:  # another process was first, or only another user may
             continue
 
 
@@ -234,7 +216,7 @@ def _ordered(content: bytes) -> bytes:
 
 
 def checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
-    """Of all that a value is read from, in hexadecimal; it reads memory as fast as that can be read.
+    """Of all that a value is read from, in hexadecimal, as fast as memory can be read.
 
     The arrays enter by the sums of their columns, where each is seen as rows of 512 words of eight bytes.
     """

@@ -12,9 +12,10 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from igps.data.cache import check_checksum, checksum, decode, encode, whole_file
+from igps._files import whole_file
+from igps.data.cache import check_checksum, checksum, decode, encode
 from igps.data.requirements import Requirements
-from igps.data.sources import Bodies, file_of
+from igps.data.sources import Bodies, file_name_of
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature, SignatureConfig
 
@@ -25,8 +26,8 @@ _KINDS = {"float64": "F64", "float32": "F32"}
 
 
 @dataclass(frozen=True)
-class About:
-    """What a collection tells of itself."""
+class Contents:
+    """What a collection holds beside the Signatures."""
 
     bodies: Bodies  # without folders
     classes: tuple[str, ...]  # all names of classes, in the order of their numbers
@@ -34,21 +35,21 @@ class About:
     reading: LoadOptions  # how the meshes were read
     config: SignatureConfig  # of the Signatures
 
-    def written(self) -> str:
-        """All of it as JSON; of the paths, what their names tell."""
+    def to_json(self) -> str:
+        """All of it as JSON, but for the paths."""
         bodies = {name: value for name, value in vars(self.bodies).items() if name != "paths"}
         labels = None if self.bodies.labels is None else list(map(str, self.bodies.labels))  # numbers may be given
         words = {"labels": labels, "classes": list(map(str, self.classes)), "keys": self.keys}
         return json.dumps({**bodies, **words, "reading": asdict(self.reading), "config": asdict(self.config)})
 
     @staticmethod
-    def read(text: str) -> About:
+    def from_json(text: str) -> Contents:
         """What was written; a ValueError, KeyError or TypeError where it does not fit together."""
         told: dict[str, Any] = json.loads(text)
         names, parts, columns = _words(told["names"]), tuple(told["parts"]), dict(told.get("columns", {}))
         labels = None if told["labels"] is None else _words(told["labels"])
         columns = {name: tuple(values) for name, values in columns.items()}
-        paths = tuple(Path(file_of(name, part)) for name, part in zip(names, parts, strict=True))
+        paths = tuple(Path(file_name_of(name, part)) for name, part in zip(names, parts, strict=True))
         bodies = Bodies(paths, names, labels, parts, columns)
         classes, keys = _words(told["classes"]), _words(told["keys"])
         if len(keys) != len(names) or len(parts) != len(names) or len(set(names)) < len(names):
@@ -57,13 +58,12 @@ class About:
         if not set(labels or ()) <= set(classes) or not all(one is None or isinstance(one, str) for one in words):
             raise ValueError("its labels are none of its classes, or its parts or columns no words")
         try:
-            config = SignatureConfig(**{**told["config"], "attributes": tuple(told["config"]["attributes"])})
-            return About(bodies, classes, keys, LoadOptions(**told["reading"]), config)
+            return Contents(bodies, classes, keys, LoadOptions(**told["reading"]), SignatureConfig(**told["config"]))
         except (TypeError, KeyError, ValueError) as error:
             raise ValueError(f"parameters of another version: {error}") from error
 
 
-def write_collection(path: Path, about: About, signature: Callable[[int], Signature]) -> None:
+def write_collection(path: Path, about: Contents, signature: Callable[[int], Signature]) -> None:
     """Write a collection, whole or not at all: a safetensors file of the arrays of all Signatures.
 
     A file that is there is replaced. Each Signature is asked for by its number, several times, and not kept.
@@ -86,7 +86,7 @@ def write_collection(path: Path, about: About, signature: Callable[[int], Signat
         kind, shape, n_bytes = arrays[i][name]
         header[f"{i}.{name}"] = {"dtype": _KINDS[kind], "shape": shape, "data_offsets": (end, end + n_bytes)}
         end += n_bytes
-    words = {"format": _FORMAT, "about": about.written(), "signatures": json.dumps(told)}
+    words = {"format": _FORMAT, "about": about.to_json(), "signatures": json.dumps(told)}
     words["checksum"] = checksum({}, {"about": words["about"]})
     text = json.dumps({"__metadata__": words, **header}, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
@@ -125,19 +125,19 @@ class CollectionFile:
             if metadata.get("format") != _FORMAT:
                 raise ValueError(f"its format is {metadata.get('format')!r}")
             check_checksum({}, {"about": metadata["about"], "checksum": metadata["checksum"]})
-            self.about = About.read(metadata["about"])
-            self._told: list[dict[str, str]] = json.loads(metadata["signatures"])
-            if len(self._told) != len(self.about.bodies):
-                raise ValueError(f"{len(self.about.bodies)} names for {len(self._told)} signatures")
+            self.about = Contents.from_json(metadata["about"])
+            self._metadata: list[dict[str, str]] = json.loads(metadata["signatures"])
+            if len(self._metadata) != len(self.about.bodies):
+                raise ValueError(f"{len(self.about.bodies)} names for {len(self._metadata)} signatures")
             names = set(self._file.keys())
         except (SafetensorError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(
                 f"{self.path}: expected a collection in the format {_FORMAT} ({error}). Export it again."
             ) from error
-        self._arrays: list[list[str]] = [[] for _ in self._told]
+        self._arrays: list[list[str]] = [[] for _ in self._metadata]
         for name in sorted(names):
             number, _, array = name.partition(".")
-            if number.isdecimal() and int(number) < len(self._told):
+            if number.isdecimal() and int(number) < len(self._metadata):
                 self._arrays[int(number)].append(array)
 
     def __reduce__(self) -> tuple[type[CollectionFile], tuple[Path]]:
@@ -145,7 +145,7 @@ class CollectionFile:
 
     def __getitem__(self, index: int) -> Signature:
         """A Signature by its number, its arrays views of the file; a ValueError where it is damaged, or out of date."""
-        metadata = self._told[index]
+        metadata = self._metadata[index]
         try:
             tensors = {name: self._file.get_tensor(f"{index}.{name}").numpy() for name in self._arrays[index]}
             check_checksum(tensors, metadata)
@@ -163,7 +163,7 @@ class CollectionFile:
 
     def notes(self, index: int) -> tuple[str, ...]:
         """What was done to the mesh of a Signature, in words."""
-        return tuple(json.loads(self._told[index]["notes"]))
+        return tuple(json.loads(self._metadata[index]["notes"]))
 
 
 def _words(values: Sequence[object]) -> tuple[str, ...]:

@@ -13,12 +13,12 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from igps._parallel import Failed, Limits
-from igps.data.attributes import ROOMS, AttributeSource, PointFunction, split_attributes, with_attribute
-from igps.data.batch import LabelledSignature, Several, SignatureBatch, chosen_of, number_of
+from igps.data.attributes import AttributeSource, PointFunction, split_attributes, with_attribute
+from igps.data.batch import Indices, LabelledSignature, SignatureBatch, resolve_indices, scalar_index
 from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.collation import collate
-from igps.data.collection import About, CollectionFile, write_collection
-from igps.data.filling import Failure, fill, hits_in_cache
+from igps.data.collection import CollectionFile, Contents, write_collection
+from igps.data.filling import Failure, fill, find_cached
 from igps.data.in_memory import bodies_in_memory
 from igps.data.pipeline import CacheHit, PreTransform, SignaturePipeline
 from igps.data.requirements import AnyDescriptor, requirements_of
@@ -26,7 +26,7 @@ from igps.data.sources import Bodies, ClassRule, bodies_of
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
-from igps.signature.signature import Signature, SignatureConfig
+from igps.signature.signature import SAMPLE_KINDS, Signature, SignatureConfig
 
 
 class SignatureDataset(Dataset[LabelledSignature]):
@@ -90,7 +90,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         meshes: Mapping[BodyRef, Mesh | MeshError] = {}
         if isinstance(root_or_paths, Mapping):
             (root_or_paths, meshes), labels = bodies_in_memory(root_or_paths, labels, reading, config), None
-        self.bodies = bodies_of(root_or_paths, labels, reading, sources.values()).classed(classes or "folder")
+        self.bodies = bodies_of(root_or_paths, labels, reading, sources.values()).with_classes(classes or "folder")
         self.classes: tuple[str, ...] = tuple(sorted(set(self.bodies.labels or ())))
         if pre_transform is not None and self._functions:
             raise ValueError("pre_transform: expected attributes with a cache_tag beside it, got a function of points.")
@@ -98,9 +98,9 @@ class SignatureDataset(Dataset[LabelledSignature]):
         self.config, self.reading = config.resolved(), reading
         self.pipeline = SignaturePipeline(self.config, reading, directory, sources, pre_transform, meshes)
         self.transform = transform
-        # What serves each body, once `precompute` has seen to it; Signatures that need no cache, and whose each is
+        # The cache entries that `precompute` found; Signatures outside of the cache, and each body's number among them
         self._hits: tuple[CacheHit | None, ...] = (None,) * len(self.bodies)
-        self._at_hand: CollectionFile | list[Signature] | None = None
+        self._loaded: CollectionFile | list[Signature] | None = None
         self._numbers: tuple[int, ...] = tuple(range(len(self.bodies)))
 
     @property
@@ -124,17 +124,17 @@ class SignatureDataset(Dataset[LabelledSignature]):
     @overload
     def __getitem__(self, index: int | str) -> LabelledSignature: ...  # type: ignore[overload-overlap]
     @overload
-    def __getitem__(self, index: Several) -> Self: ...
-    def __getitem__(self, index: int | str | Several) -> LabelledSignature | Self:
+    def __getitem__(self, index: Indices) -> Self: ...
+    def __getitem__(self, index: int | str | Indices) -> LabelledSignature | Self:
         """An item by number or name; the dataset of some of the bodies by slice, numbers, names, or mask."""
         if isinstance(index, str):
             index = self.bodies.number(index)
-        index = number_of(index)
+        index = scalar_index(index)
         if isinstance(index, int | np.integer):
             return self._item(range(len(self))[index])
         if not isinstance(index, slice | Tensor):
             index = [self.bodies.number(one) if isinstance(one, str) else one for one in index]
-        return self.subset(chosen_of(index, len(self)))
+        return self.subset(resolve_indices(index, len(self)))
 
     def _item(self, i: int) -> LabelledSignature:
         label = -1 if self.bodies.labels is None else self.classes.index(self.bodies.labels[i])
@@ -145,13 +145,13 @@ class SignatureDataset(Dataset[LabelledSignature]):
     def _signature(self, i: int) -> Signature:
         """Without the transform."""
         name = self.bodies.names[i]
-        if self._at_hand is not None:
-            return replace(self._at_hand[self._numbers[i]], name=name)
+        if self._loaded is not None:
+            return replace(self._loaded[self._numbers[i]], name=name)
         hit = self._hits[i]
         found = None if hit is None else self.pipeline.read(hit)
         signature = replace(found or self.pipeline.signature(self.bodies[i]), name=name)
         for attribute, function in self._functions.items():
-            values = {room: function(getattr(signature, room).points) for room in ROOMS}
+            values = {kind: function(getattr(signature, kind).points) for kind in SAMPLE_KINDS}
             signature = with_attribute(signature, attribute, values)
         return signature
 
@@ -161,14 +161,14 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def mesh(self, index: int) -> Mesh:
         """The mesh itself, read and checked as for its Signature; a MeshError where it cannot be used."""
-        if isinstance(self._at_hand, CollectionFile):
-            name, file = self.bodies.names[index], self._at_hand.path
+        if isinstance(self._loaded, CollectionFile):
+            name, file = self.bodies.names[index], self._loaded.path
             raise MeshError(f"{name}: {file} holds signatures and no meshes. Make the dataset of the folder of meshes.")
         return self.pipeline.mesh(self.bodies[index])
 
     def key(self, index: int) -> str:
         """The name of a Signature in the cache, by all that it depends on; a MeshError if its file cannot be read."""
-        hit = self._hits[index] if isinstance(self._at_hand, CollectionFile) else None
+        hit = self._hits[index] if isinstance(self._loaded, CollectionFile) else None
         return self.pipeline.key(self.bodies[index]) if hit is None else hit.key
 
     def cached_keys(self) -> list[str | None]:
@@ -187,8 +187,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     def units(self) -> list[str | None]:
         """The unit of length of each body, as cached Signatures tell; None where its file tells none."""
-        if self._at_hand is not None:
-            return [self._at_hand[number].unit for number in self._numbers]
+        if self._loaded is not None:
+            return [self._loaded[number].unit for number in self._numbers]
         cache = SignatureCache(self.pipeline.cache_dir)
         return [None if hit is None else cache.unit(hit.key) for hit in self._found()]
 
@@ -202,8 +202,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
         chosen.bodies = self.bodies.subset(indices)
         chosen._hits = tuple(self._hits[i] for i in indices)
         chosen._numbers = tuple(self._numbers[i] for i in indices)
-        if isinstance(self._at_hand, list):  # no more goes to a worker than it needs
-            chosen._at_hand = [self._at_hand[number] for number in chosen._numbers]
+        if isinstance(self._loaded, list):  # no more goes to a worker than it needs
+            chosen._loaded = [self._loaded[number] for number in chosen._numbers]
             chosen._numbers = tuple(range(len(chosen)))
         return chosen
 
@@ -218,7 +218,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         Each is kept as `change` makes it, such as `FewerSamples`, of which more fit.
         """
         chosen = copy.copy(self)
-        chosen._at_hand = [copy.deepcopy(one if change is None else change(one)) for one in self.signatures()]
+        chosen._loaded = [copy.deepcopy(one if change is None else change(one)) for one in self.signatures()]
         if change is not None:  # no description of what is in the cache
             chosen._hits = (None,) * len(self)
         chosen._numbers = tuple(range(len(self)))
@@ -233,7 +233,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         whole = copy.copy(self)
         hits = [hit or self.pipeline.hit(body) for hit, body in zip(self._hits, self.bodies, strict=True)]
         whole._hits = tuple(hits)
-        about = About(self.bodies, self.classes, tuple(hit.whole_key for hit in hits), self.reading, self.config)
+        about = Contents(self.bodies, self.classes, tuple(hit.whole_key for hit in hits), self.reading, self.config)
         write_collection(Path(path), about, whole._signature)
 
     @classmethod
@@ -254,7 +254,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
             file.check_serves(requirements_of(descriptor))
         dataset = cls.__new__(cls)
         SignatureDataset.__init__(dataset, about.bodies, about.config, cache_dir, reading=about.reading)
-        dataset.classes, dataset._at_hand = about.classes, file
+        dataset.classes, dataset._loaded = about.classes, file
         dataset._hits = tuple(CacheHit(key, 0, file.notes(i), (0, 0, 0)) for i, key in enumerate(about.keys))
         return dataset
 
@@ -282,17 +282,17 @@ class SignatureDataset(Dataset[LabelledSignature]):
             MeshError: a bad body, if `strict`.
             MachineError: the disk is full, or the like; what is done is kept.
         """
-        if self._at_hand is not None:
+        if self._loaded is not None:
             return []
         hits, failures = fill(self.pipeline, self.bodies, executor, n_workers, strict, progress, limits)
         self._hits = tuple(hits)
         return failures
 
     def _found(self) -> list[CacheHit | None]:
-        """What serves each body, as far as something does."""
-        if self._at_hand is not None or None not in self._hits:
+        """The cache entry of each body, None where there is none."""
+        if self._loaded is not None or None not in self._hits:
             return list(self._hits)
-        found = hits_in_cache(self.pipeline, self.bodies)
+        found = find_cached(self.pipeline, self.bodies)
         return [known or hit for known, hit in zip(self._hits, found, strict=True)]
 
     def failure(self, index: int, failed: Failed) -> Failure:

@@ -33,7 +33,7 @@ _TABLE = (
 class FileStatCache:
     """The bodies of one pipeline, by path, part, size and times of change, in a small database beside its cache.
 
-    It may be removed at any time, and where it cannot be read or written, it is done without.
+    It may be removed at any time, and nothing fails where it cannot be read or written.
     """
 
     def __init__(self, pipeline: SignaturePipeline) -> None:
@@ -47,18 +47,18 @@ class FileStatCache:
         self._is_useful = not (pipeline.attributes and pipeline.pre_transform)
 
     def ready(self, bodies: Iterable[BodyRef]) -> dict[BodyRef, CacheHit]:
-        """Those of the bodies whose files have not changed since, and whose Signature is there in full."""
+        """The bodies whose files have not changed since, and whose Signatures are complete in the cache."""
         found: dict[BodyRef, CacheHit] = {}
         if not self._path.exists() or not self._is_useful:
             return found
         cache = SignatureCache(self._pipeline.cache_dir)
         stamp_now = lru_cache(maxsize=1)(lambda path: stamp_of(*files_read(path, self._pipeline.reading)))
-        with self._dispensable(), contextlib.closing(self._database()) as database:
+        with self._tolerating_faults(), contextlib.closing(self._database()) as database:
             for body in bodies:
                 row = database.execute(
                     "SELECT size, mtime, ctime, key, bytes, notes FROM body "
                     "WHERE pipeline = ? AND path = ? AND part = ?",
-                    (self._name, *_address(body)),
+                    (self._name, *_row_key(body)),
                 ).fetchone()
                 if row is None:
                     continue
@@ -75,12 +75,12 @@ class FileStatCache:
         """Keep what serves these bodies, but for files that changed just now."""
         now = time.time_ns()
         rows = [
-            (self._name, *_address(body), *hit.stamp, hit.key, hit.n_bytes, json.dumps(hit.notes))
+            (self._name, *_row_key(body), *hit.stamp, hit.key, hit.n_bytes, json.dumps(hit.notes))
             for body, hit in hits.items()
             if now - max(hit.stamp[1:]) > _YOUNG
         ]
         if rows and self._is_useful:
-            with self._dispensable(), contextlib.closing(self._database()) as database, database:
+            with self._tolerating_faults(), contextlib.closing(self._database()) as database, database:
                 database.executemany("INSERT OR REPLACE INTO body VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
 
     def _database(self) -> sqlite3.Connection:
@@ -90,7 +90,7 @@ class FileStatCache:
         return database
 
     @contextlib.contextmanager
-    def _dispensable(self) -> Generator[None, None, None]:
+    def _tolerating_faults(self) -> Generator[None, None, None]:
         """A fault of the database is logged, and costs no more than the database would have saved."""
         try:
             yield
@@ -101,5 +101,5 @@ class FileStatCache:
                     self._path.unlink()
 
 
-def _address(body: BodyRef) -> tuple[str, str]:
+def _row_key(body: BodyRef) -> tuple[str, str]:
     return os.path.abspath(body.path), body.part or ""

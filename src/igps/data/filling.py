@@ -1,4 +1,4 @@
-"""The cache is filled: what it has of many bodies serves, the rest is computed by processes here or elsewhere."""
+"""Fill the cache: what it lacks of many bodies is computed by processes, here or elsewhere."""
 
 from __future__ import annotations
 
@@ -48,18 +48,18 @@ def fill(
     progress: bool, limits: Limits | None,
 ) -> tuple[list[CacheHit | None], list[Failure]]:  # fmt: skip
     """What serves each body, after computing what was missing; and what failed, see `SignatureDataset.precompute`."""
-    try:  # once, or each body would be told to be at fault
+    try:  # once here, or every body would be reported as a failure
         pipeline.cache_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         told = f"cache_dir: {pipeline.cache_dir} cannot be made ({error.strerror})"
         raise MachineError(f"{told}. Choose a folder that can be written and run again.") from error
     SignatureCache(pipeline.cache_dir).remove_abandoned()
     known = FileStatCache(pipeline)
-    found = hits_in_cache(pipeline, bodies, look=executor is None)
+    found = find_cached(pipeline, bodies, look=executor is None)
     failures: dict[int, Failure] = {}
     new: dict[BodyRef, CacheHit] = {}
     missing = [i for i, hit in enumerate(found) if hit is None]
-    outcomes = filled(pipeline, bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits())
+    outcomes = compute(pipeline, bodies, missing, n_workers=n_workers, executor=executor, limits=limits or Limits())
     bar = tqdm(total=len(bodies), initial=len(bodies) - len(missing), desc="signatures", disable=not progress)
     with bar, contextlib.closing(outcomes):
         try:
@@ -72,7 +72,7 @@ def fill(
                     logger.warning("skipped: %s", failures[i].error)
                     continue
                 if not new:
-                    check_visible(pipeline, outcome)
+                    wait_until_visible(pipeline, outcome)
                 new[bodies[i]] = found[i] = outcome
                 if len(new) >= _REMEMBERED_AT_ONCE:
                     known.remember(new)
@@ -82,7 +82,7 @@ def fill(
     return found, [failures[i] for i in sorted(failures)]
 
 
-def hits_in_cache(pipeline: SignaturePipeline, bodies: Bodies, look: bool = True) -> list[CacheHit | None]:
+def find_cached(pipeline: SignaturePipeline, bodies: Bodies, look: bool = True) -> list[CacheHit | None]:
     """What in the cache serves each body, None where nothing does.
 
     Files that are not known or have changed are read only if `look`; otherwise nothing serves their bodies.
@@ -91,7 +91,7 @@ def hits_in_cache(pipeline: SignaturePipeline, bodies: Bodies, look: bool = True
     ready = known.ready(bodies)
     found = [ready.get(body) for body in bodies]
     new: dict[BodyRef, CacheHit] = {}
-    for group in by_file(bodies, (i for i, hit in enumerate(found) if hit is None and look)):
+    for group in group_by_file(bodies, (i for i, hit in enumerate(found) if hit is None and look)):
         with contextlib.suppress(MeshError):  # computing it will say why
             for i, hit in zip(group, pipeline.lookup([bodies[i] for i in group]), strict=True):
                 if hit is not None:
@@ -100,7 +100,7 @@ def hits_in_cache(pipeline: SignaturePipeline, bodies: Bodies, look: bool = True
     return found
 
 
-def filled(
+def compute(
     pipeline: SignaturePipeline,
     bodies: Bodies,
     numbers: Sequence[int],
@@ -110,14 +110,14 @@ def filled(
     limits: Limits,
     at_once: int | None = None,
 ) -> Generator[tuple[int, CacheHit | Failed], None, None]:
-    """Compute Signatures into the cache, and tell of each body by its number what serves it, or why it failed.
+    """Compute Signatures into the cache, and yield of each body, by number, its cache entry, or why it failed.
 
     The bodies of one file are computed in chunks, for each of which it is read once. Where one of a chunk loses its
     process, each of the chunk is tried again alone. With limits, which are of one body, every body is. A chunk has at
     most `at_once` bodies; so many that every worker has one if None. See `igps._parallel.run` for the rest.
     """
     most = 1 if limits != Limits() else at_once or max(1, -(-len(numbers) // (n_workers or n_cores())))
-    jobs = by_file(bodies, numbers, most)
+    jobs = group_by_file(bodies, numbers, most)
     work: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
     given = [[bodies[i] for i in job] for job in jobs]
     if executor is not None:  # elsewhere, and from another folder
@@ -137,10 +137,10 @@ def filled(
             else:
                 yield job[0], outcome
     if lost:
-        yield from filled(pipeline, bodies, lost, n_workers=n_workers, executor=executor, limits=limits, at_once=1)
+        yield from compute(pipeline, bodies, lost, n_workers=n_workers, executor=executor, limits=limits, at_once=1)
 
 
-def check_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
+def wait_until_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
     """Raise a MachineError if what a worker put into its cache does not come to this one."""
     path = SignatureCache(pipeline.cache_dir).path(hit.key)
     deadline = time.monotonic() + _SHARED_WITHIN
@@ -153,8 +153,8 @@ def check_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
         time.sleep(0.1)
 
 
-def by_file(bodies: Bodies, numbers: Iterable[int], most: int | None = None) -> list[list[int]]:
-    """The numbers of bodies, those of one file together, so many at most."""
+def group_by_file(bodies: Bodies, numbers: Iterable[int], most: int | None = None) -> list[list[int]]:
+    """The numbers of bodies in groups of one file each, at most so many in a group."""
     groups: dict[Path, list[int]] = {}
     for i in numbers:
         groups.setdefault(bodies.paths[i], []).append(i)

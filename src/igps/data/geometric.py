@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import torch
 
-from igps.signature.signature import Signature
+from igps.signature.signature import SampleKind, Signature
 
 if TYPE_CHECKING:
     from torch_geometric.data import Data
 
 
-def to_pyg(signature: Signature, samples: Literal["interior", "surface"] = "surface", label: int = -1) -> Data:
+def to_pyg(signature: Signature, samples: SampleKind = "surface", label: int = -1) -> Data:
     """The samples of a body as `torch_geometric.data.Data`: P nodes without edges, which its loaders batch.
 
     They are copies, which transforms may change in place.

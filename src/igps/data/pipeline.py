@@ -16,15 +16,15 @@ from typing import Protocol
 import numpy as np
 
 from igps._parallel import Failed, MachineError, attempt
-from igps.data.attribute_sources import of_bodies_read
-from igps.data.attributes import ROOMS, AttributeSource, with_attribute
+from igps.data.attribute_sources import with_load_options
+from igps.data.attributes import AttributeSource, with_attribute
 from igps.data.cache import AttributeCache, SignatureCache, content_digest
 from igps.mesh.formats import files_read, stamp_of
 from igps.mesh.loading import BodyRef, each_body, load_mesh
 from igps.mesh.mending import MENDING_VERSION, repair_steps
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
-from igps.signature.signature import Signature, SignatureConfig, compute_signature
+from igps.signature.signature import SAMPLE_KINDS, Signature, SignatureConfig, compute_signature
 
 
 class PreTransform(Protocol):
@@ -40,7 +40,7 @@ class PreTransform(Protocol):
 
 @dataclass(frozen=True)
 class BodyFile:
-    """What a key needs to know of a file."""
+    """What the key of a Signature depends on of a file."""
 
     stamp: tuple[int, int, int]  # see `stamp_of`
     digest: bytes  # of its content, and of what is read with it
@@ -90,7 +90,7 @@ class SignaturePipeline:
         return mesh
 
     def _file(self, body: BodyRef) -> BodyFile:
-        """That of a body, or what stands for it in memory; a MeshError where it cannot be read."""
+        """The file of a body, or what stands for one in memory; a MeshError where it cannot be read."""
         if body in self.meshes:
             mesh = self.mesh(body)
             content = mesh.vertices.tobytes(), mesh.faces.tobytes(), repr((mesh.unit, mesh.notes)).encode()
@@ -106,7 +106,7 @@ class SignaturePipeline:
         file = self._file(body)
         hit = self._lookup(body, file)
         found = None if hit is None else self.read(hit)
-        return self._made(body, file)[1] if found is None else found
+        return self._compute(body, file)[1] if found is None else found
 
     def fill(self, bodies: Sequence[BodyRef]) -> list[CacheHit | Failed]:
         """Put the Signatures of bodies of one file into the cache; they are not returned, to spare the way back.
@@ -132,13 +132,13 @@ class SignaturePipeline:
                     done[body] = attempt(partial(self.hit, body, file, mesh))
         except MeshError as error:  # of the file: so of each
             done = {**dict.fromkeys(missing.values(), Failed(str(error))), **done}
-        # Those that the file does not have are told so one by one.
+        # A body that the file lacks fails by itself
         return [done[body] if body in done else attempt(partial(self.hit, body, file)) for body in bodies]
 
     def hit(self, body: BodyRef, file: BodyFile | None = None, mesh: Mesh | None = None) -> CacheHit:
         """What serves a body, which is in the cache then; a MeshError where it cannot be used."""
         file = file or self._file(body)
-        return self._lookup(body, file) or self._made(body, file, mesh)[0]
+        return self._lookup(body, file) or self._compute(body, file, mesh)[0]
 
     def lookup(self, bodies: Sequence[BodyRef]) -> list[CacheHit | None]:
         """What in the cache serves each body of one file, None where nothing does; a MeshError if unreadable."""
@@ -146,7 +146,7 @@ class SignaturePipeline:
         return [self._lookup(body, self._file(body) if body in self.meshes else file) for body in bodies]
 
     def with_attributes(self, body: BodyRef, hit: CacheHit) -> CacheHit | None:
-        """What serves a body whose Signature in the cache is known, with its attributes; None if one is missing."""
+        """The cache entry of a body whose Signature is known, with its attributes; None if one is missing."""
         if not self.attributes or self.pre_transform is not None:
             return hit
         try:
@@ -186,10 +186,10 @@ class SignaturePipeline:
         hit = CacheHit(key, cache.path(key).stat().st_size, cache.notes(key), file.stamp)
         return self.with_attributes(body, hit)
 
-    def _made(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> tuple[CacheHit, Signature]:
+    def _compute(self, body: BodyRef, file: BodyFile, mesh: Mesh | None = None) -> tuple[CacheHit, Signature]:
         """The Signature of a body, with what serves it from now on."""
         cache = SignatureCache(self.cache_dir)
-        key, signature = self._plain(body, file, mesh)
+        key, signature = self._compute_plain(body, file, mesh)
         keys = {}
         for name in self.attributes:
             keys[name] = self._attribute_key(body, key, name)
@@ -202,7 +202,7 @@ class SignaturePipeline:
             cache.put(key, signature)
         return CacheHit(key, cache.path(key).stat().st_size, tuple(signature.notes), file.stamp, keys), signature
 
-    def _plain(self, body: BodyRef, file: BodyFile, mesh: Mesh | None) -> tuple[str, Signature]:
+    def _compute_plain(self, body: BodyRef, file: BodyFile, mesh: Mesh | None) -> tuple[str, Signature]:
         """The Signature as it is computed, and its key in the cache, where it is then."""
         cache = SignatureCache(self.cache_dir)
         for key in self._cached(body, file):
@@ -219,11 +219,11 @@ class SignaturePipeline:
         values = cache.get(key)
         if values is not None:
             return with_attribute(signature, name, values)
-        points = [getattr(signature, room).points for room in ROOMS]
-        rows = of_bodies_read(self.attributes[name], self.reading)(body, np.concatenate(points))
-        found = dict(zip(ROOMS, np.split(rows, [len(points[0])]), strict=True))
+        points = [getattr(signature, kind).points for kind in SAMPLE_KINDS]
+        rows = with_load_options(self.attributes[name], self.reading)(body, np.concatenate(points))
+        found = dict(zip(SAMPLE_KINDS, np.split(rows, [len(points[0])]), strict=True))
         signature = with_attribute(signature, name, found)
-        cache.put(key, {room: getattr(signature, room).attributes[name] for room in ROOMS})
+        cache.put(key, {kind: getattr(signature, kind).attributes[name] for kind in SAMPLE_KINDS})
         return signature
 
     def _cached(self, body: BodyRef, file: BodyFile) -> Iterator[str]:

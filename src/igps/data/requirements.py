@@ -86,7 +86,7 @@ def embedding_requirements(embedding: nn.Module) -> Requirements:
 
 
 class Requiring(Protocol):
-    """A descriptor, as far as a Dataset knows it."""
+    """What a Dataset has to know of a descriptor."""
 
     @property
     def requirements(self) -> Requirements:

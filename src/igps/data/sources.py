@@ -92,14 +92,14 @@ class Bodies:
                 raise ValueError(f"{name}: expected numbers, got {value!r} of {body}. Correct it in {LABELS_FILE}.")
         return [float(value) for value in values]
 
-    def classed(self, rule: ClassRule) -> Bodies:
+    def with_classes(self, rule: ClassRule) -> Bodies:
         """The same bodies with the classes that a rule gives them; "folder" leaves them as they are."""
         if rule not in get_args(ClassRule):
             raise ValueError(f"classes: expected 'folder', 'body' or 'file', got {rule!r}.")
         if rule == "folder":
             return self
         if rule == "file":
-            return replace(self, labels=tuple(map(file_of, self.names, self.parts)))
+            return replace(self, labels=tuple(map(file_name_of, self.names, self.parts)))
         if all(part is None for part in self.parts):
             raise ValueError(f"classes: expected files of several bodies with 'body', but {self.names[0]} is one body.")
         # A file that cannot be read, such as an empty mask, has no parts; and costs the others nothing
@@ -129,15 +129,16 @@ def find_bodies(
 
     Raises:
         FileNotFoundError: the folder does not exist, or holds no file that may be a body.
-        ValueError: `labels.csv` cannot be understood, or no classes are told where they must be.
+        ValueError: `labels.csv` cannot be understood, or it has no classes where they are needed.
     """
     root, options = Path(root), options or LoadOptions()
-    if not _is_told(root.absolute()):
+    if not _is_utf8(root.absolute()):
         raise ValueError(f"{os.fsencode(root)!r}: a name in UTF-8 expected. Rename the folder.")
     if not root.is_dir():
         raise FileNotFoundError(f"{root}: {'a file; a folder expected' if root.exists() else 'no such folder'}.")
     table = (root / LABELS_FILE).is_file()
-    bodies = (_from_labels_file(root, options) if table else _from_folder(root, options, attributes)).classed(classes)
+    bodies = _from_labels_file(root, options) if table else _from_folder(root, options, attributes)
+    bodies = bodies.with_classes(classes)
     if labelled and bodies.labels is None:
         raise ValueError(f"{root}: no classes found. Expected one folder per class, or a {LABELS_FILE} (file,label).")
     return bodies
@@ -172,7 +173,7 @@ def given_bodies(
     files = [file_and_part(Path(path)) for path in paths]
     if not files:
         raise ValueError("paths: expected at least one mesh file, got none.")
-    if unknown := [file for file, _ in files if not _is_told(file.absolute())]:
+    if unknown := [file for file, _ in files if not _is_utf8(file.absolute())]:
         raise ValueError(f"paths: expected names in UTF-8, got {os.fsencode(unknown[0])!r}. Rename the file.")
     if labels is not None and len(labels) != len(files):
         raise ValueError(f"labels: expected one for each of {len(files)} files, got {len(labels)}.")
@@ -216,7 +217,7 @@ def is_number(value: str | float | None) -> bool:
         return False
 
 
-def file_of(name: str, part: str | None) -> str:
+def file_name_of(name: str, part: str | None) -> str:
     """The name of the file of a body, by the name of the body."""
     return name if part is None else name.removesuffix(f"#{part}")
 
@@ -279,22 +280,22 @@ def _expanded(
 def _files_in(folder: Path) -> list[Path]:
     """Files that may be bodies, but for hidden ones; of links those too that lead nowhere, which reading them says."""
 
-    def untold(error: OSError) -> None:
+    def warn(error: OSError) -> None:
         logger.warning(
             "%s: left out with all that is in it (%s). Ask for the right to read it.", error.filename, error.strerror
         )
 
     found = []
-    for place, folders, names in os.walk(folder, onerror=untold):
+    for place, folders, names in os.walk(folder, onerror=warn):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for path in (Path(place, name) for name in names if not name.startswith(".") and is_searched(name)):
-            if not _is_told(path):
+            if not _is_utf8(path):
                 logger.warning("%s: left out, its name is not UTF-8. Rename it.", os.fsencode(path))
             elif os.path.isfile(path) or not os.path.exists(path):  # of a pipe reading might wait for ever
                 found.append(path)
     return found
 
 
-def _is_told(path: Path) -> bool:
-    """Whether the name of a file can be printed and written: those of other systems may be bytes without meaning."""
+def _is_utf8(path: Path) -> bool:
+    """Whether the name of a file is text: names from other systems may be bytes that are not UTF-8."""
     return str(path).encode(errors="ignore").decode() == str(path)

@@ -84,7 +84,7 @@ def split_unseen(
 
 
 def _count(wanted: float, n: int, least: int, rest: int = 1) -> int:
-    """A number as it is; of a share that of n, at least so many of them, which leaves a rest."""
+    """A whole number as it is; a share below 1 of n as a number, at least `least`, which leaves at least `rest`."""
     return min(max(round(wanted * n), least), n - rest) if 0 < wanted < 1 else int(wanted)
 
 

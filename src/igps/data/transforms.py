@@ -46,7 +46,7 @@ class Compose:
 
     @property
     def cache_tag(self) -> str:
-        """Those of all."""
+        """The tags of all changes."""
         return "; ".join(one.cache_tag for one in self.transforms)  # type: ignore[attr-defined]
 
     def __call__(self, signature: Signature) -> Signature:
@@ -83,10 +83,8 @@ class FewerEigenpairs(Transform):
 
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         kept = np.sort(generator.permutation(len(signature.eigenvalues))[: self.n_eigenpairs])
-        return _changed_samples(
-            replace(signature, eigenvalues=signature.eigenvalues[kept]),
-            lambda samples: replace(samples, eigenfunctions=samples.eigenfunctions[:, kept]),
-        )
+        fewer = signature.map_samples(lambda one: replace(one, eigenfunctions=one.eigenfunctions[:, kept]))
+        return replace(fewer, eigenvalues=signature.eigenvalues[kept])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +106,7 @@ class Noise(Transform):
                 values = values + np.float32(self.eigenfunctions / length) * noise
             return replace(samples, points=points, eigenfunctions=values)
 
-        return _changed_samples(signature, noisy)
+        return signature.map_samples(noisy)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +129,7 @@ class Scale(Transform):
 
         area, volume = signature.area * factor**2, signature.volume * factor**3
         whole = replace(signature, eigenvalues=signature.eigenvalues / factor**2, area=area, volume=volume)
-        return _changed_samples(whole, scaled)
+        return whole.map_samples(scaled)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,11 +138,4 @@ class FlipSigns(Transform):
 
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature:
         signs = generator.choice(np.array([-1, 1], np.float32), len(signature.eigenvalues))
-
-        return _changed_samples(
-            signature, lambda samples: replace(samples, eigenfunctions=samples.eigenfunctions * signs)
-        )
-
-
-def _changed_samples(signature: Signature, change: Callable[[Samples], Samples]) -> Signature:
-    return replace(signature, interior=change(signature.interior), surface=change(signature.surface))
+        return signature.map_samples(lambda one: replace(one, eigenfunctions=one.eigenfunctions * signs))

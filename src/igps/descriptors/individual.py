@@ -87,7 +87,7 @@ class IndividualDescriptor(Descriptor):
             self.requirements |= self.twists.requirements
 
     def describe(self, batch: SignatureBatch) -> Tensor:
-        """(N, D + 53 + 2), of which side and size are there if they are told."""
+        """(N, D + 53 + 2); without the numbers of side or of size where these are not kept."""
         parts = [self.descriptor(batch).flatten(1)]
         if self.twists is not None:
             counts = self.twists(BatchFeatures(batch, self.training))
@@ -124,7 +124,7 @@ class IndividualDescriptor(Descriptor):
         form, *others = self.split(descriptions)
         return torch.cat([self.descriptor.short(form), *others], dim=1)
 
-    def beside(self, descriptor: Descriptor) -> "IndividualDescriptor":
+    def wrap(self, descriptor: Descriptor) -> "IndividualDescriptor":
         """The same numbers of side and size beside another descriptor."""
         kept = {"size": self.keeps_size, "side": self.twists is not None}
         found = IndividualDescriptor(descriptor, scale=self.scale, **kept)
@@ -132,7 +132,7 @@ class IndividualDescriptor(Descriptor):
         return found
 
     def split(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(N, D) descriptions to those of the descriptor, and the numbers of side and of size, of which may be none."""
+        """(N, D) descriptions split into the descriptor's own, and the numbers of side and of size, perhaps none."""
         n_volumes = math.comb(_N_VECTORS, 3)
         n_size, n_side = 2 * self.keeps_size, 0 if self.twists is None else n_volumes + self.twists.n_cells // 2
         n_form = descriptions.shape[1] - n_side - n_size

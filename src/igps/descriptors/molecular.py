@@ -62,7 +62,7 @@ class Shares(PointAxis):
         return values
 
     def members(self, values: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Those of the classes that samples have a share in, see `PointAxis`."""
+        """The classes that samples have a share in, and the shares, see `PointAxis`."""
         self.memberships(values[mask])
         return largest_members(values, mask)
 

@@ -1,10 +1,10 @@
 """Interior distances alone, on several scales, side by side."""
 
 from igps.nn.axes import EmbeddedPairCosines, InteriorDistance, Potential
-from igps.nn.batch_features import SampleKind
 from igps.nn.descriptor import HistogramDescriptor
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.pairs import PairHistogram
+from igps.signature.signature import SampleKind
 
 # Of the bodies with the most samples so many tell the histograms well enough, and the time grows with their square.
 N_SAMPLES = 1500

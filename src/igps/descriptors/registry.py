@@ -13,6 +13,7 @@ import torch
 from igps._parameters import check_one_of
 from igps.descriptors.canonical_form import CanonicalForm
 from igps.descriptors.d2 import D2
+from igps.descriptors.from_yaml import load_yaml
 from igps.descriptors.geodesic_spectral import GeodesicSpectral
 from igps.descriptors.gps import gps
 from igps.descriptors.individual import SIDE, SIZE, IndividualDescriptor, Mirror, Size, keeps_size
@@ -27,7 +28,6 @@ from igps.descriptors.shape_dna import ShapeDNA
 from igps.descriptors.spectral_gw import SpectralGromovWasserstein
 from igps.descriptors.volume_shape_dna import VolumeShapeDNA
 from igps.descriptors.with_attributes import WithAttributes
-from igps.descriptors.written import written
 from igps.nn.descriptor import NAME, Descriptor, EmbeddedDescriptor, HistogramDescriptor
 from igps.nn.heads import ClassifierHead
 from igps.nn.specification import IN_FOLDER, load_module
@@ -69,7 +69,7 @@ def is_file(which: str | Path) -> bool:
 def load(path: str | Path) -> Descriptor:
     """A descriptor that `Descriptor.save` or `igps fit` wrote, in evaluation mode, with its `card`. No code runs.
 
-    From a file or a folder. Or one that is written in YAML, see `igps.descriptors.written`.
+    From a file or a folder. Or one that is written in YAML, see `igps.descriptors.from_yaml`.
 
     Example:
         >>> import tempfile
@@ -84,7 +84,7 @@ def load(path: str | Path) -> Descriptor:
         ValueError: it is another file, or a damaged one.
     """
     if str(path).lower().endswith(_WRITTEN):
-        return written(path)
+        return load_yaml(path)
     module, card = load_module(path)
     if not isinstance(module, Descriptor):
         raise ValueError(f"{path}: expected a descriptor, got {type(module).__name__}.")

@@ -26,9 +26,8 @@ from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
-from igps.signature.signature import Signature
+from igps.signature.signature import SAMPLE_KINDS, SampleKind, Signature
 
-Where = Literal["surface", "interior"]
 Bound = Literal["trace", "signature", "pairs"]
 
 # Around the largest c², which falls off steeply on both sides.
@@ -48,7 +47,7 @@ class SpectralGromovWasserstein(BodyDescriptor):
     source = "Mémoli 2009"
     invariant_to = ("motion", "scale", "pose")
 
-    samples: Where = "surface"
+    samples: SampleKind = "surface"
     bound: Bound = "pairs"
     times: tuple[float, ...] = TIMES  # in units of A/8π
     n_samples: int = 500  # at most so many of the body's samples, at equal steps of their order of form
@@ -87,7 +86,7 @@ class SpectralGromovWasserstein(BodyDescriptor):
 
 def heat_kernels(
     body: Body | Signature,
-    samples: Where,
+    samples: SampleKind,
     times: Sequence[float],
     n_samples: int,
     n_eigenpairs: int | None = None,
@@ -130,7 +129,7 @@ def gromov_wasserstein(
     a: Signature,
     b: Signature,
     *,
-    samples: Where = "surface",
+    samples: SampleKind = "surface",
     times: Sequence[float] = TIMES,
     n_samples: int = 50,
     seed: int = 0,
@@ -158,8 +157,8 @@ def gromov_wasserstein(
     return largest
 
 
-def _check(samples: Where, times: Sequence[float], n_samples: int) -> None:
-    check_one_of(get_args(Where), samples=samples)
+def _check(samples: SampleKind, times: Sequence[float], n_samples: int) -> None:
+    check_one_of(SAMPLE_KINDS, samples=samples)
     check_at_least(1, n_samples=n_samples)
     if not times or not all(0 < time < np.inf for time in times):
         raise ValueError(f"times: expected at least one positive number, got {tuple(times)}.")

@@ -58,7 +58,7 @@ def expected_faces(path: Path) -> int:
 def available_memory() -> int | None:
     """Bytes that the process may still take: of its own limits, its control group's and the machine's, the least.
 
-    None where the system does not say.
+    None where the system does not tell it.
     """
     kilobytes = _number(Path("/proc/meminfo"), r"^MemAvailable:\s+")
     found = (_of_limits(), _of_group(), None if kilobytes is None else 1024 * kilobytes)

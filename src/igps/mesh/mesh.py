@@ -161,7 +161,7 @@ class Mesh:
         return other
 
     def outer(self) -> tuple[Mesh, Booleans]:
-        """The body without its cavities, and which of the vertices (V,) are its."""
+        """The body without its cavities, and which of the vertices (V,) belong to it."""
         surfaces = connected(self.vertices, self.faces) if self.cavities else []
         if len(surfaces) < 2:
             return self, np.ones(len(self.vertices), dtype=bool)

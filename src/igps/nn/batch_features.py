@@ -1,7 +1,5 @@
 """Features of a batch that histograms share: embeddings, positions, attributes, each computed once."""
 
-from typing import Literal
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -11,13 +9,12 @@ from igps.nn._kernels.balls import ball_radii
 from igps.nn._kernels.nearest import smallest
 from igps.nn._precision import full_precision
 from igps.nn.embedding import barycentroid_potential
-
-SampleKind = Literal["interior", "surface"]
+from igps.signature.signature import SampleKind
 
 WEIGHT = "weight"
 """An attribute of samples: how much each counts in histograms, all alike where there is none."""
 
-# Where padded targets are put: farther than any, and its square can be told.
+# The place of padded targets: farther than any real one, with a square that does not overflow.
 _FAR = 1e18
 # For the direction to the surface in the embedding.
 _N_NEAREST = 8
@@ -26,7 +23,7 @@ N_NEIGHBOURS = 16
 
 
 class SampleFeatures:
-    """All samples of a kind of each shape, or a subset, and what is computed from them, once for all who ask."""
+    """All samples of a kind of each shape, or a subset, and what is computed from them, each once."""
 
     def __init__(self, batch: SignatureBatch, kind: SampleKind, samples: SampleBatch) -> None:
         self.batch = batch

@@ -4,7 +4,9 @@ import contextlib
 import hashlib
 import json
 import logging
+import time
 from collections.abc import Collection, Generator, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -76,7 +78,7 @@ def describe(
         raise TypeError(f"descriptor: expected a module, got {descriptor!r}. Give {given}.")
     if not len(dataset):
         raise ValueError("dataset: expected at least one mesh to describe, got none.")
-    kept = None if cache_tag is None else _Kept(dataset, cache_tag)
+    kept = None if cache_tag is None else _DescriptionStore(dataset, cache_tag)
     found = {} if kept is None else kept.found()
     failed: dict[int, Failure] = {}
     missing = [i for i in range(len(dataset)) if i not in found]
@@ -109,7 +111,7 @@ def describe(
 
 
 def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
-    """Give axes whose centres are quantiles those of a collection's samples; whether there were any.
+    """Fit the centres of axes by quantiles to the samples of a collection; whether there were such axes.
 
     What has its centres keeps them. Of each body as many samples count, the first 500. A ValueError where the samples
     have no such attribute.
@@ -126,7 +128,7 @@ def fit_centres(descriptor: nn.Module, dataset: SignatureDataset) -> bool:
 
 
 def check_attributes(descriptor: nn.Module, names: Collection[str]) -> None:
-    """Raise a ValueError where an axis is of an attribute that is not among those of these names."""
+    """Raise a ValueError where an axis needs an attribute that is not among these names."""
     for one in descriptor.modules():
         if isinstance(one, Attribute) and one.name not in names:
             raise ValueError(
@@ -144,7 +146,7 @@ def check_centres(descriptor: nn.Module) -> None:
 
 @contextlib.contextmanager
 def evaluation_mode(module: nn.Module) -> Iterator[None]:
-    """The module and all in it in evaluation mode; afterwards each in the mode in which it was."""
+    """Put a module, and all in it, into evaluation mode, and afterwards back into the mode of before."""
     modes = [(one, one.training) for one in module.modules()]
     module.eval()
     try:
@@ -162,7 +164,7 @@ def _on_threads(
 
     def outcomes(indices: Sequence[int]) -> Sequence[Singles | Failure]:
         try:
-            return list(_described((descriptor, dataset.subset(indices), device)))
+            return list(describe_timed((descriptor, dataset.subset(indices), device))[0])
         except ValueError as error:
             if len(indices) == 1:
                 return [dataset.failure(indices[0], Failed(str(error)))]
@@ -177,25 +179,31 @@ def _on_processes(
 ) -> _Described:
     """The same one by one on processes: a mesh that kills its process costs no other its description."""
     jobs = [(descriptor, dataset.subset([i]), torch.device("cpu")) for i in indices]
-    for number, outcome in run(_described, jobs, n_workers=n_workers):
+    for number, outcome in run(describe_timed, jobs, n_workers=n_workers):
         i = indices[number]
-        yield [i], [dataset.failure(i, outcome) if isinstance(outcome, Failed) else outcome[0]]
+        yield [i], [dataset.failure(i, outcome) if isinstance(outcome, Failed) else outcome[0][0]]
 
 
-def _described(job: tuple[nn.Module, SignatureDataset, torch.device]) -> Singles:
-    """(N, ...) descriptions of all meshes of a dataset at once."""
+def describe_timed(job: tuple[nn.Module, SignatureDataset, torch.device]) -> tuple[Singles, float]:
+    """(N, ...) descriptions of all meshes of a dataset at once, and the seconds of processor time that they took.
+
+    The time includes reading the meshes, where the descriptor needs them, but not the Signatures.
+    """
     descriptor, dataset, device = job
-    meshes = isinstance(descriptor, Descriptor) and descriptor.requirements.mesh
     with one_thread(), torch.inference_mode():  # hold for the thread that enters them
-        batch = dataset.batch(range(len(dataset)), meshes).to(device)
-        values: Singles = descriptor(batch).cpu().numpy()
+        batch = dataset.batch(range(len(dataset)))
+        start = time.process_time()
+        if isinstance(descriptor, Descriptor) and descriptor.requirements.mesh:
+            batch = replace(batch, meshes=tuple(dataset.mesh(i) for i in range(len(dataset))))
+        values: Singles = descriptor(batch.to(device)).cpu().numpy()
+        seconds = time.process_time() - start
     if not np.isfinite(values).all():
         raise MeshError(f"{dataset.bodies.paths[0]}: the description has entries that are not finite.")
-    return values
+    return values, seconds
 
 
-class _Kept:
-    """The descriptions of a dataset that are in its cache; done without where the cache cannot be written."""
+class _DescriptionStore:
+    """The descriptions of a dataset in its cache; a cache that cannot be written is no error."""
 
     def __init__(self, dataset: SignatureDataset, cache_tag: str) -> None:
         self._dataset, self._tag = dataset, cache_tag
@@ -209,7 +217,7 @@ class _Kept:
         return {i: one for i, one in values.items() if one is not None}
 
     def keep(self, i: int, values: Singles) -> None:
-        """Keep a description, if the file is the one that it was before it was described."""
+        """Keep a description, unless its file has changed meanwhile."""
         key = self._keys[i]
         if key is None or not self._is_writable or self._dataset.subset([i]).cached_keys() != [key]:
             return

@@ -66,7 +66,7 @@ class Descriptor(Specified, ABC):
         searched_by: the distance by which an index finds candidates, "cosine" for unit vectors or "chi_square" for
             histograms; what is near by `distances` must be among the few hundred that are nearest by it. None where
             neither is: an index compares with all.
-        card: what is told of one that was fitted, by name.
+        card: facts about a fitted descriptor, by name.
         scale: the median of its distances between bodies of one class, by which size and side are weighed against it,
             see `IndividualDescriptor`; None if it is not known.
         description_shape: of the entries of a description in the eyes of `distances`, (-1,) where it is a row.
@@ -83,7 +83,7 @@ class Descriptor(Specified, ABC):
 
     @property
     def n_features(self) -> int:
-        """Numbers of a description; of a descriptor that does not know, those of a ball that is described for it."""
+        """The size of a description; found by describing a ball where a descriptor does not define it."""
         import trimesh
 
         ball = trimesh.creation.icosphere(subdivisions=3)

@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
-from igps.data.cache import whole_file
+from igps._files import whole_file
 
 _FORMAT = "igps-descriptor-1"
 # Of a folder that is shared as a whole, beside its card
@@ -51,7 +51,7 @@ class Specified(nn.Module):
 def specification(module: nn.Module) -> dict[str, Any]:
     """A module of the library as `class_path` and `init_args`, for JSON or YAML; parameters are not in it.
 
-    A module that occurs again is `same_as`, and the number of the module that was told.
+    A module that occurs again is written as `same_as`, the number of its first occurrence.
 
     Example:
         >>> from igps.nn.embedding import SpectralEmbedding
@@ -61,19 +61,19 @@ def specification(module: nn.Module) -> dict[str, Any]:
     Raises:
         ValueError: it, or what it was made with, is not the library's.
     """
-    told: list[nn.Module] = []
+    written: list[nn.Module] = []
 
     def words(value: Any) -> Any:
         if value is None or isinstance(value, bool | int | float | str):
             return value
         if isinstance(value, list | tuple):
             return [words(one) for one in value]
-        if any(value is one for one in told):
-            return {"same_as": next(i for i, one in enumerate(told) if value is one)}
+        if any(value is one for one in written):
+            return {"same_as": next(i for i, one in enumerate(written) if value is one)}
         path = f"{type(value).__module__}.{type(value).__qualname__}"
         if not isinstance(value, Specified) or not _CLASS.fullmatch(path):
             raise ValueError(f"descriptor: expected to be made of modules of igps and numbers, got {path} in it.")
-        told.append(value)
+        written.append(value)
         arguments, options = value.__dict__["_made_with"]
         given = inspect.signature(type(value)).bind(*arguments, **options).arguments
         return {"class_path": path, "init_args": {name: words(one) for name, one in given.items()}}
@@ -82,18 +82,18 @@ def specification(module: nn.Module) -> dict[str, Any]:
     return found
 
 
-def made(told: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
-    """The module that a `specification` tells of; none is made that would need many more bytes of parameters.
+def build_module(spec: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
+    """The module of a `specification`; none is made that would need many more bytes of parameters.
 
-    A ValueError where it tells of something else than modules of the library.
+    A ValueError where it specifies anything but modules of the library.
     """
     known: list[nn.Module] = []
 
-    def module(told: Mapping[str, Any]) -> nn.Module:
-        if set(told) == {"same_as"}:
-            return known[told["same_as"]]
-        path, arguments = told["class_path"], told.get("init_args", {})
-        if not set(told) <= {"class_path", "init_args"} or not _CLASS.fullmatch(path) or len(known) >= _MOST_MODULES:
+    def module(spec: Mapping[str, Any]) -> nn.Module:
+        if set(spec) == {"same_as"}:
+            return known[spec["same_as"]]
+        path, arguments = spec["class_path"], spec.get("init_args", {})
+        if not set(spec) <= {"class_path", "init_args"} or not _CLASS.fullmatch(path) or len(known) >= _MOST_MODULES:
             raise ValueError(f"{path!r} is no module of igps, or one of too many")
         room, _, name = path.rpartition(".")
         kind = getattr(importlib.import_module(room), name, None)
@@ -107,12 +107,12 @@ def made(told: Mapping[str, Any], n_bytes: int = 0) -> nn.Module:
         known[place] = kind(**{name: value(one) for name, one in arguments.items()})
         return known[place]
 
-    def value(told: Any) -> Any:
-        if isinstance(told, Mapping):
-            return module(told)
-        return tuple(map(value, told)) if isinstance(told, list | tuple) else told
+    def value(spec: Any) -> Any:
+        if isinstance(spec, Mapping):
+            return module(spec)
+        return tuple(map(value, spec)) if isinstance(spec, list | tuple) else spec
 
-    return module(told)
+    return module(spec)
 
 
 def _numbers(values: Any) -> Iterator[int]:
@@ -124,7 +124,7 @@ def _numbers(values: Any) -> Iterator[int]:
 
 
 def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) -> None:
-    """Write a module of the library, with its parameters and what is told of it, to a safetensors file or a folder."""
+    """Write a module of the library, with its parameters and its card, to a safetensors file or a folder."""
     if Path(path).suffix != ".safetensors":
         save_module(module, path := Path(path) / IN_FOLDER, card)
         rows = (f"| {name} | `{json.dumps(value)}` |\n" for name, value in card.items())
@@ -139,7 +139,7 @@ def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) ->
 
 
 def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
-    """The module that `save_module` wrote, in evaluation mode, and what is told of it. No code of the file runs.
+    """The module that `save_module` wrote, in evaluation mode, and its card. No code of the file runs.
 
     A FileNotFoundError without a file, a ValueError if it is none of these, or damaged.
     """
@@ -152,7 +152,7 @@ def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
             words = file.metadata() or {}
             if words.get("format") != _FORMAT:
                 raise ValueError(f"its format is {words.get('format')!r}")
-            module = made(json.loads(words["specification"]), path.stat().st_size)
+            module = build_module(json.loads(words["specification"]), path.stat().st_size)
             module.load_state_dict({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
         if not all(bool(torch.isfinite(one).all()) for one in module.state_dict().values()):
             raise ValueError("a parameter is not finite")

@@ -9,14 +9,14 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats
 from igps.analysis.clusters import STABLE, Clusters
 from igps.analysis.groups import GroupTest
 from igps.analysis.map import BodyMap
 from igps.analysis.outliers import Outlier
 from igps.mesh.mesh import Mesh
-from igps.report.drawing import PALETTE, draw_body, new_figure, paint, save_figure, seen_from_the_front, shown
+from igps.report.drawing import PALETTE, draw_body, new_figure, paint, save_figure, seen_from_the_front, shortened
 from igps.report.page_data import finite
 from igps.report.tables import write_rows
 from igps.retrieval import PrecisionRecallCurve
@@ -52,7 +52,7 @@ def groups_figure(tests: Sequence[GroupTest]) -> Figure | None:
         axes.plot([lows[place], highs[place]], [place, place], color=colour, linewidth=1.6)
         axes.plot(effects[place], place, "o" if colour == _FOUND else "s", color=colour, markersize=5)
     axes.axvline(0, color="#BBBBBB", linewidth=0.8, zorder=0)
-    axes.set_yticks(range(len(tested)), [shown(one.body) for one in tested])
+    axes.set_yticks(range(len(tested)), [shortened(one.body) for one in tested])
     axes.set_xlabel("share of squared distances that the groups explain, 95 % interval")
     axes.set_title(f"round, orange: false discovery rate at most {LEVEL:.0%}; square, grey: above", fontsize=9)
     return figure
@@ -67,12 +67,12 @@ def outliers_figure(pictured: Sequence[tuple[Outlier, str, Mesh]]) -> Figure:
         axes.set_axis_off()
     for axes, (one, name, mesh) in zip(all_axes, pictured, strict=False):
         draw_body(axes, mesh)
-        title = "\n".join(wrap(f"{one.score:.1f}  {shown(name)}", 38) + wrap(one.reason, 38))
+        title = "\n".join(wrap(f"{one.score:.1f}  {shortened(name)}", 38) + wrap(one.reason, 38))
         axes.set_title(title, fontsize=6, color=_FOUND if one.is_outlier else "#000000")
     return figure
 
 
-def explanation_figure(painted: Sequence[tuple[str, Mesh, NDArray[np.float64]]]) -> Figure:
+def explanation_figure(painted: Sequence[tuple[str, Mesh, Floats]]) -> Figure:
     """Named bodies from the front and from behind, in red what each face (F,) has of the difference, blue if less."""
     figure = new_figure(7, 3.4 * len(painted))
     all_axes = figure.subplots(len(painted), 2, squeeze=False)
@@ -83,7 +83,7 @@ def explanation_figure(painted: Sequence[tuple[str, Mesh, NDArray[np.float64]]])
         turned = seen_from_the_front(mesh.vertices)
         for axes, turn, side in zip(row, ([1, 1, 1], [-1, 1, -1]), ("front", "back"), strict=True):
             paint(axes, turned * turn, mesh.faces, colours)
-            axes.set_title(f"{shown(name)}, {side}", fontsize=7)
+            axes.set_title(f"{shortened(name)}, {side}", fontsize=7)
     return figure
 
 
@@ -101,7 +101,7 @@ def map_figure(found: BodyMap, values: Sequence[str] | Sequence[float], title: s
         if any(names):  # by hand: Matplotlib leaves out what begins with an underscore
             figure.legend(
                 drawn,
-                list(map(shown, names)),
+                list(map(shortened, names)),
                 loc="outside right upper",
                 title=title,
                 fontsize=7,
@@ -120,10 +120,9 @@ def clusters_figure(found: Clusters, names: Sequence[str]) -> Figure:
     figure = new_figure(7, max(2.0, 0.6 + 0.13 * len(names)))
     axes = figure.add_subplot()
     leaves = dendrogram(found.tree, orientation="left", ax=axes, link_color_func=lambda _: _OTHER)["leaves"]
-    clusters = found.numbers[leaves]
-    told = [
-        f"{shown(names[i])}  {one + 1} ({found.stability[one]:.2f})" for i, one in zip(leaves, clusters, strict=True)
-    ]
+    clusters = found.labels[leaves]
+    names = [shortened(names[i]) for i in leaves]
+    told = [f"{name}  {one + 1} ({found.stability[one]:.2f})" for name, one in zip(names, clusters, strict=True)]
     axes.set_yticks(5 + 10 * np.arange(len(leaves)), told, fontsize=5)
     for label, one in zip(axes.get_yticklabels(), clusters, strict=True):
         label.set(color=PALETTE[one % len(PALETTE)], weight="bold" if found.stability[one] >= STABLE else "normal")

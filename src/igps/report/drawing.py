@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
+from igps._arrays import Floats, Integers
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
@@ -33,7 +33,7 @@ _THUMBNAIL_VERTICES = 800
 _MOST_LETTERS = 60
 
 
-def paint(axis: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int64], colour: Any) -> None:
+def paint(axis: Axes, vertices: Floats, faces: Integers, colour: Any) -> None:
     """Draw a surface, lit from the upper right, as seen from +z, in a colour (3,) or one of each face (F, 3)."""
     from matplotlib.collections import PolyCollection
 
@@ -50,13 +50,13 @@ def paint(axis: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int64], c
     axis.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", xticks=[], yticks=[])
 
 
-def axes_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def axes_of(points: Floats) -> Floats:
     """(3, 3) columns x, y, z of a right-handed frame: y along the longest principal axis, x along the next.
 
     The slender end is down and the wider side left, so that poses of one body are seen alike.
     """
     centred = points - points.mean(axis=0)
-    axes: NDArray[np.float64] = np.linalg.svd(centred, full_matrices=False)[2][:2]
+    axes: Floats = np.linalg.svd(centred, full_matrices=False)[2][:2]
     slender = np.where(((centred @ axes.T) ** 3).mean(axis=0) < 0, -1, 1)
     up, right = -slender[0] * axes[0], slender[1] * axes[1]
     return np.stack([right, up, np.cross(right, up)], axis=1)
@@ -82,7 +82,7 @@ def save_figure(figure: Figure, path: Path, dpi: float | None = None) -> None:
         figure.savefig(path, dpi=dpi or "figure", metadata={"Date": None} if path.suffix == ".svg" else None)
 
 
-def shown(name: str) -> str:
+def shortened(name: str) -> str:
     """A name as it is drawn: the middle of a long one is left out, which would leave no room for the picture."""
     return name if len(name) <= _MOST_LETTERS else f"{name[: _MOST_LETTERS // 2]}…{name[1 - _MOST_LETTERS // 2 :]}"
 
@@ -129,6 +129,6 @@ def draw_body(axis: Axes, mesh: Mesh) -> None:
     paint(axis, seen_from_the_front(mesh.vertices), mesh.faces, GREY)
 
 
-def seen_from_the_front(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+def seen_from_the_front(vertices: Floats) -> Floats:
     """The same, turned so that the thinnest principal axis is z, the longest y, and the slender end up."""
     return vertices @ (axes_of(vertices) * [-1, -1, 1])

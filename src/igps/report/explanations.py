@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._parallel import one_thread
-from igps.analysis.explanation import KINDS, Shares, explain, on_surface
+from igps.analysis.explanation import Shares, explain, on_surface
 from igps.data.dataset import SignatureDataset
 from igps.mesh.mesh import Mesh
 from igps.nn.descriptor import Descriptor
 from igps.report.drawing import axes_of
 from igps.report.results import System
-from igps.report.surfaces import STEPS, Surface, made
-from igps.signature.signature import Signature
+from igps.report.surfaces import STEPS, PageSurface, run_jobs
+from igps.signature.signature import SAMPLE_KINDS, Signature
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ def keep_explanations(
     system: System,
     dataset: SignatureDataset,
     descriptor: Descriptor,
-    surfaces: Mapping[str, Surface],
+    surfaces: Mapping[str, PageSurface],
     *,
     n_workers: int | None = None,
 ) -> dict[str, Painted]:
@@ -46,7 +46,7 @@ def keep_explanations(
     jobs = {
         p[0]: (descriptor, dataset.subset([place[name] for name in p]), [surfaces[name] for name in p]) for p in pairs
     }
-    found = made(_painted, jobs, "explanation", n_workers)
+    found = run_jobs(_painted, jobs, "explanation", n_workers)
     found = {name: found[name] for name in system.names if name in found}
     both = [np.concatenate(one.values) for one in found.values()]
     np.savez_compressed(
@@ -61,8 +61,8 @@ def keep_explanations(
     return found
 
 
-def read_explanations(path: Path, surfaces: Mapping[str, Surface]) -> dict[str, Painted]:
-    """What `keep_explanations` wrote, by name, as far as the surfaces are still those; nothing without a file."""
+def read_explanations(path: Path, surfaces: Mapping[str, PageSurface]) -> dict[str, Painted]:
+    """What `keep_explanations` wrote, by name, where the surfaces are unchanged; nothing without a file."""
     if not path.is_file():
         return {}
     with np.load(path) as archive:
@@ -76,7 +76,7 @@ def read_explanations(path: Path, surfaces: Mapping[str, Surface]) -> dict[str, 
     return found
 
 
-def _painted(job: tuple[Descriptor, SignatureDataset, list[Surface]]) -> Painted:
+def _painted(job: tuple[Descriptor, SignatureDataset, list[PageSurface]]) -> Painted:
     descriptor, dataset, surfaces = job
     with one_thread():
         found = explain(descriptor, dataset.batch([0]), dataset.batch([1]))
@@ -85,10 +85,10 @@ def _painted(job: tuple[Descriptor, SignatureDataset, list[Surface]]) -> Painted
     return Painted(dataset.bodies.names[1], found.summary(), (one, other))
 
 
-def _values(mesh: Mesh, signature: Signature, shares: Shares, surface: Surface) -> NDArray[np.uint8]:
+def _values(mesh: Mesh, signature: Signature, shares: Shares, surface: PageSurface) -> NDArray[np.uint8]:
     """At the vertices of a surface, which lies in its cube as the mesh does in its own."""
     axes = axes_of(signature.surface.points)
-    turned = {kind: getattr(signature, kind).points @ axes for kind in KINDS}
+    turned = {kind: getattr(signature, kind).points @ axes for kind in SAMPLE_KINDS}
     corners = mesh.vertices @ axes
     low, high = corners.min(axis=0), corners.max(axis=0)
     points = surface.vertices / STEPS - 0.5

@@ -11,7 +11,7 @@ from typing import Any
 from igps.report.explanations import Painted
 from igps.report.page_data import N_WORST, data_of, letters
 from igps.report.results import Results
-from igps.report.surfaces import Surface
+from igps.report.surfaces import PageSurface
 from igps.report.tables import TITLES
 
 _TEMPLATE = files("igps.report") / "template"
@@ -21,7 +21,7 @@ N_OUTLIERS = 50
 # Inside the axes of the plot of precision and recall, in units of its drawing.
 _PLOT_WIDTH, _PLOT_HEIGHT = 600, 340
 
-MEANINGS = dict(  # noqa: C408
+SCORE_MEANINGS = dict(  # noqa: C408
     nn="nearest neighbour: share of queries whose nearest shape is of their class",
     ft="first tier: share of the class among as many nearest shapes as it has other members",
     st="second tier: share of the class among twice as many",
@@ -35,7 +35,7 @@ MEANINGS = dict(  # noqa: C408
 
 
 def write_page(
-    path: Path, results: Results, surfaces: Mapping[str, Surface], explanations: Mapping[str, Painted] | None = None
+    path: Path, results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, Painted] | None = None
 ) -> None:
     """Write the page of results as an HTML file, see `page_of`."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -43,7 +43,7 @@ def write_page(
 
 
 def page_of(
-    results: Results, surfaces: Mapping[str, Surface], explanations: Mapping[str, Painted] | None = None
+    results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, Painted] | None = None
 ) -> str:
     """The page of results as text, with surfaces by the name of the mesh, and explanations of those that have one."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -81,7 +81,7 @@ def page_of(
         policy=policy,
         licence=(_TEMPLATE / "three.LICENSE").read_text(encoding="utf-8"),
         titles=TITLES,
-        meanings=MEANINGS,
+        meanings=SCORE_MEANINGS,
         curves=[_drawn(i, system) for i, system in enumerate(data["systems"]) if system["curve"]],
         n_worst=N_WORST,
         plot=(_PLOT_WIDTH, _PLOT_HEIGHT),

@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Integers
 from igps.analysis.clusters import STABLE, clusters_of
 from igps.analysis.map import body_map
 from igps.report.explanations import Painted
 from igps.report.results import Results, System
-from igps.report.surfaces import Surface
+from igps.report.surfaces import PageSurface
 from igps.retrieval import RetrievalScores
 
 N_WORST = 20
@@ -27,7 +27,7 @@ _LEAST_MAPPED, _MOST_MAPPED = 3, 3000
 
 
 def data_of(
-    results: Results, surfaces: Mapping[str, Surface], explanations: Mapping[str, Painted] | None = None
+    results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, Painted] | None = None
 ) -> dict[str, Any]:
     """All numbers of the page but the surfaces themselves; for `shapes` see `_shapes`, for `systems` `_of_system`."""
     classes = sorted(set(results.labels or ()))
@@ -50,7 +50,7 @@ def letters(content: bytes) -> str:
 
 
 def _shapes(
-    results: Results, surfaces: Mapping[str, Surface], classes: Sequence[str], explanations: Mapping[str, Painted]
+    results: Results, surfaces: Mapping[str, PageSurface], classes: Sequence[str], explanations: Mapping[str, Painted]
 ) -> list[dict[str, Any]]:
     """Of each body its name, class, notes and surface: place among the surfaces and numbers of vertices and faces.
 
@@ -131,16 +131,14 @@ def _map(system: System) -> dict[str, Any] | None:
     return {
         "points": ((found.points - found.points.min(axis=0)) / extent).round(4).tolist(),
         "stress": round(found.stress, 3),
-        "cluster": clusters.numbers.tolist(),
+        "cluster": clusters.labels.tolist(),
         "stability": finite(clusters.stability, _DECIMALS),
         "n_stable": sum(one >= STABLE for one in clusters.stability),
         "tree": [[int(one), int(other), _significant(height)] for one, other, height, _ in clusters.tree.tolist()],
     }
 
 
-def _confusion(
-    order: NDArray[np.int64], labels: Sequence[str], classes: Sequence[str]
-) -> dict[str, list[list[int]]] | None:
+def _confusion(order: Integers, labels: Sequence[str], classes: Sequence[str]) -> dict[str, list[list[int]]] | None:
     """(C, C) how many shapes of a class (row) have their nearest in a class (column), and so for their first tiers."""
     if not order.size:
         return None
@@ -153,9 +151,7 @@ def _confusion(
     return {"nearest": nearest.tolist(), "tier": tier.tolist()}
 
 
-def _worst(
-    system: System, order: NDArray[np.int64], scores: RetrievalScores, places: NDArray[np.int64]
-) -> list[dict[str, Any]]:
+def _worst(system: System, order: Integers, scores: RetrievalScores, places: Integers) -> list[dict[str, Any]]:
     """The queries whose rankings are most wrong, at most twenty, the worst first; ranks count from 1.
 
     The later the first shape of the query's class comes, the worse; then the lower the first tier; then by name. So a

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from igps._arrays import Integers
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import Bodies, file_of
+from igps.data.sources import Bodies, file_name_of
 from igps.mesh.options import LoadOptions
 from igps.retrieval import PrecisionRecallCurve, RetrievalScores, precision_recall_curve, rank, retrieval_scores
 from igps.signature.signature import SignatureConfig
@@ -46,7 +46,7 @@ class System:
         """Precision and recall; None where there are no scores."""
         return precision_recall_curve(self.distances, self.labels or ()) if self.is_scored else None
 
-    def ranked(self) -> NDArray[np.int64]:
+    def ranked(self) -> Integers:
         """(N, N − 1) the other meshes, nearest first, ties in the order of the meshes."""
         n = len(self.names)
         order = rank(self.distances)
@@ -144,11 +144,10 @@ def read_sources(folder: Path, meshes: Path | None = None) -> SignatureDataset |
         if meshes is None:
             paths = tuple(Path(one["path"]) for one in summary["meshes"])
         else:
-            paths = tuple(meshes / file_of(name, part) for name, part in zip(names, parts, strict=True))
+            paths = tuple(meshes / file_name_of(name, part) for name, part in zip(names, parts, strict=True))
         columns = {str(name): tuple(values) for name, values in summary.get("columns", {}).items()}
-        signature = {**summary["signature"], "attributes": tuple(summary["signature"]["attributes"])}
         bodies, reading = Bodies(paths, names, None, parts, columns), LoadOptions(**summary["reading"])
-        return SignatureDataset(bodies, SignatureConfig(**signature), summary["cache_dir"], reading=reading)
+        return SignatureDataset(bodies, SignatureConfig(**summary["signature"]), summary["cache_dir"], reading=reading)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected the format {_FORMAT} ({error}). Run the command again.") from error
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
+from igps._arrays import Floats, Integers
 from igps._parallel import Failed, Job, Result, run
 from igps.data.dataset import SignatureDataset
 from igps.data.pipeline import SignaturePipeline
@@ -34,8 +35,8 @@ _NEIGHBOURS = 4  # samples that a vertex takes its potential from
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """What is shown of a body."""
+class PageSurface:
+    """The small surface of a body, for the page."""
 
     vertices: NDArray[np.uint16]  # (V, 3) in a cube around it, the longest principal axis along y, the next along x
     faces: NDArray[np.uint16]  # (F, 3), counter-clockwise seen from outside
@@ -59,7 +60,7 @@ def fitting_vertices(n_shapes: int) -> int:
     return int(np.clip(_MOST_BYTES / _BYTES_A_VERTEX / max(n_shapes, 1), _LEAST_VERTICES, _MOST_VERTICES))
 
 
-def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, Surface]:
+def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | None = None) -> dict[str, PageSurface]:
     """The surfaces of meshes by name: read from an archive those that are there, computed and written the others.
 
     A mesh file that has changed since is read again; of one that is gone, what was kept serves. A mesh that cannot be
@@ -71,15 +72,17 @@ def keep_surfaces(path: Path, dataset: SignatureDataset, *, n_workers: int | Non
     if missing:
         make = partial(_surface_of_body, dataset.pipeline, fitting_vertices(len(names)))
         jobs = {names[i]: bodies[i] for i in missing}
-        kept |= made(make, jobs, "picture", n_workers)
+        kept |= run_jobs(make, jobs, "picture", n_workers)
     found = {name: kept[name] for name in names if name in kept}
     if missing:
         write_surfaces(path, found)
     return found
 
 
-def made(work: Callable[[Job], Result], jobs: Mapping[str, Job], what: str, n_workers: int | None) -> dict[str, Result]:
-    """The results of jobs by name; of one that fails the log tells what there is not."""
+def run_jobs(
+    work: Callable[[Job], Result], jobs: Mapping[str, Job], what: str, n_workers: int | None
+) -> dict[str, Result]:
+    """The results of jobs by name; a job that fails is logged as lacking `what`, and left out."""
     names, found = list(jobs), dict[str, Result]()
     with contextlib.closing(run(work, list(jobs.values()), n_workers=n_workers)) as outcomes:
         for number, outcome in tqdm(outcomes, total=len(jobs), desc=f"{what}s"):
@@ -90,11 +93,11 @@ def made(work: Callable[[Job], Result], jobs: Mapping[str, Job], what: str, n_wo
     return found
 
 
-def _surface_of_body(pipeline: SignaturePipeline, n_vertices: int, body: BodyRef) -> Surface:
+def _surface_of_body(pipeline: SignaturePipeline, n_vertices: int, body: BodyRef) -> PageSurface:
     return surface_of(pipeline.mesh(body), pipeline.signature(body), n_vertices, pipeline.key(body))
 
 
-def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "") -> Surface:
+def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "") -> PageSurface:
     """The surface of a mesh with at most `n_vertices` vertices; its potential is from samples of the Signature."""
     try:
         small = simplify(mesh, n_vertices)
@@ -111,14 +114,14 @@ def surface_of(mesh: Mesh, signature: Signature, n_vertices: int, key: str = "")
     turned = vertices @ axes_of(samples)
     lowest, highest = turned.min(axis=0), turned.max(axis=0)
     in_cube = (turned - (lowest + highest) / 2) / (highest - lowest).max() + 0.5
-    return Surface(
+    return PageSurface(
         np.rint(STEPS * in_cube).astype(np.uint16), faces.astype(np.uint16),
         np.rint(255 * (values - low) / ((high - low) or 1)).astype(np.uint8), (low, high),
         len(mesh.vertices), len(mesh.faces), mesh.area, mesh.volume, key, mesh.unit,
     )  # fmt: skip
 
 
-def write_surfaces(path: Path, surfaces: Mapping[str, Surface]) -> None:
+def write_surfaces(path: Path, surfaces: Mapping[str, PageSurface]) -> None:
     """Write surfaces as a NumPy archive: the arrays of all behind each other, with the numbers that tell them apart."""
     many = list(surfaces.values())
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -137,7 +140,7 @@ def write_surfaces(path: Path, surfaces: Mapping[str, Surface]) -> None:
     )
 
 
-def read_surfaces(path: Path) -> dict[str, Surface]:
+def read_surfaces(path: Path) -> dict[str, PageSurface]:
     """What `write_surfaces` wrote, by name; nothing where there is no file; a ValueError of another kind of file."""
     if not path.is_file():
         return {}
@@ -151,15 +154,15 @@ def read_surfaces(path: Path) -> dict[str, Surface]:
     ]
     columns += [arrays[name].tolist() for name in ("names", "measures", "mesh_counts", "keys", "units")]
     return {
-        name: Surface(vertices, faces, potential, (low, high), n_v, n_f, area, volume, key, unit or None)
+        name: PageSurface(vertices, faces, potential, (low, high), n_v, n_f, area, volume, key, unit or None)
         for vertices, faces, potential, name, (low, high, area, volume), (n_v, n_f), key, unit in zip(
             *columns, strict=True
         )
     }
 
 
-def _is_current(pipeline: SignaturePipeline, body: BodyRef, kept: Surface | None) -> bool:
-    """Whether the file is gone, or the one that the surface was made from."""
+def _is_current(pipeline: SignaturePipeline, body: BodyRef, kept: PageSurface | None) -> bool:
+    """Whether the file is gone, or unchanged since the surface was made."""
     if kept is None:
         return False
     try:
@@ -168,9 +171,7 @@ def _is_current(pipeline: SignaturePipeline, body: BodyRef, kept: Surface | None
         return True
 
 
-def clustered(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], n_vertices: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def clustered(vertices: Floats, faces: Integers, n_vertices: int) -> tuple[Floats, Integers]:
     """At most `n_vertices` vertices, each the mean of those in a cell of a grid (Rossignac and Borrel 1993).
 
     Handles and gaps may close, so that the result is good to look at and for nothing else.

@@ -1,13 +1,10 @@
 """Loops that Numba compiles for `distances`: sums over the cells, and no temporary of all pairs and cells."""
 
-from typing import TypeVar
-
 import numpy as np
 from numpy.typing import NDArray
 
+from igps._arrays import Real
 from igps._compiled import SUMS, compiled
-
-Real = TypeVar("Real", np.float32, np.float64)
 
 # Rows of the gallery that the processor's second cache keeps while the queries go by, if they have some hundred cells
 TILE = 64

@@ -187,7 +187,7 @@ def _row_distance(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _is_derived(tensor: Tensor) -> bool:
-    """Whether a derivative by it is asked for, in reverse or forward: NumPy's arrays know neither."""
+    """Whether a derivative by it is recorded, in reverse or forward mode, which NumPy's arrays cannot do."""
     return (torch.is_grad_enabled() and tensor.requires_grad) or unpack_dual(tensor).tangent is not None
 
 

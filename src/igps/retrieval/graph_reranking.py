@@ -149,7 +149,7 @@ def _binary(lists: Integers) -> sparse.csr_array:
 
 
 def _reciprocal(lists: Integers) -> sparse.csr_array:
-    """Ones of the pairs of which each lies in the other's list."""
+    """Ones for the pairs that lie in each other's lists."""
     ones = _binary(lists)
     return ones.multiply(ones.T).tocsr()
 
@@ -165,7 +165,7 @@ def _rows(graph: sparse.csr_array) -> Integers:
 
 
 def _brought_forward(values: Floats, graph: sparse.csr_array, nearest: Integers) -> Floats:
-    """The values of pairs, with those of which one is the other's nearest before all others, in their own order."""
+    """The values of pairs; those of pairs of nearest neighbours made smaller than all others, in their own order."""
     nearest = nearest.astype(graph.indices.dtype)
     rows = _rows(graph)
     first = (nearest[rows] == graph.indices) | (nearest[graph.indices] == rows)

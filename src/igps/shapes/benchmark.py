@@ -4,7 +4,6 @@ import json
 import logging
 import operator
 import os
-import uuid
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +11,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from igps._arrays import Floats, Integers
+from igps._files import whole_file
 from igps._parameters import check_at_least
-from igps.shapes.meshing import Faces, defect, mesh, roughen
+from igps.shapes.meshing import defect, mesh, roughen
 from igps.shapes.skeleton import Skeleton, pose
-from igps.shapes.solids import Array
 from igps.shapes.templates import TEMPLATES
 
 _VERSION = 1  # raised whenever the same arguments would give other meshes
@@ -27,12 +27,12 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class GeneratedShape:
-    vertices: Array  # (V,3) float64, in units of about half the height of a figure
-    faces: Faces  # (F,3) int64, outward
+    vertices: Floats  # (V,3) float64, in units of about half the height of a figure
+    faces: Integers  # (F,3) int64, outward
     label: str  # name of the class
     name: str  # class and running number, such as ``biped/00``
     genus: int  # number of handles of the surface; V − E + F = 2 − 2 genus
-    rotation: Array  # (3,3) what turned it out of its upright frame; ``vertices @ rotation`` stands upright again
+    rotation: Floats  # (3,3) what turned it out of its upright frame; ``vertices @ rotation`` stands upright again
 
 
 class ArticulatedShapes:
@@ -146,7 +146,8 @@ class ArticulatedShapes:
             if not is_whole_off(path):
                 shape = self[index]
                 path.parent.mkdir(parents=True, exist_ok=True)
-                write_whole(path, off_text(shape.vertices, shape.faces))
+                with whole_file(path) as file:
+                    file.write(off_text(shape.vertices, shape.faces).encode())
 
 
 def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
@@ -155,13 +156,14 @@ def shapes_folder(root: str | os.PathLike[str], **settings: object) -> Path:
     manifest = folder / "shapes.json"
     if not manifest.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(manifest, wanted)
+        with whole_file(manifest) as file:
+            file.write(wanted.encode())
     elif (found := manifest.read_text(encoding="utf-8")) != wanted:
         raise ValueError(f"root={str(root)!r} holds shapes of {found}, not of {wanted}; choose another folder")
     return folder
 
 
-def off_text(vertices: Array, faces: Faces) -> str:
+def off_text(vertices: Floats, faces: Integers) -> str:
     """A mesh in the Object File Format; 17 digits give the same float64 values back."""
     lines = [f"OFF\n{len(vertices)} {len(faces)} 0"]
     lines += [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in vertices.tolist()]
@@ -178,13 +180,3 @@ def is_whole_off(path: Path) -> bool:
     if len(header) < 3 or header[0] != b"OFF":
         return False
     return text.endswith(b"\n") and text.count(b"\n") == 2 + int(header[1]) + int(header[2])
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file under another name and move it into place, so that nobody sees a part of it."""
-    temporary = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
-    try:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -5,13 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import sparse
 
-from igps._arrays import Integers
+from igps._arrays import Floats, Integers
 from igps.mesh import surface
 from igps.mesh.mesh import Mesh, MeshError
 from igps.shapes.skeleton import Placed
-from igps.shapes.solids import Array
-
-Faces = Integers
 
 _MIN_ANGLE = 5.0  # degrees; keeps every cotangent below 11.5
 _VERTEX_TOLERANCE = 0.4
@@ -20,7 +17,7 @@ _SNAP = 0.1  # grid values closer to zero than this share of the spacing move aw
 _RELAXATION_STEPS = 10
 
 
-def mesh(body: Sequence[Placed], target: int) -> tuple[Array, Faces, float]:
+def mesh(body: Sequence[Placed], target: int) -> tuple[Floats, Integers, float]:
     """Vertices (V,3), outward faces (F,3) and the grid spacing, with V within about a tenth of ``target``."""
     from skimage.measure import marching_cubes
 
@@ -41,7 +38,7 @@ def mesh(body: Sequence[Placed], target: int) -> tuple[Array, Faces, float]:
     return _relax(body, vertices, faces, spacing), faces, spacing
 
 
-def roughen(vertices: Array, faces: Faces, amplitude: float, wavelength: float, rng: np.random.Generator) -> Array:
+def roughen(vertices: Floats, faces: Integers, amplitude: float, wavelength: float, rng: np.random.Generator) -> Floats:
     """Move vertices (V,3) along their normals by a band-limited random field."""
     waves = rng.normal(size=(12, 3)) * (2.0 * np.pi / wavelength / np.sqrt(3.0))
     phases = rng.uniform(0.0, 2.0 * np.pi, 12)
@@ -51,7 +48,7 @@ def roughen(vertices: Array, faces: Faces, amplitude: float, wavelength: float, 
     return vertices + surface.vertex_normals(vertices, faces) * (amplitude * noise / np.sqrt(6.0))[:, None]
 
 
-def defect(vertices: Array, faces: Faces, genus: int, n_vertices: int, min_angle: float = _MIN_ANGLE) -> str | None:
+def defect(vertices: Floats, faces: Integers, genus: int, n_vertices: int, min_angle: float = _MIN_ANGLE) -> str | None:
     """What keeps a mesh out of the benchmark, in words, or None; ``min_angle`` in degrees."""
     import igl
 
@@ -72,7 +69,7 @@ def defect(vertices: Array, faces: Faces, genus: int, n_vertices: int, min_angle
     return None
 
 
-def _distance(body: Sequence[Placed], points: Array) -> Array:
+def _distance(body: Sequence[Placed], points: Floats) -> Floats:
     """The blended signed distance (V,) at points (V,3)."""
     x, y, z = points.T
     total = body[0].distance(x, y, z)
@@ -81,18 +78,18 @@ def _distance(body: Sequence[Placed], points: Array) -> Array:
     return total
 
 
-def _smooth_minimum(a: Array, b: Array, blend: float) -> Array:
+def _smooth_minimum(a: Floats, b: Floats, blend: float) -> Floats:
     """The polynomial smooth union of two distances; differs from the minimum where they are closer than ``blend``."""
     overlap = np.maximum(blend - np.abs(a - b), 0.0)
     return np.minimum(a, b) - overlap * overlap / (4.0 * blend)
 
 
-def _bounds(body: Sequence[Placed]) -> tuple[Array, Array]:
+def _bounds(body: Sequence[Placed]) -> tuple[Floats, Floats]:
     corners = np.array([part.bounds() for part in body])
     return corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
 
 
-def _sample(body: Sequence[Placed], spacing: float) -> tuple[Array, Array]:
+def _sample(body: Sequence[Placed], spacing: float) -> tuple[Floats, Floats]:
     """The grid's first corner (3,) and the blended distances on it; each solid is evaluated only near itself."""
     margin = max(part.blend for part in body) + 2.5 * spacing
     low, high = _bounds(body)
@@ -118,7 +115,7 @@ def _rough_area(body: Sequence[Placed]) -> float:
     return float(np.count_nonzero(np.abs(grid) < spacing)) * spacing**2 / 2.0
 
 
-def _relax(body: Sequence[Placed], vertices: Array, faces: Faces, spacing: float) -> Array:
+def _relax(body: Sequence[Placed], vertices: Floats, faces: Integers, spacing: float) -> Floats:
     """Slide vertices (V,3) towards their neighbours' mean along the surface, and back onto the zero level set."""
     start, end = surface.directed_edges(faces)
     adjacency = sparse.csr_array((np.ones(len(start)), (start, end)), shape=(len(vertices),) * 2)

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from igps.shapes.solids import Array, Cone, Solid, Vector
+from igps._arrays import Floats
+from igps.shapes.solids import Cone, Solid, Vector
 
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 UP: Vector = (0.0, 0.0, 1.0)
@@ -27,7 +28,7 @@ class Part:
     group: str = "body"  # parts of one group share their proportions
     bend: Vector = ORIGIN  # limits of the joint (raise, swing, twist), degrees
     at: Vector = ORIGIN  # the joint's place on the parent
-    turn: Array = field(default_factory=lambda: np.eye(3))  # the joint's frame at rest, in the parent's
+    turn: Floats = field(default_factory=lambda: np.eye(3))  # the joint's frame at rest, in the parent's
     blend: float = 0.06  # how far from the solid its union with the others is smooth
     lift: float = 0.0  # how far the solid's own origin lies along z from the joint
     children: tuple[Part, ...] = ()
@@ -61,18 +62,18 @@ class Placed:
     """A solid in the world: ``world = rotation @ local + offset``."""
 
     solid: Solid
-    rotation: Array
-    offset: Array
+    rotation: Floats
+    offset: Floats
     blend: float
 
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         """The solid's signed distance at world coordinates."""
         # Written out: a library product may sum in another order on another number of threads.
         r, (a, b, c) = self.rotation, self.offset
         x, y, z = x - a, y - b, z - c
         return self.solid.distance(*(r[0, i] * x + r[1, i] * y + r[2, i] * z for i in range(3)))
 
-    def bounds(self) -> tuple[Array, Array]:
+    def bounds(self) -> tuple[Floats, Floats]:
         """The lower and upper corner of a box around the solid, along the world's axes."""
         low, high = self.solid.box()
         centre = (self.rotation * (0.5 * (low + high))).sum(axis=1) + self.offset
@@ -80,7 +81,7 @@ class Placed:
         return centre - half, centre + half
 
 
-def aim(heading: Vector, roll: float = 0.0) -> Array:
+def aim(heading: Vector, roll: float = 0.0) -> Floats:
     """A rotation that takes +z to ``heading``, with x level (x itself where the heading is steep) before the roll."""
     z = np.array(heading) / np.linalg.norm(heading)
     x = np.array([1.0, 0.0, 0.0]) - z[0] * z if abs(z[2]) > 0.9 else np.array([-z[1], z[0], 0.0])
@@ -88,7 +89,7 @@ def aim(heading: Vector, roll: float = 0.0) -> Array:
     return np.column_stack([x, np.cross(z, x), z]) @ Rotation.from_euler("z", roll).as_matrix()
 
 
-def turned(axes: str, *degrees: float) -> Array:
+def turned(axes: str, *degrees: float) -> Floats:
     """A rotation by Euler angles, as in `scipy.spatial.transform.Rotation.from_euler`."""
     return np.asarray(Rotation.from_euler(axes, degrees, degrees=True).as_matrix()).reshape(3, 3)
 
@@ -124,12 +125,12 @@ def limb(
     return children[0]
 
 
-def pose(skeleton: Skeleton, rng: np.random.Generator, flex: float, rotation: Array) -> list[Placed]:
+def pose(skeleton: Skeleton, rng: np.random.Generator, flex: float, rotation: Floats) -> list[Placed]:
     """Draw proportions and joint angles (``flex`` times the limits) and place every solid."""
     proportions: dict[str, tuple[float, float]] = {}
     placed: list[Placed] = []
 
-    def place(part: Part, frame: Array, origin: Array) -> None:
+    def place(part: Part, frame: Floats, origin: Floats) -> None:
         if part.group not in proportions:
             thick, length = np.exp(rng.uniform(-1.0, 1.0, 2) * (0.1, 0.13))
             proportions[part.group] = (float(thick), float(length))

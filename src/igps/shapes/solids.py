@@ -13,7 +13,6 @@ import numpy as np
 
 from igps._arrays import Floats
 
-Array = Floats
 Vector = tuple[float, float, float]
 
 
@@ -26,18 +25,18 @@ class Solid(ABC):
         return 0
 
     @abstractmethod
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         """The signed distance (exact or a good approximation), negative inside."""
 
     @abstractmethod
-    def box(self) -> tuple[Array, Array]:
+    def box(self) -> tuple[Floats, Floats]:
         """The lower and upper corner of a box around the solid."""
 
     @abstractmethod
     def stretched(self, thick: float, length: float) -> Solid:
         """The solid with other proportions."""
 
-    def factors(self, thick: float, length: float) -> Array:
+    def factors(self, thick: float, length: float) -> Floats:
         """The factors (3,) by which points fixed to the solid move when it is stretched."""
         return np.array([thick, thick, length])
 
@@ -50,14 +49,14 @@ class Cone(Solid):
     start: float
     end: float
 
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         radial = np.hypot(x, y)
         slope = (self.start - self.end) / self.length
         # The nearest sphere of a tapered sweep lies off the perpendicular foot by the taper's tilt.
         along = np.clip(z - radial * (slope / np.sqrt(1.0 - slope * slope)), 0.0, self.length)
         return np.hypot(radial, z - along) - (self.start - slope * along)
 
-    def box(self) -> tuple[Array, Array]:
+    def box(self) -> tuple[Floats, Floats]:
         wide = max(self.start, self.end)
         return np.array([-wide, -wide, -self.start]), np.array([wide, wide, self.length + self.end])
 
@@ -74,7 +73,7 @@ class Arc(Solid):
     start: float
     end: float
 
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         turned = np.arctan2(z, self.bend - y) - 0.5 * self.angle
         turned = np.mod(turned + np.pi, 2.0 * np.pi) - np.pi
         turned = np.clip(turned, -0.5 * self.angle, 0.5 * self.angle) + 0.5 * self.angle
@@ -82,7 +81,7 @@ class Arc(Solid):
         tube = self.start + (self.end - self.start) / self.angle * turned
         return np.sqrt(x * x + (y - centre_y) ** 2 + (z - centre_z) ** 2) - tube
 
-    def box(self) -> tuple[Array, Array]:
+    def box(self) -> tuple[Floats, Floats]:
         wide = max(self.start, self.end)
         turned = np.linspace(0.0, self.angle, 33)
         y, z = self.bend * (1.0 - np.cos(turned)), self.bend * np.sin(turned)
@@ -92,7 +91,7 @@ class Arc(Solid):
     def stretched(self, thick: float, length: float) -> Solid:
         return Arc(self.bend * length, self.angle, self.start * thick, self.end * thick)
 
-    def factors(self, thick: float, length: float) -> Array:
+    def factors(self, thick: float, length: float) -> Floats:
         return np.full(3, length)
 
     def tip(self) -> Vector:
@@ -112,10 +111,10 @@ class Ring(Solid):
     def genus(self) -> int:
         return 1
 
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         return np.hypot(np.hypot(x, np.maximum(np.abs(z) - self.side, 0.0)) - self.radius, y) - self.tube
 
-    def box(self) -> tuple[Array, Array]:
+    def box(self) -> tuple[Floats, Floats]:
         wide = self.radius + self.tube
         upper = np.array([wide, self.tube, wide + self.side])
         return -upper, upper
@@ -123,7 +122,7 @@ class Ring(Solid):
     def stretched(self, thick: float, length: float) -> Solid:
         return Ring(self.radius * length, self.tube * thick, self.side * length)
 
-    def factors(self, thick: float, length: float) -> Array:
+    def factors(self, thick: float, length: float) -> Floats:
         return np.full(3, length)
 
 
@@ -133,14 +132,14 @@ class Blob(Solid):
 
     radii: Vector
 
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         a, b, c = self.radii
         unit = np.sqrt((x / a) ** 2 + (y / b) ** 2 + (z / c) ** 2)
         gradient = np.sqrt((x / a**2) ** 2 + (y / b**2) ** 2 + (z / c**2) ** 2)
         # First order in the distance from the surface; the floor keeps the centre finite and inside.
         return unit * (unit - 1.0) / np.maximum(gradient, 1e-9) - 1e-12
 
-    def box(self) -> tuple[Array, Array]:
+    def box(self) -> tuple[Floats, Floats]:
         return -np.array(self.radii), np.array(self.radii)
 
     def stretched(self, thick: float, length: float) -> Solid:
@@ -155,12 +154,12 @@ class Box(Solid):
     size: Vector
     rounding: float
 
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         a, b, c = (np.abs(q) - (0.5 * s - self.rounding) for q, s in zip((x, y, z), self.size, strict=True))
         outside = np.sqrt(np.maximum(a, 0.0) ** 2 + np.maximum(b, 0.0) ** 2 + np.maximum(c, 0.0) ** 2)
         return outside + np.minimum(np.maximum(np.maximum(a, b), c), 0.0) - self.rounding
 
-    def box(self) -> tuple[Array, Array]:
+    def box(self) -> tuple[Floats, Floats]:
         return -0.5 * np.array(self.size), 0.5 * np.array(self.size)
 
     def stretched(self, thick: float, length: float) -> Solid:
@@ -179,7 +178,7 @@ class Shell(Solid):
     def genus(self) -> int:
         return 0 if self.profile[0][0] == 0.0 else 1  # a profile that starts off the axis is a tube, open at both ends
 
-    def distance(self, x: Array, y: Array, z: Array) -> Array:
+    def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
         radial = np.hypot(x, y)
         squared = np.full(radial.shape, np.inf)
         for (r0, z0), (r1, z1) in itertools.pairwise(self.profile):
@@ -188,7 +187,7 @@ class Shell(Solid):
             np.minimum(squared, (radial - r0 - along * dr) ** 2 + (z - z0 - along * dz) ** 2, out=squared)
         return np.sqrt(squared) - 0.5 * self.wall
 
-    def box(self) -> tuple[Array, Array]:
+    def box(self) -> tuple[Floats, Floats]:
         radii, heights = np.array(self.profile).T
         wide = radii.max() + 0.5 * self.wall
         low, high = heights.min() - 0.5 * self.wall, heights.max() + 0.5 * self.wall

@@ -32,7 +32,7 @@ N_TERMS = 19
 _HALVES = 1 - np.eye(3) / 2
 
 
-class Surface:
+class HatSurface:
     """A scaled mesh without flat faces and loose vertices, numbered so that close vertices follow each other.
 
     It is turned into its principal axes, so that boxes turn with the body. A ValueError if no face has an area.
@@ -97,7 +97,7 @@ def _hats(
     thirds: Floats,
     squared_sides: Floats,
 ) -> Floats:
-    """`Surface.hats`; thirds (F, 1) are those of the areas, and `at_vertex` (V, 3 F) sums over corners.
+    """`HatSurface.hats`; thirds (F, 1) are those of the areas, and `at_vertex` (V, 3 F) sums over corners.
 
     Over a face with corners v, a, b and t = v + a + b the hat of v has the mean (v + t)/4 and the second moment
     (2vvᵀ + vtᵀ + tvᵀ + ttᵀ + aaᵀ + bbᵀ + vvᵀ)/20.
@@ -137,7 +137,7 @@ def _entries(forms: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class Clusters:
+class HatClusters:
     """Consecutive hats: 32 each on the first level, four clusters of the level before on the next."""
 
     centres: Floats  # (C, 3) of all levels, numbered through
@@ -147,7 +147,7 @@ class Clusters:
     n_hats: int  # V
 
     @staticmethod
-    def of(hats: Floats, functions: NDArray[np.floating], team: Team = ALONE) -> Clusters:
+    def of(hats: Floats, functions: NDArray[np.floating], team: Team = ALONE) -> HatClusters:
         """Of functions (V, K) at hats (V, 24)."""
         n_hats = len(hats)
         sizes = [_LEAF]
@@ -172,7 +172,7 @@ class Clusters:
                 np.matmul(terms[part].T, functions[part], out=sums[cluster])
 
         team.each(fill, range(len(sizes)))
-        return Clusters(np.concatenate(centres), np.concatenate(radii), first, sums, n_hats)
+        return HatClusters(np.concatenate(centres), np.concatenate(radii), first, sums, n_hats)
 
     def seen_from(self, x: Floats, ratio: float) -> tuple[Integers, Integers]:
         """The clusters that are `ratio` radii or more away from the box of points x (3, n), and the other hats."""

@@ -145,5 +145,5 @@ def dot(p: tuple[float, float, float], q: tuple[float, float, float]) -> float:
 
 @compiled()
 def logarithm(total: float, length: float) -> float:
-    """That of a side of this length, the distances of whose ends have this sum."""
+    """ln((r + r' + l)/(r + r' − l)) of a side of length l, from the sum of the distances of its ends."""
     return math.log((total + length) / max(total - length, _TINY))

@@ -74,6 +74,7 @@ class SignatureConfig:
                 f"max_vertices: expected more than n_eigenpairs + 1 = {self.n_kept + 1}, got {self.max_vertices}."
             )
         check_share(accuracy=self.accuracy)
+        object.__setattr__(self, "attributes", tuple(self.attributes))  # JSON and YAML have lists
         check_attributes(self.attributes)
 
     @classmethod
@@ -108,7 +109,7 @@ class SignatureConfig:
         return replace(self, n_eigenpairs=n_computed, least_vertices=self.n_vertices_read)
 
     def larger(self) -> Iterator[SignatureConfig]:
-        """Those whose Signature of a body begins with this one's, smallest first, as far as a cache may well have them.
+        """Configurations whose Signatures begin with this one's, the smallest first, among those that caches may hold.
 
         For a mesh that is subdivided that holds only of those with as many `n_vertices_read`.
         """

@@ -24,7 +24,7 @@ from igps._arrays import Floats, Integers
 from igps._parameters import check_share
 from igps._threads import Team
 from igps.mesh.winding import checked_places
-from igps.signature._far_field import Clusters, Surface
+from igps.signature._far_field import HatClusters, HatSurface
 from igps.signature.ordering import spatial_order
 
 logger = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ def mean_value_coordinates(
         ValueError: a shape, an index or a value of an argument is invalid, or the weights of a point sum to zero.
     """
     scaled, faces, x = _scaled(vertices, faces, points)
-    surface = Surface(scaled, faces)
+    surface = HatSurface(scaled, faces)
     out = np.zeros((len(x), len(scaled)))
     x = x @ surface.axes
     for rows in _pieces(np.arange(len(x)), len(surface.order)):
@@ -130,7 +130,7 @@ class Extension:
             raise ValueError(
                 f"divisors: expected one for each of {values.shape[1]} functions, got shape {np.shape(divisors)}"
             )
-        self._surface = Surface(scaled, scaled_faces)
+        self._surface = HatSurface(scaled, scaled_faces)
         order = self._surface.order
         self._n_functions = values.shape[1]
         # Those behind the functions sum the weights: one would do, but whole registers are multiplied faster.
@@ -173,7 +173,7 @@ class Extension:
         hat_ratio, cluster_ratio = _far_ratios(setting)
         order = spatial_order(x, _GROUP)
 
-        def of_group(clusters: Clusters | None, start: int) -> list[tuple[Integers, NDArray[np.floating]]]:
+        def of_group(clusters: HatClusters | None, start: int) -> list[tuple[Integers, NDArray[np.floating]]]:
             group = order[start : start + _GROUP]
             far, hats, values = np.empty(0, np.int64), np.arange(len(columns)), columns
             if clusters is not None:
@@ -191,7 +191,7 @@ class Extension:
 
         with Team(None if len(columns) >= _TEAM_VERTICES else 1) as team:
             clustered = setting is not None and len(columns) >= _CLUSTERED
-            clusters = Clusters.of(surface.hats, columns, team) if clustered else None
+            clusters = HatClusters.of(surface.hats, columns, team) if clustered else None
             for found in team.each(partial(of_group, clusters), range(0, len(x), _GROUP)):
                 yield from found
 
@@ -235,7 +235,7 @@ def _pieces(rows: Integers, n_weights: int) -> list[Integers]:
     return [rows[start : start + size] for start in range(0, len(rows), size)]
 
 
-def _exact_weights(surface: Surface, points: Floats) -> Floats:
+def _exact_weights(surface: HatSurface, points: Floats) -> Floats:
     """(V, n) at points (n, 3)."""
     hats = np.arange(len(surface.hats))
     weights = np.empty((len(hats), len(points)))

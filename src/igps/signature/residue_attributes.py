@@ -5,7 +5,6 @@ little when atoms do.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -80,7 +79,7 @@ def with_residue_attributes(signature: Signature, molecule: Molecule, names: Seq
     def added(samples: Samples) -> Samples:
         return samples.with_attributes({name: residue_attribute(molecule, samples.points, name) for name in names})
 
-    return replace(signature, interior=added(signature.interior), surface=added(signature.surface))
+    return signature.map_samples(added)
 
 
 def _by_name(table: Mapping[str, float], default: float = np.nan) -> Callable[[Molecule], Floats]:

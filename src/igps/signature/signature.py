@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,9 +28,12 @@ from igps.spectra import ConvergenceError, Spectrum, eigenpairs
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["Samples", "Signature", "SignatureConfig", "compute_signature"]
+__all__ = ["SAMPLE_KINDS", "SampleKind", "Samples", "Signature", "SignatureConfig", "compute_signature"]
 
 logger = logging.getLogger(__name__)
+
+SampleKind = Literal["interior", "surface"]
+SAMPLE_KINDS: tuple[SampleKind, ...] = ("interior", "surface")
 
 # Largest relative residual of an eigenpair. It is mostly far smaller; on meshes with very thin triangles rounding does
 # not allow much less, and the histograms cannot tell.
@@ -124,8 +127,12 @@ class Signature:
         potential = np.square(self.interior.eigenfunctions, dtype=np.float64) @ (1 / self.eigenvalues)
         return self.interior.points[int(np.argmin(potential))]
 
+    def map_samples(self, change: Callable[[Samples], Samples]) -> Signature:
+        """The Signature with a function applied to its interior and to its surface samples."""
+        return replace(self, interior=change(self.interior), surface=change(self.surface))
+
     def truncated(self, config: SignatureConfig) -> Signature:
-        """The Signature of a configuration of which this one's is one of the larger, see `SignatureConfig.larger`."""
+        """The Signature of a smaller configuration: this one's is among its `SignatureConfig.larger`."""
 
         def cut(samples: Samples) -> Samples:
             attributes = samples.attributes.items()
@@ -134,8 +141,7 @@ class Signature:
             return replace(samples, eigenfunctions=functions, attributes=kept)
 
         eigenvalues = self.eigenvalues[: config.n_kept].copy()
-        interior, surface = cut(self.interior), cut(self.surface)
-        return replace(self, eigenvalues=eigenvalues, interior=interior, surface=surface, config=config)
+        return replace(self.map_samples(cut), eigenvalues=eigenvalues, config=config)
 
 
 @one_thread()

@@ -6,9 +6,10 @@ from torch.nn.functional import normalize
 
 from igps.data.requirements import Requirements
 from igps.nn.axes.points import soft_memberships
-from igps.nn.batch_features import SampleFeatures, SampleKind
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential
 from igps.nn.histograms.base import SampleHistogram, counted, joint
+from igps.signature.signature import SampleKind
 
 # The weight of a sample is so great a power of its potential: the trunk decides where the axes lie, limbs hardly
 _POWER = -4
@@ -73,7 +74,7 @@ class AxialHistogram(SampleHistogram):
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, 3, ...) histograms of some samples of N shapes."""
         mask, potential = features.samples.mask, barycentroid_potential(features.embedded(self.embedding))
-        # What is padded may be anything, and counts nowhere.
+        # Padding may hold anything, and counts nowhere
         points, directions, potential, own = (
             one.masked_fill(~mask.view(*mask.shape, *[1] * (one.ndim - 2)), 0)
             for one in (

@@ -7,9 +7,10 @@ from torch.nn.utils.rnn import pad_sequence
 
 from igps._parameters import check_at_least
 from igps.descriptors.pretrained._merge_tree import MergeTree, merge_tree, merge_trees
-from igps.nn.batch_features import SampleFeatures, SampleKind
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram
+from igps.signature.signature import SampleKind
 
 
 class BranchHistogram(SampleHistogram):
@@ -74,7 +75,7 @@ class BranchHistogram(SampleHistogram):
 
 
 def _limbs(tree: MergeTree, longest: Tensor, heights: Tensor, neighbours: Tensor, mask: Tensor) -> Tensor:
-    """(B, P) which samples each of the longest branches has: those of the piece that joins no other yet."""
+    """(B, P) the samples of each of the longest branches: those of its piece before it joins another."""
     kept = longest[longest < len(tree.peaks)]
     order = heights.masked_fill(~mask, -torch.inf).argsort(descending=True, stable=True)
     above = order.argsort()[tree.saddles[kept]].clamp_min(1)

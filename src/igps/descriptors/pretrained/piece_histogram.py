@@ -7,9 +7,10 @@ from torch import Tensor, nn
 
 from igps.descriptors.pretrained._merge_tree import merge_trees
 from igps.nn.axes.points import soft_memberships
-from igps.nn.batch_features import SampleFeatures, SampleKind
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram
+from igps.signature.signature import SampleKind
 
 # Centres are logarithms to base 2. Of sizes, from one sample in 64 on
 _SMALLEST, _LARGEST = -6.0, -0.5

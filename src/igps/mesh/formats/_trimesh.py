@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from igps.mesh.formats._format import RawBody, check_unpacked, distinct
 from igps.mesh.options import LoadOptions
 
-# An error names the file and its fault; tracebacks that trimesh logs where nobody has set up logging say nothing more
+# Errors name the file and its fault; the tracebacks that trimesh logs by default add nothing
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 

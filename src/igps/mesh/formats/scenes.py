@@ -76,7 +76,7 @@ def read_step(path: Path, options: LoadOptions, part: str | None) -> list[RawBod
 
 def _converted(path: Path) -> bytes:
     """The glTF scene of a STEP file, made in a process of its own: OpenCASCADE crashes on some damaged files."""
-    import cascadio  # noqa: F401  # missing, it is told as such
+    import cascadio  # noqa: F401  # to report a missing module as such
 
     with tempfile.TemporaryDirectory() as folder:
         step, scene = Path(folder) / "x.step", Path(folder) / "x.glb"

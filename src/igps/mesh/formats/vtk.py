@@ -138,7 +138,7 @@ def read_legacy(path: Path, options: LoadOptions, part: str | None) -> list[RawB
 
 
 def point_values(path: Path, options: LoadOptions) -> PointValues:
-    """What a file of VTK of one piece knows of its points."""
+    """The arrays at the points of a VTK file of one piece."""
     if path.suffix.lower() == ".vtk":
         legacy = _Legacy(path.read_bytes())
         vertices, cells, heading = legacy.geometry()

@@ -1,17 +1,13 @@
 """The largest balls that touch a surface at its samples, from inside and from outside."""
 
-from typing import TypeVar
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from igps._arrays import Singles
+from igps._arrays import Real, Singles
 from igps._compiled import compiled
 from igps.nn._precision import full_precision
-
-Real = TypeVar("Real", np.float32, np.float64)
 
 # Points that lie so nearly in the tangent plane, by the sine, tell of the sampled normal's error and not of a ball
 _TANGENTIAL = 0.1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,14 +12,12 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from igps._arrays import Booleans, Floats
-from igps._threads import ALONE, Team
+from igps._threads import ALONE, Result, Team
 from igps.nn._kernels.count_by_torch import count_by_torch
 from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES, Axes, Numbers, Places
 from igps.nn._kernels.pair_loops import count_block, gradient_block
 from igps.nn._kernels.pair_values import PairValues, centres_of, cosine_factors, with_tensors
 from igps.nn._precision import full_precision
-
-Result = TypeVar("Result")
 
 # Pairs of a block, whose values stay in a core's second-level cache; more could overflow the integers of `pair_sums`
 _BLOCK, _MOST_COLUMNS = 2**18, 2048
@@ -33,7 +31,7 @@ Blocks = Sequence[tuple[int, int]]
 
 
 class Layout(NamedTuple):
-    """What a count has no gradient by, see `count_pairs`."""
+    """The arguments of a count without gradients, see `count_pairs`."""
 
     classes: Tensor
     n_classes: int
@@ -88,7 +86,7 @@ class CompiledCount(torch.autograd.Function):
 
 
 def _of_shapes(task: Callable[[int, Team], Result], n_shapes: int) -> list[Result]:
-    """What a task finds of each shape: of as many side by side as there are threads, or else with a team for each."""
+    """The result of a task for each shape: shapes side by side if there are as many as threads, else with a team."""
     with full_precision(), Team() as team:
         if n_shapes >= team.n_threads:
             return team.each(lambda number: task(number, ALONE), range(n_shapes))

@@ -22,7 +22,7 @@ def count_by_torch(
     classes: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: Tensor, weights: Tensor, *tensors: Tensor
 ) -> Tensor:
     """(N, C(C+1)/2, B, ...) float64 counts."""
-    # What is padded may be anything, and 0 times that no number.
+    # Padding may hold anything, and 0 times infinity is NaN
     clean = [t.masked_fill(~mask.view(*mask.shape, *[1] * (t.ndim - 2)), 0) if t.ndim > 1 else t for t in tensors]
     weights = weights.masked_fill(~mask[:, :, None], 0)
     if torch.compiler.is_compiling():  # what is traced cannot look at numbers

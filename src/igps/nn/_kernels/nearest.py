@@ -1,16 +1,12 @@
 """The smallest entries of each row, for the few nearest of many points."""
 
-from typing import TypeVar
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from igps._arrays import Integers
+from igps._arrays import Integers, Real
 from igps._compiled import compiled
-
-Real = TypeVar("Real", np.float32, np.float64)
 
 
 def smallest(values: Tensor, n: int) -> tuple[Tensor, Tensor]:

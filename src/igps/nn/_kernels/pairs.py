@@ -19,7 +19,7 @@ from igps.nn._kernels.count_by_torch import count_by_torch
 from igps.nn._kernels.pair_cells import VALUES
 from igps.nn._kernels.pair_values import WAYS, PairValues, centres_of, with_tensors
 
-# Since PyTorch 2.7; an exported program is to hold what any machine knows, not an operator of this library.
+# Since PyTorch 2.7. An exported program must run without this library, and so without its operator.
 _is_exporting = getattr(torch.compiler, "is_exporting", lambda: False)
 
 
@@ -68,11 +68,11 @@ def _count(classes: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: T
 
 
 def _known(ways: Sequence[int], tensors: list[Tensor]) -> list[PairValues]:
-    """Those of `WAYS` by their numbers, of tensors that follow the weights."""
+    """The `WAYS` of these numbers, with the tensors that follow the weights."""
     return with_tensors([WAYS[k] for k in ways], tensors[1:])
 
 
-# Written out, as the first versions that have operators do not know what `list[int]` is.
+# Spelled out: the first versions of PyTorch with custom operators cannot infer `list[int]`.
 _ARGUMENTS = "Tensor classes, int n_classes, int[] ways, Tensor mask, Tensor[] tensors"
 
 
@@ -93,7 +93,7 @@ def _gradients(
     upstream: Tensor, classes: Tensor, n_classes: int, ways: list[int], mask: Tensor, tensors: list[Tensor]
 ) -> list[Tensor]:
     keys = torch._C.DispatchKey
-    # Within an operator PyTorch has put aside what records derivatives.
+    # PyTorch switches autograd off inside of an operator
     with (
         torch._C._SetExcludeDispatchKeyGuard(keys.AutogradFunctionality, False),
         torch._C._SetExcludeDispatchKeyGuard(keys.ADInplaceOrView, False),

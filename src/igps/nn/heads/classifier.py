@@ -98,7 +98,7 @@ class ClassifierHead(KernelHead):
 
 
 def folds(labels: Tensor, n_folds: int = _MOST_FOLDS) -> Iterator[Tensor]:
-    """(N,) masks of what is held out in turn: each shape once, of each class (N,) at most all but one; singles never.
+    """(N,) masks of held-out folds: each shape once, at most all but one of a class, and never a class of one.
 
     There are fewer folds where all classes are smaller.
     """

@@ -108,7 +108,7 @@ class WCCNHead(Head):
 
     @property
     def n_compared(self) -> int:
-        """Numbers of a vector that distances are of: without the one that makes the length 1, once fitted."""
+        """How many numbers of a vector distances use, once fitted: all but the one that makes the length 1."""
         return sum(min(len(self.directions), size) for size in self._sizes())
 
     @property

@@ -4,7 +4,6 @@ import math
 from abc import ABC, abstractmethod
 from functools import reduce
 from operator import or_
-from typing import get_args
 
 import torch
 from torch import Tensor, nn
@@ -14,8 +13,9 @@ from igps.data.batch import SignatureBatch
 from igps.data.requirements import Requirements, embedding_requirements
 from igps.nn.axes.pairs import DistanceAxis, PairAxis
 from igps.nn.axes.points import PointAxis
-from igps.nn.batch_features import BatchFeatures, SampleFeatures, SampleKind
+from igps.nn.batch_features import BatchFeatures, SampleFeatures
 from igps.nn.specification import Specified
+from igps.signature.signature import SAMPLE_KINDS, SampleKind
 
 
 class DescriptionPart(Specified, ABC):
@@ -74,7 +74,7 @@ class SampleHistogram(DescriptionPart):
         self, samples: SampleKind, n_samples: int | None = None, n_training_samples: int | None = None
     ) -> None:
         super().__init__()
-        check_one_of(get_args(SampleKind), samples=samples)
+        check_one_of(SAMPLE_KINDS, samples=samples)
         check_at_least(2, n_samples=n_samples, n_training_samples=n_training_samples)
         self.samples: SampleKind = samples
         self.n_samples = n_samples

@@ -12,9 +12,10 @@ from igps.nn._kernels.pair_values import PairValues, euclidean_distances
 from igps.nn._kernels.pairs import check_pairs, class_pairs, count_pairs
 from igps.nn.axes import PairAxis, PointAxis, axis_of
 from igps.nn.axes.points import largest_members
-from igps.nn.batch_features import SampleFeatures, SampleKind
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import AxesHistogram
+from igps.signature.signature import SampleKind
 
 
 class PairHistogram(AxesHistogram):

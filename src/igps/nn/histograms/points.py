@@ -6,9 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from igps.nn.axes.points import PointAxis
-from igps.nn.batch_features import SampleFeatures, SampleKind
+from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import AxesHistogram, counted, joint
+from igps.signature.signature import SampleKind
 
 
 class PointHistogram(AxesHistogram):
@@ -57,7 +58,7 @@ class PointHistogram(AxesHistogram):
         memberships = []
         for axis in self.point_axes:
             values = axis.values(features, self.embedding)
-            # What is padded may be anything, and counts nowhere.
+            # Padding may hold anything, and counts nowhere
             real = mask.view(*mask.shape, *[1] * (values.ndim - 2))
             memberships.append(axis.memberships(torch.where(real, values, 0)))
         first, *others = memberships

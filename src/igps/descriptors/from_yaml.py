@@ -31,8 +31,8 @@ _MOST_BYTES, _MOST = 100_000, 10_000
 _ABOUT = ("name", "source", "invariant_to", "scale")
 
 
-def written(path: str | Path) -> HistogramDescriptor:
-    """The descriptor that a YAML file tells of, in evaluation mode.
+def load_yaml(path: str | Path) -> HistogramDescriptor:
+    """The descriptor that a YAML file specifies, in evaluation mode.
 
     Its `parts` are histograms, or lists of histograms, with one share each. A histogram has `axes`, each a name or a
     name with its options; `eigenpairs` of its embedding, which an axis may have of its own; `samples`, `n_samples`, and
@@ -51,38 +51,38 @@ def written(path: str | Path) -> HistogramDescriptor:
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise ValueError(f"expected at most {_MOST_BYTES} bytes, got {path.stat().st_size}")
-        told = yaml.safe_load(path.read_text(encoding="utf-8"))
-        _only(told, ("parts", *_ABOUT), "a descriptor")
-        if not isinstance(told.get("parts"), list):
+        spec = yaml.safe_load(path.read_text(encoding="utf-8"))
+        _only(spec, ("parts", *_ABOUT), "a descriptor")
+        if not isinstance(spec.get("parts"), list):
             raise ValueError("expected a list of `parts`, got none")
         embedding = cache(lambda n: SpectralEmbedding(n_eigenpairs=n))
         parts = [
             [_histogram(each, embedding) for each in one] if isinstance(one, list) else _histogram(one, embedding)
-            for one in told["parts"]
+            for one in spec["parts"]
         ]
-        about = {name: told[name] for name in ("source", "invariant_to") if name in told}
-        made = HistogramDescriptor(parts, name=str(told.get("name", path.stem)), **about)
-        made.scale = told.get("scale")
+        about = {name: spec[name] for name in ("source", "invariant_to") if name in spec}
+        made = HistogramDescriptor(parts, name=str(spec.get("name", path.stem)), **about)
+        made.scale = spec.get("scale")
     except (ValueError, TypeError, AttributeError, KeyError, yaml.YAMLError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path}: expected a descriptor ({reason}). Correct it.") from error
     return made.eval()
 
 
-def _histogram(told: Any, embedding: Callable[[int], SpectralEmbedding]) -> DescriptionPart:
-    kind = str(told.get("histogram", "pairs") if isinstance(told, Mapping) else told)
+def _histogram(spec: Any, embedding: Callable[[int], SpectralEmbedding]) -> DescriptionPart:
+    kind = str(spec.get("histogram", "pairs") if isinstance(spec, Mapping) else spec)
     if kind not in HISTOGRAMS:
         raise ValueError(f"histogram: expected one of {', '.join(HISTOGRAMS)}, got {kind!r}")
-    options = {name: value for name, value in told.items() if name != "histogram"}
+    options = {name: value for name, value in spec.items() if name != "histogram"}
     if "axes" in options:
         options["axes"] = [_axis(one, embedding) for one in options["axes"]]
     return _made(HISTOGRAMS[kind], options, embedding, kind)
 
 
-def _axis(told: Any, embedding: Callable[[int], SpectralEmbedding]) -> Any:
-    name, options = next(iter(told.items())) if isinstance(told, Mapping) and len(told) == 1 else (told, {})
+def _axis(spec: Any, embedding: Callable[[int], SpectralEmbedding]) -> Any:
+    name, options = next(iter(spec.items())) if isinstance(spec, Mapping) and len(spec) == 1 else (spec, {})
     if not isinstance(name, str) or not isinstance(options, Mapping | None):
-        raise ValueError(f"axes: expected a name, or a name with its options, got {told!r}")
+        raise ValueError(f"axes: expected a name, or a name with its options, got {spec!r}")
     if name not in AXES and not {"centres", "quantiles"} & set(options or {}):
         raise ValueError(
             f"axes: expected one of {', '.join(AXES)}, or an attribute with centres or quantiles, got {name!r}"
@@ -110,8 +110,8 @@ def _number(value: Any) -> Any:
     return value
 
 
-def _only(told: Any, known: tuple[str, ...], what: str) -> None:
-    if not isinstance(told, Mapping) or (unknown := [one for one in told if one not in known]):
+def _only(spec: Any, known: tuple[str, ...], what: str) -> None:
+    if not isinstance(spec, Mapping) or (unknown := [one for one in spec if one not in known]):
         raise ValueError(
-            f"{what}: expected {', '.join(known)}, got {unknown[0] if isinstance(told, Mapping) else told!r}"
+            f"{what}: expected {', '.join(known)}, got {unknown[0] if isinstance(spec, Mapping) else spec!r}"
         )
