@@ -115,11 +115,10 @@ def filled_share(field: Floats | Singles, reach: float) -> tuple[float, float]:
 
     Of a voxel with a value beyond the reach all is on one side.
     """
-    field = np.ascontiguousarray(field)  # splines turn its axes
     near = np.nonzero(np.abs(field[1:-1, 1:-1, 1:-1]) < reach)
     at = np.ravel_multi_index(tuple(index + 1 for index in near), field.shape)
     values, width = field.reshape(-1), np.full(len(at), 1e-3)
-    for step in np.array(field.strides) // field.itemsize:
+    for step in np.cumprod([1, *field.shape[:0:-1]]).tolist():  # strides are others: splines turn the axes
         width += np.abs(values[at + step] - values[at - step]) / 2
     share = 0.5 - values[at] / width
     full = np.count_nonzero(field < 0) - np.count_nonzero(values[at] < 0)
