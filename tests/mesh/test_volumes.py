@@ -201,6 +201,8 @@ def write_nrrd(path: Path, *lines: str) -> None:
     [
         ((), 1440, "mm"),
         (('units: "microns" "microns" "microns"',), 1440e-9, "mm"),
+        (('units: "micrometers" "micrometers" "micrometers"',), 1440e-9, "mm"),
+        (('units: "\u03bcm" "\u03bcm" "\u03bcm"',), 1440e-9, "mm"),
         (('units: "µm" "µm" "µm"',), 1440e-9, "mm"),
         (('units: "pixel" "pixel" "pixel"',), 1440, None),
     ],

@@ -9,10 +9,12 @@ Zisserman 1987).
 The level is moved as a whole to give the voxels' volume: if it were moved nearby, that would write their stairs back.
 """
 
+import math
+
 import numpy as np
 from scipy import ndimage
 
-from igps._arrays import Booleans, Floats, Integers
+from igps._arrays import Booleans, Floats, Integers, Singles
 from igps._compiled import SUMS, compiled
 
 # Least absolute value of a voxel that is wholly inside or outside, in shortest sides (half would be the most that all
@@ -35,13 +37,47 @@ _BAND = 2
 PAD = _BAND + 2
 """Empty voxels that the grid must have on every side."""
 
+# Grids of more voxels, such as those around thin vessels, are solved block by block, each with so many voxels around.
+_WHOLE, _BLOCK, _AROUND = 1 << 22, 48, 12
 
-def smooth_field(share: Floats, sides: Floats) -> Floats:
+
+def smooth_field(share: Singles, sides: Floats) -> Floats | Singles:
     """The function at the centres of the voxels, in shortest sides, about the distance to the surface nearby.
 
     Shares (X, Y, Z) of each voxel that lies in the body, 0 to 1, have `PAD` empty layers around; those of a mask are 0
     or 1 and tell whether the centre is in the body. The sides (3,) of a voxel have 1 as the shortest.
     """
+    if share.size <= _WHOLE:
+        return _solved(share, sides)
+    far = (PAD - 0.5) * float(sides.max())
+    margin = np.ceil(PAD * sides.max() / sides).astype(np.int64)
+    around = np.maximum(margin, _AROUND)
+    field = np.full(share.shape, far, dtype=np.float32)
+    for corner in np.ndindex(*(math.ceil(n / _BLOCK) for n in share.shape)):
+        low = _BLOCK * np.array(corner)
+        high = np.minimum(low + _BLOCK, share.shape)
+        start = np.maximum(low - around, 0)
+        inside = share[tuple(map(slice, start, high + around))] >= 0.5
+        if not inside.any():
+            continue
+        if inside.all():
+            field[tuple(map(slice, low, high))] = -far
+            continue
+        (box,) = ndimage.find_objects(inside.view(np.uint8))
+        first, last = (start + [getattr(side, end) for side in box] for end in ("start", "stop"))
+        least, most = np.maximum(first - margin, start), np.minimum(last + margin, start + inside.shape)
+        missing = list(zip(margin - (first - least), margin - (most - last), strict=True))
+        solved = _solved(np.pad(share[tuple(map(slice, least, most))], missing), sides)
+        origin = first - margin  # of what was solved, in the grid
+        a, b = np.maximum(low, least), np.minimum(high, most)
+        if (a < b).all():
+            own = solved[tuple(map(slice, a - origin, b - origin))]
+            field[tuple(map(slice, a, b))] = np.clip(own, -far, far)
+    return field
+
+
+def _solved(share: Singles, sides: Floats) -> Floats:
+    """The function on a grid as a whole."""
     inside = share >= 0.5
     distance = ndimage.distance_transform_edt(inside, sampling=sides)
     distance += ndimage.distance_transform_edt(~inside, sampling=sides)
@@ -74,13 +110,20 @@ def smooth_field(share: Floats, sides: Floats) -> Floats:
     return field
 
 
-def filled_share(field: Floats) -> tuple[Floats, Floats]:
-    """The share of each voxel on which the field is negative, and how fast it grows as the level does."""
-    width = np.full(field.shape, 1e-3)
-    for axis in range(3):
-        width += np.abs(np.gradient(field, axis=axis))
-    share = 0.5 - field / width
-    return np.clip(share, 0, 1), np.where((share > 0) & (share < 1), 1 / width, 0.0)
+def filled_share(field: Floats | Singles, reach: float) -> tuple[float, float]:
+    """How many voxels the part fills on which the field is negative, and how fast that grows as the level does.
+
+    Of a voxel with a value beyond the reach all is on one side.
+    """
+    near = np.nonzero(np.abs(field[1:-1, 1:-1, 1:-1]) < reach)
+    at = np.ravel_multi_index(tuple(index + 1 for index in near), field.shape)
+    values, width = field.reshape(-1), np.full(len(at), 1e-3)
+    for step in np.cumprod([1, *field.shape[:0:-1]]).tolist():  # strides are others: splines turn the axes
+        width += np.abs(values[at + step] - values[at - step]) / 2
+    share = 0.5 - values[at] / width
+    full = np.count_nonzero(field < 0) - np.count_nonzero(values[at] < 0)
+    part = (share > 0) & (share < 1)
+    return float(np.clip(share, 0, 1).sum()) + full, float((1 / width[part]).sum())
 
 
 @compiled(fastmath=SUMS)

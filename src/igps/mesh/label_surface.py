@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from igps._arrays import Booleans, Floats, Integers, Surface
+from igps._arrays import Booleans, Floats, Integers, Singles, Surface
 from igps.mesh._isosurface import level_surface, simplified, with_volume
 from igps.mesh._label_field import PAD, filled_share, smooth_field
 from igps.mesh._level_set import LEAST, without_bubbles
@@ -81,15 +81,15 @@ def voxel_surface(
     mask, hollows = _whole(mask[box], notes, LEAST_VOXELS if cavities else None)
     share, factor = _coarsened(mask, spacing, max_vertices)
     mask = _joined(share >= 0.5)
-    share = np.pad(np.where(mask, np.maximum(share, 0.5), share), PAD)
+    share = np.pad(np.where(mask, np.maximum(share, np.float32(0.5)), share), PAD)
     check_grid(share.size, name)
     sides = spacing * factor / (spacing * factor).min()  # nothing depends on the unit of length
     field = smooth_field(share, sides)
     # Into how many parts each side goes, so that the parts are about equal and make vertices enough.
     finer = min(max(math.ceil(math.sqrt(_FEWEST / _n_vertices(mask, sides))), 1), _MOST_REFINED)
     fineness = np.maximum(np.round(finer * sides / sides.min()), 1).astype(np.int64)
-    field = _refined(field, share, fineness, LEAST * float((sides / fineness).min()))
-    vertices, faces = _meshed(field, sides / fineness, share.sum() * sides.prod(), max_vertices, name)
+    field = _refined(field, share, fineness, sides / fineness)
+    vertices, faces = _meshed(field, sides / fineness, share.sum(dtype=np.float64) * sides.prod(), max_vertices, name)
     # Index of the first voxel's centre: that of a block of `factor` voxels lies (factor - 1) / 2 further.
     index = (vertices / sides - PAD) * factor + (factor - 1) / 2 + low
     if np.linalg.det(matrix[:3, :3]) < 0:
@@ -167,12 +167,12 @@ def _joined(mask: Booleans) -> Booleans:
 
 def _n_vertices(mask: Booleans, sides: Floats) -> float:
     """About how many vertices marching cubes make on a grid as fine as the shortest side."""
-    steps = (np.diff(mask.view(np.int8), axis=axis, prepend=0, append=0) for axis in range(3))
-    cuts = np.array([np.count_nonzero(step) for step in steps])
+    layers = [np.moveaxis(mask, axis, 0) for axis in range(3)]
+    cuts = np.array([np.count_nonzero(one[1:] != one[:-1]) + np.count_nonzero(one[[0, -1]]) for one in layers])
     return float((cuts * sides.prod() / sides).sum() / sides.min() ** 2)
 
 
-def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Floats, Integers]:
+def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Singles, Integers]:
     """Shares of larger voxels, and how many of the given ones each takes along each axis."""
     from skimage.measure import block_reduce
 
@@ -190,7 +190,7 @@ def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Floa
             break
         coarse[np.isin(label, island) & (label > 0)] = 0
         share, factor, mask = coarse, factor * np.where(halved, 2, 1), np.asarray(coarse >= 0.5)
-    return share.astype(np.float64), factor
+    return share, factor
 
 
 def _is_thick(mask: Booleans, axes: Booleans) -> bool:
@@ -200,7 +200,7 @@ def _is_thick(mask: Booleans, axes: Booleans) -> bool:
     return bool(np.count_nonzero(mask & ~reached) <= _THIN * np.count_nonzero(mask))
 
 
-def _refined(field: Floats, share: Floats, fineness: Integers, least: float) -> Floats:
+def _refined(field: Floats | Singles, share: Singles, fineness: Integers, sides: Floats) -> Floats | Singles:
     """The field between the centres of the voxels, at the level that gives their volume.
 
     It is negative between neighbours in the body, which therefore hold together.
@@ -213,10 +213,10 @@ def _refined(field: Floats, share: Floats, fineness: Integers, least: float) -> 
             index = np.arange(field.shape[axis])
             places = np.linspace(0, index[-1], index[-1] * parts + 1)
             field = CubicSpline(index, field, axis=axis, bc_type="natural")(places)
-    volume = share.sum() * fineness.prod()
+    volume, least = share.sum(dtype=np.float64) * fineness.prod(), LEAST * float(sides.min())
     for _ in range(_N_LEVELS):
-        filled, slope = filled_share(field)
-        field -= (volume - filled.sum()) / max(slope.sum(), 1e-9)
+        filled, slope = filled_share(field, float(sides.sum()))
+        field -= (volume - filled) / max(slope, 1e-9)
     for axis, parts in enumerate(fineness.tolist()):
         both = inside & np.roll(inside, -1, axis)
         for part in range(parts):
@@ -226,11 +226,11 @@ def _refined(field: Floats, share: Floats, fineness: Integers, least: float) -> 
     return field
 
 
-def _meshed(field: Floats, sides: Floats, volume: float, max_vertices: int, name: str) -> Surface:
+def _meshed(field: Floats | Singles, sides: Floats, volume: float, max_vertices: int, name: str) -> Surface:
     """The zero level of a field as closed pieces, in the unit of the sides, which are about equal."""
     cell = float(sides.min())
     level = np.where(field < 0, np.minimum(field, -LEAST * cell), np.maximum(field, LEAST * cell)) / cell
-    vertices, faces = level_surface(without_bubbles(level.astype(np.float32)), name)
+    vertices, faces = level_surface(without_bubbles(level.astype(np.float32, copy=False)), name)
     vertices = vertices * (sides / cell)
     pieces = connected(vertices, faces)
     volumes = np.abs([signed_volume(*piece) for piece in pieces])

@@ -31,7 +31,8 @@ logger = logging.getLogger(__name__)
 MILLIMETRES: Mapping[str, float] = {
     "m": 1e3, "cm": 10.0, "mm": 1.0, "µm": 1e-3, "um": 1e-3, "micron": 1e-3, "microns": 1e-3, "nm": 1e-6, "Å": 1e-7,
     "in": 25.4, "inch": 25.4, "inches": 25.4, "ft": 304.8, "feet": 304.8, "meter": 1e3, "meters": 1e3,
-    "centimeters": 10.0, "millimeter": 1.0, "millimeters": 1.0, "micrometer": 1e-3, "\\u00B5m": 1e-3,
+    "centimeters": 10.0, "millimeter": 1.0, "millimeters": 1.0, "micrometer": 1e-3, "micrometers": 1e-3,
+    "\\u00B5m": 1e-3, "\u03bcm": 1e-3,  # the second with the Greek letter, not the sign of micro
 }  # fmt: skip
 """In a unit of length, by the names that files and libraries give it."""
 
