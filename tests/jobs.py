@@ -25,6 +25,12 @@ def die_at_zero(x: int) -> int:
     return x
 
 
+def interrupt(x: int) -> int:
+    """Ctrl-C, as a worker gets it."""
+    os.kill(os.getpid(), signal.SIGINT)
+    return x
+
+
 def die_once(marker: Path) -> str:
     """Die if the file is missing, and leave it."""
     if not marker.exists():

@@ -60,6 +60,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict:  # type: ignore[t
         partial(jobs.die_at_zero, 0),
         partial(jobs.die_once, tmp_path_factory.mktemp("marked") / "marker"),
         *2 * [partial(jobs.process, 0)],
+        partial(jobs.interrupt, 7),
     ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("OMP_NUM_THREADS", "3")
@@ -93,6 +94,11 @@ def test_a_job_that_kills_its_process_is_named(results: dict[int, object]) -> No
 
 def test_a_job_that_is_killed_once_is_tried_again(results: dict[int, object]) -> None:
     assert results[7] == "marker"
+
+
+def test_workers_leave_an_interruption_to_their_parent(results: dict[int, object]) -> None:
+    """The terminal sends Ctrl-C to all processes; each that told of it would bury the one line."""
+    assert results[10] == 7
 
 
 def test_workers_have_one_thread(results: dict[int, tuple[int, str]]) -> None:

@@ -94,6 +94,7 @@ def workers_environment() -> Generator[None, None, None]:
 
 def _begin(memory: int | None) -> None:
     """What a worker does first: bound its memory, and watch its parent, to end with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes; the parent ends this one, and tells it
     if memory is not None:
         with contextlib.suppress(ImportError, ValueError):
             import resource

@@ -12,6 +12,7 @@ from conftest import as_mesh
 from igps.analysis.groups import squared_distances
 from igps.analysis.outliers import LIMIT, flat_share, measures_of, outliers
 from igps.data.dataset import SignatureDataset
+from igps.data.sources import find_bodies
 from igps.mesh.formats import volumes
 
 LABELS = ["a"] * 12 + ["b"] * 12
@@ -192,6 +193,19 @@ def test_labels_are_measured_in_their_grid(tmp_path: Path) -> None:
     assert found["overlap"][0, 2] == 0  # of one class, which may be another subject
     assert found["stray"] ** 2 == pytest.approx([0, 0, 0, 0, ball(56, 2).sum() / island.sum()])
     assert found["cut"][2] > 3 * max(found["cut"][[0, 1, 3]])
+
+
+def test_labels_of_other_subjects_in_the_same_standard_space_do_not_overlap(tmp_path: Path) -> None:
+    """A file for each subject, all on the grid of an atlas: the ball of one lies in the block of the other."""
+    nibabel = pytest.importorskip("nibabel", reason="nibabel is not installed")
+    x, y, z = np.indices((40, 24, 24))
+    for name, at in (("s1", 12), ("s2", 20)):
+        labels = np.where((x - at) ** 2 + (y - 12) ** 2 + (z - 12) ** 2 <= 64, 1, 0)
+        labels[at + 9 :, 4:20, 4:20] = 2
+        nibabel.save(nibabel.Nifti1Image(labels.astype(np.uint8), np.eye(4)), tmp_path / f"{name}.nii.gz")
+    bodies = find_bodies(tmp_path, classes="body")
+    assert bodies.labels == ("1", "2", "1", "2")
+    assert not measures_of(SignatureDataset(bodies, cache_dir=tmp_path), n_workers=1)["overlap"].any()
 
 
 def test_a_volume_is_read_once_for_all_its_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,6 +81,44 @@ def test_groups_prints_and_writes_the_tests(
     assert (tmp_path / "groups.svg").read_text().startswith("<?xml")
 
 
+def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of eight subjects, the right egg is longer than the left one; only as pairs are they told apart so surely."""
+    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+    place, rows = np.indices((24, 60, 24)) - 12, ["file,body,side,subject"]
+    for i in range(8):
+        labels = np.zeros((24, 60, 24), dtype=np.uint8)
+        for label, at, length in ((17, 0, 6 + 0.2 * i), (53, 26, 10 + 0.2 * i)):
+            inside = (place[0] / 6) ** 2 + ((place[1] - at) / length) ** 2 + (place[2] / 6) ** 2 <= 1
+            labels[inside] = label
+            rows.append(f"s{i}.nii.gz,{label},{'left' if label == 17 else 'right'},{i}")
+        (root := tmp_path / "brains").mkdir(exist_ok=True)
+        nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), root / f"s{i}.nii.gz")
+    (root / "labels.csv").write_text("\n".join(rows))
+    words = ["--group", "side", "--strata", "subject", "--out", tmp_path / "found"]
+    igps(monkeypatch, root, "groups", root, *OWN, *words)
+    (found,) = json.loads((tmp_path / "found" / "groups.json").read_text())
+    assert (found["body"], found["sizes"]) == ("all", "left:8 right:8")
+    assert found["permanova_p"] <= 3 / 128  # the swap of all pairs does as well, and one or two may be drawn more often
+
+
+def test_single_masks_in_a_folder_for_each_group_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are called by their files, so that no name comes twice; the volumes of the two groups do not overlap."""
+    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+    place = np.indices((24, 24, 24)) - 12
+    for group, side in (("patients", 6), ("controls", 8)):
+        (folder := tmp_path / "masks" / group).mkdir(parents=True)
+        for i in range(5):
+            inside = (place[0] / (side + 0.2 * i)) ** 2 + (place[1] / 7) ** 2 + (place[2] / 7) ** 2 <= 1
+            nibabel.save(nibabel.Nifti1Image(inside.astype(np.uint8), np.eye(4)), folder / f"{group}{i}.nii.gz")
+    words = ["--size", "--out", tmp_path / "found"]
+    igps(monkeypatch, tmp_path / "masks", "groups", tmp_path / "masks", *OWN, *words)
+    _, size = json.loads((tmp_path / "found" / "groups.json").read_text())
+    assert (size["body"], size["sizes"]) == ("all, size", "controls:5 patients:5")
+    assert size["permanova_p"] <= 6 / 252  # of the 252 ways to draw five of ten, this one and its mirror
+
+
 def test_volumes_are_compared_in_one_unit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -397,6 +397,17 @@ def test_help_explains_every_option(
             assert word in text, word
 
 
+def test_an_interruption_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def wait() -> None:
+        """Wait."""
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "COMMANDS", {"wait": wait})
+    with pytest.raises(SystemExit, match="130"):
+        igps(monkeypatch, "wait")
+    assert capsys.readouterr().err == "igps: interrupted. Run again to go on: what is done is kept.\n"
+
+
 def test_commands_may_be_grouped(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def pose(mesh: Path, classes: list[int] | None = None, exact: bool = False, size: float = 2.0) -> None:
         """Draw a pose.

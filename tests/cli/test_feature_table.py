@@ -81,6 +81,28 @@ def test_a_wide_table_has_a_row_for_each_file(
             assert wide[f"{part}.{column}"].tolist() == rows[column].tolist()
 
 
+def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As TotalSegmentator writes them: two subjects with a cube and a bar, the third without the bar."""
+    for i, sides in enumerate([{"cube": (8, 8, 8), "bar": (5, 5, 15)}, {"cube": (9, 9, 9), "bar": (5, 5, 17)},
+                               {"cube": (10, 10, 10)}]):  # fmt: skip
+        (folder := tmp_path / f"masks/s{i}/segmentations").mkdir(parents=True)
+        for name, (a, b, c) in sides.items():
+            mask = np.zeros((20, 20, 20), dtype=np.uint8)
+            mask[2 : 2 + a, 2 : 2 + b, 2 : 2 + c] = 1
+            nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), folder / f"{name}.nii.gz")
+    rows = [f"{path.relative_to(tmp_path / 'masks')}" for path in sorted((tmp_path / "masks").rglob("*.nii.gz"))]
+    lines = [f"{row},{row[:2]},{'b' if row.startswith('s2') else 'a'}" for row in rows]
+    (tmp_path / "masks" / "labels.csv").write_text("\n".join(["file,label,folder", *lines]))
+    extract(monkeypatch, tmp_path / "masks", tmp_path / "wide.csv", "--wide")
+    wide = pd.read_csv(tmp_path / "wide.csv")
+    assert wide["folder"].tolist() == [f"s{i}/segmentations" for i in range(3)]
+    np.testing.assert_allclose(wide["cube.volume"], [512, 729, 1000], rtol=1e-3)
+    np.testing.assert_allclose(wide["bar.volume"], [375, 425, np.nan], rtol=1e-3)
+    assert wide["folder of labels.csv"].tolist() == ["a", "a", "b"]  # a column of the user's takes no rows together
+    assert "file" not in wide
+    assert wide["label"].tolist() == ["s0", "s1", "s2"]
+
+
 @pytest.mark.parametrize("options", [[], ["--wide"]])
 def test_columns_that_are_called_as_ours_are_kept_beside_them(
     options: list[str], root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -4,7 +4,7 @@ import contextlib
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -133,7 +133,7 @@ def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> d
     millimetres where the unit is known. Of meshes: "handles", and "flat", the largest share of the surface that lies in
     one plane. Of labels: "stray", "cavity", "hole" and "gap", roots of shares of their voxels, and "cut", see
     `igps.analysis.segmentation`; and "overlap", (N, N), the share of each that lies in each body of another class in
-    the same grid and folder.
+    the same grid and file, or of files of one body, folder.
     """
     found = np.full((len(dataset), len(_MEASURED)), np.nan)
     places = list[Place | None]([None] * len(dataset))
@@ -144,6 +144,11 @@ def measures_of(dataset: SignatureDataset, *, n_workers: int | None = None) -> d
             for i, body in zip(jobs[number], given[number], strict=True):
                 if not isinstance(outcome, Failed) and body in outcome:
                     found[i], places[i] = outcome[body]
+    # A file of several labels is a subject by itself; other subjects of its folder may be in the same standard space
+    counts = Counter(dataset.bodies.paths)
+    for i, (path, place) in enumerate(zip(dataset.bodies.paths, places, strict=True)):
+        if place is not None and counts[path] > 1:
+            places[i] = replace(place, grid=(path, *place.grid))
     return {**dict(zip(_MEASURED, found.T, strict=True)), "overlap": overlaps(places, dataset.bodies.labels)}
 
 

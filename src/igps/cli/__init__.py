@@ -87,6 +87,9 @@ def faults_in_a_sentence() -> Iterator[None]:
         full = isinstance(error, OSError) and is_machine_error(error)
         print(f"igps: {machine_error_text(error) if full else error}", file=sys.stderr)  # type: ignore[arg-type]
         sys.exit(2 if full or isinstance(error, MachineError) else 1)
+    except KeyboardInterrupt:
+        print("igps: interrupted. Run again to go on: what is done is kept.", file=sys.stderr)
+        sys.exit(130)  # as shells say it
 
 
 def main(

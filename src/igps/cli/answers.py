@@ -74,6 +74,9 @@ def groups(
     members: dict[str, list[int]] = {}
     for i, part in enumerate(bodies.parts):
         members.setdefault(part or "all", []).append(i)
+    one_group_each = len(set(zip(bodies.parts, labels, strict=True))) == len(members)
+    if one_group_each and len(members) in (len(set(labels)), len(bodies)):
+        members = {"all": list(range(len(bodies)))}  # names are those of the groups, or of the files of single masks
     jobs = [(body + what, places, rows[places]) for body, places in members.items() for what, rows in vectors.items()]
     tests = with_discovery_rates([
         group_test(

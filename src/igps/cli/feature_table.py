@@ -1,7 +1,7 @@
 """Descriptions as a table, for statistics packages: a row for each body, or for each file."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ def feature_table(dataset: SignatureDataset, features: np.ndarray) -> tuple[Tabl
 
     Returns:
         `file`, `part`, `name`, `label`, further columns of the table of labels, and the `unit` of length; and `volume`,
-        `area`, and the description as `v0`, `v1` and so on. A further column of one of these names is
+        `area`, and the description as `v0`, `v1` and so on. A further column of one of these names, or `folder`, is
         `NAME of labels.csv`.
     """
     bodies = dataset.bodies
@@ -33,7 +33,7 @@ def feature_table(dataset: SignatureDataset, features: np.ndarray) -> tuple[Tabl
     own = {"file": files, "part": bodies.parts, "name": bodies.names, "label": bodies.labels or [None] * len(bodies)}
     vectors = features.reshape(len(features), -1)
     measured = {"volume": volumes, "area": areas, **{f"v{i}": list(column) for i, column in enumerate(vectors.T)}}
-    taken = {*own, "unit", *measured}
+    taken = {*own, "folder", "unit", *measured}
     further = {f"{name} of {LABELS_FILE}" * (name in taken) or name: bodies.columns[name] for name in bodies.columns}
     return {**own, **further, "unit": units}, measured
 
@@ -41,10 +41,15 @@ def feature_table(dataset: SignatureDataset, features: np.ndarray) -> tuple[Tabl
 def wide_table(known: Table, measured: Table) -> Table:
     """A row for each file: what its bodies share, and `PART.volume`, `PART.v0` and so on; see `feature_table`.
 
-    A body that a file lacks, or that could not be used, has no values.
+    Masks of one organ each, with names that come again in other folders, have a row for each folder. A body that a file
+    or folder lacks, or that could not be used, has no values.
     """
+    folders = [PurePath(file).parent.as_posix() for file in known["file"]]
+    n, parts = len(folders), set(known["part"])
+    if len(set(known["file"])) == n == len(set(zip(folders, known["part"], strict=True))) > len(parts) > 1:
+        known = {"folder": folders, **{name: known[name] for name in known if name != "file"}}
     rows: dict[str, dict[str | None, int]] = {}
-    for i, (file, part) in enumerate(zip(known["file"], known["part"], strict=True)):
+    for i, (file, part) in enumerate(zip(next(iter(known.values())), known["part"], strict=True)):
         rows.setdefault(file, {})[part] = i
     table: dict[str, Sequence[Any]] = {}
     apart: dict[str, Sequence[Any]] = {}

@@ -99,7 +99,8 @@ def extract(
             in a file of the same name ending in .notes.csv.
         short: write unit vectors of at most 256 numbers in place of longer ones, for engines that compare by the cosine
             (pretrained).
-        wide: write a row for each file, with columns PART.volume, PART.v0 and so on for each of its bodies.
+        wide: write a row for each file, or folder of a mask for each organ, with columns PART.volume, PART.v0 and so on
+            for each of its bodies.
     """
     suffix = out.suffix.lower()
     if wide and suffix == ".npz":

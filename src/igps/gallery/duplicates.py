@@ -226,7 +226,10 @@ def body_distance(
         MeshError: a mesh that cannot be used.
     """
     if len(dataset) != 2:
-        raise ValueError(f"dataset: expected two meshes to compare, got {len(dataset)}.")
+        told = ", ".join(dataset.bodies.names[:4])
+        raise ValueError(
+            f"dataset: expected two meshes to compare, got {len(dataset)}: {told}. Name one of a file as FILE#PART."
+        )
     calibration, chosen = calibration or Calibration.load(), descriptor_of(descriptor)
     calibration.check(descriptor, chosen, dataset.config)
     descriptions = describe(dataset, chosen, n_workers=1, progress=progress)
