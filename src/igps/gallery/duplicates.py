@@ -32,8 +32,8 @@ from igps.nn.descriptor import Descriptor
 
 # Pairs whose surfaces are compared at once.
 _PAIRS = 256
-# `least_distances` knows the first order alone, and a distance averages over what thin wires lose all around: between
-# copies the former is up to 1.5 times the latter.
+# `least_distances` knows the first order alone, and a distance averages over what thin wires lose all around: of
+# copies that are found the former is up to 1.3 times the most that the latter may be.
 _LEAST = 2.0
 
 _Pairs = dict[tuple[int, int], float]
