@@ -217,13 +217,3 @@ def test_what_is_farther_than_asked_for_is_told_to_be() -> None:
     far = surface_distance(one, other)
     assert far / 3 < surface_distance(one, other, most=far / 3) <= far
     assert surface_distance(one, other, most=1.01 * far) == far
-
-
-def test_the_profile_of_a_ball_is_its_closed_form() -> None:
-    """Of radius 1/√(4π) over √area: of all chords d²/4r² are shorter than d; tangent planes lie a radius away."""
-    directions = even_directions(2000)
-    profile = SurfaceSamples.of(5 * directions, directions, 4 * np.pi * 25).profile
-    radius, shares = 1 / np.sqrt(4 * np.pi), (np.arange(64) + 0.5) / 64
-    np.testing.assert_allclose(profile[0], 2 * radius * np.sqrt(shares), atol=5e-3)
-    np.testing.assert_allclose(profile[1], radius / 2, rtol=1e-3)
-    np.testing.assert_allclose(profile[2], radius / 3, rtol=1e-3)

@@ -22,8 +22,9 @@ from igps.cli import COMMANDS, main
 from igps.data.dataset import SignatureDataset
 from igps.descriptors import descriptor
 from igps.descriptors.fingerprint import fingerprint
+from igps.gallery._moments import least_distances
 from igps.gallery.calibration import Calibration, calibration_params
-from igps.gallery.duplicates import _around_the_finest, _profile_distances, body_distance, duplicates
+from igps.gallery.duplicates import _around_the_finest, body_distance, duplicates
 from igps.gallery.gallery import Gallery
 from igps.gallery.surfaces import Surfaces
 from igps.signature.signature import SignatureConfig
@@ -345,14 +346,15 @@ def test_what_is_wrong_is_one_sentence(
     assert "built with --size ignore" in words
 
 
-def test_other_extents_are_no_candidates(tmp_path: Path) -> None:
-    """Ellipsoids whose axes differ by a ninth are no copies of each other; of a copy the triangles alone are others."""
+def test_other_lengths_are_no_candidates(tmp_path: Path) -> None:
+    """Ellipsoids of which one axis is longer by a quarter are no copies; of a copy the triangles alone are others."""
     for name, subdivisions, stretch in (("ball", 3, 1.0), ("copy", 4, 1.0), ("longer", 4, 1.25)):
         body = trimesh.creation.icosphere(subdivisions=subdivisions)
         body.apply_scale([1.3, 1.0, 0.8 * stretch])
         body.export(tmp_path / f"{name}.off")
-    profiles, failures = Surfaces(SignatureDataset(tmp_path, descriptor="pretrained", cache_dir=tmp_path)).profiles(1)
-    near = _profile_distances(profiles, profiles).isfinite()
+    dataset, most = SignatureDataset(tmp_path, CONFIG, tmp_path), Calibration.load().same.distance
+    moments, failures = Surfaces(dataset).moments(most, 1)
     assert not failures
     # in order of names: ball, copy, longer
+    near = least_distances(moments, moments) <= most
     assert near.tolist() == [[True, True, False], [True, True, False], [False, False, True]]

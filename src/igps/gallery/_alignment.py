@@ -12,7 +12,6 @@ from operator import itemgetter
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
-from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from igps.mesh.surface import area_vectors, unit
@@ -28,7 +27,6 @@ _GAP = 2.5
 # the axes are hopeless
 _AMBIGUOUS = 1.1
 _N_ROTATIONS = 300
-_N_PROFILE = 1000
 _N_SCORED, _N_FITTED = 60, 250
 _N_TRIED, _COARSE_STEPS, _FINE_STEPS, _LAST_STEPS = 12, 6, 4, 10
 # Placings that samples tell no better from each other than by this factor are laid onto the surface
@@ -40,7 +38,8 @@ _FINER = 1.5
 _LAST_GAIN = 0.004
 # Neighbouring samples whose offsets are averaged.
 _PATCH = 10
-_MOST_SCALED = math.log(1.1)
+MOST_SCALED = math.log(1.1)
+"""How much one is scaled at most beside the other: the logarithm of the factor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,24 +69,10 @@ class SurfaceSamples:
         """Finds the nearest of them."""
         return KDTree(_with_normals(self), leafsize=50)  # in six dimensions twice as fast as the default
 
-    @property
+    @cached_property
     def extents(self) -> Array:
         """(3,) standard deviations along the principal axes, ascending, without unit."""
         return np.sqrt(np.linalg.eigvalsh(np.cov(self.points.T)))
-
-    @property
-    def profile(self) -> Array:
-        """(3, 64) quantiles of distances between samples, of half of those to the middle, of a third to tangent planes.
-
-        The root mean square difference of two surfaces' distances between samples is at most twice that of their
-        offsets, but for what the sampling adds, and however the surfaces are laid: distances between corresponding
-        points differ by no more than both moved. Relief that goes in and out, which `surface_distance` averages away,
-        hardly moves a quantile either. The middle moves with the sampling, and the planes' distances from it also with
-        relief, which turns them: so these count less.
-        """
-        planes = np.einsum("ni,ni->n", self.points, self.normals)
-        lengths = pdist(_subset(self, _N_PROFILE).points), np.linalg.norm(self.points, axis=1) / 2, planes / 3
-        return np.stack([np.quantile(some, (np.arange(64) + 0.5) / 64) for some in lengths])
 
     @property
     def gap(self) -> float:
@@ -227,7 +212,7 @@ class _Placing:
     def then(self, step: Array) -> _Placing:
         """After a further small rotation vector, shift and logarithm of a scale, (7,)."""
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
-        log_scale = np.clip(math.log(self.scale) + step[6], -_MOST_SCALED, _MOST_SCALED)
+        log_scale = np.clip(math.log(self.scale) + step[6], -MOST_SCALED, MOST_SCALED)
         factor = math.exp(log_scale) / self.scale
         shift = factor * turn @ np.broadcast_to(self.shift, 3) + step[3:6]
         return _Placing(turn @ self.turn, shift, math.exp(log_scale))

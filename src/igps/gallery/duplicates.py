@@ -1,8 +1,8 @@
 """Files that show the same body, whatever its scale, mirror image, triangulation, level of detail or file format.
 
 Two surfaces are laid onto each other, which tells the same shape from another pose and from a sibling, see
-`igps.gallery.surfaces`. Only those are laid whose samples lie at about the same distances from each other, or in a
-gallery, whose descriptions are near. And no file joins two that are not the same as each other.
+`igps.gallery.surfaces`. Only those are laid whose moments allow that they are near, or in a gallery, whose
+descriptions are. And no file joins two that are not the same as each other.
 """
 
 import math
@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from scipy.cluster.hierarchy import DisjointSet
-from torch import Tensor
 from tqdm import tqdm
 
 from igps._parallel import on_threads
@@ -23,17 +22,19 @@ from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import Size, keeps_size
 from igps.gallery._alignment import surface_distance
+from igps.gallery._moments import least_distances
 from igps.gallery._near_pairs import NearPairs, near_in_gallery, near_pairs, of_one_size
 from igps.gallery.calibration import Calibration
 from igps.gallery.gallery import Gallery
-from igps.gallery.surfaces import MOST_STRETCHED, Grade, Surfaces
+from igps.gallery.surfaces import Grade, Surfaces
 from igps.nn.description import describe
 from igps.nn.descriptor import Descriptor
 
 # Pairs whose surfaces are compared at once.
 _PAIRS = 256
-# What sampling adds to the difference of the profiles of one surface: between copies, it is up to 0.013.
-_PROFILE_NOISE = 0.02
+# `least_distances` knows the first order alone, and a distance averages over what thin wires lose all around: of
+# copies that are found the former is up to 1.3 times the most that the latter may be.
+_LEAST = 2.0
 
 _Pairs = dict[tuple[int, int], float]
 
@@ -111,9 +112,9 @@ def duplicates(
             descriptions = describe(source, chosen, failures=failures, n_workers=n_workers, progress=progress)
             near = near_pairs(descriptions, chosen.distances, calibration.pose.distance, progress)
         else:
-            profiles, failures = Surfaces(source).profiles(n_workers, progress)
             most = max(calibration.same.distance, tolerance)
-            near = near_pairs(profiles, _profile_distances, 2 * most + _PROFILE_NOISE, progress)
+            moments, failures = Surfaces(source).moments(most, n_workers, progress)
+            near = near_pairs(moments, least_distances, _LEAST * most, progress)
         dataset = source.usable(failures)
     if keeps_size(size, dataset.units())[0]:
         near = of_one_size(near, dataset)
@@ -238,16 +239,6 @@ def body_distance(
     surfaces = Surfaces(dataset)
     apart, limit = surface_distance(*map(surfaces.samples, range(2))), surfaces.limit(0, 1, calibration)
     return BodyDistance(distance, apart, limit, calibration.words(distance), apart <= limit)
-
-
-def _profile_distances(one: Tensor, other: Tensor) -> Tensor:
-    """Root mean square differences (M, N) of the quantiles that differ most, of profiles as of `Surfaces.profiles`.
-
-    Infinite where the extents tell that two are not the same.
-    """
-    (one, extents), (other, of_other) = ((some[:, :, :-1].movedim(1, 0), some[:, :, -1]) for some in (one, other))
-    apart = torch.cdist(one, other).amax(dim=0) / one.shape[2] ** 0.5
-    return apart.where(torch.cdist(extents, of_other, p=math.inf) <= MOST_STRETCHED, math.inf)
 
 
 def _files_of(gallery: Gallery, cache_dir: str | Path | None) -> SignatureDataset:

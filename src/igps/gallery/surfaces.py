@@ -24,6 +24,7 @@ from tqdm import tqdm
 from igps._parallel import Failed, on_threads
 from igps.data.dataset import Failure, SignatureDataset
 from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
+from igps.gallery._moments import moments
 from igps.gallery.calibration import Calibration
 from igps.mesh.loading import load_mesh
 from igps.mesh.mending import Step, repair_steps
@@ -37,8 +38,8 @@ _SURFACES, _TRIANGLES = 512, 64
 _NORMALS: AttributeName = "surface_direction"
 # A tenth of this is much between copies.
 _HOPELESS = 0.03
-MOST_STRETCHED = 0.1
-"""Copies differ by up to 0.045 in the logarithms of their extents; what differs by more is not laid onto each other."""
+# Copies differ by up to 0.045 in the logarithms of their extents; what differs by more is not laid onto each other
+_MOST_STRETCHED = 0.1
 MOST_TOLERATED = 0.02
 """Over √area: what is farther apart is not looked at closely."""
 
@@ -60,7 +61,7 @@ def distance_if_alike(
     one: SurfaceSamples, other: SurfaceSamples, *, enough: float = 0.0, most: float = math.inf
 ) -> float:
     """`surface_distance`, infinite where the extents of the two tell that they are not the same."""
-    if np.abs(np.log(one.extents / other.extents)).max() > MOST_STRETCHED:
+    if np.abs(np.log(one.extents / other.extents)).max() > _MOST_STRETCHED:
         return math.inf
     return surface_distance(one, other, enough=enough, hopeless=_HOPELESS, most=most)
 
@@ -157,24 +158,26 @@ class Surfaces:
             return 0.0
         return calibration.limit(max(coarseness, of_other))
 
-    def profiles(self, n_workers: int | None = None, progress: bool = False) -> tuple[Tensor, list[Failure]]:
-        """(M, 3, 65) of all that can be read, in order, and failures of the others; a MeshError if none can be read.
+    def moments(
+        self, most: float, n_workers: int | None = None, progress: bool = False
+    ) -> tuple[Tensor, list[Failure]]:
+        """(M, 7, 6) `moments` of all that can be read, in order, and failures of the others.
 
-        The first 64 columns are `SurfaceSamples.profile`, the last has the logarithms of the three `extents`.
+        A MeshError if none can be read.
         """
 
-        def profile(i: int) -> NDArray[np.float64] | None:
+        def moments_of(i: int) -> NDArray[np.float64] | None:
             with contextlib.suppress(MeshError):  # which is among the failures
-                samples = self.samples(i)
-                return np.column_stack([samples.profile, np.log(np.maximum(samples.extents, 1e-9))])
+                mesh = self._mesh(i)
+                return moments(self._placed(i, mesh), mesh.faces, most)
             return None
 
-        found = on_threads(profile, range(len(self._dataset)), n_workers)
+        found = on_threads(moments_of, range(len(self._dataset)), n_workers)
         bar = tqdm(found, desc="surfaces", total=len(self._dataset), disable=not progress)
-        profiles = [one for one in bar if one is not None]
-        if not profiles:
+        some = [one for one in bar if one is not None]
+        if not some:
             raise MeshError(self.failures[0].error)
-        return torch.from_numpy(np.stack(profiles)), [self.failures[i] for i in sorted(self.failures)]
+        return torch.from_numpy(np.stack(some)), [self.failures[i] for i in sorted(self.failures)]
 
     def _coarseness_and_handles(self, i: int) -> tuple[float, int | None]:
         """Handles are None where the mesh is open, and where mending may have made some or closed holes."""

@@ -1,0 +1,105 @@
+"""Moments against closed forms, and how far apart they tell surfaces to be at least against known moves."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from igps.gallery._moments import least_distances, moments
+
+Array = NDArray[np.float64]
+MOST = 0.002
+
+
+def of(body: trimesh.Trimesh, scale: float = 1.0) -> Array:
+    return moments(scale * body.vertices / body.area**0.5, np.asarray(body.faces), MOST)
+
+
+def apart(one: trimesh.Trimesh, other: trimesh.Trimesh, scale: float = 1.0) -> float:
+    some, others = (torch.from_numpy(found)[None] for found in (of(one), of(other, scale)))
+    return float(least_distances(some, others))
+
+
+def lump(stretch: tuple[float, float, float], bumps: float = 0.0, subdivisions: int = 3) -> trimesh.Trimesh:
+    """An ellipsoid; with bumps, without any symmetry."""
+    body = trimesh.creation.icosphere(subdivisions=subdivisions)
+    x, y, z = body.vertices.T
+    body.vertices *= (1 + bumps * (np.sin(2 * x + 1) + np.cos(3 * y) + z * x))[:, None] * stretch
+    return body
+
+
+def test_moments_of_a_box_are_its_closed_forms() -> None:
+    sides, area = np.array([1.0, 2.0, 3.0]), 22.0
+    body = trimesh.creation.box(sides)
+    body.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9])))
+    body.apply_translation([3.0, -2.0, 1.0])
+    volume, (a, b, c) = 6.0, sides**2
+    fourth = volume * ((a * a + b * b + c * c) / 80 + (a * b + b * c + a * c) / 72)
+    expected = np.log([volume / area**1.5, *(volume * sides**2 / 12 / area**2.5), fourth / area**3.5])
+    np.testing.assert_allclose(of(body)[0], [*expected, 0.0], rtol=1e-9, atol=1e-5)
+
+
+def test_moments_of_a_tetrahedron_are_those_of_its_points() -> None:
+    """By a product of Gauss's rules on the cube that is folded into it, exact up to the ninth degree."""
+    corners = np.array([[0.0, 0, 0], [2, 0.1, 0], [0.3, 1, 0], [0.2, 0.1, 0.7]])
+    body = trimesh.Trimesh(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    places = np.array(list(product((nodes + 1) / 2, repeat=3)))
+    r, s, t = places.T
+    shares = np.column_stack([r, s * (1 - r), t * (1 - r) * (1 - s)])
+    points = (shares @ (corners[1:] - corners[0])) / body.area**0.5
+    density = np.prod(list(product(weights / 2, repeat=3)), axis=1) * (1 - r) ** 2 * (1 - s)
+    density *= abs(np.linalg.det(corners[1:] - corners[0])) / body.area**1.5
+    points -= density @ points / density.sum()
+    square = np.square(points).sum(axis=1)
+    volume, second = density.sum(), np.linalg.eigvalsh((density[:, None] * points).T @ points)
+    third = np.linalg.norm((density * square) @ points) * volume**0.5 / second.sum() ** 1.5
+    np.testing.assert_allclose(of(body)[0], [*np.log([volume, *second, density @ square**2]), third], rtol=1e-9)
+
+
+def test_a_motion_a_mirror_image_and_other_triangles_leave_nothing() -> None:
+    body = lump((1.0, 0.7, 0.4), 0.1)
+    turn = -Rotation.random(random_state=1).as_matrix()
+    again = trimesh.Trimesh(7 * body.vertices @ turn.T + 5.0, body.faces[:, ::-1], process=False).subdivide()
+    assert apart(body, again) < 1e-7
+
+
+@pytest.mark.parametrize("bumps", [0.0, 0.1])
+@pytest.mark.parametrize("stretch", [(1.0, 1.0, 1.0), (1.0, 1.0, 0.4), (3.0, 0.5, 0.5), (3.0, 0.8, 0.5)])
+def test_no_move_is_told_to_be_farther_than_it_is(stretch: tuple[float, float, float], bumps: float) -> None:
+    """Outward moves by polynomials of what is round, long, flat, symmetric and not; some of them are told nearly."""
+    body = lump(stretch, bumps)
+    normals, weights = np.asarray(body.vertex_normals), np.bincount(body.faces.ravel(), np.repeat(body.area_faces, 3))
+    places, told = body.vertices / np.abs(body.vertices).max(axis=0), []
+    for powers in product(range(4), repeat=3):
+        if sum(powers) <= 4:
+            move = np.prod(places**powers, axis=1)
+            move *= MOST / np.sqrt(np.average(move**2, weights=weights))
+            moved = trimesh.Trimesh(body.vertices + body.area**0.5 * move[:, None] * normals, body.faces, process=False)
+            told.append(apart(body, moved, (moved.area / body.area) ** 0.5) / MOST)
+    assert max(told) < 1.1
+    assert max(told) > 0.6
+
+
+def test_a_scale_by_a_tenth_counts_as_much_as_the_most() -> None:
+    body = lump((1.0, 0.7, 0.4), 0.1)
+    assert apart(body, body, 1.1) == pytest.approx(MOST, rel=0.01)
+
+
+def test_a_hole_is_closed_by_a_cone_whatever_the_triangles() -> None:
+    """Three sides of a box are a corner; with its cones it is half of the box, and no other corner's."""
+    corner = trimesh.creation.box((1.0, 0.8, 0.6)).subdivide()
+    corner.update_faces((corner.face_normals > 0.5).any(axis=1))
+    corner.remove_unreferenced_vertices()
+    finer = corner.subdivide().subdivide()
+    finer.apply_translation([3.0, -1.0, 2.0])
+    assert apart(corner, finer) < 1e-7
+    other = corner.copy()
+    other.vertices *= [1.2, 1.0, 1.0]
+    assert apart(corner, other) > 2 * MOST
