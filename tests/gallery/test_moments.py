@@ -87,6 +87,27 @@ def test_no_move_is_told_to_be_farther_than_it_is(stretch: tuple[float, float, f
     assert max(told) > 0.6
 
 
+def test_the_least_move_of_a_difference_is_told_as_far_as_it_is() -> None:
+    """Moves along gradients, by finite differences at each vertex, of what a scale leaves as it is."""
+    body = lump((1.0, 0.8, 0.6), 0.05)
+    body.vertices *= np.exp(1.2 * body.vertices[:, 2:])  # far from symmetric, so that its middle moves
+    vertices, faces, normals = body.vertices / body.area**0.5, np.asarray(body.faces), body.vertex_normals
+    gradients, step = np.zeros((len(vertices), 6)), 1e-4
+    for i, normal in enumerate(normals):
+        moved = [vertices.copy(), vertices.copy()]
+        moved[0][i] -= step * normal
+        moved[1][i] += step * normal
+        below, above = (moments(one, faces, MOST)[0] for one in moved)
+        gradients[i] = (above - below) / (2 * step)
+    shares = np.bincount(faces.ravel(), np.repeat(body.area_faces, 3)) / body.area_faces.sum() / 3
+    for which in ([0, 0, 0, 0, 0, 1], [-7 / 3, 0, 0, 0, 1, 0], [-5 / 3, 1, 0, 0, 0, 0]):
+        move = gradients @ which / shares
+        move *= MOST / np.sqrt(shares @ move**2)
+        some = [moments(one, faces, MOST) for one in (vertices, vertices + move[:, None] * normals)]
+        found = least_distances(*(torch.from_numpy(one)[None] for one in some))
+        assert float(found) == pytest.approx(MOST, rel=0.07), which
+
+
 def test_a_scale_by_a_tenth_counts_as_much_as_the_most() -> None:
     body = lump((1.0, 0.7, 0.4), 0.1)
     assert apart(body, body, 1.1) == pytest.approx(MOST, rel=0.01)
