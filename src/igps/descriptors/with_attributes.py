@@ -68,14 +68,22 @@ class WithAttributes(Descriptor):
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, G)."""
-        sizes = list(self.inside.part_cells)
-        (form, *own), (forms, *others) = (
-            torch.split(one, [one.shape[1] - sum(sizes), *sizes], dim=1) for one in (queries, gallery)
-        )
-        shape = self.descriptor.description_shape
-        found = self.descriptor.distances(form.unflatten(1, shape), forms.unflatten(1, shape))
+        (form, *own), (forms, *others) = self._split(queries), self._split(gallery)
+        found = self.descriptor.distances(form, forms)
         for weight, one, other in zip(self.weights, own, others, strict=True):
             for n_together in _LEVELS:
                 levels = (cells.unflatten(1, (-1, n_together)).sum(dim=2) for cells in (one, other))
                 found = found + weight / len(_LEVELS) * chi_square(*levels)
         return found
+
+    def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
+        """(N, ≤ D + cells) the coordinates of the descriptor, and roots of the histograms times their weights."""
+        form, *own = self._split(descriptions)
+        roots = [(weight * cells).sqrt() for weight, cells in zip(self.weights, own, strict=True)]
+        return torch.cat([self.descriptor.coordinates(form, of_one_kind=of_one_kind), *roots], dim=1)
+
+    def _split(self, descriptions: Tensor) -> list[Tensor]:
+        """The descriptor's part of (N, D + cells) descriptions, in its shape, and the histograms of each attribute."""
+        sizes = list(self.inside.part_cells)
+        form, *own = torch.split(descriptions, [descriptions.shape[1] - sum(sizes), *sizes], dim=1)
+        return [form.unflatten(1, self.descriptor.description_shape), *own]
