@@ -5,6 +5,7 @@ from igps.nn._kernels.pair_values import euclidean_distances, oriented_pairs, pa
 from igps.nn.axes.points import soft_memberships
 from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding, spectral_weights
 from igps.nn.histograms.pairs import joint_histogram, pair_histogram
+from igps.nn.histograms.points import point_histogram
 from igps.retrieval import chi_square
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "oriented_pairs",
     "pair_histogram",
     "pair_twists",
+    "point_histogram",
     "point_pair_features",
     "soft_memberships",
     "spectral_embedding",

@@ -11,6 +11,7 @@ import torch
 
 from batches import alone, embedded, scaled, two_bodies
 from igps.data.requirements import Requirements
+from igps.nn import functional
 from igps.nn._kernels.balls import ball_radii
 from igps.nn.axes import BallRadius, EuclideanDistance, Potential
 from igps.nn.batch_features import SampleFeatures
@@ -86,3 +87,19 @@ def test_what_it_cannot_count_is_named() -> None:
     none = replace(batch.surface, mask=torch.zeros_like(batch.surface.mask))
     with pytest.raises(ValueError, match="expected at least 3 of each body, which tell its balls, got 0"):
         layout()(replace(batch, surface=none))
+
+
+def test_the_function_counts_memberships_by_masks_and_weights() -> None:
+    random = np.random.default_rng(0)
+    one, other, weights = random.random((2, 5, 3)), random.random((2, 5, 2)), random.random((2, 5))
+    mask = np.array([[True] * 5, [True, True, False, True, False]])
+    expected = np.einsum("npc,npd,np->ncd", one, other, mask * weights) / mask.sum(axis=1)[:, None, None]
+    given = [torch.from_numpy(array).requires_grad_() for array in (one, other, weights)]
+
+    def count(one: torch.Tensor, other: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        return functional.point_histogram([one, other], torch.from_numpy(mask), weights)
+
+    np.testing.assert_allclose(count(*given).detach(), expected)
+    assert torch.autograd.gradcheck(count, given)
+    with pytest.raises(ValueError, match="samples: expected at least one"):
+        functional.point_histogram([given[0]], torch.zeros(2, 5, dtype=torch.bool))

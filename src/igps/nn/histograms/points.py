@@ -61,8 +61,25 @@ class PointHistogram(AxesHistogram):
             # Padding may hold anything, and counts nowhere
             real = mask.view(*mask.shape, *[1] * (values.ndim - 2))
             memberships.append(axis.memberships(torch.where(real, values, 0)))
-        first, *others = memberships
-        rest = joint([torch.ones_like(first[..., :1]), *others])
-        weights = features.weights()
-        counts = mask if weights is None else mask * weights
-        return counted(first * counts.unsqueeze(2), rest, mask.sum(dim=1)).view(len(mask), *self.shape)
+        return point_histogram(memberships, mask, features.weights())
+
+
+def point_histogram(memberships: Sequence[Tensor], mask: Tensor, weights: Tensor | None = None) -> Tensor:
+    """The joint histogram of the samples of each body, from their memberships in the classes of each axis.
+
+    Args:
+        memberships: (N, P, C) of one axis after the other, such as `soft_memberships` gives.
+        mask: (N, P) which samples are there.
+        weights: (N, P) what each counts; 1 if None.
+
+    Returns:
+        (N, C, ...) shares of the samples, of sum 1 where memberships sum to 1 and samples count 1.
+
+    Raises:
+        ValueError: a body without samples.
+    """
+    first, *others = memberships
+    rest = joint([torch.ones_like(first[..., :1]), *others])
+    counts = mask if weights is None else mask * weights
+    shares = counted(first * counts.unsqueeze(2), rest, mask.sum(dim=1))
+    return shares.view(mask.shape[0], *(one.shape[-1] for one in memberships))
