@@ -12,7 +12,9 @@ import pytest
 import trimesh
 
 import igps.data.pipeline as pipeline_module
+from igps._parallel import Limits
 from igps.data.dataset import SignatureDataset
+from igps.data.filling import compute
 from igps.data.sources import Bodies, find_bodies, given_bodies
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh
@@ -154,6 +156,22 @@ def test_a_table_of_columns_alone_tells_no_classes(root: Path) -> None:
     with pytest.raises(ValueError, match="no classes found"):
         find_bodies(root, OBJECTS, labelled=True)
     assert find_bodies(root, OBJECTS, classes="body", labelled=True).labels == ("liver", "spleen", "liver", "spleen")
+
+
+def test_many_bodies_of_a_file_are_reported_some_at_a_time(tmp_path: Path, reads: list[str]) -> None:
+    """Of 65 labels of a volume the first 64 are reported before the last is computed, for which it is read again."""
+    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+    labels = np.zeros((65 * 7, 8, 8), dtype=np.uint8)
+    for i in range(65):
+        labels[7 * i + 1 : 7 * i + 6, 1:6, 1:6] = i + 1
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "cells.nii.gz")
+    few = SignatureConfig(n_eigenpairs=5, resolution=4, min_samples=0, n_surface_samples=10)
+    pipeline = SignatureDataset(tmp_path, few, tmp_path / "cache").pipeline
+    outcomes = compute(pipeline, find_bodies(tmp_path), range(65), n_workers=1, executor=None, limits=Limits())
+    assert [next(outcomes)[0] for _ in range(64)] == list(range(64))
+    assert len(reads) == 1
+    assert [number for number, _ in outcomes] == [64]
+    assert len(reads) == 2
 
 
 def test_counts_that_do_not_fit_are_refused() -> None:

@@ -24,6 +24,8 @@ from igps.mesh.mesh import MeshError
 logger = logging.getLogger(__name__)
 
 _REMEMBERED_AT_ONCE = 1000
+# Bodies of one file that are computed before any of them is reported; the file is read again for the next
+_REPORTED_AT_ONCE = 64
 # Seconds until a file that another machine wrote is seen here, by a file system for many.
 _SHARED_WITHIN = 60.0
 
@@ -114,9 +116,10 @@ def compute(
 
     The bodies of one file are computed in chunks, for each of which it is read once. Where one of a chunk loses its
     process, each of the chunk is tried again alone. With limits, which are of one body, every body is. A chunk has at
-    most `at_once` bodies; so many that every worker has one if None. See `igps._parallel.run` for the rest.
+    most `at_once` bodies; if None 64, or fewer so that every worker has one. See `igps._parallel.run` for the rest.
     """
-    most = 1 if limits != Limits() else at_once or max(1, -(-len(numbers) // (n_workers or n_cores())))
+    shared = min(-(-len(numbers) // (n_workers or n_cores())), _REPORTED_AT_ONCE)
+    most = 1 if limits != Limits() else at_once or max(1, shared)
     jobs = group_by_file(bodies, numbers, most)
     work: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
     given = [[bodies[i] for i in job] for job in jobs]

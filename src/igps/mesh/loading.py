@@ -176,7 +176,7 @@ def _bodies(kind: Format, options: LoadOptions) -> BodyKind:
 
 def _format(path: Path) -> Format:
     if not os.path.isfile(path):  # False, too, of a name that no file can have
-        if path.is_dir():
+        if os.path.isdir(path):
             raise MeshError(f"{path}: a folder; a file expected. Name each file of it.")
         raise MeshError(f"{path}: no such file. Check the path.")
     if path.stat().st_size == 0:
