@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from igps._arrays import Floats
 from igps._parameters import check_at_least
 
 FEWEST = 5
@@ -22,8 +23,6 @@ _BLOCK = 2**24
 _BODIES_EACH = 10
 _MOST_OF_RANK = 0.9
 _ROUNDING = 1e-9
-
-Rows = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -49,17 +48,17 @@ class GroupTest:
     refused: str | None = None  # why nothing was tested
 
 
-def squared_distances(rows: Rows) -> Rows:
+def squared_distances(rows: Floats) -> Floats:
     """(N, N) squared Euclidean distances of rows (N, D)."""
     return _squares((centred := rows - rows.mean(axis=0)) @ centred.T)
 
 
 def group_test(
-    vectors: Rows,
+    vectors: Floats,
     groups: Sequence[str],
     *,
     strata: Sequence[str] | None = None,
-    covariates: Rows | None = None,
+    covariates: Floats | None = None,
     body: str = "all",
     n_permutations: int = 10_000,
     n_bootstraps: int = 2000,
@@ -198,11 +197,11 @@ def _senseless(sizes: Mapping[str, int], group: NDArray[np.int64], stratum: NDAr
     return None
 
 
-def _indicators(codes: NDArray[np.int64]) -> Rows:
+def _indicators(codes: NDArray[np.int64]) -> Floats:
     return np.eye(int(codes.max()) + 1)[codes]
 
 
-def _orthonormal(columns: Rows, least: float) -> Rows:
+def _orthonormal(columns: Floats, least: float) -> Floats:
     """An orthonormal basis of what columns of like scale span."""
     lengths = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(lengths > least, lengths, np.inf)
@@ -210,7 +209,7 @@ def _orthonormal(columns: Rows, least: float) -> Rows:
     return left[:, values > least]
 
 
-def _whitened(gram: Rows) -> Rows:
+def _whitened(gram: Floats) -> Floats:
     """G (G + ρ)⁻¹ of a Gram matrix G; ρ leaves a degree of freedom for every ten bodies, or as the rank allows."""
     from scipy.optimize import brentq
 
@@ -225,11 +224,11 @@ def _whitened(gram: Rows) -> Rows:
     # With the first each value counts for at least the share of the rank, with the other all for at most the freedom
     ridges = values[0] * (1 / _MOST_OF_RANK - 1) / 2, 2 * values.sum() / freedom
     ridge = np.exp(brentq(excess, *np.log(ridges)))
-    found: Rows = (axes * (values / (values + ridge))) @ axes.T
+    found: Floats = (axes * (values / (values + ridge))) @ axes.T
     return found
 
 
-def _squares(gram: Rows) -> Rows:
+def _squares(gram: Floats) -> Floats:
     lengths = np.diag(gram)
     found = np.maximum(lengths[:, None] + lengths - 2 * gram, 0)
     np.fill_diagonal(found, 0)
@@ -245,40 +244,40 @@ def _orders(stratum: NDArray[np.int64], count: int, random: np.random.Generator)
     return orders
 
 
-def _along(matrix: Rows, basis: Rows, orders: NDArray[np.int64]) -> Rows:
+def _along(matrix: Floats, basis: Floats, orders: NDArray[np.int64]) -> Floats:
     """Traces bᵀ M b of a basis (N, k), its rows in each of several orders (n, N)."""
     count, n = orders.shape
     moved = basis[orders.T].reshape(n, -1)
     return np.einsum("ij,ij->j", matrix @ moved, moved).reshape(count, -1).sum(axis=1)
 
 
-def _probability(values: Rows) -> float:
+def _probability(values: Floats) -> float:
     """Of the first among all; ties within rounding count as extreme."""
     return float((values >= values[0] - _ROUNDING * values.max()).mean())
 
 
-def _effects(squares: Rows, group: NDArray[np.int64], weights: Sequence[NDArray[Any]]) -> Rows:
+def _effects(squares: Floats, group: NDArray[np.int64], weights: Sequence[NDArray[Any]]) -> Floats:
     """(n,) effects, each with weights (n, members) of each group's bodies; no pair of a body with itself counts."""
     members = [np.flatnonzero(group == one) for one in range(len(weights))]
     shares = [len(one) / len(group) for one in members]
 
-    def mean(a: int, b: int) -> Rows:
+    def mean(a: int, b: int) -> Floats:
         of_pairs = np.einsum(
             "ni,ij,nj->n", weights[a], squares[np.ix_(members[a], members[b])], weights[b], optimize=True
         )
         pairs = weights[a].sum(axis=1) * weights[b].sum(axis=1)
-        found: Rows = of_pairs / (pairs - np.square(weights[a]).sum(axis=1) if a == b else pairs)
+        found: Floats = of_pairs / (pairs - np.square(weights[a]).sum(axis=1) if a == b else pairs)
         return found
 
     inside = [mean(a, a) / 2 for a in range(len(members))]
     pairs = combinations(range(len(members)), 2)
     between: Any = sum(shares[a] * shares[b] * (mean(a, b) - inside[a] - inside[b]) for a, b in pairs)
     within: Any = sum(share * one for share, one in zip(shares, inside, strict=True))
-    effects: Rows = between / (between + within)
+    effects: Floats = between / (between + within)
     return effects
 
 
-def _auc(gram: Rows, known: Rows, group: NDArray[np.int64], n_repeats: int, seed: int) -> float:
+def _auc(gram: Floats, known: Floats, group: NDArray[np.int64], n_repeats: int, seed: int) -> float:
     """By five folds; the rows' principal coordinates are to a ridge what the rows are.
 
     What is known (N, k) is regressed out by the bodies that train alone: of a pair, the mean would tell the other.
