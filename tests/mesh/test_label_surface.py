@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
@@ -225,6 +226,55 @@ def test_small_pieces_apart_are_dropped_and_large_ones_stay() -> None:
     assert components(faces, len(vertices))[0] == 2
     assert notes == ("dropped 1 small piece apart of 8 voxels, 0.1% of the label",)
     assert Mesh(*largest(vertices, faces)).volume == pytest.approx(16**3, rel=0.01)
+
+
+def rod_across(angle: float, radius: float = 6.0, length: float = 30.0, n: int = 52) -> NDArray[np.bool_]:
+    """A capsule so many degrees off the third axis, in voxels of side 1."""
+    axis = np.array([np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))])
+    points = np.moveaxis(np.indices((n, n, n)), 0, -1) - (n - 1) / 2
+    along = np.clip(points @ axis, -length / 2, length / 2)
+    return np.asarray(np.linalg.norm(points - along[..., None] * axis, axis=-1) < radius)
+
+
+@pytest.mark.parametrize(("angle", "axis", "n_missed"), [(0, 2, 3), (25, 2, 1), (40, 2, 2), (60, 0, 2)])
+def test_slices_that_were_missed_are_filled(angle: float, axis: int, n_missed: int) -> None:
+    """The volume and the area are those of the whole capsule; a bar would lack a tenth of one and add to the other."""
+    mask = rod_across(angle)
+    np.moveaxis(mask, axis, 0)[24 : 24 + n_missed] = False
+    vertices, faces, notes = voxel_surface(mask, joins=True)
+    assert len(notes) == 1
+    assert "slices that were missed" in notes[0]
+    mesh = Mesh(vertices, faces)
+    assert mesh.genus == 0
+    assert mesh.volume == pytest.approx(np.pi * (36 * 30 + 4 / 3 * 216), rel=0.02)
+    assert mesh.area == pytest.approx(2 * np.pi * 6 * (30 + 2 * 6), rel=0.02)
+
+
+def test_pieces_that_face_each_other_in_a_slant_are_not_filled_up() -> None:
+    """Vertebrae: the volume is that of the voxels and of a bar from one to the other."""
+    mask = rod_across(45, radius=10, length=24, n=60)
+    normal = np.array([np.sqrt(0.5), 0, np.sqrt(0.5)])
+    mask &= abs((np.moveaxis(np.indices(mask.shape), 0, -1) - 29.5) @ normal) > 1
+    vertices, faces, notes = voxel_surface(mask, joins=True)
+    assert notes == ("joined 2 pieces by bars",)
+    assert Mesh(vertices, faces).volume == pytest.approx(np.count_nonzero(mask), rel=0.01)
+
+
+@pytest.mark.parametrize("side", [1.0, 0.6])
+def test_a_bar_is_as_thick_on_every_grid(side: float) -> None:
+    """Two balls of radius 15 at a distance of 10: a fiftieth of the square root of their area is 1.5."""
+    n = np.ceil(np.array([37, 16, 16]) / side).astype(int)
+    points = (np.moveaxis(np.indices(2 * n + 1), 0, -1) - n) * side
+    mask = np.linalg.norm(points - [20, 0, 0], axis=-1) < 15
+    mask |= mask[::-1]
+    affine = np.diag([side, side, side, 1])
+    affine[:3, 3] = -n * side
+    vertices, faces, notes = voxel_surface(mask, affine, joins=True)
+    assert notes == ("joined 2 pieces by bars",)
+    assert Mesh(vertices, faces).genus == 0
+    ((_, y, z),) = (line.T for line in trimesh.Trimesh(vertices, faces).section([1, 0, 0], [0, 0, 0]).discrete)
+    section = abs(y[1:] @ z[:-1] - y[:-1] @ z[1:]) / 2
+    assert np.sqrt(section / np.pi) == pytest.approx(1.5, abs=0.3)
 
 
 def test_holes_inside_are_filled() -> None:

@@ -5,6 +5,7 @@ It is made of the exact distances of the grid's points to the triangles.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +23,7 @@ _BAND = 1.1
 _HALF_SHEET = 0.55
 # No value is closer to zero: marching cubes would make triangles without area.
 LEAST = 0.02
-# Radius of the bars between pieces.
+# Least radius of the bars between pieces.
 _BAR = 0.9
 # Pieces of less than this share of the volume are specks.
 SPECK_VOLUME = 2e-3
@@ -156,7 +157,7 @@ def without_bubbles(field: Singles) -> Singles:
     return field
 
 
-def joined(field: Singles, notes: list[str]) -> Singles:
+def joined(field: Singles, notes: list[str], radius: float = 0.0) -> Singles:
     """The field of one piece: small ones dropped, the others joined by bars where the gaps are narrowest."""
     label, count = ndimage.label(field < 0)
     if count < 2:
@@ -191,16 +192,18 @@ def joined(field: Singles, notes: list[str]) -> Singles:
     lookup = {(int(i[k]), int(j[k])): k for k in chosen}
     for row, column in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
         k = lookup[row, column]
-        _add_bar(field, *(index.reshape(3, -1)[:, place].astype(np.float64) for place in (p[k], q[k])))
+        a, b = (index.reshape(3, -1)[:, place].astype(np.float64) for place in (p[k], q[k]))
+        _add_bar(field, a, b, max(radius, _BAR))
     notes.append(f"joined {len(pieces)} pieces by bars")
     return without_bubbles(field)
 
 
-def _add_bar(field: Singles, a: Floats, b: Floats) -> None:
-    low = np.maximum(np.minimum(a, b).astype(int) - 2, 0)
-    high = np.minimum(np.maximum(a, b).astype(int) + 3, field.shape)
+def _add_bar(field: Singles, a: Floats, b: Floats, radius: float) -> None:
+    around = math.ceil(radius) + 1
+    low = np.maximum(np.minimum(a, b).astype(int) - around, 0)
+    high = np.minimum(np.maximum(a, b).astype(int) + around + 1, field.shape)
     box = tuple(map(slice, low, high))
     points = np.moveaxis(np.indices(high - low), 0, -1) + low
     along = np.clip(((points - a) @ (b - a)) / max(float((b - a) @ (b - a)), 1e-9), 0, 1)
     distance = np.linalg.norm(points - a - along[..., None] * (b - a), axis=-1)
-    field[box] = np.minimum(field[box], distance - _BAR)
+    field[box] = np.minimum(field[box], distance - radius)

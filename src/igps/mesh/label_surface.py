@@ -15,7 +15,8 @@ from scipy import ndimage
 from igps._arrays import Booleans, Floats, Integers, Singles, Surface
 from igps.mesh._isosurface import level_surface, simplified, with_volume
 from igps.mesh._label_field import PAD, filled_share, smooth_field
-from igps.mesh._level_set import LEAST, without_bubbles
+from igps.mesh._label_gaps import TOUCHING, with_missed_slices
+from igps.mesh._level_set import LEAST, joined, without_bubbles
 from igps.mesh.limits import check_grid
 from igps.mesh.mesh import MeshError
 from igps.mesh.surface import connected, signed_volume, stacked
@@ -32,14 +33,16 @@ _SPARE = 4  # the grid may make so many times more vertices than are wanted, whi
 _FEWEST = 1500  # vertices that the grid makes at least, if need be by interpolation
 _MOST_REFINED = 4
 _N_LEVELS = 3
+# Radius of the bars between pieces, over the square root of the area: thicker than most cells, and so the same on all
+# grids.
+_BAR = 0.02
 # Share of a label that may lie where it is too thin for a coarser grid.
 _THIN = 0.005
-_TOUCHING = np.ones((3, 3, 3), dtype=bool)  # voxels that share a corner belong together
 
 
 def voxel_surface(
     inside: ArrayLike, affine: ArrayLike | None = None, *, max_vertices: int = MAX_VERTICES, cavities: bool = False,
-    name: str = "volume",
+    joins: bool = False, name: str = "volume",
 ) -> tuple[Floats, Integers, tuple[str, ...]]:  # fmt: skip
     """The closed, outward surface of the voxels of a body.
 
@@ -58,6 +61,7 @@ def voxel_surface(
         affine: (4, 4) from indices of voxels to the world; may shear and mirror. None for voxels of side 1.
         max_vertices: about so many vertices at most.
         cavities: hollows of the size of a label, too, get a surface, turned towards the inside.
+        joins: pieces become one: a few slices between them are filled, and wider gaps bridged where they are narrowest.
         name: what error messages call the body.
 
     Returns:
@@ -78,7 +82,8 @@ def voxel_surface(
     (box,) = ndimage.find_objects(mask.view(np.uint8))
     low = np.array([side.start for side in box], dtype=np.float64)
     notes: list[str] = []
-    mask, hollows = _whole(mask[box], notes, LEAST_VOXELS if cavities else None)
+    mask = with_missed_slices(mask[box], notes) if joins else mask[box]
+    mask, hollows = _whole(mask, notes, LEAST_VOXELS if cavities else None)
     share, factor = _coarsened(mask, spacing, max_vertices)
     mask = _joined(share >= 0.5)
     share = np.pad(np.where(mask, np.maximum(share, np.float32(0.5)), share), PAD)
@@ -86,10 +91,17 @@ def voxel_surface(
     sides = spacing * factor / (spacing * factor).min()  # nothing depends on the unit of length
     field = smooth_field(share, sides)
     # Into how many parts each side goes, so that the parts are about equal and make vertices enough.
-    finer = min(max(math.ceil(math.sqrt(_FEWEST / _n_vertices(mask, sides))), 1), _MOST_REFINED)
+    n_vertices = _n_vertices(mask, sides)
+    finer = min(max(math.ceil(math.sqrt(_FEWEST / n_vertices)), 1), _MOST_REFINED)
     fineness = np.maximum(np.round(finer * sides / sides.min()), 1).astype(np.int64)
     field = _refined(field, share, fineness, sides / fineness)
-    vertices, faces = _meshed(field, sides / fineness, share.sum(dtype=np.float64) * sides.prod(), max_vertices, name)
+    n_cells = float(share.sum(dtype=np.float64) * fineness.prod())
+    if joins and ndimage.label(mask)[1] > 1:
+        n_before = np.count_nonzero(field < 0)
+        # A surface has about one and a half vertices for a square of the grid's side.
+        field = joined(field.astype(np.float32, copy=False), notes, _BAR * math.sqrt(n_vertices / 1.5) * finer)
+        n_cells += np.count_nonzero(field < 0) - n_before
+    vertices, faces = _meshed(field, sides / fineness, n_cells * (sides / fineness).prod(), max_vertices, name)
     # Index of the first voxel's centre: that of a block of `factor` voxels lies (factor - 1) / 2 further.
     index = (vertices / sides - PAD) * factor + (factor - 1) / 2 + low
     if np.linalg.det(matrix[:3, :3]) < 0:
@@ -136,7 +148,7 @@ def _whole(mask: Booleans, notes: list[str], least: int | None) -> tuple[Boolean
 
 def _islands(mask: Booleans) -> tuple[NDArray[np.int32], Integers, Integers]:
     """The piece of each voxel, from 1; the pieces that are too small to stay; and the voxels of each, of 0 none."""
-    label, _ = ndimage.label(mask, _TOUCHING)
+    label, _ = ndimage.label(mask, TOUCHING)
     size = np.bincount(label.reshape(-1))
     size[0] = 0
     return label, np.nonzero(size < _ISLAND * size.sum())[0][1:], size
@@ -177,7 +189,7 @@ def _coarsened(mask: Booleans, spacing: Floats, max_vertices: int) -> tuple[Sing
     from skimage.measure import block_reduce
 
     share, factor = mask.astype(np.float32), np.ones(3, dtype=np.int64)
-    n_pieces = ndimage.label(mask, _TOUCHING)[1]
+    n_pieces = ndimage.label(mask, TOUCHING)[1]
     while _n_vertices(mask, spacing * factor) > _SPARE * max_vertices:
         sides = spacing * factor
         halved = sides < 1.5 * sides.min()

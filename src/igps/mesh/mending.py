@@ -26,7 +26,7 @@ Mending = Literal["auto", "never", "always"]
 Cavities = Literal["fill", "keep"]
 Step = Literal["welded", "filled", "united", "smoothed", "subdivided", "watertight"]
 
-MENDING_VERSION = 7
+MENDING_VERSION = 8
 """Raised whenever a surface that is mended would give another body: part of the cache keys of such bodies alone."""
 
 # The first words of the notes of each step.

@@ -152,7 +152,7 @@ def label_surface(volume: LabelVolume, part: int | str, *, how: Mending = "auto"
     affine = np.array(volume.affine, dtype=np.float64)
     affine[:3, 3] += affine[:3, :3] @ [side.start for side in body.box]
     mask, affine = _canonical(volume.mask(part), affine)
-    vertices, faces, notes = voxel_surface(mask, affine, cavities=cavities == "keep", name=name)
+    vertices, faces, notes = voxel_surface(mask, affine, cavities=cavities == "keep", joins=how != "never", name=name)
     notes = (*volume.notes, *notes)
     if (volume.names or {}).get(body.label, body.name) != body.name:
         notes = (*notes, "another label has the same name: the number was put behind. Give names by a table")
