@@ -171,10 +171,8 @@ def test_who_leaves_last_lifts_the_limit_that_another_set() -> None:
     assert settings() == before
 
 
-def test_no_thread_is_needed_beside_those_that_are_asleep(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the system gives no more, as in a container with a limit."""
-    with one_thread():
-        pass
+def test_no_thread_is_needed_where_the_system_starts_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container with a limit."""
     before, refused = settings(), []
 
     def refuse(*_: object) -> None:

@@ -14,10 +14,9 @@ import os
 import sys
 import threading
 from _thread import start_new_thread
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from functools import lru_cache
+from functools import lru_cache, partial
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
@@ -54,17 +53,20 @@ def one_thread() -> Iterator[None]:
     before = _get_torch_threads()
     try:
         with _blas_on_one_thread():
-            _set_torch_threads(1)
+            if before > 1:
+                _set_torch_threads(1)
             yield
     finally:
-        _set_torch_threads(before)
+        if before > 1:  # torch may count those of MKL, which has its own again, while new threads would get one
+            _set_torch_threads(before)
         _state.most = outside
 
 
 def stay_on_one_thread() -> None:
     """As `one_thread`, but for the rest of this thread's life, and with no other beside it."""
     _state.most = 1
-    _set_torch_threads(1)
+    if _get_torch_threads() > 1:
+        _set_torch_threads(1)
 
 
 class Team:
@@ -194,63 +196,18 @@ def _set_torch_threads(n: int) -> None:
 
     `torch.set_num_threads` also sets the number for threads that have not computed yet. One of those sets it back.
     """
-    if _get_torch_threads() == n:
-        return
-    with _torch_threads, _new_threads.one() as ask:
-        of_new_threads = ask(torch.get_num_threads)
+    with _torch_threads, contextlib.ExitStack() as afterwards:
+        with contextlib.suppress(RuntimeError):  # the system starts no more threads
+            of_new_threads = _in_new_thread(torch.get_num_threads)
+            afterwards.callback(_in_new_thread, partial(torch.set_num_threads, of_new_threads))
         torch.set_num_threads(n)
-        ask(lambda: torch.set_num_threads(of_new_threads))
 
 
-_Questions = SimpleQueue[Callable[[], Any] | None]
-_Answers = SimpleQueue[Any]
-
-
-class _NewThreads:
-    """Threads that have not computed yet, started ahead of their use.
-
-    Beside busy processes a thread takes milliseconds until it runs for the first time, but hardly any time to wake.
-    """
-
-    _AHEAD = 2  # as many as `one_thread` takes
-
-    def __init__(self) -> None:
-        self._asleep: deque[tuple[_Questions, _Answers]] = deque()
-        _at_fork(after_in_child=self._asleep.clear)  # of the threads, only the one that forks lives on
-
-    @contextlib.contextmanager
-    def one(self) -> Iterator[Callable[[Callable[[], Any]], Any]]:
-        """Calls functions of the caller in one new thread, and gives their results."""
-        try:
-            questions, answers = self._asleep.popleft()
-        except IndexError:
-            questions, answers = self._started()
-
-        def ask(function: Callable[[], Any]) -> Any:
-            questions.put(function)
-            return answers.get()
-
-        try:
-            yield ask
-        finally:
-            questions.put(None)
-            with contextlib.suppress(RuntimeError):  # where the system gives no more, one is started when it is needed
-                while len(self._asleep) < self._AHEAD:
-                    self._asleep.append(self._started())
-
-    @staticmethod
-    def _started() -> tuple[_Questions, _Answers]:
-        questions, answers = _Questions(), _Answers()
-
-        def work() -> None:
-            while (function := questions.get()) is not None:
-                answers.put(function())
-
-        start_new_thread(work, ())  # `Thread.start` would wait until it runs
-        return questions, answers
-
-
-_new_threads = _NewThreads()
+def _in_new_thread(function: Callable[[], Result]) -> Result:
+    """The result of a function in a thread that has not computed before."""
+    answer: SimpleQueue[Result] = SimpleQueue()
+    start_new_thread(lambda: answer.put(function()), ())  # `Thread.start` would wait until it runs
+    return answer.get()
 
 
 @lru_cache(maxsize=1)
