@@ -7,8 +7,6 @@ Shape letters in all docstrings: V vertices, F faces, K eigenpairs, P samples, C
 N shapes, Q queries, G gallery, D embedding width.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

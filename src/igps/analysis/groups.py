@@ -8,9 +8,9 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.optimize import brentq
 
-from igps._arrays import Floats
+from igps._arrays import Floats, Integers
 from igps._parameters import check_at_least
 
 FEWEST = 5
@@ -182,7 +182,7 @@ def with_discovery_rates(tests: Sequence[GroupTest]) -> list[GroupTest]:
     return [found.get(i, one) for i, one in enumerate(tests)]
 
 
-def _senseless(sizes: Mapping[str, int], group: NDArray[np.int64], stratum: NDArray[np.int64]) -> str | None:
+def _senseless(sizes: Mapping[str, int], group: Integers, stratum: Integers) -> str | None:
     """Why a test would make no sense."""
     if len(sizes) < 2:
         return f"expected two groups, got {', '.join(sizes) or 'none'} alone."
@@ -197,7 +197,7 @@ def _senseless(sizes: Mapping[str, int], group: NDArray[np.int64], stratum: NDAr
     return None
 
 
-def _indicators(codes: NDArray[np.int64]) -> Floats:
+def _indicators(codes: Integers) -> Floats:
     return np.eye(int(codes.max()) + 1)[codes]
 
 
@@ -211,8 +211,6 @@ def _orthonormal(columns: Floats, least: float) -> Floats:
 
 def _whitened(gram: Floats) -> Floats:
     """G (G + ρ)⁻¹ of a Gram matrix G; ρ leaves a degree of freedom for every ten bodies, or as the rank allows."""
-    from scipy.optimize import brentq
-
     values, axes = np.linalg.eigh(gram)
     kept = values > _ROUNDING * values[-1]
     values, axes = values[kept], axes[:, kept]
@@ -235,7 +233,7 @@ def _squares(gram: Floats) -> Floats:
     return found
 
 
-def _orders(stratum: NDArray[np.int64], count: int, random: np.random.Generator) -> NDArray[np.int64]:
+def _orders(stratum: Integers, count: int, random: np.random.Generator) -> Integers:
     """(count, N) random permutations within strata."""
     orders = np.empty((count, len(stratum)), dtype=np.int64)
     for one in range(stratum.max() + 1):
@@ -244,7 +242,7 @@ def _orders(stratum: NDArray[np.int64], count: int, random: np.random.Generator)
     return orders
 
 
-def _along(matrix: Floats, basis: Floats, orders: NDArray[np.int64]) -> Floats:
+def _along(matrix: Floats, basis: Floats, orders: Integers) -> Floats:
     """Traces bᵀ M b of a basis (N, k), its rows in each of several orders (n, N)."""
     count, n = orders.shape
     moved = basis[orders.T].reshape(n, -1)
@@ -256,7 +254,7 @@ def _probability(values: Floats) -> float:
     return float((values >= values[0] - _ROUNDING * values.max()).mean())
 
 
-def _effects(squares: Floats, group: NDArray[np.int64], weights: Sequence[NDArray[Any]]) -> Floats:
+def _effects(squares: Floats, group: Integers, weights: Sequence[Any]) -> Floats:
     """(n,) effects, each with weights (n, members) of each group's bodies; no pair of a body with itself counts."""
     members = [np.flatnonzero(group == one) for one in range(len(weights))]
     shares = [len(one) / len(group) for one in members]
@@ -277,7 +275,7 @@ def _effects(squares: Floats, group: NDArray[np.int64], weights: Sequence[NDArra
     return effects
 
 
-def _auc(gram: Floats, known: Floats, group: NDArray[np.int64], n_repeats: int, seed: int) -> float:
+def _auc(gram: Floats, known: Floats, group: Integers, n_repeats: int, seed: int) -> float:
     """By five folds; the rows' principal coordinates are to a ridge what the rows are.
 
     What is known (N, k) is regressed out by the bodies that train alone: of a pair, the mean would tell the other.

@@ -1,7 +1,5 @@
 """How a body in a file becomes a Signature: read, computed and cached, in this process or in a worker."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.metadata
 import json

@@ -279,14 +279,9 @@ def _expanded(
 
 def _files_in(folder: Path) -> list[Path]:
     """Files that may be bodies, but for hidden ones; of links those too that lead nowhere, which reading them says."""
-
-    def warn(error: OSError) -> None:
-        logger.warning(
-            "%s: left out with all that is in it (%s). Ask for the right to read it.", error.filename, error.strerror
-        )
-
+    refused = "%s: left out with all that is in it (%s). Ask for the right to read it."
     found = []
-    for place, folders, names in os.walk(folder, onerror=warn):
+    for place, folders, names in os.walk(folder, onerror=lambda e: logger.warning(refused, e.filename, e.strerror)):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for path in (Path(place, name) for name in names if not name.startswith(".") and is_searched(name)):
             if not _is_utf8(path):
