@@ -45,15 +45,9 @@ def _binary(content: bytes, announced: int) -> tuple[Floats, tuple[str, ...]]:
 def merged(corners: Floats) -> Surface:
     """The places (V, 3) of corners (3F, 3), in the order in which they first come, and the triangles (F, 3)."""
     corners = corners + 0.0  # of two zeros, one
-    order = np.lexsort(corners.T)
-    new = np.ones(len(corners), dtype=bool)
-    new[1:] = (corners[order[1:]] != corners[order[:-1]]).any(axis=1)
-    group = np.empty(len(corners), dtype=np.int64)
-    group[order] = np.cumsum(new) - 1
-    first = order[new]  # the sort is stable
-    rank = np.empty(len(first), dtype=np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return corners[np.sort(first)], rank[group].reshape(-1, 3)
+    _, first, place = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    rank = np.argsort(np.argsort(first))
+    return corners[np.sort(first)], rank[place.ravel()].reshape(-1, 3)
 
 
 FORMAT = Format("STL", (".stl", ".stl_ascii"), read)
