@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -10,14 +9,12 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from igps._arrays import Floats, Integers, Singles
-from igps._parameters import check_at_least, check_one_of
+from igps._parameters import check_at_least
 from igps.data.batch import Body
 from igps.data.requirements import Requirements
 from igps.descriptors._geodesics import geodesic_samples
 from igps.nn.descriptor import BodyDescriptor
 from igps.retrieval.distances import euclidean
-
-Scaling = Literal["least squares", "classical"]
 
 _DIMENSION = 3
 # The iteration ends where a step takes off less than this share of the stress, or after so many steps.
@@ -40,15 +37,12 @@ class CanonicalForm(BodyDescriptor):
     invariant_to = ("motion", "scale", "pose")
     requirements = Requirements(mesh=True)
 
-    # "least squares" minimises Σ (‖xᵢ−xⱼ‖ − dᵢⱼ)² from the classical solution on, which is faster and fits less well
-    scaling: Scaling = "least squares"
     max_order: int = 4  # of the moments
     n_samples: int = 200  # farthest points of the surface
     max_vertices: int = 1000  # larger meshes are simplified first
 
     def __post_init__(self) -> None:
         super().__init__()
-        check_one_of(get_args(Scaling), scaling=self.scaling)
         check_at_least(2, max_order=self.max_order)  # lower moments are fixed
         if not _DIMENSION < self.n_samples <= self.max_vertices:
             raise ValueError(
@@ -59,9 +53,7 @@ class CanonicalForm(BodyDescriptor):
         """(number of moments,), in √area, ordered as `exponents(max_order)`; errors as of `geodesic_samples`."""
         samples = geodesic_samples(body.mesh, self.n_samples, self.max_vertices)
         distances = samples.mutual / np.sqrt(body.mesh.area)
-        form = classical_scaling(distances)
-        if self.scaling == "least squares":
-            form = least_squares_scaling(distances, form)
+        form = least_squares_scaling(distances, classical_scaling(distances))
         return moments(form, self.max_order).astype(np.float32)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
