@@ -20,7 +20,6 @@ from igps.mesh.surface import face_areas
 # count for nothing, and it does not matter whether the last ones are all of a multiplet.
 _CUTOFF = 100.0
 _N_NEAREST = 32
-_ROWS_AT_ONCE = 1024
 _LEAST_WEIGHT = 1e-4
 # Of the distances from the anchors, beside the potential. They are no multiples of each other, so that two points have
 # the same place only by chance.
@@ -73,23 +72,17 @@ def canonically_ordered(mesh: Mesh) -> Mesh:
 
 
 def _by_anchors(embedding: Floats, marks: Floats | None) -> Floats:
-    found = _distances(embedding, np.zeros(embedding.shape[1]))
+    found = np.linalg.norm(embedding, axis=1)
     if marks is not None:
         found += _MARK_SHARE * marks
     anchor, nearest = int(np.argmax(found)), np.full(len(found), np.inf)
     for share in _ANCHOR_SHARES:
-        distance = _distances(embedding, embedding[anchor])
+        distance = np.linalg.norm(embedding - embedding[anchor], axis=1)
         found += share * distance
         nearest = np.minimum(nearest, distance)
         # Not the nearest alone: that of two points may agree where the distances from the other anchors do not.
         anchor = int(np.argmax(nearest + found))
     return found
-
-
-def _distances(points: Floats, from_point: Floats) -> Floats:
-    """(P,) of points (P, D), by so many at once that the differences stay in the processor's cache."""
-    pieces = [slice(start, start + _ROWS_AT_ONCE) for start in range(0, len(points), _ROWS_AT_ONCE)]
-    return np.concatenate([np.linalg.norm(points[piece] - from_point, axis=1) for piece in pieces])
 
 
 def nearest_spacing(points: Floats) -> Floats:
@@ -123,7 +116,7 @@ def spatial_order(points: Floats, size: int) -> Integers:
     n_points = len(points)
     n_cuts = max(0, math.ceil(math.log2(max(1, n_points) / size)))
     order = np.minimum(np.arange(size << n_cuts), n_points)
-    # What is missing to 2ᵏ full runs is in the middle for the boxes, and behind all points for the cuts.
+    # Runs are filled up by a point that is in the middle for the boxes, and behind all others for the cuts.
     padded = np.ascontiguousarray(np.vstack([points, points.mean(axis=0) if n_points else np.zeros(3)]).T)
     for cut in range(n_cuts):
         boxes = padded.take(order, axis=1).reshape(3, 1 << cut, -1)
