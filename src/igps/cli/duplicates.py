@@ -79,7 +79,7 @@ def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
     """
     if len(meshes) != 2:
         raise ValueError(f"meshes: expected two files, got {len(meshes)}.")
-    reading["strict"] = True  # only by `**reading` alone the parser finds the options
+    reading["strict"] = True  # within `**reading`, where the parser finds the options
     dataset, _ = signatures(meshes, [descriptor_of(DESCRIPTOR)], **reading)
     found = body_distance(dataset, DESCRIPTOR, progress=True)
     print(f"{found.distance:.4g} by {DESCRIPTOR}: {found.meaning}")

@@ -53,7 +53,7 @@ class ResidueAttribute:
         check_one_of(RESIDUE_ATTRIBUTES, attribute=self.name)
 
     def cache_tag(self, body: BodyRef) -> str:
-        """The name alone: the molecule is the body's file."""
+        """The name: the molecule is the body's own file, which the key of its Signature tells."""
         return f"residues 1 {self.name}"
 
     def __call__(self, body: BodyRef, points: Floats) -> Floats:
@@ -68,7 +68,7 @@ class ResidueAttribute:
 
 
 def _molecule(body: BodyRef) -> Molecule:
-    """That whose surface the body is."""
+    """The molecule that the body is the surface of."""
     part, changed = body.part or "", stamp_of(body.path)
     words = part.split()  # before them may stand the name of one of several structures
     kinds: dict[str, MoleculeBodies] = {"chain": "chains", "assembly": "assembly"}
@@ -91,7 +91,7 @@ class FileAttribute(ABC):
     Args:
         path: in it {stem} stands for the name of the body's file without suffixes, {file} for its path below `root`,
             and {part} for the name of the body in its file. Behind a # stands the name of the array, where the file has
-            several. What the braces stand for leads out of no folder.
+            several. No name that is filled in may lead out of the folder.
         root: from where a relative path leads; the folder of the body's file if None.
     """
 
@@ -137,7 +137,7 @@ class FileAttribute(ABC):
         """The file of a body, and the name of the array in it, which may be ""; a MeshError where there is none."""
         pattern, _, name = self.path.partition("#")
         root = body.path.parent if self.root is None else self.root
-        # As the path says; where folders are called otherwise there, as they are. A file may be a link to anywhere
+        # By the path as it is written, or else by the real names of its folders. The file may be a link to anywhere
         ways = ((Path(os.path.abspath(body.path)), Path(os.path.abspath(root))),
                 (body.path.parent.resolve() / body.path.name, root.resolve()))  # fmt: skip
         below = next((one.relative_to(at).as_posix() for one, at in ways if one.is_relative_to(at)), body.path.name)
@@ -156,7 +156,7 @@ class FileAttribute(ABC):
 
 @lru_cache(maxsize=1000)
 def _checksum(*files: Path, stamp: tuple[int, int, int]) -> str:
-    """Of the content; the many bodies of a volume may have one image."""
+    """Of the content, remembered: the many bodies of a volume may have one image."""
     return content_digest(*files).hex()
 
 
@@ -258,7 +258,7 @@ def attribute_source(path: str, root: Path | None = None) -> AttributeSource:
 
 
 def with_load_options(source: AttributeSource, options: LoadOptions) -> AttributeSource:
-    """The source for bodies that are read so, with cavities or without; carried inside from closed ones."""
+    """The source for bodies that are read by these options; values at vertices go inside from closed surfaces."""
     closed = replace(options, allow_open=False, mend="auto")
     return replace(source, reading=closed) if isinstance(source, VertexAttribute) else source
 
@@ -277,7 +277,7 @@ def attribute_sources(given: Sequence[str], root: Path | None) -> dict[str, Attr
 def fill_missing(values: Floats, points: Floats, what: str) -> Floats:
     """Values (P,) or (P, C), those that are not known (NaN) taken from the nearest of points (P, 3) that has one.
 
-    It is logged of `what` that is; a MeshError where more than a tenth is not known.
+    How many these are is logged, and of `what`; a MeshError where more than a tenth is not known.
     """
     known = np.asarray(_is_known(values.reshape(len(points), -1)).all(axis=1))
     n_missing = int((~known).sum())

@@ -38,7 +38,7 @@ class FromFiles(Protocol):
     """A source that reads files, which may lie among those of bodies."""
 
     def files(self, paths: Iterable[Path]) -> set[Path]:
-        """What it reads for the bodies in the files of these paths, but for their own files."""
+        """The files that it reads for the bodies in these files, without the latter."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from igps.signature.signature import SignatureConfig
 def has_configuration() -> bool:
     """Whether Lightning's command line makes this object, from a configuration that a checkpoint can keep as words.
 
-    What is given as objects a checkpoint could keep only by pickling them, and it would run code to read them.
+    Objects that are given in Python could be kept only by pickling them, and reading them would run code.
     """
     return _given_hyperparameters.get() is not None
 
@@ -104,7 +104,7 @@ class SignatureDataModule(LightningDataModule):
         self.dataset.precompute(n_workers=self.n_workers, strict=True)
 
     def train_dataloader(self) -> DataLoader[LabelledSignature]:
-        """Endless variety of P×K batches, as many an epoch as cover the training part once."""
+        """P×K batches, drawn anew each epoch, which has as many as cover the training part once."""
         try:
             from pytorch_metric_learning.samplers import MPerClassSampler
         except ImportError as error:
@@ -137,7 +137,7 @@ class SignatureDataModule(LightningDataModule):
     def transfer_batch_to_device(
         self, batch: SignatureBatch, device: torch.device, dataloader_index: int
     ) -> SignatureBatch:
-        """Lightning moves tensors and their containers, not batches of ours."""
+        """Lightning by itself moves tensors and containers of them, and no other batches."""
         return batch.to(device, non_blocking=True)
 
     def _in_order(self, indices: Sequence[int]) -> DataLoader[LabelledSignature]:

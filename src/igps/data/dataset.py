@@ -269,8 +269,8 @@ class SignatureDataset(Dataset[LabelledSignature]):
     ) -> list[Failure]:
         """Fill the cache, skipping what is there, and list the bodies that cannot be used.
 
-        From then on this dataset, and those that are made from it, read Signatures from the cache alone, and the files
-        no more: call it again where files have changed.
+        Afterwards this dataset, and those that are made from it, read Signatures from the cache without a look at the
+        files: call it again if files have changed.
 
         Args:
             executor: any `concurrent.futures.Executor`, such as that of a cluster, whose workers must see the files and

@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 _FILE = "known_files.sqlite"
 # A writer holds it for milliseconds.
 _PATIENCE = 30.0
-# A file may change again within the grain of its clock: a younger one is not remembered.
+# A file may change again before its clock moves on: one that is younger than this is not remembered.
 _YOUNG = 2 * 10**9
 _TABLE = (
     "CREATE TABLE IF NOT EXISTS body (pipeline TEXT, path TEXT, part TEXT, size INTEGER, mtime INTEGER, ctime INTEGER, "
@@ -41,7 +41,7 @@ class FileStatCache:
         self._path = pipeline.cache_dir / _FILE
         changed = pipeline.pre_transform.cache_tag if pipeline.pre_transform else None
         words = [pipeline.reading.as_dict(), pipeline.config.as_dict(), MENDING_VERSION, changed]
-        words += [pipeline.reading.names] if pipeline.reading.names else []  # the time of another table may be as old
+        words += [pipeline.reading.names] if pipeline.reading.names else []  # another table may have the same time
         self._name = hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()[:32]
         # What attributes depend on may change while the file does not, and a transform may depend on them.
         self._is_useful = not (pipeline.attributes and pipeline.pre_transform)

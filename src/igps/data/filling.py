@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 _REMEMBERED_AT_ONCE = 1000
 # Bodies of one file that are computed before any of them is reported; the file is read again for the next
 _REPORTED_AT_ONCE = 64
-# Seconds until a file that another machine wrote is seen here, by a file system for many.
+# Seconds within which a shared file system shows a file that another machine wrote.
 _SHARED_WITHIN = 60.0
 
 
@@ -123,7 +123,7 @@ def compute(
     jobs = group_by_file(bodies, numbers, most)
     work: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
     given = [[bodies[i] for i in job] for job in jobs]
-    if executor is not None:  # elsewhere, and from another folder
+    if executor is not None:  # whose workers run in another folder
         there = replace(pipeline, cache_dir=pipeline.cache_dir.absolute())
         work = partial(fill_elsewhere, there.fill, version())
         known = pipeline.meshes  # these are in no file
@@ -144,7 +144,7 @@ def compute(
 
 
 def wait_until_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
-    """Raise a MachineError if what a worker put into its cache does not come to this one."""
+    """Raise a MachineError if what a worker put into the cache does not appear there."""
     path = SignatureCache(pipeline.cache_dir).path(hit.key)
     deadline = time.monotonic() + _SHARED_WITHIN
     while not path.exists():

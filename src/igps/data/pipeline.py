@@ -249,7 +249,7 @@ class SignaturePipeline:
         return _digest(["attribute", key, name, self.attributes[name].cache_tag(body)])
 
     def _changed_key(self, body: BodyRef, key: str) -> str:
-        """Of the Signature with its attributes, changed: by all that these depend on."""
+        """The key of the changed Signature: by the Signature's own, the change, and the attributes."""
         assert self.pre_transform is not None
         attributes = [self._attribute_key(body, key, name) for name in sorted(self.attributes)]
         return _digest(["changed", key, self.pre_transform.cache_tag, attributes])

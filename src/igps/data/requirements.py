@@ -100,7 +100,7 @@ _by_name: list[Callable[[str], Requiring]] = []
 
 
 def register_descriptors(by_name: Callable[[str], Requiring]) -> None:
-    """Tell how a descriptor is found by its name: the package does so when it is imported, for the rooms below it."""
+    """Set how a descriptor is found by its name: this room may not import those above it, so the package tells it."""
     _by_name[:] = [by_name]
 
 

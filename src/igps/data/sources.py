@@ -223,7 +223,7 @@ def file_name_of(name: str, part: str | None) -> str:
 
 
 def _parts(path: Path, options: LoadOptions) -> Sequence[str | None]:
-    """The bodies that a file holds, by name. None where the file is one, or cannot be read: computing it says why."""
+    """The bodies of a file by name; None where it is one body, or cannot be read, which is told when it is computed."""
     try:
         return [body.part for body in list_bodies(path, options)] or [None]
     except MeshError:
@@ -278,7 +278,7 @@ def _expanded(
 
 
 def _files_in(folder: Path) -> list[Path]:
-    """Files that may be bodies, but for hidden ones; of links those too that lead nowhere, which reading them says."""
+    """Files that may be bodies, without hidden ones; links that lead nowhere stay, to be told when they are read."""
     refused = "%s: left out with all that is in it (%s). Ask for the right to read it."
     found = []
     for place, folders, names in os.walk(folder, onerror=lambda e: logger.warning(refused, e.filename, e.strerror)):
@@ -286,7 +286,7 @@ def _files_in(folder: Path) -> list[Path]:
         for path in (Path(place, name) for name in names if not name.startswith(".") and is_searched(name)):
             if not _is_utf8(path):
                 logger.warning("%s: left out, its name is not UTF-8. Rename it.", os.fsencode(path))
-            elif os.path.isfile(path) or not os.path.exists(path):  # of a pipe reading might wait for ever
+            elif os.path.isfile(path) or not os.path.exists(path):  # reading a pipe might never end
                 found.append(path)
     return found
 

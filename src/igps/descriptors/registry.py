@@ -49,7 +49,7 @@ _MAKERS: Mapping[str, Callable[[], Descriptor]] = {
     "molecular": molecular,
 }
 
-# That of molecules is for bodies that bring attributes of their own
+# "molecular" needs attributes that only molecules bring
 NAMES: tuple[str, ...] = tuple(name for name in _MAKERS if name != "molecular")
 """The names of the library's descriptors of any body."""
 

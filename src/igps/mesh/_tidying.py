@@ -17,7 +17,7 @@ from igps.mesh.winding import winding_number
 _WELD = 1e-8
 # So near are the sides of a crack: corners in single precision that differ in their last digits.
 _CRACK = 1e-6
-# Where more vertices are that near to each, the surface is tiny beside its bounding box, and they are no crack.
+# Where each vertex has more others so near, the surface is tiny in its bounding box, and they are no crack.
 _MOST_NEAR = 50
 # Parts of less than this share of the area are specks, unless all of them together have ten times as much.
 SPECK = 2e-3
@@ -64,7 +64,7 @@ def places(vertices: Floats) -> Integers:
 
 
 def met(vertices: Floats, faces: Integers) -> Integers:
-    """The faces (F, 3) where they meet in one vertex: those at free edges are one if they are in one place."""
+    """The faces (F, 3), where vertices at free edges are made one if they are in one place."""
     free, index = _at_free_edges(vertices, faces), np.arange(len(vertices))
     if len(free):
         index[free] = free[places(vertices[free])]
@@ -72,7 +72,7 @@ def met(vertices: Floats, faces: Integers) -> Integers:
 
 
 def _without_cracks(vertices: Floats, faces: Integers) -> Integers:
-    """(V,) of each vertex the one that it is, where the sides of a crack are nearer than single precision can tell."""
+    """(V,) which vertex each becomes: sides of a crack that are nearer than single precision can tell are made one."""
     free, index = _at_free_edges(vertices, faces), np.arange(len(vertices))
     tree, near = cKDTree(vertices[free]), _CRACK * diagonal(vertices)
     if tree.count_neighbors(tree, near) > _MOST_NEAR * len(free):

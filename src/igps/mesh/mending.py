@@ -108,7 +108,7 @@ def _mended(vertices: Floats, faces: Integers, name: str, cavities: bool, denois
             vertices, faces = step(vertices, faces, notes)
         if body := _body(vertices, faces, notes, name, cavities, denoise):
             return body
-    # What may go wrong with a heap of parts is tried, and left behind where it makes no body.
+    # Of a heap of parts these may make no body: then what they did is given up.
     for attempt, surface, done in ((without_walls, (vertices, faces), list(notes)), (united, given, [])):
         if len(surface[1]) and (body := _body(*attempt(*surface, done), done, name, cavities, denoise)):
             return body

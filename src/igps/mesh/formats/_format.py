@@ -64,7 +64,7 @@ class Format:
 def made_later(
     make: Callable[[], Mesh], part: str | None, unit: str | None, voxels: Callable[[], LabelVoxels] | None = None
 ) -> RawBody:
-    """A body whose surface is made when it is asked for; a fault of it leaves the others."""
+    """A body whose surface is made when it is asked for; if that fails, the others of the file are still read."""
 
     def made() -> RawBody:
         try:

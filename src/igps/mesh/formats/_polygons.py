@@ -4,7 +4,7 @@ import numpy as np
 
 from igps._arrays import Floats, Integers
 
-# Of more corners no ears are sought, which takes time as their number squared, and more.
+# Polygons of more corners are not cut ear by ear: the time grows with the square of their number, or faster.
 _MOST_CORNERS = 2000
 
 
@@ -27,10 +27,10 @@ def triangles(corners: Integers, n_corners: Integers) -> Integers:
 
 
 def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> Integers:
-    """The same, but for polygons that would fold over themselves: of those ears are cut off (Meisters 1975), last.
+    """The same, but polygons that would fold over themselves are cut ear by ear (Meisters 1975), and come last.
 
-    Of polygons that cross themselves no ear may be left, and the rest is cut from its first corner. What has fewer than
-    three corners has no area, and is left out.
+    A polygon that crosses itself may run out of ears; the rest is cut from its first corner. Polygons of fewer than
+    three corners have no area, and are left out.
     """
     has_area = n_corners >= 3
     corners, n_corners = corners[np.repeat(has_area, n_corners)], n_corners[has_area]

@@ -1,4 +1,4 @@
-"""XML of strangers: no entities, nothing from elsewhere, and arrays that unpack to no more than they announce."""
+"""XML from strangers: no entities, no other files, and arrays that unpack to no more than they announce."""
 
 import lzma
 import zlib

@@ -30,7 +30,7 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
                 if part in (None, name) and (found := _inside(place, path, options, None)):
                     bodies.append(replace(joined(found), part=name))
             except MeshError as fault:
-                if options.bodies != "objects":  # of the whole it would be missing
+                if options.bodies != "objects":  # the whole would lack it
                     raise
                 bodies.append(RawBody(part=name, fault=fault))
     if not bodies:
@@ -64,7 +64,7 @@ def _inside(place: Path, path: Path, options: LoadOptions, part: str | None) -> 
 
 
 def _unpacked(path: Path, folder: Path, options: LoadOptions) -> list[tuple[str, Path]]:
-    """The names of the files in an archive, and where they are now, but for links, ways out of it and hidden files."""
+    """The names of the files in an archive, and where they are now; without links, hidden files and paths out of it."""
     found = []
     with _members(path, options) as members:
         for name, stream in members:

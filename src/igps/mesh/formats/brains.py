@@ -82,8 +82,8 @@ def read_freesurfer(path: Path, options: LoadOptions, part: str | None) -> list[
 def in_scanner(path: Path, points: Floats) -> Floats:
     """Points (P, 3) of the body of a file in the coordinates of images.
 
-    Others than those of FreeSurfer's triangle files are in them: its own have their origin in the middle of a volume
-    whose place and axes the end of the file tells.
+    Points of FreeSurfer's triangle files have their origin in the middle of a volume, whose place and axes are written
+    at the end of the file. Those of other files are in the coordinates of images already.
     """
     if not path.name.lower().endswith(FREESURFER.suffixes):
         return points

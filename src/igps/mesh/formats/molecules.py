@@ -30,7 +30,7 @@ MoleculeBodies = Literal["chains", "models", "assembly"]
 
 # Elements that the first letter of an atom's name gives where the file does not.
 _ELEMENTS = frozenset("HCNOSP")
-# All that residues are made of whose names are standard, with the selenium of a methionine; and deuterium.
+# The elements of residues with standard names, with the selenium of a methionine; and deuterium.
 _OF_STANDARD = frozenset({*_ELEMENTS, "D", "Se"})
 # Radius of an atom whose element is not known, carbon's.
 _UNKNOWN_RADIUS = 1.7
@@ -176,7 +176,7 @@ class _Builder:
         name = _standard(residue.name, kind)
         named = {atom.name for atom in atoms}
         is_known = name != residue.name or (kind.is_amino_acid() or kind.is_nucleic_acid())
-        # An ion whose name is not known is an atom by itself, which is no polymer; calcium is called as Cα is.
+        # An ion of an unknown name is a single atom, which is no polymer; the name of calcium is that of Cα.
         is_alone = len(atoms) == 1 and (not named & {"CA", "P"} or atoms[0].element.name == "Ca")
         in_polymer = is_known or {"N", "CA", "C"} <= named or (residue.het_flag == "A" and not is_alone)
         if not atoms or not (in_polymer or self.ligands):

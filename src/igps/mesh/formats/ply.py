@@ -26,7 +26,7 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     head, end, body = path.read_bytes().partition(b"end_header")
     try:
         polygons = _polygons(head.decode("latin-1"), body.partition(b"\n")[2])
-    except (ValueError, KeyError, IndexError, struct.error):  # a broken file, of which trimesh says why, or a rare one
+    except (ValueError, KeyError, IndexError, struct.error):  # a broken file, whose fault trimesh tells, or a rare one
         polygons = None
     if polygons is not None:
         return [RawBody(*polygons)]
@@ -70,7 +70,7 @@ def _polygons(head: str, body: bytes) -> Surface | None:
 def _of_text(text: bytes, names: list[str], n_vertices: int, n_faces: int, at: int) -> Polygons | None:
     lines = [line for line in text.splitlines() if line and not line.isspace()]
     places, faces = lines[:n_vertices], lines[n_vertices : n_vertices + n_faces]
-    if len(faces) < n_faces:  # of which trimesh makes as much as it can
+    if len(faces) < n_faces:  # trimesh would read the part that is there
         raise EOFError(f"{n_vertices} vertices and {n_faces} faces announced, {len(lines)} lines there")
     if at == 0 and all(line.startswith(b"3 ") for line in faces):
         return None

@@ -44,7 +44,7 @@ def _binary(content: bytes, announced: int) -> tuple[Floats, tuple[str, ...]]:
 
 def merged(corners: Floats) -> Surface:
     """The places (V, 3) of corners (3F, 3), in the order in which they first come, and the triangles (F, 3)."""
-    corners = corners + 0.0  # of two zeros, one
+    corners = corners + 0.0  # -0 is 0
     _, first, place = np.unique(corners, axis=0, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
     return corners[np.sort(first)], rank[place.ravel()].reshape(-1, 3)
