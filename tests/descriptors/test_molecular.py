@@ -21,8 +21,8 @@ from igps.mesh.residues import CHARGED_ATOMS, VOLUMES, residue_ball
 from igps.nn.axes import InteriorDistance
 from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import chi_square
-from igps.signature.residue_attributes import with_residue_attributes
-from igps.signature.signature import Signature, SignatureConfig, compute_signature
+from igps.signature.residue_attributes import residue_attribute
+from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 
 CONFIG = SignatureConfig(n_eigenpairs=64, n_surface_samples=100, min_samples=300, resolution=16)
 ROTATION = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
@@ -50,7 +50,12 @@ def moved(molecule: Molecule) -> Molecule:
 
 def signature_of(molecule: Molecule) -> Signature:
     surface = molecular_surface(molecule, spacing=1.0, max_vertices=1200)
-    return with_residue_attributes(compute_signature(surface, CONFIG), molecule, MOLECULAR_ATTRIBUTES)
+
+    def added(samples: Samples) -> Samples:
+        found = {name: residue_attribute(molecule, samples.points, name) for name in MOLECULAR_ATTRIBUTES}
+        return samples.with_attributes(found)
+
+    return compute_signature(surface, CONFIG).map_samples(added)
 
 
 @cache

@@ -19,7 +19,6 @@ from igps.signature.residue_attributes import (
     residue_attribute,
     residue_means,
     screened_potential,
-    with_residue_attributes,
 )
 from igps.signature.signature import SignatureConfig, compute_signature
 
@@ -144,7 +143,9 @@ def test_a_signature_gets_attributes_and_keeps_its_own() -> None:
     config = SignatureConfig(n_eigenpairs=10, n_surface_samples=50, min_samples=100, attributes=("surface_direction",))
     signature = compute_signature(mesh, config)
     molecule = peptide("ASP", "LYS")
-    found = with_residue_attributes(signature, molecule, ["charge"])
+    found = signature.map_samples(
+        lambda samples: samples.with_attributes({"charge": residue_attribute(molecule, samples.points, "charge")})
+    )
     for samples in (found.interior, found.surface):
         assert set(samples.attributes) == {"surface_direction", "charge"}
         np.testing.assert_allclose(

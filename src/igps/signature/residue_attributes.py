@@ -4,7 +4,7 @@ Each is a mean over the residues by a Gaussian of their distance, so that it is 
 little when atoms do.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -12,7 +12,6 @@ from scipy.spatial.distance import cdist
 from igps._arrays import Floats
 from igps.mesh.formats.molecules import Molecule
 from igps.mesh.residues import ACCEPTORS, AROMATIC, DONORS, HYDROPATHY, VOLUMES
-from igps.signature.signature import Samples, Signature
 
 RESIDUE_KINDS = (*sorted(VOLUMES), "A", "C", "G", "U", "other")
 """Amino acids, the bases of nucleotides (U is T, too), and all else."""
@@ -71,15 +70,6 @@ def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
         raise ValueError(f"attributes: expected some of {', '.join(RESIDUE_ATTRIBUTES)}, got {name!r}.")
     means = residue_means(molecule, points, _COLUMNS[name](molecule))
     return means[:, 0] if means.shape[1] == 1 else means
-
-
-def with_residue_attributes(signature: Signature, molecule: Molecule, names: Sequence[str]) -> Signature:
-    """A Signature of the molecule's surface whose samples have the named attributes, too."""
-
-    def added(samples: Samples) -> Samples:
-        return samples.with_attributes({name: residue_attribute(molecule, samples.points, name) for name in names})
-
-    return signature.map_samples(added)
 
 
 def _by_name(table: Mapping[str, float], default: float = np.nan) -> Callable[[Molecule], Floats]:
