@@ -69,7 +69,7 @@ def clusters_of(
     members = [np.flatnonzero(numbers == one) for one in range(numbers.max() + 1)]
     medoids = tuple(int(own[found[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members)
     random, shares = np.random.default_rng(seed), np.full((n_resamples, len(members)), np.nan)
-    for row in shares if n > max(3, 2 * len(members)) else ():  # half of three is one body, and no tree
+    for row in shares if n > max(3, 2 * len(members)) else ():  # half of three is one body, which makes no tree
         drawn = np.sort(random.choice(n, n // 2, replace=False))
         again = np.eye(n, dtype=np.int64)[_cut(_tree(found[np.ix_(drawn, drawn)], linkage), len(members))]
         first = np.eye(len(members), dtype=np.int64)[numbers[drawn]]

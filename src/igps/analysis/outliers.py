@@ -31,7 +31,7 @@ _PRIOR = 5
 _NORMAL = 1.4826
 # Fewer values have no tail
 _FEW = 10
-# Less is as odd as more
+# Measures of which less than usual is as odd as more
 _TWO_SIDED = ("volume", "spacing")
 # Scatter below which no measure is taken to differ; of logarithms, counts, shares and their roots
 _LEAST = {

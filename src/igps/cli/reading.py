@@ -66,7 +66,7 @@ class Folder:
 
     root: Path
     labelled: bool = False  # whether it must tell classes
-    needs_meshes: bool = False  # whether signatures alone do not do
+    needs_meshes: bool = False  # whether signatures alone are not enough
     check: Callable[[Bodies], object] | None = None  # raises what is wrong with its bodies before any is computed
 
 
@@ -110,7 +110,7 @@ def signatures(
     """
     needs = reduce(or_, (one.requirements for one in descriptors), Requirements()) if descriptors else None
     dataset = chosen_dataset(source, needs, **reading)
-    for one in descriptors if not isinstance(source, Folder) or source.root.is_dir() else ():  # others are computed
+    for one in descriptors if not isinstance(source, Folder) or source.root.is_dir() else ():  # a file is checked
         check_attributes(one, {*dataset.config.attributes, *dataset.pipeline.attributes})
     failures = dataset.precompute(n_workers=n_workers, strict=strict, limits=limits_of(time_limit, memory_limit))
     if len(failures) == len(dataset):

@@ -55,7 +55,7 @@ class System:
 
 @dataclass(frozen=True)
 class Unused:
-    """A mesh that one descriptor, or none of them, could use."""
+    """A mesh that one descriptor could not use, or none of them could."""
 
     file: str
     error: str

@@ -50,7 +50,7 @@ class SignatureConfig:
     ALGORITHM_VERSION: ClassVar[int] = 5
 
     DEFAULT_EIGENPAIRS: ClassVar[int] = 250
-    # What the library's descriptors ask for: known to be in caches.
+    # As many as descriptors of the library ask for, so that caches may hold them.
     SIZES: ClassVar[tuple[int, ...]] = (64, 100, 250)
 
     n_eigenpairs: int | None = None

@@ -1,4 +1,4 @@
-"""What trimesh reads: from bytes, with no way to files elsewhere."""
+"""What trimesh reads, from bytes: of other files it gets those of the same folder alone."""
 
 from __future__ import annotations
 
