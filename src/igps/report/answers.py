@@ -9,6 +9,7 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.cluster.hierarchy import dendrogram
 
 from igps._arrays import Floats
 from igps.analysis.clusters import STABLE, Clusters
@@ -115,8 +116,6 @@ def map_figure(found: BodyMap, values: Sequence[str] | Sequence[float], title: s
 
 def clusters_figure(found: Clusters, names: Sequence[str]) -> Figure:
     """The tree, with the cluster of each body and its stability in brackets."""
-    from scipy.cluster.hierarchy import dendrogram
-
     figure = new_figure(7, max(2.0, 0.6 + 0.13 * len(names)))
     axes = figure.add_subplot()
     leaves = dendrogram(found.tree, orientation="left", ax=axes, link_color_func=lambda _: _OTHER)["leaves"]

@@ -63,12 +63,10 @@ def axes_of(points: Floats) -> Floats:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    """A figure of so many inches that is no part of pyplot's state, which is the user's."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)  # draws to a file without touching the user's pyplot state
-    return figure
+    return Figure(figsize=(width, height), layout="constrained")
 
 
 def save_figure(figure: Figure, path: Path, dpi: float | None = None) -> None:
