@@ -25,7 +25,7 @@ class BucketBatchSampler(Sampler[list[int]]):
 
     Args:
         sizes: (N,) of the shapes, see `SignatureDataset.sizes`.
-        batch_size: shapes in a batch; the rest of them in the last of the last bucket.
+        batch_size: shapes in a batch; the last batch of the last bucket has what is left.
         drop_last: leave out the batch with fewer.
         generator: of the order; PyTorch's global one if None.
     """
@@ -52,7 +52,7 @@ class BucketBatchSampler(Sampler[list[int]]):
         order = torch.randperm(len(self.sizes), generator=self.generator)
         batches: list[list[int]] = []
         for bucket in order.split(_BATCHES_IN_A_BUCKET * self.batch_size):
-            # By size, and those of one size as they were shuffled.
+            # By size; shapes of one size stay in the order in which they were shuffled.
             by_size = bucket[torch.sort(self.sizes[bucket], stable=True).indices]
             batches += [batch.tolist() for batch in by_size.split(self.batch_size)]
         least = self.batch_size if self.drop_last else 1

@@ -159,7 +159,7 @@ def _outside_by_winding(outside: Booleans, distance: Singles, surface: OrientedS
     leaked = probe[surface.winding(probe) > 0.5]
     if not len(leaked):
         return outside, 0
-    # Where it went in, all it reached near the leak is asked.
+    # If it did, every point that it reached near these leaks is looked at.
     low, high = np.maximum(leaked.min(axis=0) - 4, 0), np.minimum(leaked.max(axis=0) + 5, outside.shape)
     box = tuple(map(slice, low, high))
     points = np.argwhere(outside[box]) + low

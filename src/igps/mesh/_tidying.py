@@ -15,9 +15,9 @@ from igps.mesh.winding import winding_number
 
 # Vertices closer than this share of the bounding box's diagonal are one.
 _WELD = 1e-8
-# So near are the sides of a crack: corners in single precision that differ in their last digits.
+# How near the sides of a crack are: their corners, in single precision, differ in the last digits.
 _CRACK = 1e-6
-# Where each vertex has more others so near, the surface is tiny in its bounding box, and they are no crack.
+# With more vertices so near to each, on average, the surface is tiny in its bounding box, and they are no cracks.
 _MOST_NEAR = 50
 # Parts of less than this share of the area are specks, unless all of them together have ten times as much.
 SPECK = 2e-3
@@ -126,9 +126,9 @@ def tidied(vertices: Floats, faces: Integers, notes: list[str]) -> Surface:
 
 
 def _without_fins(vertices: Floats, faces: Integers) -> Integers:
-    """The faces but for those that hang on an edge of two others, peeled from their free edges; all, if they are many.
+    """The faces but for fins, which have a free edge and one that two others share; all, if fins have much area.
 
-    A face with a second free edge that is left of a larger fin does no harm: it hangs on nothing crowded.
+    What may be left of a larger fin shares no edge with two other faces, and does no harm.
     """
     kept = faces
     while len(kept):

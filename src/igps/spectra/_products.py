@@ -24,7 +24,7 @@ from igps._compiled import SUMS, Lazy, compiled
 
 Four = tuple[float, float, float, float]
 
-# Of a tile: as many sums as the registers of AVX2 hold, beside what they are made of
+# Of a tile: AVX2 has registers for so many sums, and for the numbers that are multiplied
 ROWS, COLUMNS = 6, 8
 # Columns of a few rows that the processor's second cache holds
 CHUNK = 4096
