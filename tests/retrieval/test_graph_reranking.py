@@ -9,7 +9,7 @@ from scipy import sparse
 from torch import Tensor
 
 from igps.retrieval import SearchResult, euclidean, graph_reranking, rerank, rerank_graph, reranking, retrieval_scores
-from igps.retrieval.graph_reranking import common, walks
+from igps.retrieval.graph_reranking import jaccard, walks
 
 
 def own_distances(points: Tensor) -> Tensor:
@@ -75,16 +75,14 @@ def test_walks_are_those_inside_the_list() -> None:
         np.testing.assert_allclose(row, expected, atol=1e-4)
 
 
-def test_common_weights_are_the_sums_of_the_smaller() -> None:
+def test_distances_by_the_sums_of_the_smaller_weights() -> None:
     generator = np.random.default_rng(1)
-    weights = sparse.random_array((30, 30), density=0.3, random_state=generator, format="csr")
-    weights.sort_indices()
-    pairs = sparse.random_array((30, 30), density=0.2, random_state=generator, format="csr")
-    found, dense = np.zeros(pairs.nnz), weights.toarray()
-    for part in ((0, 12), (12, 30)):
-        common(part, pairs.indptr, pairs.indices, weights.indptr, weights.indices, weights.data, found)
-    rows = np.repeat(np.arange(30), np.diff(pairs.indptr))
-    np.testing.assert_allclose(found, np.minimum(dense[rows], dense[pairs.indices]).sum(axis=1), atol=1e-12)
+    weights = sparse.random_array((50, 50), density=0.3, random_state=generator, format="csr")
+    weights = sparse.csr_array(sparse.diags_array(1 / weights.sum(axis=1)) @ weights)
+    pairs = sparse.random_array((50, 50), density=0.2, random_state=generator, format="csr")
+    dense, rows = weights.toarray(), np.repeat(np.arange(50), np.diff(pairs.indptr))
+    smaller, larger = (one(dense[rows], dense[pairs.indices]).sum(axis=1) for one in (np.minimum, np.maximum))
+    np.testing.assert_allclose(jaccard(weights, pairs, False), 1 - smaller / larger, atol=1e-12)
 
 
 def test_what_it_refuses() -> None:

@@ -14,8 +14,8 @@ MOST_WHOLE = 2000
 
 # Of conjugate gradients, for walks whose condition is below 40
 _ROUNDS = 40
-# Rows between two steps of the bar
-_AT_ONCE = 100
+# Rows whose pairs are compared at a time
+_AT_ONCE = 20
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -67,7 +67,7 @@ def rerank_graph(
         apart = _brought_forward(apart, graph, lists[:, 0])
     average = 1 + (apart.sum() - before) / n_pairs
     weights = _neighbourhoods(apart, graph, n_neighbours, half, n_expanded)
-    anew = (1 - share) * _jaccard(weights, graph, progress) + share * apart / average
+    anew = (1 - share) * jaccard(weights, graph, progress) + share * apart / average
     if keep_nearest:
         anew = _brought_forward(anew, graph, lists[:, 0])
     ranked = _like(graph, anew)[np.repeat(np.arange(n), m), lists.ravel()].reshape(n, m)
@@ -98,8 +98,10 @@ def _neighbourhoods(
 ) -> sparse.csr_array:
     """(N, N) weights of the members of each shape's neighbourhood, averaged over its nearest; rows add up to 1."""
     n = graph.shape[0]
-    order = np.empty((n, max(n_neighbours, n_expanded - 1) + 1), dtype=np.int64)
-    nearest_of_rows(graph.indptr, graph.indices, apart, order)
+    n_first = max(n_neighbours, n_expanded - 1)
+    rows = map(slice, graph.indptr, graph.indptr[1:])
+    firsts = [graph.indices[row][apart[row].argsort(kind="stable")[:n_first]] for row in rows]
+    order = np.column_stack([np.arange(n), firsts])
     members, halves = (_reciprocal(order[:, : k + 1]) for k in (n_neighbours, half))
     joins = sparse.csr_array(members @ halves.T).multiply(members).tocsr()
     joins.data = (2 / 3 * halves.sum(axis=1)[joins.indices] <= joins.data).astype(np.float64)
@@ -116,14 +118,16 @@ def _neighbourhoods(
     return weights
 
 
-def _jaccard(weights: sparse.csr_array, graph: sparse.csr_array, progress: bool) -> Floats:
+def jaccard(weights: sparse.csr_array, graph: sparse.csr_array, progress: bool) -> Floats:
     """Distances of the pairs of a graph, 0 to 1, by the share of weights that their neighbourhoods have in common."""
-    n, smaller = graph.shape[0], np.zeros(graph.nnz)
+    n, rows, smaller = graph.shape[0], _rows(graph), np.empty(graph.nnz)
+    ones = np.ones(n)
     with tqdm(total=n, desc="re-ranked", disable=not progress) as bar:
         for first in range(0, n, _AT_ONCE):
-            rows = first, min(first + _AT_ONCE, n)
-            common(rows, graph.indptr, graph.indices, weights.indptr, weights.indices, weights.data, smaller)
-            bar.update(rows[1] - first)
+            last = min(first + _AT_ONCE, n)
+            pairs = slice(graph.indptr[first], graph.indptr[last])
+            smaller[pairs] = weights[rows[pairs]].minimum(weights[graph.indices[pairs]]) @ ones
+            bar.update(last - first)
     return (1 - smaller / (2 - smaller)).clip(0)
 
 
@@ -206,38 +210,3 @@ def walks(lists: Integers, starts: Integers, ends: Integers, steps: Floats, n_ro
             size = left
         for a in range(len(here)):
             place[here[a]] = -1
-
-
-@compiled()
-def nearest_of_rows(starts: Integers, others: Integers, values: Floats, order: Integers) -> None:
-    """Write each shape, and those of its pairs of least value, ties by number, to (N, k + 1); rows have at least k."""
-    least = np.empty(order.shape[1])
-    for i in range(len(order)):
-        order[i, 0], n = i, 1
-        for e in range(starts[i], starts[i + 1]):
-            if n < len(least) or values[e] < least[n - 1]:
-                n = min(n + 1, len(least))
-                place = n - 1
-                while place > 1 and values[e] < least[place - 1]:
-                    least[place], order[i, place] = least[place - 1], order[i, place - 1]
-                    place -= 1
-                least[place], order[i, place] = values[e], others[e]
-
-
-@compiled()
-def common(
-    rows: tuple[int, int], starts: Integers, others: Integers, row_starts: Integers, members: Integers,
-    weights: Floats, smaller: Floats,
-) -> None:  # fmt: skip
-    """Write, of each pair of a range of a graph's rows, the sum of the smaller of their weights, sorted by member."""
-    for i in range(rows[0], rows[1]):
-        for e in range(starts[i], starts[i + 1]):
-            a, b = row_starts[i], row_starts[others[e]]
-            while a < row_starts[i + 1] and b < row_starts[others[e] + 1]:
-                if members[a] == members[b]:
-                    smaller[e] += min(weights[a], weights[b])
-                    a, b = a + 1, b + 1
-                elif members[a] < members[b]:
-                    a += 1
-                else:
-                    b += 1
