@@ -9,7 +9,7 @@ import torch
 import trimesh
 from scipy.spatial.distance import cdist
 
-from igps.data.transforms import FewerEigenpairs, FewerSamples, FlipSigns, Noise, Scale, Transform
+from igps.data.transforms import Compose, FewerEigenpairs, FewerSamples, FlipSigns, Noise, Scale, Transform
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 
@@ -127,3 +127,10 @@ def test_signs_are_flipped_for_all_samples_alike_and_change_no_distance(signatur
     assert (signs == signs[0]).all()
     before = cdist(inside, outside)
     np.testing.assert_allclose(cdist(flipped.interior.eigenfunctions, flipped.surface.eigenfunctions), before)
+
+
+def test_composed_are_one_after_the_other(signature: Signature) -> None:
+    both = Compose(FewerSamples(n_interior=9, seed=0), Scale(seed=1))
+    assert same(both(signature), Scale(seed=1)(FewerSamples(n_interior=9, seed=0)(signature)))
+    assert both.cache_tag == f"{FewerSamples(n_interior=9, seed=0)!r}; {Scale(seed=1)!r}"
+    assert same(pickle.loads(pickle.dumps(both))(signature), both(signature))

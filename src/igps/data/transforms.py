@@ -7,6 +7,7 @@ draws, which a DataLoader seeds anew in every worker.
 
 import zlib
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +36,24 @@ class Transform(ABC):
 
     @abstractmethod
     def _changed(self, signature: Signature, generator: np.random.Generator) -> Signature: ...
+
+
+class Compose:
+    """Several changes, one after the other: callables from Signature to Signature."""
+
+    def __init__(self, *transforms: Callable[[Signature], Signature]) -> None:
+        self.transforms = transforms
+
+    @property
+    def cache_tag(self) -> str:
+        """The tags of all changes."""
+        return "; ".join(one.cache_tag for one in self.transforms)  # type: ignore[attr-defined]
+
+    def __call__(self, signature: Signature) -> Signature:
+        """The changed Signature; the given one stays as it is."""
+        for one in self.transforms:
+            signature = one(signature)
+        return signature
 
 
 @dataclass(frozen=True, kw_only=True)
