@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from igps.data.batch import SampleBatch, SignatureBatch
@@ -116,3 +116,37 @@ def batch_of(
         labels=torch.full((n_shapes,), -1),
         ids=tuple(map(str, range(n_shapes))),
     )
+
+
+class OfTensors(nn.Module):
+    """A descriptor of the tensors of a padded batch, as a program in another language would call it."""
+
+    def __init__(self, descriptor: nn.Module, like: SignatureBatch) -> None:
+        super().__init__()
+        self.descriptor, self.like = descriptor, like
+
+    def forward(self, eigenvalues: Tensor, area: Tensor, kinds: dict[str, dict[str, Tensor]]) -> Tensor:
+        own = ("points", "eigenfunctions", "mask")
+        samples = {
+            kind: SampleBatch(*(one[name] for name in own), {name: one[name] for name in one if name not in own})
+            for kind, one in kinds.items()
+        }
+        return self.descriptor(replace(self.like, eigenvalues=eigenvalues, area=area, **samples))
+
+
+def tensors(batch: SignatureBatch) -> tuple[Tensor, Tensor, dict[str, dict[str, Tensor]]]:
+    """What `OfTensors` takes of a batch."""
+    kinds = {
+        kind: {"points": one.points, "eigenfunctions": one.eigenfunctions, "mask": one.mask, **one.attributes}
+        for kind, one in (("interior", batch.interior), ("surface", batch.surface))
+    }
+    return batch.eigenvalues, batch.area, kinds
+
+
+def exported(descriptor: nn.Module, batch: SignatureBatch) -> nn.Module:
+    """The program of `OfTensors` that `torch.export` makes for any number of bodies and samples."""
+    given, some = tensors(batch), {0: torch.export.Dim.AUTO}
+    of_samples = {kind: {name: {**some, 1: torch.export.Dim.AUTO} for name in one} for kind, one in given[2].items()}
+    shapes = (some, some, of_samples)
+    program = torch.export.export(OfTensors(descriptor, batch), given, dynamic_shapes=shapes, strict=False)
+    return program.module()

@@ -4,28 +4,34 @@ from __future__ import annotations
 
 import pickle
 import re
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, reduce
 from operator import or_
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 from numpy.typing import NDArray
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import igps
+from batches import exported, tensors
 from igps.data.batch import Body, SignatureBatch
 from igps.data.collation import collate
 from igps.data.requirements import Requirements
 from igps.descriptors import NAMES, descriptor
 from igps.mesh.mesh import Mesh
-from igps.nn._kernels import pairs
-from igps.nn.descriptor import Descriptor, EmbeddedDescriptor
+from igps.nn._kernels import blocks, count_by_torch
+from igps.nn.descriptor import BodyDescriptor, Descriptor, EmbeddedDescriptor
 from igps.retrieval import cosine
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 
 ROTATION = trimesh.transformations.euler_matrix(0.4, 1.1, -0.7)[:3, :3]
+ON_TENSORS = [name for name in NAMES if not isinstance(descriptor(name), BodyDescriptor)]
 CHANGES = [(name, change) for name in NAMES for change in descriptor(name).invariant_to]
 
 
@@ -133,7 +139,7 @@ def test_tensors_are_made_on_the_device_of_the_bodies(
 ) -> None:
     """Of the device "meta" are then those that are made without saying where: they have no numbers to go on with."""
     if not compiled:  # as on a GPU
-        monkeypatch.setattr(pairs, "_is_compiled", lambda *_: False)
+        monkeypatch.setattr(blocks, "in_loops", lambda _: False)
     found = with_individuals(name)
     with torch.inference_mode():
         expected = found(body("rod"))
@@ -142,6 +148,52 @@ def test_tensors_are_made_on_the_device_of_the_bodies(
             distances = found.distances(described, expected)
     torch.testing.assert_close(described, expected, rtol=0, atol=0)
     assert not distances.is_meta
+
+
+def fewer_samples(batch: SignatureBatch, n: int) -> SignatureBatch:
+    return replace(batch, interior=batch.interior.subset(n, seed=0), surface=batch.surface.subset(n, seed=0))
+
+
+class Counting(TorchDispatchMode):
+    """Counts the operations that reach a device, of which each that reads a number waits for it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.found[str(func)] += 1
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("name", ON_TENSORS)
+def test_a_batch_on_a_device_is_described_at_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With more bodies there are no more operations, and none that waits; each is described as on the CPU."""
+    found = descriptor(name)
+    pair = SignatureBatch.concatenate([fewer_samples(body("rod"), 200), fewer_samples(body("other"), 150)])
+    with torch.inference_mode():
+        expected = torch.cat([found(pair[:1]), found(pair[1:])] * 3)
+    monkeypatch.setattr(blocks, "in_loops", lambda _: False)
+    for module, block in ((blocks, "BLOCK"), (count_by_torch, "_BLOCK")):  # all fit
+        monkeypatch.setattr(module, block, 2**40)
+    counts = []
+    for n in (2, 3):
+        several = SignatureBatch.concatenate([pair] * n)
+        with torch.inference_mode(), Counting() as counting:
+            together = found(several)
+        counts.append(counting.found)
+    assert counts[0] == counts[1]
+    torch.testing.assert_close(together, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("name", ON_TENSORS)
+def test_any_number_of_bodies_goes_through_an_exported_program(name: str) -> None:
+    rod, other = (body(kind) for kind in ("rod", "other"))
+    found, several = descriptor(name), SignatureBatch.concatenate([other, rod, other, body("pose")])
+    with torch.no_grad():
+        program = exported(found, SignatureBatch.concatenate([rod, other]))
+        for batch in (several, other):
+            torch.testing.assert_close(program(*tensors(batch)), found(batch), rtol=0, atol=1e-6)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -159,8 +211,8 @@ def test_cuda_describes_as_the_cpu_does(name: str) -> None:
     torch.testing.assert_close(found_distances.cpu(), distances, rtol=1e-3, atol=1e-4 * float(distances.max()))
 
 
-@pytest.mark.parametrize("name", ["gps", "multiscale", "rich", "rich+"])
-def test_descriptors_of_histograms_are_traced_whole(name: str) -> None:
+@pytest.mark.parametrize("name", ["gps", "multiscale", "rich", "rich+", "pretrained", "pretrained+"])
+def test_descriptors_are_traced_whole(name: str) -> None:
     found = with_individuals(name)
     torch.compiler.reset()
     with torch.inference_mode():

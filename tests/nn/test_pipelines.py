@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 import igps.nn.functional as functional
-from batches import alone, two_bodies
+from batches import OfTensors, alone, exported, tensors, two_bodies
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.nn._kernels import count_by_torch
 from igps.nn.axes import (
@@ -107,30 +107,6 @@ def test_what_is_compiled_for_some_numbers_of_bodies_serves_all(name: str) -> No
     assert len(programs) == 2  # the second time with any number
 
 
-class OfTensors(nn.Module):
-    """A descriptor of the tensors of a padded batch, as a program in another language would call it."""
-
-    def __init__(self, descriptor: nn.Module, like: SignatureBatch) -> None:
-        super().__init__()
-        self.descriptor, self.like = descriptor, like
-
-    def forward(self, eigenvalues: Tensor, area: Tensor, kinds: dict[str, dict[str, Tensor]]) -> Tensor:
-        samples = {
-            kind: SampleBatch(one["points"], one["eigenfunctions"], one["mask"], {
-                name: values for name, values in one.items() if name in ("depth", "surface_direction")})
-            for kind, one in kinds.items()
-        }  # fmt: skip
-        return self.descriptor(replace(self.like, eigenvalues=eigenvalues, area=area, **samples))
-
-
-def tensors(batch: SignatureBatch) -> tuple[Tensor, Tensor, dict[str, dict[str, Tensor]]]:
-    kinds = {
-        kind: {"points": one.points, "eigenfunctions": one.eigenfunctions, "mask": one.mask, **one.attributes}
-        for kind, one in (("interior", batch.interior), ("surface", batch.surface))
-    }
-    return batch.eigenvalues, batch.area, kinds
-
-
 def test_a_description_of_a_padded_batch_is_exported() -> None:
     descriptor = HistogramDescriptor([make() for make in MODULES.values()]).eval()
     batch = two_bodies()
@@ -142,18 +118,11 @@ def test_a_description_of_a_padded_batch_is_exported() -> None:
             torch.testing.assert_close(program(*tensors(one)), descriptor(one), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["hard", "learned", "in space"])
-def test_an_exported_program_takes_any_number_of_bodies_and_samples(name: str) -> None:
-    descriptor, batch = HistogramDescriptor(MODULES[name]()).eval(), two_bodies()
+def test_an_exported_program_takes_any_number_of_bodies_and_samples(module: DescriptionPart) -> None:
+    descriptor, batch = HistogramDescriptor(module).eval(), two_bodies()
     fewer = {kind: getattr(batch, kind).map(lambda one: one[:, :30]) for kind in ("interior", "surface")}
-    given = tensors(batch)
-    any_number = {0: torch.export.Dim.AUTO, 1: torch.export.Dim.AUTO}
-    of_samples = {kind: dict.fromkeys(one, any_number) for kind, one in given[2].items()}
-    bodies_alone = {0: torch.export.Dim.AUTO}
     with torch.no_grad():
-        program = torch.export.export(
-            OfTensors(descriptor, batch), given, dynamic_shapes=(bodies_alone, bodies_alone, of_samples), strict=False
-        ).module()
+        program = exported(descriptor, batch)
         for one in (batch, batch[:1], SignatureBatch.concatenate([batch, batch[1:]]), replace(batch, **fewer)):
             torch.testing.assert_close(program(*tensors(one)), descriptor(one), rtol=0, atol=1e-6)
 

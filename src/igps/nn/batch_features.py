@@ -6,6 +6,7 @@ from torch.nn import functional
 
 from igps.data.batch import SampleBatch, SignatureBatch
 from igps.nn._kernels.balls import ball_radii
+from igps.nn._kernels.blocks import of_bodies
 from igps.nn._kernels.nearest import smallest
 from igps.nn._precision import full_precision
 from igps.nn.embedding import barycentroid_potential
@@ -76,17 +77,14 @@ class SampleFeatures:
     def neighbours(self, embedding: nn.Module) -> Tensor:
         """(N, P, k) of each shape the other samples that are nearest to each in the embedding, see their function."""
         if embedding not in self._neighbours:
-            shapes = zip(self.embedded(embedding), self.samples.mask, strict=True)
-            self._neighbours[embedding] = torch.stack([nearest_neighbours(one, mask=real) for one, real in shapes])
+            self._neighbours[embedding] = of_bodies(_neighbours, self.embedded(embedding), self.samples.mask)
         return self._neighbours[embedding]
 
     def embedded_directions(self, embedding: nn.Module) -> Tensor:
         """(N, P, D) unit vectors from interior samples to the surface in the embedding, or out of it on the surface."""
         other, outward = (self.batch.surface, 1) if self.kind == "interior" else (self.batch.interior, -1)
         targets = embedding(other.eigenfunctions, self.batch.eigenvalues, self.batch.area)
-        coordinates = self.embedded(embedding)
-        shapes = zip(coordinates, targets, other.mask, strict=True)
-        return torch.stack([outward * nearest_directions(*one) for one in shapes])
+        return outward * of_bodies(nearest_directions, self.embedded(embedding), targets, other.mask)
 
 
 class BatchFeatures:
@@ -114,29 +112,35 @@ class BatchFeatures:
 
 
 def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest: int = _N_NEAREST) -> Tensor:
-    """(P, D) unit vectors from points to the mean of the nearest of targets (T, D), those of the mask alone.
+    """(..., P, D) unit vectors from points to the mean of the nearest of targets (..., T, D), of the mask alone.
 
     Zero where the mean is the point itself; of all targets where there are fewer.
     """
     with full_precision():
-        distances = torch.cdist(points.detach(), targets.detach().masked_fill(~mask[:, None], _FAR))
-    nearest, which = smallest(distances, min(n_nearest, len(targets)))
-    found = (nearest < _FAR).unsqueeze(2)
-    mean = torch.where(found, targets[which], 0).sum(dim=1) / found.sum(dim=1)
-    return functional.normalize(mean - points, dim=1)
+        distances = torch.cdist(points.detach(), targets.detach().masked_fill(~mask.unsqueeze(-1), _FAR))
+    nearest, which = smallest(distances, min(n_nearest, mask.shape[-1]))
+    found = (nearest < _FAR).unsqueeze(-1)
+    rows = which.flatten(-2).unsqueeze(-1).expand(*which.shape[:-2], -1, points.shape[-1])
+    taken = targets.gather(-2, rows).unflatten(-2, which.shape[-2:])
+    mean = torch.where(found, taken, 0).sum(dim=-2) / found.sum(dim=-2)
+    return functional.normalize(mean - points, dim=-1)
 
 
 def nearest_neighbours(points: Tensor, n_nearest: int = N_NEIGHBOURS, mask: Tensor | None = None) -> Tensor:
-    """(P, k) the others nearest to each of points (P, D), those of the mask alone if there is one, nearest first.
+    """(..., P, k) the others nearest to each of points (..., P, D), of the mask alone if there is one, nearest first.
 
     A point has itself for those that it lacks. A ValueError if there is no point.
     """
-    if not len(points):
+    if not (n_points := points.shape[-2]):
         raise ValueError("samples: expected at least one of each body, got none.")
     with full_precision():
         squares = torch.cdist(points.detach(), points.detach(), compute_mode="use_mm_for_euclid_dist")
-    squares.diagonal().fill_(torch.inf)
+    squares.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
     if mask is not None:
-        squares.masked_fill_(~mask, torch.inf)
-    nearest, which = smallest(squares, min(n_nearest, len(points) - 1))
-    return torch.where(nearest < torch.inf, which, torch.arange(len(points), device=points.device)[:, None])
+        squares.masked_fill_(~mask.unsqueeze(-2), torch.inf)
+    nearest, which = smallest(squares, min(n_nearest, n_points - 1))
+    return torch.where(nearest < torch.inf, which, torch.arange(n_points, device=points.device)[:, None])
+
+
+def _neighbours(points: Tensor, mask: Tensor) -> Tensor:
+    return nearest_neighbours(points, mask=mask)

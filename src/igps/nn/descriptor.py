@@ -21,6 +21,7 @@ from igps.data.batch import Body, SignatureBatch
 from igps.data.collation import collate
 from igps.data.requirements import Requirements
 from igps.mesh.mesh import Mesh
+from igps.nn._kernels import blocks
 from igps.nn.batch_features import BatchFeatures
 from igps.nn.heads.base import Head
 from igps.nn.histograms.base import DescriptionPart
@@ -115,8 +116,7 @@ class Descriptor(Specified, ABC):
         """(N, ...) descriptions of N shapes; a ValueError if the batch lacks what the descriptor needs."""
         self.requirements.check(batch)
         # On other devices nothing is gained, and what is traced runs later.
-        alone = batch.device.type == "cpu" and not torch.compiler.is_compiling()
-        with one_thread() if alone else contextlib.nullcontext():
+        with one_thread() if blocks.in_loops(batch.device) else contextlib.nullcontext():
             return self.describe(batch)
 
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:

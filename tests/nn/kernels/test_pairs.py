@@ -16,8 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from conftest import torch_threads
 from igps import _threads as threads
-from igps.nn._kernels import count_by_loops, count_by_torch
-from igps.nn._kernels import pairs as pair_module
+from igps.nn._kernels import blocks, count_by_loops, count_by_torch
 from igps.nn._kernels.pairs import class_pairs
 from igps.nn.axes import PairValues, euclidean_distances, oriented_pairs, pair_twists, point_pair_features
 from igps.nn.histograms import joint_histogram
@@ -35,7 +34,7 @@ BACK_ENDS = ["compiled", "torch", pytest.param("cuda", marks=pytest.mark.skipif(
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Where the points are; on the CPU by compiled loops or by operations of PyTorch."""
     if request.param == "torch":
-        monkeypatch.setattr(pair_module, "_is_compiled", lambda *_: False)
+        monkeypatch.setattr(blocks, "in_loops", lambda _: False)
     return "cuda" if request.param == "cuda" else "cpu"
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor, library, nn
 
 from igps._arrays import Integers
 from igps._compiled import compiled
@@ -20,26 +20,53 @@ class MergeTree(NamedTuple):
     pieces: Tensor  # (L, P) of each point the peak of the piece of the superlevel set it belongs to; −1 where below
 
 
-def merge_trees(features: SampleFeatures, embedding: nn.Module, levels: Sequence[float] = ()) -> list[MergeTree]:
+def merge_trees(features: SampleFeatures, embedding: nn.Module, levels: Sequence[float] = ()) -> tuple[Tensor, Tensor]:
     """The merge tree of log U of some samples of each body, U the barycentroid potential of an embedding.
 
-    Two samples are neighbours if one is among the nearest to the other in the embedding. Pieces are those of the
-    levels, shares of the samples of a body that are in them, ascending. All is on the CPU. A ValueError of values that
-    are not finite, or of a body without samples.
+    Two samples are neighbours if one is among the nearest to the other in the embedding. It is one operator to what
+    traces it. Its loops join points one after the other, on the CPU: of another device, all bodies go there at once.
+
+    Args:
+        features: of the samples.
+        embedding: of the potential and of the graph.
+        levels: shares of the samples of a body that are in its pieces, ascending.
+
+    Returns:
+        (N, P) of each peak where its branch ends, of all other points themselves, and (N, L, P) the pieces, see
+        `MergeTree`, on the device of the samples.
+
+    Raises:
+        ValueError: values that are not finite, or a body without samples.
     """
-    if torch.compiler.is_compiling():  # the loops are compiled already; as a decorator this would import the compiler
-        return torch.compiler.disable(_merge_trees)(features, embedding, levels)
-    return _merge_trees(features, embedding, levels)
+    potential = features.log_potential(embedding).detach()
+    found: tuple[Tensor, Tensor] = _operator(
+        potential, features.neighbours(embedding), features.samples.mask, list(levels)
+    )
+    return found
 
 
-def _merge_trees(features: SampleFeatures, embedding: nn.Module, levels: Sequence[float]) -> list[MergeTree]:
-    asked = features.log_potential(embedding).detach(), features.neighbours(embedding), features.samples.mask
-    trees = []
-    for values, neighbours, mask in zip(*(one.cpu() for one in asked), strict=True):
-        if not (n := int(mask.sum())):
+@library.custom_op(
+    "igps::merge_trees",
+    mutates_args=(),
+    schema="(Tensor values, Tensor neighbours, Tensor mask, float[] levels) -> (Tensor, Tensor)",
+)
+def _operator(values: Tensor, neighbours: Tensor, mask: Tensor, levels: list[float]) -> tuple[Tensor, Tensor]:
+    ends, pieces = _like(values, neighbours, mask, levels)
+    ends, pieces = ends.cpu(), pieces.cpu()
+    for i, (heights, near, real) in enumerate(zip(values.cpu(), neighbours.cpu(), mask.cpu(), strict=True)):
+        if not (n := int(real.sum())):
             raise ValueError("samples: expected at least one of each body, got none.")
-        trees.append(merge_tree(values, neighbours, [max(1, round(share * n)) for share in levels], mask))
-    return trees
+        tree = merge_tree(heights, near, [max(1, round(share * n)) for share in levels], real)
+        ends[i] = torch.arange(len(heights), device="cpu").scatter(0, tree.peaks, tree.saddles)
+        pieces[i] = tree.pieces
+    return ends.to(values.device), pieces.to(values.device)
+
+
+@_operator.register_fake
+def _like(values: Tensor, neighbours: Tensor, mask: Tensor, levels: list[float]) -> tuple[Tensor, Tensor]:
+    n_shapes, n_points = values.shape
+    whole = values.new_empty(n_shapes, n_points, dtype=torch.int64)
+    return whole, whole.new_empty(n_shapes, len(levels), n_points)
 
 
 def merge_tree(values: Tensor, neighbours: Tensor, counts: Sequence[int] = (), mask: Tensor | None = None) -> MergeTree:

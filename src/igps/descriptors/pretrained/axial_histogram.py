@@ -15,8 +15,6 @@ from igps.signature.signature import SampleKind
 _POWER = -4
 # Of places, in units of the root mean square distance from the centre
 _REACH = 2.2
-# The two other axes of each
-_OTHERS = torch.tensor([[1, 2], [0, 2], [0, 1]], device="cpu")
 
 
 class AxialHistogram(SampleHistogram):
@@ -82,7 +80,7 @@ class AxialHistogram(SampleHistogram):
                 features.weights_or_ones(potential),
             )
         )  # fmt: skip
-        if not torch.isfinite(points.sum() + directions.sum() + potential.sum()):
+        if not torch.compiler.is_compiling() and not torch.isfinite(points.sum() + directions.sum() + potential.sum()):
             raise ValueError("AxialHistogram: expected finite values, got NaN or infinity.")
         with torch.no_grad():
             weights = potential.double().clamp_min(torch.finfo().tiny).pow(_POWER) * mask
@@ -92,7 +90,7 @@ class AxialHistogram(SampleHistogram):
         places = places / (places.square().sum(dim=(1, 2)) / n_points).sqrt()[:, None, None]
         # (N, 3, P) along each axis, and (N, 3, P, 2) along the two others
         along, of_direction = places.mT, directions.mT
-        aside, of_aside = (one[:, :, _OTHERS].transpose(1, 2) for one in (places, directions))
+        aside, of_aside = (torch.stack([one.roll(n, 1) for n in (1, 2)], dim=3) for one in (along, of_direction))
         outward = (of_aside * normalize(aside, dim=3)).sum(dim=3)
         place = [soft_memberships(along, self.along), soft_memberships(aside.norm(dim=3), self.beside)]
         # towards the nearer end of the axis: so a body and its mirror image agree

@@ -3,10 +3,9 @@
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.nn.utils.rnn import pad_sequence
 
 from igps._parameters import check_at_least
-from igps.descriptors.pretrained._merge_tree import MergeTree, merge_tree, merge_trees
+from igps.descriptors.pretrained._merge_tree import merge_tree, merge_trees
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding
 from igps.nn.histograms.base import SampleHistogram
@@ -55,32 +54,24 @@ class BranchHistogram(SampleHistogram):
 
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, B) histograms of some samples of N shapes."""
-        trees, heights = merge_trees(features, self.embedding), features.log_potential(self.embedding)
-        peaks, saddles = (
-            pad_sequence(list(one), batch_first=True).to(heights.device)
-            for one in zip(*((tree.peaks, tree.saddles) for tree in trees), strict=True)
-        )
-        lengths, longest = (heights.gather(1, peaks) - heights.gather(1, saddles)).sort(dim=1, descending=True)
-        lengths = lengths[:, : self.n_branches]
+        (ends, _), mask = merge_trees(features, self.embedding), features.samples.mask
+        heights = features.log_potential(self.embedding).masked_fill(~mask, 0)
+        lengths, longest = (heights - heights.gather(1, ends)).sort(dim=1, descending=True)
+        lengths, longest = lengths[:, : self.n_branches], longest[:, : self.n_branches]
         total = lengths.sum(dim=1, keepdim=True)
         shares = lengths / torch.where(total > 0, total, 1)
         if (weights := features.weights()) is not None:
-            asked = longest[:, : self.n_branches], heights.detach(), features.neighbours(self.embedding)
-            of_bodies = zip(trees, *(one.cpu() for one in (*asked, features.samples.mask)), strict=True)
-            limbs = torch.stack([_limbs(*body) for body in of_bodies]).to(weights)
+            asked = ends, longest, heights.detach(), features.neighbours(self.embedding), mask
+            limbs = torch.stack([_limbs(*body) for body in zip(*(one.cpu() for one in asked), strict=True)]).to(weights)
             shares = shares * (limbs @ weights[:, :, None])[:, :, 0] / limbs.sum(dim=2).clamp_min(1)
         found = functional.pad(shares, (0, self.n_branches - shares.shape[1]))
         # A body that is the same everywhere has one branch, of no length.
-        return torch.where(total > 0, found, functional.one_hot(torch.zeros_like(peaks[:, 0]), self.n_branches))
+        return torch.where(total > 0, found, functional.pad(torch.ones_like(total), (0, self.n_branches - 1)))
 
 
-def _limbs(tree: MergeTree, longest: Tensor, heights: Tensor, neighbours: Tensor, mask: Tensor) -> Tensor:
+def _limbs(ends: Tensor, longest: Tensor, heights: Tensor, neighbours: Tensor, mask: Tensor) -> Tensor:
     """(B, P) the samples of each of the longest branches: those of its piece before it joins another."""
-    kept = longest[longest < len(tree.peaks)]
     order = heights.masked_fill(~mask, -torch.inf).argsort(descending=True, stable=True)
-    above = order.argsort()[tree.saddles[kept]].clamp_min(1)
+    above = order.argsort()[ends[longest]].clamp_min(1)
     levels, which = above.unique(return_inverse=True)
-    pieces = merge_tree(heights, neighbours, levels.tolist(), mask).pieces[which]
-    limbs = torch.zeros(len(longest), len(heights), dtype=torch.bool, device="cpu")
-    limbs[: len(kept)] = pieces == tree.peaks[kept][:, None]
-    return limbs
+    return merge_tree(heights, neighbours, levels.tolist(), mask).pieces[which] == longest[:, None]

@@ -73,29 +73,31 @@ class PieceHistogram(SampleHistogram):
     def of_samples(self, features: SampleFeatures) -> Tensor:
         """(N, L, ...) histograms of some samples of N shapes."""
         mask, points = features.samples.mask, features.positions()
-        if not torch.isfinite(points.masked_fill(~mask[:, :, None], 0)).all():
+        points, weights = points.masked_fill(~mask[:, :, None], 0), features.weights_or_ones(points[..., 0])
+        traced = torch.compiler.is_compiling()  # what is traced cannot look at numbers
+        if not traced and not torch.isfinite(points).all():
             raise ValueError("PieceHistogram: expected finite places, got NaN or infinity.")
-        trees = merge_trees(features, self.embedding, self.levels)
-        pieces = torch.stack([tree.pieces for tree in trees]).to(points.device)
-        left, weights = pieces >= 0, features.weights_or_ones(points[..., 0])
-        # Pieces of all levels of all bodies at once, those of each level side by side
-        n_shapes, n_levels, longest = left.shape
-        levels = torch.arange(n_shapes * n_levels, device=pieces.device).view(n_shapes, n_levels, 1)
-        found, piece, n_points = (pieces + longest * levels)[left].unique(return_inverse=True, return_counts=True)
-        points = points[:, None].expand(*left.shape, 3)[left]
-        weights = weights[:, None].expand_as(left)[left].to(points.dtype)
+        _, peaks = merge_trees(features, self.embedding, self.levels)
+        left, n_longest = peaks >= 0, mask.shape[1]
+        # Pieces of a level are numbered by their peaks, and samples that are not left count nowhere
+        numbers = (peaks == torch.arange(n_longest, device=peaks.device)).cumsum(dim=2) - 1
+        piece = numbers.gather(2, peaks.clamp_min(0)).masked_fill(~left, 0)
+        n_pieces = n_longest if traced else int(piece.max()) + 1
 
         def sums(values: Tensor) -> Tensor:
-            return values.new_zeros(len(found), *values.shape[1:]).index_add(0, piece, values)
+            """(N, L, pieces, k) of values (N, P, k) or (N, L, P, k) of the samples."""
+            of_left = torch.where(left[..., None], values if values.ndim == 4 else values[:, None], 0)
+            into = of_left.new_zeros(*left.shape[:2], n_pieces, values.shape[-1])
+            return into.scatter_add(2, piece[..., None].expand_as(of_left), of_left)
 
-        places = points - (sums(points) / n_points[:, None])[piece]
-        covariance = sums((places[:, :, None] * places[:, None, :]).flatten(1)) / n_points[:, None]
-        spread = torch.linalg.eigvalsh(covariance.view(-1, 3, 3))[:, -1]
-        level = found // longest
-        sizes = (n_points / mask.sum(dim=1)[level // n_levels]).to(points.dtype)
-        lengths = 12 * torch.where(n_points < _FEWEST, 0, spread) / sizes
+        n_points = sums(torch.ones_like(points[..., :1])).clamp_min(1)
+        means = sums(points) / n_points
+        places = points[:, None] - means.gather(2, piece[..., None].expand(*left.shape, 3))
+        covariance = sums((places[..., :, None] * places[..., None, :]).flatten(3)) / n_points
+        spread = torch.linalg.eigvalsh(covariance.unflatten(3, (3, 3)))[..., -1]
+        sizes = n_points[..., 0] / mask.sum(dim=1)[:, None, None]
+        lengths = 12 * torch.where(n_points[..., 0] < _FEWEST, 0, spread) / sizes
         lengths = lengths.clamp_min(torch.finfo(points.dtype).tiny).log2() / 2
-        of_sizes = soft_memberships(sizes.log2(), self.sizes) * sums(weights)[:, None]
-        cells = of_sizes[:, :, None] * soft_memberships(lengths, self.lengths)[:, None, :]
-        counts = cells.new_zeros(n_shapes * n_levels, *self.n_bins).index_add(0, level, cells)
-        return counts.view(n_shapes, *self.shape) / left.sum(dim=(1, 2))[:, None, None, None]
+        of_sizes = soft_memberships(sizes.log2(), self.sizes) * sums(weights[..., None].to(points.dtype))
+        counts = of_sizes.mT @ soft_memberships(lengths, self.lengths)
+        return counts / left.sum(dim=(1, 2))[:, None, None, None]

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from igps._arrays import Real, Singles
 from igps._compiled import compiled
+from igps.nn._kernels import blocks
 from igps.nn._precision import full_precision
 
 # Points that lie so nearly in the tangent plane, by the sine, tell of the sampled normal's error and not of a ball
@@ -43,8 +44,8 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
         if not (torch.isfinite(points[mask]).all() and torch.isfinite(directions[mask]).all()):
             raise ValueError("samples: expected finite points and directions, got NaN or infinity.")
     differentiable = torch.is_grad_enabled() and (points.requires_grad or directions.requires_grad)
-    if points.device.type != "cpu" or differentiable or torch.compiler.is_compiling():
-        found = torch.stack([_radii(*one) for one in zip(points, directions, mask, strict=True)])
+    if differentiable or not blocks.in_loops(points.device):
+        found = blocks.of_bodies(_radii, points, directions, mask)
     else:
         found = torch.ones_like(points[..., :2])
         for into, places, ways, real in zip(found, points, directions.to(points.dtype), mask, strict=True):
@@ -55,22 +56,22 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
 
 
 def _radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
-    """(P, 2) radii of one shape by operations of PyTorch, differentiable."""
+    """(N, P, 2) radii by operations of PyTorch, differentiable."""
     # In double precision: the nearest points decide, and of theirs products of matrices leave few digits.
     dtype = points.dtype
-    points, directions = (one.masked_fill(~mask[:, None], 0).double() for one in (points, directions))
+    points, directions = (one.masked_fill(~mask[:, :, None], 0).double() for one in (points, directions))
     with full_precision():
         squares = torch.cdist(points, points, compute_mode="use_mm_for_euclid_dist").square()
         # n·(x − y): how deep each point lies below the tangent plane of every other one
-        depth = (directions * points).sum(dim=1, keepdim=True) - directions @ points.T
-    none = ~mask | torch.eye(len(points), dtype=torch.bool, device=points.device)
+        depth = (directions * points).sum(dim=2, keepdim=True) - directions @ points.mT
+    none = ~mask[:, None, :] | torch.eye(mask.shape[1], dtype=torch.bool, device=points.device)
     flat = squares.sqrt() * _TANGENTIAL
     sides = []
     for height in (depth, -depth):
         counts = (height > flat) & ~none
         radii = torch.where(counts, squares / torch.where(counts, 2 * height, 1), torch.inf)
-        sides.append(radii.topk(_RANK, dim=1, largest=False).values[:, -1])
-    return torch.stack(sides, dim=1).to(dtype)
+        sides.append(radii.topk(_RANK, dim=2, largest=False).values[..., -1])
+    return torch.stack(sides, dim=2).to(dtype)
 
 
 def _array(vectors: Tensor) -> Singles:

@@ -8,12 +8,11 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from igps.nn._kernels.blocks import BLOCK as _BLOCK
 from igps.nn._kernels.located import located
 from igps.nn._kernels.pair_values import PairValues, centres_of, with_tensors
 from igps.nn._precision import full_precision
 
-# Numbers of a block, which fill a device
-_BLOCK = 2**25
 # Shapes side by side have so many points at least, as a share of the most: each pays for as many as the largest
 _ALIKE = 0.8
 

@@ -7,22 +7,25 @@ from torch import Tensor
 
 from igps._arrays import Integers, Real
 from igps._compiled import compiled
+from igps.nn._kernels import blocks
 
 
 def smallest(values: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """The n smallest entries of each row of (P, T), the smallest first: (P, n) values and their columns.
+    """The n smallest entries of each row of (..., P, T), the smallest first: (..., P, n) values and their columns.
 
     No gradient flows through them. The columns of infinite entries say nothing.
     """
     values = values.detach()
-    if values.device.type != "cpu" or torch.compiler.is_compiling():
-        found = values.topk(n, dim=1, largest=False)
+    if not blocks.in_loops(values.device):
+        found = values.topk(n, dim=-1, largest=False)
         return found.values, found.indices
     # PyTorch copies and partly sorts each row, which takes some times as long as to keep the few smallest of it.
-    kept, columns = np.full((len(values), n), np.inf, values.numpy().dtype), np.zeros((len(values), n), np.int64)
+    rows = values.contiguous().numpy().reshape(-1, values.shape[-1])
+    kept, columns = np.full((len(rows), n), np.inf, rows.dtype), np.zeros((len(rows), n), np.int64)
     if n:
-        keep_smallest(values.contiguous().numpy(), kept, columns)
-    return torch.from_numpy(kept), torch.from_numpy(columns)
+        keep_smallest(rows, kept, columns)
+    shape = (*values.shape[:-1], n)
+    return torch.from_numpy(kept.reshape(shape)), torch.from_numpy(columns.reshape(shape))
 
 
 @compiled()

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, library
 
+from igps.nn._kernels import blocks
 from igps.nn._kernels.count_by_loops import CompiledCount, Layout
 from igps.nn._kernels.count_by_torch import count_by_torch
 from igps.nn._kernels.pair_cells import VALUES
@@ -61,7 +62,7 @@ def count_pairs(classes: Tensor, weights: Tensor, n_classes: int, pairs: Sequenc
 
 def _count(classes: Tensor, n_classes: int, pairs: Sequence[PairValues], mask: Tensor, tensors: list[Tensor]) -> Tensor:
     """(N, C(C+1)/2, B, ...) float64 counts, by the back end that is there for the tensors."""
-    if _is_compiled(tensors[0].dtype, classes.device):
+    if blocks.in_loops(classes.device) and tensors[0].dtype in (torch.float32, torch.float64):
         counts: Tensor = CompiledCount.apply(Layout(classes, n_classes, tuple(pairs), mask), *tensors)
         return counts
     return count_by_torch(classes, n_classes, pairs, mask, *tensors)
@@ -122,11 +123,6 @@ def _backward(ctx: Any, upstream: Tensor) -> tuple[None, None, None, None, list[
 
 
 _operator.register_autograd(_backward, setup_context=_keep)
-
-
-def _is_compiled(dtype: torch.dtype, device: torch.device) -> bool:
-    """Whether compiled loops count points of a type on a device."""
-    return device.type == "cpu" and dtype in (torch.float32, torch.float64) and not torch.compiler.is_compiling()
 
 
 def check_pairs(pairs: Sequence[PairValues], mask: Tensor) -> None:

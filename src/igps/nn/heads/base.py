@@ -61,6 +61,12 @@ class Head(Specified, ABC):
             if stored is not None and stored.shape != buffer.shape and stored.ndim == buffer.ndim:
                 setattr(self, name, buffer.new_zeros(stored.shape))
         super()._load_from_state_dict(state_dict, prefix, *arguments)
+        self._note_parts()
+
+    def _note_parts(self) -> None:
+        """Keep as numbers what buffers say of shapes: on a device to read them waits, and what is traced cannot."""
+        cells = dict(self.named_buffers(recurse=False)).get("part_cells")
+        self._cells: list[int] = [] if cells is None else cells.tolist()  # a list: no part of a fingerprint
 
     def _not_fitted(self) -> RuntimeError:
         return RuntimeError(f"{type(self).__name__}: expected to be fitted first. Call fit(descriptions, labels).")
@@ -69,7 +75,7 @@ class Head(Specified, ABC):
 def square_roots(histograms: Tensor) -> Tensor:
     """(N, cells) roots of the cells of histograms (N, ...), with a finite gradient; a ValueError of one below zero."""
     cells = histograms.flatten(1)
-    if bool((cells < 0).any()):
+    if not torch.compiler.is_compiling() and bool((cells < 0).any()):
         raise ValueError("descriptions: expected histograms, entries ≥ 0, got a negative one.")
     return square_root(cells)
 
