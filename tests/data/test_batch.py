@@ -337,6 +337,19 @@ def test_a_worker_does_not_gather_memory(signatures: list[Signature]) -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_numbers_of_samples_take_another_type_and_all_others_stay(signatures: list[Signature]) -> None:
+    batch = collate(signatures)
+    other = batch.to(torch.float16)
+    for one, before in ((other.interior, batch.interior), (other.surface, batch.surface)):
+        assert torch.equal(one.points, before.points.half())
+        assert torch.equal(one.eigenfunctions, before.eigenfunctions.half())
+        assert all(values.dtype == torch.float16 for values in one.attributes.values())
+        assert torch.equal(one.mask, before.mask)
+    for name in ("eigenvalues", "area", "volume", "labels"):
+        assert torch.equal(getattr(other, name), getattr(batch, name))
+        assert getattr(other, name).dtype == getattr(batch, name).dtype
+
+
 def test_batches_go_to_a_device_and_bodies_come_back(signatures: list[Signature]) -> None:
     (pinned,) = DataLoader(Several(signatures), batch_size=3, num_workers=1, collate_fn=collate, pin_memory=True)
     assert pinned.interior.points.is_pinned()

@@ -132,6 +132,18 @@ def with_individuals(name: str) -> Descriptor:
     return descriptor(name.strip("+"), **{"size": "keep", "mirror": "distinct"} if name.endswith("+") else {})
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("name", ON_TENSORS)
+def test_half_precision_describes_nearly_the_same(name: str, dtype: torch.dtype) -> None:
+    """Of the module, and of the samples; what is rounded to 3 or 2 digits falls into other cells now and then."""
+    expected = description(name, "rod").flatten().float()
+    with torch.inference_mode():
+        halved = descriptor(name).to(dtype)(body("rod"))
+        of_half = descriptor(name)(body("rod").to(dtype))
+    for found in (halved, of_half):
+        assert float(torch.cosine_similarity(found.flatten().float(), expected, dim=0)) > 0.98
+
+
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("name", [*NAMES, "rich+", "pretrained+"])
 def test_tensors_are_made_on_the_device_of_the_bodies(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from torch import nn
@@ -50,6 +52,14 @@ def test_one_call_builds_a_classifier() -> None:
     assert model.eval()(two_bodies()).shape == (2, 2)
     with pytest.raises(ValueError, match="n_classes: expected at least 2, got 1"):
         Classifier(learnable(), 1)
+
+
+def test_a_classifier_is_as_precise_as_its_layers() -> None:
+    model, batch = Classifier(learnable(), 2).eval(), two_bodies()
+    expected = model(batch).double()
+    double = copy.deepcopy(model).double()(batch.to(torch.float64))
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(double, expected, rtol=0, atol=1e-4)
 
 
 def test_a_fixed_descriptor_leaves_only_the_layer_to_train() -> None:

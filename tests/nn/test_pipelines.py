@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 import igps.nn.functional as functional
 from batches import OfTensors, alone, exported, tensors, two_bodies
-from igps.data.batch import SampleBatch, SignatureBatch
+from igps.data.batch import SignatureBatch
 from igps.nn._kernels import count_by_torch
 from igps.nn.axes import (
     Attribute,
@@ -127,27 +127,34 @@ def test_an_exported_program_takes_any_number_of_bodies_and_samples(module: Desc
             torch.testing.assert_close(program(*tensors(one)), descriptor(one), rtol=0, atol=1e-6)
 
 
-def doubled(batch: SignatureBatch) -> SignatureBatch:
-    def samples(one: SampleBatch) -> SampleBatch:
-        attributes = {name: values.double() for name, values in one.attributes.items()}
-        return replace(
-            one, points=one.points.double(), eigenfunctions=one.eigenfunctions.double(), attributes=attributes
-        )
-
-    return replace(batch, interior=samples(batch.interior), surface=samples(batch.surface))
-
-
 def test_double_precision_stays_double(module: DescriptionPart) -> None:
     single = module(two_bodies()).detach()
-    result = module.double()(doubled(two_bodies()))
+    result = module.double()(two_bodies().to(torch.float64))
     assert result.dtype == torch.float64
     torch.testing.assert_close(result.detach(), single.double(), rtol=0, atol=1e-5)
     torch.testing.assert_close(result.flatten(1).sum(dim=1).detach(), torch.ones(2).double(), rtol=0, atol=1e-12)
 
 
+def test_transforms_of_functions_follow_a_histogram(module: DescriptionPart) -> None:
+    """`torch.func.grad` gives what a backward pass gives, and `jvp` what it says of a direction."""
+    batch = two_bodies().to(torch.float64)
+    module = module.double().eval()
+    upstream = torch.randn(2, *module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    def loss(area: Tensor) -> Tensor:
+        return (module(replace(batch, area=area)) * upstream).sum()
+
+    area = batch.area.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(loss(area) + 0 * area.sum(), area)
+    torch.testing.assert_close(torch.func.grad(loss)(batch.area), expected)
+    if not any(isinstance(one, EmbeddedPairCosines | BallRadius) for one in module.modules()):  # no PyTorch has more
+        along = torch.func.jvp(loss, (batch.area,), (torch.tensor([1.0, -2.0]).double(),))[1]
+        torch.testing.assert_close(along, expected @ torch.tensor([1.0, -2.0]).double())
+
+
 def test_gradients_by_positions_and_by_eigenvalues_are_those_of_finite_differences(module: DescriptionPart) -> None:
     """Of padding there is none: neither of samples nor of eigenvalues, which are infinite there."""
-    batch, module = doubled(two_bodies()), module.double()
+    batch, module = two_bodies().to(torch.float64), module.double()
     interior, surface = (one.points.clone().requires_grad_() for one in (batch.interior, batch.surface))
     eigenvalues = batch.eigenvalues.clone().requires_grad_()
     upstream = torch.randn(2, *module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -183,7 +190,7 @@ def test_padding_leaves_second_derivatives_as_they_are(module: DescriptionPart) 
     """Of a body whose samples and eigenvalues are padded, and of the same body alone."""
     if any(isinstance(one, EmbeddedPairCosines) for one in module.modules()):
         pytest.skip("first derivatives only: between points of many coordinates PyTorch has no others")
-    batch, module = doubled(two_bodies()), module.double()
+    batch, module = two_bodies().to(torch.float64), module.double()
     upstream = torch.randn(module.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     found = []
     for one, row in ((batch, 1), (alone(batch, 1), 0)):

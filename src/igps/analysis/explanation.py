@@ -180,12 +180,12 @@ def _of_the_whole(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
 def _doubled(batch: SignatureBatch) -> SignatureBatch:
     """In double precision, and with weights of the samples that have a gradient."""
 
-    def doubled(samples: SampleBatch) -> SampleBatch:
-        samples = samples.map(lambda values: values.double() if values.is_floating_point() else values)
+    def weighted(samples: SampleBatch) -> SampleBatch:
         weights = torch.ones_like(samples.points[..., 0]).requires_grad_()
         return replace(samples, attributes={**samples.attributes, WEIGHT: weights})
 
-    return replace(batch, interior=doubled(batch.interior), surface=doubled(batch.surface))
+    batch = batch.to(torch.float64)
+    return replace(batch, interior=weighted(batch.interior), surface=weighted(batch.surface))
 
 
 def _shared(

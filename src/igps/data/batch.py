@@ -44,8 +44,10 @@ class SampleBatch:
         attributes = {name: function(values) for name, values in self.attributes.items()}
         return SampleBatch(function(self.points), function(self.eigenfunctions), function(self.mask), attributes)
 
-    def to(self, device: torch.device | str, non_blocking: bool = False) -> SampleBatch:
-        """The same batch on another device; see `torch.Tensor.to`."""
+    def to(self, device: torch.device | str | torch.dtype, non_blocking: bool = False) -> SampleBatch:
+        """The same batch on another device, or with numbers of another type; see `torch.Tensor.to`."""
+        if isinstance(device, torch.dtype):
+            return self.map(lambda values: values.to(device) if values.is_floating_point() else values)
         return self.map(lambda values: values.to(device, non_blocking=non_blocking))
 
     def subset(self, n_samples: int, seed: int | None = None) -> SampleBatch:
@@ -186,8 +188,13 @@ class SignatureBatch:
             labels=function(self.labels),
         )
 
-    def to(self, device: torch.device | str, non_blocking: bool = False) -> SignatureBatch:
-        """The same batch on another device, see `torch.Tensor.to`; meshes stay where they are."""
+    def to(self, device: torch.device | str | torch.dtype, non_blocking: bool = False) -> SignatureBatch:
+        """The same batch on another device, see `torch.Tensor.to`, where meshes stay; or samples of another type.
+
+        Eigenvalues, area and volume stay in double precision.
+        """
+        if isinstance(device, torch.dtype):
+            return replace(self, interior=self.interior.to(device), surface=self.surface.to(device))
         return self.map(lambda values: values.to(device, non_blocking=non_blocking))
 
     def pin_memory(self) -> SignatureBatch:

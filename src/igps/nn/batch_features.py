@@ -42,7 +42,8 @@ class SampleFeatures:
 
     def positions(self) -> Tensor:
         """(N, P, 3) of the samples in units of √area."""
-        return self.samples.points / self.batch.area.sqrt().to(self.samples.points.dtype)[:, None, None]
+        points = _single(self.samples.points)
+        return points / self.batch.area.sqrt().to(points.dtype)[:, None, None]
 
     def attribute(self, name: str) -> Tensor:
         """(N, P) or (N, P, 3) of the samples; a ValueError if they have no such attribute."""
@@ -52,7 +53,7 @@ class SampleFeatures:
                 f"{sorted(self.samples.attributes)}. Name it in SignatureConfig(attributes=...), or give its function "
                 "to SignatureDataset(attributes=...)."
             )
-        return self.samples.attributes[name]
+        return _single(self.samples.attributes[name])
 
     def weights(self) -> Tensor | None:
         """(N, P) how much each sample counts, None where all count alike; derivatives by them tell shares."""
@@ -109,6 +110,11 @@ class BatchFeatures:
                 samples = samples.subset(n_wanted, seed=None if drawn else 0)
             self._features[key] = SampleFeatures(self.batch, kind, samples)
         return self._features[key]
+
+
+def _single(values: Tensor) -> Tensor:
+    """In single precision at least: few operations take less."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
 def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest: int = _N_NEAREST) -> Tensor:

@@ -36,5 +36,6 @@ class Classifier(nn.Module):
 
     def forward(self, batch: SignatureBatch) -> Tensor:
         """(N, n_classes) logits of N shapes."""
-        logits: Tensor = self.layers(square_root(self.descriptor(batch).flatten(1).float()))
+        cells = self.descriptor(batch).flatten(1).to(next(self.layers.parameters()).dtype)
+        logits: Tensor = self.layers(square_root(cells))
         return logits

@@ -38,6 +38,8 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
     Raises:
         ValueError: fewer than three points of a shape, or values that are not finite.
     """
+    dtype = torch.promote_types(points.dtype, torch.float32)
+    points, directions = points.to(dtype), directions.to(dtype)
     if not torch.compiler.is_compiling():
         if (fewest := int(mask.sum(dim=1).min())) < _RANK:
             raise ValueError(f"samples: expected at least {_RANK} of each body, which tell its balls, got {fewest}.")
@@ -48,7 +50,7 @@ def ball_radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
         found = blocks.of_bodies(_radii, points, directions, mask)
     else:
         found = torch.ones_like(points[..., :2])
-        for into, places, ways, real in zip(found, points, directions.to(points.dtype), mask, strict=True):
+        for into, places, ways, real in zip(found, points, directions, mask, strict=True):
             bent = np.zeros((int(real.sum()), 2), into.numpy().dtype)
             bends(_array(places[real]), _array(ways[real]), _TANGENTIAL, bent)
             into[real] = 1 / torch.from_numpy(bent)

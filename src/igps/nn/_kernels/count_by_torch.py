@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from igps.nn._kernels.blocks import BLOCK as _BLOCK
+from igps.nn._kernels.blocks import in_transforms
 from igps.nn._kernels.located import located
 from igps.nn._kernels.pair_values import PairValues, centres_of, with_tensors
 from igps.nn._precision import full_precision
@@ -54,7 +55,7 @@ def _count_together(
     for first in firsts:
         task = partial(_count_rows, first, first + n_rows, classes, n_classes, bins, pairs)
         # What the gradient needs of the pairs is many times what it needs of the points: computed again.
-        differentiable = torch.is_grad_enabled()
+        differentiable = torch.is_grad_enabled() and not in_transforms()
         total = total + (
             checkpoint(task, weights, *tensors, use_reentrant=False) if differentiable else task(weights, *tensors)
         )

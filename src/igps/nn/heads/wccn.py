@@ -139,7 +139,8 @@ class WCCNHead(Head):
     def _by_part(self, seen: Tensor) -> list[tuple[Tensor, Tensor]]:
         """(N, cells) centred, and the (n_directions, cells) directions, of each part in `_seen` roots."""
         sizes = self._sizes()
-        return list(zip((seen - self.mean).split(sizes, dim=1), self.directions.split(sizes, dim=1), strict=True))
+        centred = seen - self.mean
+        return list(zip(centred.split(sizes, 1), self.directions.to(centred.dtype).split(sizes, 1), strict=True))
 
     def _seen(self, roots: Tensor) -> Tensor:
         """(N, cells) of the parts that it looks at."""
