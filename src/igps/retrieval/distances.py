@@ -135,8 +135,8 @@ def _all_at_once(a: Tensor, b: Tensor, w: Tensor | None) -> Tensor:
 
 
 def _is_for_loops(tensor: Tensor) -> bool:
-    """Whether compiled loops can read it: those of a device compute by PyTorch's tiles."""
-    return tensor.device.type == "cpu"
+    """Whether compiled loops can read it: those of a device, and what is traced, compute by PyTorch's tiles."""
+    return tensor.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
 def _by_loops(loop: Callable[[np.ndarray, np.ndarray, np.ndarray], None], a: Tensor, b: Tensor) -> Tensor:
@@ -200,11 +200,12 @@ def square_root(values: Tensor) -> Tensor:
 def _unit(name: str, rows: Tensor) -> Tensor:
     lengths = torch.linalg.vector_norm(rows, dim=1, keepdim=True)
     limits = torch.finfo(rows.dtype)
-    if bool(((lengths > limits.tiny**0.25) & (lengths < limits.max**0.25)).all()):
+    traced = torch.compiler.is_compiling()  # what is traced cannot look at numbers
+    if not traced and bool(((lengths > limits.tiny**0.25) & (lengths < limits.max**0.25)).all()):
         return rows / lengths
     # By the largest entry first: the sum of squares of tiny or huge entries leaves the range of the dtype.
     largest = rows.detach().abs().amax(dim=1, keepdim=True)
-    empty = (largest == 0).sum().item()
+    empty = 0 if traced else (largest == 0).sum().item()
     if empty:
         raise ValueError(
             f"{name}: expected descriptors of non-zero length, {empty} of {len(rows)} are all zeros and have no "
@@ -259,7 +260,7 @@ def _cell_weights(weights: Tensor, cells: torch.Size, rows: Tensor) -> Tensor:
 def _check_entries(name: str, tensor: Tensor, *, non_negative: bool) -> None:
     if not tensor.is_floating_point():
         raise ValueError(f"{name}: expected a real floating dtype, got {tensor.dtype}; convert with .float()")
-    if tensor.numel() == 0:
+    if torch.compiler.is_compiling() or tensor.numel() == 0:
         return
     low, high = torch.stack(torch.aminmax(tensor.detach())).tolist()  # both are NaN if any entry is
     if not (math.isfinite(low) and math.isfinite(high)):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from itertools import combinations
 from statistics import fmean, pvariance
 
@@ -13,7 +14,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from igps.nn.heads.base import Head
+from igps.nn.heads.classifier import ClassifierHead
 from igps.nn.heads.closed_form import KernelHead, WhitenedHead
+from igps.nn.heads.two_level import TwoLevelHead
+from igps.nn.heads.wccn import WCCNHead
 from igps.retrieval import cosine, retrieval_scores
 from igps.retrieval.distances import euclidean
 
@@ -388,3 +392,23 @@ def test_one_shape_of_each_class_is_centred_alone(collection: tuple[Tensor, Tens
     centred = WhitenedHead().centre(histograms[::6])
     torch.testing.assert_close(head.whitened(histograms), centred(histograms), rtol=0, atol=0)
     assert (head.predict(histograms[::6]) == labels[::6]).all()
+
+
+def fitted_heads(collection: tuple[Tensor, Tensor]) -> list[Head]:
+    """All heads that are fitted in closed form, by themselves and with a prior."""
+    prior = TwoLevelHead(WCCNHead([0]), [WCCNHead([1], lengths=True)], individual_head=WCCNHead(lengths=True))
+    prior.fit(*collection, [20, 40]).fit_individuals(*collection, [20, 40])
+    priors = (None, prior)
+    made = [head(prior=one) for head in (WhitenedHead, KernelHead, ClassifierHead) for one in priors]
+    return [prior, *(head.fit(*collection, [20, 40]) for head in made)]
+
+
+def test_fitted_heads_are_traced_whole_and_take_half_precision(collection: tuple[Tensor, Tensor]) -> None:
+    histograms = collection[0]
+    for head in fitted_heads(collection):
+        expected = head(histograms)
+        torch.compiler.reset()
+        traced = torch.compile(head, backend="aot_eager", fullgraph=True)
+        torch.testing.assert_close(traced(histograms), expected, rtol=0, atol=1e-5)
+        halved = deepcopy(head).half()(histograms)
+        assert float(torch.cosine_similarity(halved.float(), expected).min()) > 0.99

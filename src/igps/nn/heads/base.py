@@ -147,4 +147,5 @@ def within_class_whitening(residuals: Tensor, rank: int, shrinkage: float, n: in
 
 def damped(rows: Tensor, directions: Tensor, gains: Tensor) -> Tensor:
     """(N, D) rows with what they have of each direction (k, D), orthonormal, times its gain (k,)."""
+    directions = directions.to(rows.dtype)  # those of a head in half precision
     return rows - ((rows @ directions.T) * (1 - gains)) @ directions

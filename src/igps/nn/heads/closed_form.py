@@ -234,7 +234,8 @@ class KernelHead(Head):
         """(N, ...) histograms to (N, n_classes), about 1 for the class that a shape is of and 0 for others."""
         if not len(self.anchors):
             raise self._not_fitted()
-        return self._kernel(self._vectors(descriptions)) @ self.coefficients
+        kernel = self._kernel(self._vectors(descriptions))
+        return kernel @ self.coefficients.to(kernel.dtype)
 
     def predict(self, descriptions: Tensor) -> Tensor:
         """(N, ...) histograms to (N,) classes, as they were named in `fit`."""
@@ -251,7 +252,7 @@ class KernelHead(Head):
 
     def _kernel(self, vectors: Tensor) -> Tensor:
         kernels = (-self._distances(vectors) / self.medians[:, None, None]).exp()
-        return torch.einsum("k,kij->ij", self.shares, kernels)
+        return torch.einsum("k,kij->ij", self.shares.to(kernels.dtype), kernels)
 
     def _vectors(self, descriptions: Tensor) -> Tensor:
         """Unit vectors of the parts and of the prior, side by side."""
@@ -260,8 +261,8 @@ class KernelHead(Head):
 
     def _distances(self, vectors: Tensor) -> Tensor:
         """(kernels, N, n_shapes) distances to the training shapes: cosine's of the parts, and the prior's own."""
-        sizes = self.whitened._cells
-        split = [one.split([*sizes, one.shape[1] - sum(sizes)], dim=1) for one in (vectors, self.anchors)]
+        sizes, both = self.whitened._cells, (vectors, self.anchors.to(vectors.dtype))
+        split = [one.split([*sizes, one.shape[1] - sum(sizes)], dim=1) for one in both]
         found = [1 - one @ other.T for one, other in list(zip(*split, strict=True))[: len(sizes)]]
         if self.prior is not None:
             found.append(self.prior.distances(split[0][-1], split[1][-1]))
