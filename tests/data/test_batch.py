@@ -336,7 +336,6 @@ def test_a_worker_does_not_gather_memory(signatures: list[Signature]) -> None:
     assert max(n_blocks for _, n_blocks in loader) <= 5
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_numbers_of_samples_take_another_type_and_all_others_stay(signatures: list[Signature]) -> None:
     batch = collate(signatures)
     other = batch.to(torch.float16)
@@ -350,6 +349,7 @@ def test_numbers_of_samples_take_another_type_and_all_others_stay(signatures: li
         assert getattr(other, name).dtype == getattr(batch, name).dtype
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_batches_go_to_a_device_and_bodies_come_back(signatures: list[Signature]) -> None:
     (pinned,) = DataLoader(Several(signatures), batch_size=3, num_workers=1, collate_fn=collate, pin_memory=True)
     assert pinned.interior.points.is_pinned()

@@ -78,7 +78,8 @@ class SampleFeatures:
     def neighbours(self, embedding: nn.Module) -> Tensor:
         """(N, P, k) of each shape the other samples that are nearest to each in the embedding, see their function."""
         if embedding not in self._neighbours:
-            self._neighbours[embedding] = of_bodies(_neighbours, self.embedded(embedding), self.samples.mask)
+            asked = self.embedded(embedding), self.samples.mask
+            self._neighbours[embedding] = of_bodies(lambda one, real: nearest_neighbours(one, mask=real), *asked)
         return self._neighbours[embedding]
 
     def embedded_directions(self, embedding: nn.Module) -> Tensor:
@@ -146,7 +147,3 @@ def nearest_neighbours(points: Tensor, n_nearest: int = N_NEIGHBOURS, mask: Tens
         squares.masked_fill_(~mask.unsqueeze(-2), torch.inf)
     nearest, which = smallest(squares, min(n_nearest, n_points - 1))
     return torch.where(nearest < torch.inf, which, torch.arange(n_points, device=points.device)[:, None])
-
-
-def _neighbours(points: Tensor, mask: Tensor) -> Tensor:
-    return nearest_neighbours(points, mask=mask)

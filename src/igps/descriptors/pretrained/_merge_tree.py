@@ -26,22 +26,12 @@ def merge_trees(features: SampleFeatures, embedding: nn.Module, levels: Sequence
     Two samples are neighbours if one is among the nearest to the other in the embedding. It is one operator to what
     traces it. Its loops join points one after the other, on the CPU: of another device, all bodies go there at once.
 
-    Args:
-        features: of the samples.
-        embedding: of the potential and of the graph.
-        levels: shares of the samples of a body that are in its pieces, ascending.
-
-    Returns:
-        (N, P) of each peak where its branch ends, of all other points themselves, and (N, L, P) the pieces, see
-        `MergeTree`, on the device of the samples.
-
-    Raises:
-        ValueError: values that are not finite, or a body without samples.
+    Found are (N, P) of each peak where its branch ends, of all other points themselves, and (N, L, P) the pieces of the
+    levels, shares of the samples of a body, ascending; see `MergeTree`. A ValueError of values that are not finite, or
+    of a body without samples.
     """
-    potential = features.log_potential(embedding).detach()
-    found: tuple[Tensor, Tensor] = _operator(
-        potential, features.neighbours(embedding), features.samples.mask, list(levels)
-    )
+    values, neighbours = features.log_potential(embedding).detach(), features.neighbours(embedding)
+    found: tuple[Tensor, Tensor] = _operator(values, neighbours, features.samples.mask, list(levels))
     return found
 
 
