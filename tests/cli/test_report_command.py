@@ -177,3 +177,20 @@ def test_columns_of_the_labels_reach_the_page(root: Path, tmp_path: Path, monkey
     (root / "labels.csv").write_text("\n".join(["file,label,age", *rows]))
     igps(monkeypatch, "retrieve", root, "--descriptor", INTERIOR, *options(tmp_path / "out", "--report"))
     assert data_of(tmp_path / "out" / "report.html")["columns"] == {"age": ["0", "1", "2", "3"]}
+
+
+def test_bodies_named_by_a_table_elsewhere_have_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nibabel = pytest.importorskip("nibabel")
+    labels = np.zeros((24, 16, 16), np.uint8)
+    labels[2:8, 3:12, 3:12], labels[11:22, 5:9, 5:9] = 1, 2
+    for subject in range(2):
+        (tmp_path / "scans").mkdir(exist_ok=True)
+        nibabel.save(nibabel.Nifti1Image(labels[subject:], np.eye(4)), tmp_path / "scans" / f"{subject}.nii.gz")
+    (tmp_path / "names.json").write_text('{"1": "block", "2": "bar"}')
+    monkeypatch.chdir(tmp_path)
+    words = ["--classes", "body", "--names", "names.json", "--size", "ignore"]
+    igps(monkeypatch, "retrieve", "scans", "--descriptor", INTERIOR, *words, *options(tmp_path / "out"))
+    monkeypatch.chdir("/")
+    igps(monkeypatch, "report", tmp_path / "out", "--n_workers", 1)
+    names = {f"{subject}.nii.gz#{body}" for subject in range(2) for body in ("block", "bar")}
+    assert set(read_surfaces(tmp_path / "out" / "surfaces.npz")) == names

@@ -531,3 +531,32 @@ def test_a_gallery_that_cannot_be_built_is_told_before_anything_is_computed(
     with_attribute = ["--out", tmp_path / "g", "--attribute", "ct=ct/{file}.nii.gz", "--with", "ct"]
     told = error_of(monkeypatch, capsys, *words, *with_attribute)
     assert "ct: expected centres, got 8 quantiles of no collection" in told
+
+
+def test_a_gallery_remembers_the_table_of_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As how files are read; another one may be given, as where it was moved to."""
+    nibabel = pytest.importorskip("nibabel")
+    labels = np.zeros((24, 16, 16), np.uint8)
+    labels[2:8, 3:12, 3:12], labels[11:22, 5:9, 5:9] = 1, 2
+    (tmp_path / "scans").mkdir()
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), tmp_path / "scans" / "scan.nii.gz")
+    (tmp_path / "names.json").write_text('{"1": "block", "2": "bar"}')
+    (tmp_path / "other.json").write_text('{"1": "cube", "2": "bar"}')
+    monkeypatch.chdir(tmp_path)
+    cache = ["--cache_dir", "cache", "--n_workers", 1]
+    build = ["gallery", "build", "scans", "--out", "g.igps", "--descriptor", INTERIOR, "--size", "ignore", *SMALL]
+    command(monkeypatch, *build, "--names", "names.json", *cache)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    cache = ["--cache_dir", "../cache", "--n_workers", 1]
+    command(monkeypatch, "query", "../scans/scan.nii.gz#bar", "--gallery", "../g.igps", "--top", 1, *cache)
+    assert "scan.nii.gz#bar" in capsys.readouterr().out
+    for given, changes in (([], "0 bodies described, 0 removed"), (["--names", "../other.json"], "1 removed")):
+        command(monkeypatch, "gallery", "sync", "../scans", "--gallery", "../g.igps", *given, *cache)
+        assert changes in capsys.readouterr().out
+    assert {row["part"] for row in Gallery("../g.igps").rows("part")} == {"cube", "bar"}
+    command(monkeypatch, *build[:2], "../scans", "--out", "../plain.igps", *build[5:], *cache)
+    command(monkeypatch, "gallery", "merge", "../g.igps", "../plain.igps", "--out", "../all.igps")
+    assert {row["part"] for row in Gallery("../all.igps").rows("part")} == {"cube", "bar", "1", "2"}

@@ -1,7 +1,7 @@
 """`igps gallery`."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -145,9 +145,10 @@ def as_described(gallery: Gallery, reading: Mapping[str, Any]) -> dict[str, Any]
     if config != SignatureConfig():
         wanted = gallery.descriptor.requirements.apply_to(config).resolved()
         check({"signature": about_of(wanted, asked, gallery.descriptor)["signature"]})
-    if asked != LoadOptions():
+    if asked.as_dict() != LoadOptions().as_dict():
         check({"reading": asked.as_dict()})
-    return {**given, "signature": gallery.config, **asdict(gallery.reading)}
+    read = replace(gallery.reading, names=asked.names or gallery.reading.names, max_unpacked=asked.max_unpacked)
+    return {**given, "signature": gallery.config, **asdict(read)}
 
 
 def _print_state(gallery: Gallery, failures: Sequence[Failure]) -> None:

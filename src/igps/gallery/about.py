@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -40,6 +41,7 @@ def about_of(config: SignatureConfig, reading: LoadOptions, descriptor: str | De
         "model": fingerprint(descriptor_of(descriptor)),
         "signature": {**signature, "attributes": list(config.attributes)},
         "reading": reading.as_dict(),
+        "names": reading.names and os.path.abspath(reading.names),
     }
 
 

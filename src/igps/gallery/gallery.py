@@ -79,7 +79,7 @@ class Gallery:
             )
         parameters = {name: value for name, value in about["signature"].items() if name != "algorithm_version"}
         self.config = SignatureConfig(**{**parameters, "attributes": tuple(parameters["attributes"])})
-        self.reading = LoadOptions(**about["reading"])
+        self.reading = LoadOptions(**about["reading"], names=about.get("names"))
 
     @property
     def about(self) -> dict[str, Any]:
@@ -226,7 +226,7 @@ class Gallery:
             opened.insert(0, open_table(path))
         first, is_new = opened[0], len(opened) == len(others)
         for one in opened:
-            check_alike(one.path, one.about, first.about)
+            check_alike(one.path, one.about, {**first.about, "names": one.about.get("names")})
         owners = {name: one for one in reversed(opened) for name in one.columns}  # the first to have a column
         for one in opened:
             for name, kind in one.columns.items():

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -115,7 +116,7 @@ def read_results(folder: Path) -> Results:
 
 def write_sources(folder: Path, dataset: SignatureDataset) -> None:
     """Write meshes.json: of each body its name in the results, file, part, columns; reading, signature, cache."""
-    pipeline, files = dataset.pipeline, dataset.bodies
+    pipeline, files, names = dataset.pipeline, dataset.bodies, dataset.pipeline.reading.names
     summary = {
         "format": _FORMAT,
         "meshes": [
@@ -123,7 +124,7 @@ def write_sources(folder: Path, dataset: SignatureDataset) -> None:
             for name, body in zip(files.names, files, strict=True)
         ],
         "columns": files.columns,
-        "reading": pipeline.reading.as_dict(),
+        "reading": {**asdict(pipeline.reading), "names": names and os.path.abspath(names)},
         "signature": asdict(pipeline.config),
         "cache_dir": str(pipeline.cache_dir.resolve()),
     }
