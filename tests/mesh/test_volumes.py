@@ -304,8 +304,10 @@ def test_segments_of_dicom_have_names_and_may_overlap(overlap: bool, tmp_path: P
         ),
         ("x.ctbl", "# Color table\n3 a_b 10 20 30 255\n"),
         ("FreeSurferColorLUT.txt", "#No. Label Name: R G B A\n\n3   a_b      70  130 180 0\n"),
+        ("x.lut", "0 0.0 0.0 0.0 Unknown\n3  0.80392 0.24314 0. a b\n"),  # FSLeyes
         ("x.csv", "LabelValue,Name,Color_R\n3,a b,1\n"),
         ("x.csv", "index\tname\tabbreviation\n3\ta b\tA\n"),
+        ("x.tsv", "index\tname\tabbreviation\n3\ta b\tA\n"),  # BIDS
         ("dataset.json", json.dumps({"labels": {"background": 0, "a b": 3}})),
         ("x.json", json.dumps({"3": "a b"})),
     ],
@@ -316,6 +318,13 @@ def test_a_table_beside_the_volume_names_its_labels(name: str, text: str, tmp_pa
     named, plain = read_label_volume(tmp_path / "x.nii.gz").bodies
     assert named.name.replace("_", " ") == "a b"
     assert plain.name == "7"
+
+
+def test_names_of_fsleyes_are_the_rest_of_the_line_and_colours_are_none(tmp_path: Path) -> None:
+    (tmp_path / "x.lut").write_text("2 0.0 1.0 0.5 3rd ventricle\n3  0.80392 0.24314 0. Left Caudate\n")
+    assert read_label_names(tmp_path / "x.lut") == {2: "3rd ventricle", 3: "Left Caudate"}
+    (tmp_path / "teeth.lut").write_text("2 11 10 20 30 255\n3 21 10 20 30\n")  # index, name, colours
+    assert read_label_names(tmp_path / "teeth.lut") == {2: "11", 3: "21"}
 
 
 def test_names_come_from_the_header_and_a_given_table_goes_first(tmp_path: Path) -> None:
@@ -363,6 +372,9 @@ def test_probabilities_are_cut_at_the_threshold(tmp_path: Path) -> None:
         radius[threshold] = (mesh.volume * 3 / 4 / np.pi) ** (1 / 3)
         assert any("probabilities" in note for note in mesh.notes)
     assert radius == pytest.approx({0.5: 8, 0.75: 6}, rel=0.02)
+    nibabel.save(nibabel.Nifti1Image(np.clip(0.9 - ball / 8, 0, 1).astype(np.float32), np.eye(4)), tmp_path / "y.nii")
+    with pytest.raises(MeshError, match=r"no voxel has a label, all are 0 \(probabilities: .* from 0\.95 on\)\. Check"):
+        read_label_volume(tmp_path / "y.nii", LoadOptions(threshold=0.95))
 
 
 def test_probabilities_may_overshoot(tmp_path: Path) -> None:

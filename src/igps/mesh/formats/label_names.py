@@ -1,4 +1,4 @@
-"""Names of labels: by a table of ITK-SNAP, 3D Slicer or FreeSurfer, of nnU-Net, by CSV, or by a NIfTI extension."""
+"""Names of labels: by a table of ITK-SNAP, 3D Slicer, FreeSurfer, FSLeyes, nnU-Net, by CSV, or a NIfTI extension."""
 
 import csv
 import html
@@ -12,11 +12,13 @@ from igps.mesh.mesh import MeshError
 
 logger = logging.getLogger(__name__)
 
-_SUFFIXES = (".label", ".ctbl", ".lut", ".txt", ".csv", ".json")  # of tables for a volume
+_SUFFIXES = (".label", ".ctbl", ".lut", ".txt", ".csv", ".tsv", ".json")  # of tables for a volume
 _BESIDE = ("FreeSurferColorLUT.txt", "dataset.json")  # for all volumes of a folder
 _MOST_BYTES = 1 << 24
 # ITK-SNAP: index, three colours, opacity, visibility, mesh visibility, "name".
 _SNAP = re.compile(r'(\d+)(?:\s+[\d.]+){6}\s+"([^"]*)"')
+# FSLeyes: index, three colours, name to the end of the line.
+_FSLEYES = re.compile(r"(\d+)(?:\s+[\d.]+){3}\s+(?![\d.\s]*$)(.+)")
 # 3D Slicer and FreeSurfer: index, name, colours; 3D Slicer quotes names, or has _ for a space.
 _COLOURS = re.compile(r'(\d+)\s+("[^"]*"|\S+)(?:\s+[\d.]+){3,4}')
 _WORKBENCH = re.compile(rb"<Label\b([^>]*)>(.*?)</Label>", re.DOTALL)
@@ -26,9 +28,9 @@ _KEY = re.compile(rb"""\bKey\s*=\s*["'](\d+)["']""")
 def read_label_names(path: str | Path) -> dict[int, str]:
     """The names that a table gives to labels.
 
-    Label descriptions of ITK-SNAP, colour tables of 3D Slicer and FreeSurfer, JSON from numbers to names or back, also
-    under "labels" as nnU-Net has it, and CSV or TSV whose first line names a column of labels (label, LabelValue,
-    index, id or value) and one of names (name or label_name).
+    Label descriptions of ITK-SNAP, colour tables of 3D Slicer, FreeSurfer and FSLeyes, JSON from numbers to names or
+    back, also under "labels" as nnU-Net has it, and CSV or TSV whose first line names a column of labels (label,
+    LabelValue, index, id or value) and one of names (name or label_name).
 
     Example:
         >>> import tempfile
@@ -50,8 +52,8 @@ def read_label_names(path: str | Path) -> dict[int, str]:
     names = _of_json(text) if path.suffix.lower() == ".json" else _of_csv(text) or _of_lines(text)
     if not names:
         raise MeshError(
-            f"{path}: names no label. Expected label descriptions of ITK-SNAP, a colour table of 3D Slicer or "
-            "FreeSurfer, CSV with the columns label,name, or JSON from numbers to names."
+            f"{path}: names no label. Expected label descriptions of ITK-SNAP, a colour table of 3D Slicer, "
+            "FreeSurfer or FSLeyes, CSV with the columns label,name, or JSON from numbers to names."
         )
     return names
 
@@ -88,7 +90,8 @@ def cleaned(names: dict[int, str]) -> dict[int, str]:
 
 
 def _of_lines(text: str) -> dict[int, str]:
-    rows = (_SNAP.match(line.strip()) or _COLOURS.match(line.strip()) for line in text.splitlines())
+    lines = (line.strip() for line in text.splitlines())
+    rows = (_SNAP.match(line) or _FSLEYES.match(line) or _COLOURS.match(line) for line in lines)
     return cleaned({int(row[1]): row[2].strip('"') for row in rows if row})
 
 

@@ -74,7 +74,9 @@ class LabelVolume:
     def __post_init__(self) -> None:
         checked_spacing(np.asarray(self.affine, dtype=np.float64), self.name)
         if not self.bodies:
-            raise MeshError(f"{self.name}: no voxel has a label, all are 0. Check that the right file was exported.")
+            told = f"{self.name}: no voxel has a label, all are 0"
+            told += f" ({'; '.join(self.notes)})" if self.notes else ""
+            raise MeshError(f"{told}. Check that the right file was exported.")
         seen: dict[str, int] = {}  # a name may be what another got for its number
         for body in self.bodies:
             if (other := seen.setdefault(body.name, body.label)) != body.label:
