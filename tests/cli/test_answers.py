@@ -103,15 +103,19 @@ def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(
     assert found["permanova_p"] <= 3 / 128  # the swap of all pairs does as well, and one or two may be drawn more often
 
 
-def test_single_masks_in_a_folder_for_each_group_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are called by their files, so that no name comes twice; the volumes of the two groups do not overlap."""
+@pytest.mark.parametrize("name", ["{group}{i}", "{i}"])
+def test_single_masks_in_a_folder_for_each_group_are_compared(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are called by their files, so that a name is no body's; the volumes of the two groups do not overlap."""
     nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
     place = np.indices((24, 24, 24)) - 12
     for group, side in (("patients", 6), ("controls", 8)):
         (folder := tmp_path / "masks" / group).mkdir(parents=True)
         for i in range(5):
             inside = (place[0] / (side + 0.2 * i)) ** 2 + (place[1] / 7) ** 2 + (place[2] / 7) ** 2 <= 1
-            nibabel.save(nibabel.Nifti1Image(inside.astype(np.uint8), np.eye(4)), folder / f"{group}{i}.nii.gz")
+            path = folder / f"{name.format(group=group, i=i)}.nii.gz"
+            nibabel.save(nibabel.Nifti1Image(inside.astype(np.uint8), np.eye(4)), path)
     words = ["--size", "--out", tmp_path / "found"]
     igps(monkeypatch, tmp_path / "masks", "groups", tmp_path / "masks", *OWN, *words)
     _, size = json.loads((tmp_path / "found" / "groups.json").read_text())

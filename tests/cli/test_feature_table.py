@@ -81,7 +81,9 @@ def test_a_wide_table_has_a_row_for_each_file(
             assert wide[f"{part}.{column}"].tolist() == rows[column].tolist()
 
 
-def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mask_for_each_organ_makes_a_row_for_each_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As TotalSegmentator writes them: two subjects with a cube and a bar, the third without the bar."""
     for i, sides in enumerate([{"cube": (8, 8, 8), "bar": (5, 5, 15)}, {"cube": (9, 9, 9), "bar": (5, 5, 17)},
                                {"cube": (10, 10, 10)}]):  # fmt: skip
@@ -101,6 +103,10 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(tmp_path: Path, monke
     assert wide["folder of labels.csv"].tolist() == ["a", "a", "b"]  # a column of the user's takes no rows together
     assert "file" not in wide
     assert wide["label"].tolist() == ["s0", "s1", "s2"]
+    assert "wide.csv, 3 rows" in capsys.readouterr().out
+    extract(monkeypatch, tmp_path / "masks/s0/segmentations", tmp_path / "one.csv", "--wide")  # of a single subject
+    one = pd.read_csv(tmp_path / "one.csv")
+    np.testing.assert_allclose(one[["bar.volume", "cube.volume"]], [[375, 512]], rtol=1e-3)
 
 
 @pytest.mark.parametrize("options", [[], ["--wide"]])

@@ -14,7 +14,7 @@ from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, with_discovery_rates
 from igps.analysis.outliers import LIMIT, measures_of
 from igps.analysis.outliers import outliers as find_outliers
-from igps.cli.reading import Folder, described, files_or_folder, print_failures
+from igps.cli.reading import Folder, described, files_or_folder, is_called_by_file, print_failures
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
@@ -74,9 +74,11 @@ def groups(
     members: dict[str, list[int]] = {}
     for i, part in enumerate(bodies.parts):
         members.setdefault(part or "all", []).append(i)
-    one_group_each = len(set(zip(bodies.parts, labels, strict=True))) == len(members)
-    if one_group_each and len(members) in (len(set(labels)), len(bodies)):
-        members = {"all": list(range(len(bodies)))}  # names are those of the groups, or of the files of single masks
+    n_pairs, called = len(set(zip(bodies.parts, labels, strict=True))), zip(bodies.names, bodies.parts, strict=True)
+    numbered = all(part and part.isdigit() and is_called_by_file(name, part) for name, part in called)
+    if n_pairs == len(members) in (len(set(labels)), len(bodies)) or (numbered and n_pairs == len(bodies)):
+        # Names are those of the groups, or of the files of single masks, which may be numbered in each group
+        members = {"all": list(range(len(bodies)))}
     jobs = [(body + what, places, rows[places]) for body, places in members.items() for what, rows in vectors.items()]
     tests = with_discovery_rates([
         group_test(

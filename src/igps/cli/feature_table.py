@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from igps.cli.reading import is_called_by_file
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import LABELS_FILE, file_name_of
 from igps.report.tables import write_rows
@@ -41,12 +42,13 @@ def feature_table(dataset: SignatureDataset, features: np.ndarray) -> tuple[Tabl
 def wide_table(known: Table, measured: Table) -> Table:
     """A row for each file: what its bodies share, and `PART.volume`, `PART.v0` and so on; see `feature_table`.
 
-    Masks of one organ each, with names that come again in other folders, have a row for each folder. A body that a file
-    or folder lacks, or that could not be used, has no values.
+    Masks of one organ each, called by their files or with names that come again in other folders, have a row for each
+    folder. A body that a file or folder lacks, or that could not be used, has no values.
     """
     folders = [PurePath(file).parent.as_posix() for file in known["file"]]
     n, parts = len(folders), set(known["part"])
-    if len(set(known["file"])) == n == len(set(zip(folders, known["part"], strict=True))) > len(parts) > 1:
+    one_each = len(set(known["file"])) == n == len(set(zip(folders, known["part"], strict=True)))
+    if one_each and len(parts) > 1 and (n > len(parts) or all(map(is_called_by_file, known["name"], known["part"]))):
         known = {"folder": folders, **{name: known[name] for name in known if name != "file"}}
     rows: dict[str, dict[str | None, int]] = {}
     for i, (file, part) in enumerate(zip(next(iter(known.values())), known["part"], strict=True)):

@@ -16,7 +16,7 @@ from igps.data.attribute_sources import attribute_sources
 from igps.data.collection import is_collection
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
-from igps.data.sources import Bodies, ClassRule, find_bodies
+from igps.data.sources import Bodies, ClassRule, file_name_of, find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
@@ -154,6 +154,11 @@ def files_or_folder(meshes: Sequence[Path]) -> Folder | Sequence[Path]:
     """What a list of words names: files, or one folder or file of signatures."""
     is_one = len(meshes) == 1 and (meshes[0].is_dir() or is_collection(meshes[0]))
     return Folder(meshes[0]) if is_one else meshes
+
+
+def is_called_by_file(name: str, part: str | None) -> bool:
+    """Whether a body of this name has that of its file, as a mask without names has."""
+    return Path(file_name_of(name, part)).name.startswith(f"{part}.")
 
 
 def limits_of(seconds: float | None, gigabytes: float | None) -> Limits:

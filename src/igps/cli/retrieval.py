@@ -118,9 +118,11 @@ def extract(
         np.savez_compressed(out, features=features, names=np.array(bodies.names), **labels)
     else:
         known, measured = feature_table(found.dataset, features)
-        write_table(out, wide_table(known, measured) if wide else {**known, **measured})
+        table = wide_table(known, measured) if wide else {**known, **measured}
+        write_table(out, table)
     write_notes(out.with_suffix(".notes.csv"), found.dataset)
-    print(f"{len(features)} descriptions of shape {features.shape[1:]} written to {out}")
+    rows = f", {len(next(iter(table.values())))} rows" if wide else ""
+    print(f"{len(features)} descriptions of shape {features.shape[1:]} written to {out}{rows}")
     print_failures(found.failures, len(features))
 
 
