@@ -103,7 +103,7 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(
     assert wide["folder of labels.csv"].tolist() == ["a", "a", "b"]  # a column of the user's takes no rows together
     assert "file" not in wide
     assert wide["label"].tolist() == ["s0", "s1", "s2"]
-    assert "wide.csv, 3 rows" in capsys.readouterr().out
+    assert "wide.csv, rows: 3" in capsys.readouterr().out
     extract(monkeypatch, tmp_path / "masks/s0/segmentations", tmp_path / "one.csv", "--wide")  # of a single subject
     one = pd.read_csv(tmp_path / "one.csv")
     np.testing.assert_allclose(one[["bar.volume", "cube.volume"]], [[375, 512]], rtol=1e-3)

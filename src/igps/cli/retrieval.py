@@ -121,7 +121,7 @@ def extract(
         table = wide_table(known, measured) if wide else {**known, **measured}
         write_table(out, table)
     write_notes(out.with_suffix(".notes.csv"), found.dataset)
-    rows = f", {len(next(iter(table.values())))} rows" if wide else ""
+    rows = f", rows: {len(next(iter(table.values())))}" if wide else ""
     print(f"{len(features)} descriptions of shape {features.shape[1:]} written to {out}{rows}")
     print_failures(found.failures, len(features))
 
