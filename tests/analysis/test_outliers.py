@@ -56,6 +56,24 @@ def test_bodies_far_off_are_found_whatever_the_size_of_the_class(n: int, n_odd: 
     assert {one.body for one in found if one.is_outlier} == set(range(n_odd))
 
 
+@pytest.mark.parametrize(("n_subjects", "n_organs"), [(10, 5), (14, 5), (10, 20)])
+def test_a_subject_with_a_wrong_unit_is_found_by_all_its_organs(n_subjects: int, n_organs: int) -> None:
+    """Twice as long: as many bodies as one subject has are no tail, of however few subjects."""
+    random, n = np.random.default_rng(n_subjects), n_subjects * n_organs
+    labels = [f"organ {i % n_organs}" for i in range(n)]
+    subjects = np.repeat(np.arange(n_subjects), n_organs)
+    points = random.normal(size=(n, 6)) + np.tile(10 * random.normal(size=(n_organs, 6)), (n_subjects, 1))
+    spacing = 0.1 * np.repeat(random.normal(size=n_subjects), n_organs)
+    volume = 0.2 * random.normal(size=n)
+    volume[subjects == 3] += np.log(8)
+    spacing[subjects == 3] += np.log(2)
+    measures = {"volume": volume, "spacing": spacing}
+    found = outliers(squared_distances(points) ** 0.5, labels, measures, subjects=subjects.tolist())
+    odd = [one.body for one in found if one.is_outlier]
+    assert set(np.flatnonzero(subjects == 3)) <= set(odd)
+    assert len(odd) <= n_organs + 0.05 * n
+
+
 def test_a_wrong_label_is_told() -> None:
     vectors = usual()
     vectors[20] = vectors[:12].mean(axis=0)

@@ -15,6 +15,7 @@ from matplotlib.image import imread
 from igps.analysis.clusters import clusters_of
 from igps.analysis.groups import group_test
 from igps.analysis.map import body_map
+from igps.analysis.outliers import LIMIT
 from igps.cli import main
 from igps.data.dataset import SignatureDataset
 from igps.nn.description import describe
@@ -198,6 +199,29 @@ def test_outliers_lists_the_short_egg_among_the_long_first(
     igps(monkeypatch, root, "outliers", root, *OWN, "--top", "0", "--out", tmp_path / "none")
     assert table(tmp_path / "none" / "outliers.csv") == rows
     assert not (tmp_path / "none" / "outliers.png").exists()
+
+
+@pytest.mark.parametrize("masks", [False, True])
+def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(
+    masks: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The labels of a file, or the masks of a folder."""
+    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+    random, place = np.random.default_rng(0), np.indices((40, 14, 14)) - 6.5
+    for subject in range(10):
+        labels = np.zeros((40, 14, 14), dtype=np.uint8)
+        for label, (x, *half) in enumerate([(0, 4, 4, 4), (12, 6, 3, 3), (26, 6, 5, 3)], start=1):
+            a, b, c = half * random.normal(1, 0.05, 3)
+            labels[((place[0] - x) / a) ** 2 + (place[1] / b) ** 2 + (place[2] / c) ** 2 < 1] = label
+        affine = np.diag([2.0, 2, 2, 1] if subject == 4 else [1.0, 1, 1, 1])
+        organs = {f"s{subject}/organ{label}": labels == label for label in (1, 2, 3)}
+        for name, voxels in organs.items() if masks else [(f"s{subject}", labels)]:
+            (path := tmp_path / "scans" / f"{name}.nii.gz").parent.mkdir(parents=True, exist_ok=True)
+            nibabel.save(nibabel.Nifti1Image(voxels.astype(np.uint8), affine), path)
+    igps(monkeypatch, tmp_path / "x", "outliers", tmp_path / "scans", *OWN, "--classes", "body", "--out", tmp_path)
+    first = table(tmp_path / "outliers.csv")[:3]
+    assert [row["body"][:2] for row in first] == ["s4"] * 3
+    assert all(float(row["score"]) > LIMIT for row in first)
 
 
 @pytest.mark.parametrize("is_group", [False, True])

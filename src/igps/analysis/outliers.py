@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from statistics import NormalDist
 
 import numpy as np
 
@@ -31,6 +32,8 @@ _PRIOR = 5
 _NORMAL = 1.4826
 # Fewer values have no tail
 _FEW = 10
+# Among fewer nobody knows which is odd
+_FEWEST_SUBJECTS = 5
 # Measures of which less than usual is as odd as more
 _TWO_SIDED = ("volume", "spacing")
 # Scatter below which no measure is taken to differ; of logarithms, counts, shares and their roots
@@ -78,6 +81,7 @@ def outliers(
     labels: Sequence[str],
     measures: Mapping[str, Floats] | None = None,
     notes: Sequence[Sequence[str]] | None = None,
+    subjects: Sequence[object] | None = None,
 ) -> list[Outlier]:
     """The bodies by how unlike their class they are, the most unlike first.
 
@@ -90,10 +94,13 @@ def outliers(
         labels: N classes.
         measures: (N,) each, see `measures_of`; "volume" is compared within classes alone.
         notes: of each body, what was done to it.
+        subjects: of each body, whose it is: all of one may be odd, as by a wrong unit. Heeded where a subject has at
+            most one of a class.
     """
     names, codes = np.unique(np.asarray(labels), return_inverse=True)
     own, other, nearest = _nearness(np.asarray(distances, dtype=float), codes)
-    scores = {"shape": np.fmax(*(_deviations(one, codes, "shape")[0] for one in (own, own - other)))}
+    n_together = _most_of_a_subject(subjects or range(len(codes)), codes)
+    scores = {"shape": np.fmax(*(_deviations(one, codes, "shape", n_together)[0] for one in (own, own - other)))}
     values = dict(measures or {})
     if "overlap" in values:
         values["overlap"] = np.sqrt(values["overlap"].max(axis=1))
@@ -103,7 +110,7 @@ def outliers(
             values["repairs"][np.isfinite(values["stray"])] = 0
     usual: dict[str, Floats] = {}
     for name, one in values.items():
-        scores[name], usual[name] = _deviations(one, codes, name)
+        scores[name], usual[name] = _deviations(one, codes, name, n_together)
     found = []
     for i, label in enumerate(labels):
         of_body = {name: float(np.nan_to_num(one[i], nan=0.0)) for name, one in scores.items()}
@@ -221,12 +228,20 @@ def _nearness(distances: Floats, codes: Integers) -> tuple[Floats, Floats, Integ
     return own, other, nearest
 
 
-def _deviations(values: Floats, codes: Integers, name: str) -> tuple[Floats, Floats]:
+def _most_of_a_subject(subjects: Sequence[object], codes: Integers) -> int:
+    """How many bodies one has at most; 1 where it may have several of a class, or all have hardly any fellows."""
+    counts = Counter(subjects)
+    is_known = len(set(zip(subjects, codes.tolist(), strict=True))) == len(codes) and len(counts) >= _FEWEST_SUBJECTS
+    return max(counts.values()) if is_known else 1
+
+
+def _deviations(values: Floats, codes: Integers, name: str, n_together: int) -> tuple[Floats, Floats]:
     """By how many robust standard deviations values exceed the usual value, and the usual value.
 
     Usual is what the others of the class have; of a class of one, other classes. Where less is as odd as more, a body
     of a class of two or three is as far away as from both, whatever is less: other classes tell which of the two is
-    odd. All is over what a twentieth of the bodies exceed, where that is more than by chance.
+    odd. All is over what a twentieth of the bodies exceed, where that is more than by chance; or a larger share that
+    those of one subject cannot make up.
     """
     n, least, known = len(values), _LEAST[name], np.isfinite(values)
     members = [np.setdiff1d(np.flatnonzero(known & (codes == codes[i])), i) for i in range(n)]
@@ -247,8 +262,9 @@ def _deviations(values: Floats, codes: Integers, name: str) -> tuple[Floats, Flo
                 usual[i] = usual[i] if len(own) else np.median(others)
         if opinions:
             found[i] = min(np.abs(opinions) if name in _TWO_SIDED else opinions)
-    if (count := np.isfinite(found).sum()) > _FEW:  # without the largest, which may be the one that is odd
-        found /= max(1.0, np.nanquantile(found, min(0.95, 1 - 1 / (count - 1))) / 1.645)
+    if (count := np.isfinite(found).sum()) > _FEW:  # without the largest, which may be what is odd
+        level = min(0.95, max(1 - 1 / _FEWEST_SUBJECTS, 1 - n_together / (count - 1)))
+        found /= max(1.0, np.nanquantile(found, level) / NormalDist().inv_cdf(level))
     return found, usual
 
 

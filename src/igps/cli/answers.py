@@ -127,7 +127,9 @@ def outliers(
     dataset = bodies.dataset
     distances = squared_distances(bodies.coordinates()) ** 0.5
     measures = measures_of(dataset, n_workers=reading.get("n_workers"))
-    found = find_outliers(distances, dataset.bodies.labels or (), measures, dataset.all_notes())
+    files = dataset.bodies.paths
+    subjects = files if len(set(files)) < len(files) else [file.parent for file in files]  # a mask for each organ
+    found = find_outliers(distances, dataset.bodies.labels or (), measures, dataset.all_notes(), subjects)
     rows: list[dict[str, Any]] = [
         {"body": dataset.bodies.names[one.body], "class": one.label, "score": round(one.score, 3), "reason": one.reason,
          **{f"score_{name}": round(value, 3) for name, value in one.scores.items()}}
