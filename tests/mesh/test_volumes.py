@@ -5,17 +5,19 @@ from __future__ import annotations
 import gzip
 import json
 import re
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from igps.mesh.formats import files_read
+from igps.mesh.formats._volume_files import _BESIDE
 from igps.mesh.formats.label_names import read_label_names
-from igps.mesh.formats.volumes import LabelVolume, label_surface, read_label_volume
+from igps.mesh.formats.volumes import LabelVolume, label_surface, read_label_volume, volume_in_memory
 from igps.mesh.loading import each_body, list_bodies, load_mesh
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.options import LoadOptions
@@ -375,6 +377,18 @@ def test_probabilities_are_cut_at_the_threshold(tmp_path: Path) -> None:
     nibabel.save(nibabel.Nifti1Image(np.clip(0.9 - ball / 8, 0, 1).astype(np.float32), np.eye(4)), tmp_path / "y.nii")
     with pytest.raises(MeshError, match=r"no voxel has a label, all are 0 \(probabilities: .* from 0\.95 on\)\. Check"):
         read_label_volume(tmp_path / "y.nii", LoadOptions(threshold=0.95))
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_labels_as_floating_point_numbers_take_no_more_memory_than_is_asked_for(order: Literal["C", "F"]) -> None:
+    labels = np.zeros((120, 120, 120), order=order)
+    labels[20:90, 30:80, 10:100], labels[100:110] = 7, 300.004
+    tracemalloc.start()
+    volume = volume_in_memory(labels, (1, 1, 1))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert label_bodies(volume) == [(7, "7", 70 * 50 * 90), (300, "300", 10 * 120 * 120)]
+    assert peak < _BESIDE * labels.size
 
 
 def test_probabilities_may_overshoot(tmp_path: Path) -> None:

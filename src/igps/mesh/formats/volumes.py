@@ -200,7 +200,8 @@ def _whole_numbers(values: NDArray[Any], name: str, threshold: float, notes: lis
     if values.dtype.kind == "f":
         if n_bad := int(np.count_nonzero(~np.isfinite(values))):
             raise MeshError(f"{name}: {n_bad} voxels are NaN or infinite; labels expected. Set them to 0.")
-        odd = values[np.abs(values - np.round(values)) > _ROUNDING]
+        slabs = values.T if values.flags.f_contiguous else values  # one by one, a whole copy may be too large
+        odd = np.concatenate([np.empty(0), *(one[np.abs(one - np.rint(one)) > _ROUNDING] for one in slabs)])
         # SPM keeps them as bytes times a rounded 1/255, and resampled ones overshoot
         if len(odd) and values.min() >= -_ROUNDING and values.max() <= 1 + _ROUNDING:
             notes.append(f"probabilities: a voxel belongs to the body from {threshold:g} on")
@@ -210,16 +211,17 @@ def _whole_numbers(values: NDArray[Any], name: str, threshold: float, notes: lis
                 f"{name}: {len(odd)} voxels have fractional labels, such as {odd[0]:g}. Resample labels to the nearest "
                 "neighbour, or give probabilities between 0 and 1."
             )
-        values = np.round(values)
-    low, high = (int(values.min()), int(values.max())) if values.size else (0, 0)
+    low, high = (int(np.rint(values.min())), int(np.rint(values.max()))) if values.size else (0, 0)
     if low < 0:
         raise MeshError(
-            f"{name}: {int(np.count_nonzero(values < 0))} voxels have negative labels, such as {low}; 0 for the "
+            f"{name}: {int(np.count_nonzero(values <= -0.5))} voxels have negative labels, such as {low}; 0 for the "
             "background and positive numbers expected. Is it an image? Export its labels."
         )
     if high >= 2**31:
         raise MeshError(f"{name}: label {high} is too large; below 2³¹ expected. Number the labels anew.")
-    return np.asarray(values, dtype=np.min_scalar_type(high))
+    if values.dtype.kind != "f":
+        return np.asarray(values, dtype=np.min_scalar_type(high))
+    return np.rint(values, out=np.empty_like(values, dtype=np.min_scalar_type(high)), casting="unsafe")
 
 
 def _counted(labels: ArrayLike, name: str) -> Iterable[tuple[int, int, Box]]:
