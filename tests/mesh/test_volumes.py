@@ -391,6 +391,12 @@ def test_labels_as_floating_point_numbers_take_no_more_memory_than_is_asked_for(
     assert peak < _BESIDE * labels.size
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.float64])
+def test_an_array_without_voxels_is_refused_in_a_sentence(dtype: type) -> None:
+    with pytest.raises(MeshError, match=r"^crop: expected labels of shape \(X, Y, Z\).* of shape \(0, 3, 3\)"):
+        volume_in_memory(np.zeros((0, 3, 3), dtype), name="crop")
+
+
 def test_probabilities_may_overshoot(tmp_path: Path) -> None:
     """SPM keeps them as bytes times 1/255 in single precision, so that the largest is more than 1."""
     ball = np.linalg.norm(np.indices((20, 20, 20)) - 9.5, axis=0)

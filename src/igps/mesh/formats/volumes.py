@@ -140,7 +140,8 @@ def volume_in_memory(
         raw = of_nibabel(labels, name)
     else:
         array = np.asarray(labels)
-        if array.ndim != 3 or array.dtype.kind not in "biuf" or (spacing is not None and len(spacing) != 3):
+        is_volume = array.ndim == 3 and array.size > 0 and array.dtype.kind in "biuf"
+        if not is_volume or (spacing is not None and len(spacing) != 3):
             got = f"{array.dtype} of shape {array.shape}, spacing {spacing}"
             raise MeshError(f"{name}: expected labels of shape (X, Y, Z) and three sides of a voxel, got {got}.")
         raw = RawVolume([array], np.diag([*(spacing or (1, 1, 1)), 1.0]), unit="mm" if spacing else None)
