@@ -89,8 +89,8 @@ def test_no_move_is_told_to_be_farther_than_it_is(stretch: tuple[float, float, f
 
 def test_the_least_move_of_a_difference_is_told_as_far_as_it_is() -> None:
     """Moves along gradients, by finite differences at each vertex, of what a scale leaves as it is."""
-    body = lump((1.0, 0.8, 0.6), 0.05)
-    body.vertices *= np.exp(1.2 * body.vertices[:, 2:])  # far from symmetric, so that its middle moves
+    body = lump((0.7, 0.5, 1.5), 0.05)
+    body.vertices[:, :2] *= np.exp(-0.65 * body.vertices[:, 2:])  # one end is thick, so that the middle moves
     vertices, faces, normals = body.vertices / body.area**0.5, np.asarray(body.faces), body.vertex_normals
     gradients, step = np.zeros((len(vertices), 6)), 1e-4
     for i, normal in enumerate(normals):
@@ -100,12 +100,13 @@ def test_the_least_move_of_a_difference_is_told_as_far_as_it_is() -> None:
         below, above = (moments(one, faces, MOST)[0] for one in moved)
         gradients[i] = (above - below) / (2 * step)
     shares = np.bincount(faces.ravel(), np.repeat(body.area_faces, 3)) / body.area_faces.sum() / 3
-    for which in ([0, 0, 0, 0, 0, 1], [-7 / 3, 0, 0, 0, 1, 0], [-5 / 3, 1, 0, 0, 0, 0]):
+    far = MOST / 10  # where the first order is all
+    for which in ([0, 0, 0, 0, 0, 1], [-7 / 3, 0, 0, 0, 1, 0], [-5 / 3, 1, 0, 0, 0, 0], [-5 / 3, 0, 0, 1, 0, 0]):
         move = gradients @ which / shares
-        move *= MOST / np.sqrt(shares @ move**2)
+        move *= far / np.sqrt(shares @ move**2)
         some = [moments(one, faces, MOST) for one in (vertices, vertices + move[:, None] * normals)]
         found = least_distances(*(torch.from_numpy(one)[None] for one in some))
-        assert float(found) == pytest.approx(MOST, rel=0.07), which
+        assert float(found) == pytest.approx(far, rel=0.04), which
 
 
 def test_a_scale_by_a_tenth_counts_as_much_as_the_most() -> None:
