@@ -233,6 +233,20 @@ def test_washers_with_other_holes_are_no_copies(tmp_path: Path) -> None:
     assert grouped(found.groups) == {frozenset({"one.off", "mirrored.off"})}
 
 
+@pytest.mark.parametrize("numbered", ["alike", "otherwise"])
+def test_a_small_hole_that_is_a_little_larger_is_another_surface(tmp_path: Path, numbered: str) -> None:
+    """Larger by 0.5 %: what is farthest is off by what the radius grew by, a small part of the root of the area."""
+    one, larger = (trimesh.creation.annulus(hole, 1.0, 0.3, sections=64) for hole in (0.05, 0.05025))
+    for name, body in (("one", one), ("copy", one.subdivide()), ("larger", larger)):
+        (body.subdivide() if name == "larger" and numbered == "otherwise" else body).export(tmp_path / f"{name}.off")
+    surfaces = Surfaces(SignatureDataset(tmp_path, CONFIG, tmp_path / "cache"))
+    # in order of names: copy, larger, one
+    assert surfaces.grade(2, 0)[0] == "same surface"
+    grade, apart = surfaces.grade(2, 1)
+    assert grade == "same at another level of detail"
+    assert apart == pytest.approx(0.00025 / one.area**0.5, rel=0.05)
+
+
 def test_coarseness_of_a_ball_falls_with_the_area_of_its_triangles(tmp_path: Path) -> None:
     """The middle of its neighbours lies off a vertex by the square of their distance: a quarter with edges of half."""
     for subdivisions in (3, 4, 5):
