@@ -59,7 +59,7 @@ def _tables() -> Any:
     torch.set_num_threads(1)
     from igps.gallery import _table
 
-    _table._FEWEST_FOR_CODES, _table._MOST_UNINDEXED = N_UNCHANGED // 2, N_UNCHANGED // 2
+    _table._FEWEST_FOR_CODES, _table._CHANGES = N_UNCHANGED // 2, 8
     return _table
 
 

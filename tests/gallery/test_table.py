@@ -76,7 +76,7 @@ def recall(table: BodyTable, asked: torch.Tensor, rows: torch.Tensor, distance: 
 def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
     """Codes, and indices of columns, for a thousand rows."""
     monkeypatch.setattr(_table, "_FEWEST_FOR_CODES", 1000)
-    monkeypatch.setattr(_table, "_MOST_UNINDEXED", 1000)
+    monkeypatch.setattr(_table, "_CHANGES", 1)
 
 
 @pytest.mark.parametrize("searched_by", ["chi_square", None])

@@ -34,11 +34,9 @@ except ImportError as error:
     raise ImportError('a gallery needs LanceDB: pip install "interior-gps[index]".') from error
 
 _BODIES, _MAP, _ABOUT = "bodies", "map-", b"gallery"
-# Fewer are all compared; short vectors and codes are fitted to so many, and anew when they have become as many times
-# more. Of more than the other, columns have indices, by which conditions are met.
-_FEWEST_FOR_CODES, _GROWN, _MOST_UNINDEXED = 4096, 8, 20_000
-# Longer descriptions are kept in half precision.
-_MOST_IN_FULL, _ROWS_AT_ONCE, _NUMBERS_AT_ONCE = 1024, 1024, 10**6
+# Fewer are all compared; fitted anew when they are so many times more; changes after which new rows come to the indices
+_FEWEST_FOR_CODES, _GROWN, _CHANGES = 4096, 8, 32
+_MOST_IN_FULL, _ROWS_AT_ONCE = 1024, 1024  # longer descriptions are kept in half precision
 _ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bytes: pa.binary()}
 
 
@@ -50,7 +48,7 @@ class BodyTable:
         if not exists(self.path):
             raise FileNotFoundError(f"{path}: no gallery there, or its building was not finished. Build it.")
         with self._told(None):
-            self.table = _opened(self.path, _BODIES)
+            self.table = lancedb.connect(self.path).open_table(_BODIES)
         with in_words(f"version: expected one of those that `igps gallery versions` lists, got {version}"):
             self.table.checkout(self.table.version if version is None else version)
         self._read_head()
@@ -58,36 +56,41 @@ class BodyTable:
     def _read_head(self) -> None:
         with self._told(None):
             schema = self.table.schema
+            if b"embedding_functions" in schema.metadata:  # LanceDB would load the models that they name
+                raise ValueError("it names models to be loaded")
             self.head: dict[str, Any] = json.loads(schema.metadata[_ABOUT])
             self.about, self.shape = self.head["about"], tuple(self.head["shape"])
             self.coder: Coder | None = None
             self._codes: Codes | None = None
             self.columns = {one.name: kind for one in schema for kind, known in _ARROW.items() if known == one.type}
-            if "short" in schema.names:
-                raise ValueError("a development version before 27 November 2026 made it")
             if schema.field("vector").type.list_size != np.prod(self.shape) + 1:
                 raise ValueError(f"descriptions of {schema.field('vector').type}, not of shape {self.shape}")
             if name := self.head["map"]:
-                kept = _opened(self.path, name).to_arrow()["arrays"][0].as_py()
+                kept = lancedb.connect(self.path).open_table(name).to_arrow()["arrays"][0].as_py()
                 with np.load(io.BytesIO(kept), allow_pickle=False) as arrays:
                     self.coder = Coder.of_arrays(arrays)
 
     def __len__(self) -> int:
         return int(self.table.count_rows())
 
-    def batches(
-        self, where: str | None = None, columns: Sequence[str] = (), at_once: int = _ROWS_AT_ONCE
-    ) -> Iterator[Any]:
+    def batches(self, where: str | None = None, columns: Sequence[str] = ()) -> Iterator[Any]:
         """Arrow tables of the rows, some at a time; of all that `decoded` needs if no columns are named."""
         with self._told(where):
-            asked = self.table.search() if where is None else self._whole(where).where(where)
-            asked = asked.with_row_id("_rowid" in columns).select([*(columns or (*self.columns, "vector"))])
-            yield from (pa.Table.from_batches([one]) for one in asked.to_batches(at_once) if one.num_rows)
+            asked = self._asked(where, *(columns or (*self.columns, "vector")))
+            yield from (pa.Table.from_batches([one]) for one in asked.to_batches(_ROWS_AT_ONCE) if one.num_rows)
 
-    def _whole(self, where: str) -> Any:
-        """A search, once the condition is read to its end: LanceDB passes over what follows it."""
-        self.table.search().where(f"CAST({where}\nAS BOOLEAN)").explain_plan()
-        return self.table.search()
+    def _asked(self, where: str | None, *columns: str) -> Any:
+        """A search for rows; the condition is read to its end, as LanceDB passes over what follows it."""
+        asked = self.table.search().select([*columns])
+        if where is not None:
+            self.table.search().where(f"CAST({where}\nAS BOOLEAN)").explain_plan()
+            asked = asked.where(where)
+        return asked.with_row_id("_rowid" in columns)
+
+    def _numbered(self, where: str | None, *columns: str) -> Any:
+        """An Arrow table of rows with LanceDB's numbers of them."""
+        with self._told(where):
+            return self._asked(where, "_rowid", *columns).to_arrow()
 
     def decoded(self, rows: Any) -> tuple[Tensor, list[dict[str, Any]]]:
         """Descriptions, and what is known of each, of an Arrow table of rows."""
@@ -109,7 +112,7 @@ class BodyTable:
         self._check_shape(query)
         groups = self.batches(where, ("_rowid", "vector"))
         if not exact and self.coder is not None:
-            named = None if where is None else self._numbers(where)[0]
+            named = None if where is None else self._numbered(where)["_rowid"].to_numpy()
             codes = self._all_codes(self.coder)
             near = codes.nearest(query.reshape(-1).cpu().float().numpy(), max(candidates, 2 * top), named)
             groups = iter([self._taken(near, "vector")] if len(near) else [])
@@ -126,17 +129,11 @@ class BodyTable:
 
     def _all_codes(self, coder: Coder) -> Codes:
         if self._codes is None:
-            rows, codes = self._numbers(None, "code")
+            rows = self._numbered(None, "code")
             with self._told(None):
-                self._codes = Codes(coder, codes.view(CODE), rows)
+                codes = rows["code"].combine_chunks().flatten().to_numpy()
+                self._codes = Codes(coder, codes.view(CODE), rows["_rowid"].to_numpy())
         return self._codes
-
-    def _numbers(self, where: str | None, *columns: str) -> list[Any]:
-        """LanceDB's numbers of rows, and lists of numbers one behind the other."""
-        read = list(self.batches(where, ("_rowid", *columns), _NUMBERS_AT_ONCE))
-        rows = [some["_rowid"].to_numpy() for some in read]
-        lists = ([np.asarray(some[name].combine_chunks().flatten()) for some in read] for name in columns)
-        return [np.concatenate([np.zeros(0, one[0].dtype if one else np.uint64), *one]) for one in (rows, *lists)]
 
     def _taken(self, row_ids: Any, *columns: str) -> Any:
         """An Arrow table of rows by LanceDB's numbers of them; few columns are read sooner than many."""
@@ -155,10 +152,10 @@ class BodyTable:
             arrow = _encoded((descriptions, rows), self.columns, self.coder).select(self.table.schema.names)
             merging = self.table.merge_insert("id").when_matched_update_all().when_not_matched_insert_all()
             merging.execute(arrow.cast(self.table.schema))
-            steps = (_FEWEST_FOR_CODES, _GROWN * _FEWEST_FOR_CODES)
-            if self.head["searched_by"] and any(n_before < step <= len(self) for step in steps):
-                some = np.random.default_rng(0).choice(self._numbers(None)[0], _FEWEST_FOR_CODES, replace=False)
-                sample = self._descriptions(self._taken(some, "vector"))
+            steps = _FEWEST_FOR_CODES * _GROWN ** np.arange(10)
+            if self.head["searched_by"] and ((n_before < steps) & (steps <= len(self))).any():
+                some = np.linspace(0, len(self) - 1, _FEWEST_FOR_CODES).astype(int).tolist()
+                sample = self._descriptions(self.table.take_offsets(some).select(["vector"]).to_arrow())
                 _overwrite(self.path, self.head, map(self.decoded, self.batches()), self.columns, sample)
 
     @contextlib.contextmanager
@@ -168,8 +165,7 @@ class BodyTable:
             self.table.checkout_latest()
             self._read_head()
             with contextlib.nullcontext() if where is None else self._told(where):
-                if where is not None:
-                    self._whole(where)
+                self._asked(where, "id")
                 yield self.table
             self.table.checkout_latest()
             _index(self.table)
@@ -194,11 +190,10 @@ class BodyTable:
 
 def check_place(path: Path) -> None:
     """Raise a ValueError where no gallery can be made."""
-    if path.is_file():
-        raise ValueError(f"{path}: expected a gallery or a new folder, got a file. Name another.")
-    there = {one.name for one in path.iterdir()} if path.is_dir() else set()
-    if strange := {one for one in there if not one.startswith((_BODIES, _MAP, "lock"))}:
-        raise ValueError(f"{path}: expected a gallery or a new folder, got one with {min(strange)}. Name another.")
+    strange = ["a file"] if path.is_file() else [f"one with {one.name}" for one in path.glob("*")
+                                                 if not one.name.startswith((_BODIES, _MAP, "lock"))]  # fmt: skip
+    if strange:
+        raise ValueError(f"{path}: expected a gallery or a new folder, got {min(strange)}. Name another.")
 
 
 def write(
@@ -210,74 +205,58 @@ def write(
     at least one row; the first few thousand should be like the others. Further columns are those beside `KNOWN`.
     """
     check_place(path)
-    batches = (batch for batch in batches if len(batch[1]))
-    if (first := next(batches, None)) is None:
+    batches, first = (batch for batch in batches if len(batch[1])), list[Batch]()
+    while sum(len(rows) for _, rows in first) < _FEWEST_FOR_CODES and (batch := next(batches, None)):
+        first.append(batch)
+    if not first:
         raise ValueError("descriptions: expected at least one for the gallery, got none.")
-    head = {"about": dict(about), "shape": list(first[0].shape[1:]), "searched_by": searched_by}
+    sample = torch.cat([some for some, _ in first])
+    head = {"about": dict(about), "shape": list(sample.shape[1:]), "searched_by": searched_by}
     with alone(path):
-        _overwrite(path, head, chain([first], batches), {**KNOWN, **further})
-        _index(_opened(path, _BODIES))
+        _index(_overwrite(path, head, chain(first, batches), {**KNOWN, **further}, sample))
 
 
-def _overwrite(
-    path: Path, head: Row, batches: Iterable[Batch], columns: Mapping[str, type], sample: Tensor | None = None
-) -> None:
-    """Under the lock: a version of these rows alone, with codes if they are many, fitted to the sample or the first."""
-    batches, first, coder, name, database = iter(batches), list[Batch](), None, None, lancedb.connect(path)
-    if sample is None:
-        while sum(len(rows) for _, rows in first) < _FEWEST_FOR_CODES and (batch := next(batches, None)):
-            first.append(batch)
-        sample = torch.cat([some for some, _ in first])
+def _overwrite(path: Path, head: Row, batches: Iterable[Batch], columns: Mapping[str, type], sample: Tensor) -> Any:
+    """Under the lock: a version of these rows alone; if they are many, with codes fitted to some of them."""
+    coder, name = None, None
     if head["searched_by"] and len(sample) >= _FEWEST_FOR_CODES:
         coder = Coder.fit(sample.flatten(1).float().numpy(), head["searched_by"])
         file, name = io.BytesIO(), _MAP + secrets.token_hex(8)
         np.savez(file, **coder.arrays())
-        database.create_table(name, pa.table({"arrays": pa.array([file.getvalue()], pa.large_binary())}))
-    coming = (_encoded(some, columns, coder) for some in chain(first, batches))
-    begun = next(coming)
-    schema = begun.schema.with_metadata({_ABOUT: json.dumps({**head, "map": name})})
-    whole = (batch for some in chain([begun], coming) for batch in some.cast(schema).to_batches())
-    reader = pa.RecordBatchReader.from_batches(schema, whole)
-    database.create_table(_BODIES, reader, mode="overwrite" if exists(path) else "create")
+        lancedb.connect(path).create_table(name, pa.table({"arrays": pa.array([file.getvalue()], pa.large_binary())}))
+    schema = _encoded((sample[:1], [{}]), columns, coder).schema
+    schema = schema.with_metadata({_ABOUT: json.dumps({**head, "map": name})})
+    rows = (one for batch in batches for one in _encoded(batch, columns, coder).cast(schema).to_batches())
+    reader = pa.RecordBatchReader.from_batches(schema, rows)
+    mode = "overwrite" if exists(path) else "create"
+    return lancedb.connect(path).create_table(_BODIES, reader, mode=mode)
 
 
 def _index(table: Any) -> None:
-    """Under the lock: a large table gets indices, rows since the last time come to them, and versions of a month go."""
-    n, listed = table.count_rows(), {one.columns[0]: one.name for one in table.list_indices()}
-    if n > _MOST_UNINDEXED and "id" not in listed:
-        for one in (one for one in table.schema if one.type in _ARROW.values() and one.type != pa.binary()):
-            table.create_index(one.name, config=BTree())
-        return
-    n_new = table.index_stats(listed["id"]).num_unindexed_rows if listed else 0
-    if table.version % 50 == 0 or n_new > _MOST_UNINDEXED // 2:
+    """Under the lock: a large table gets indices; now and then new rows come to them, and versions of a month go."""
+    n, listed = table.count_rows(), {one.columns[0] for one in table.list_indices()}
+    for one in table.schema.names if n >= _FEWEST_FOR_CODES else ():
+        if one not in {"vector", "code", "thumbnail", *listed}:
+            table.create_index(one, config=BTree())
+    if table.version % _CHANGES == 0:
         table.optimize(cleanup_older_than=timedelta(days=30))
 
 
 def _encoded(batch: Batch, columns: Mapping[str, type], coder: Coder | None) -> Any:
     """An Arrow table; long descriptions in half precision, each number to 0.05 %, behind them the power of two."""
     descriptions, rows = batch
-    values = descriptions.reshape(len(rows), -1).cpu().float().numpy()
+    values = descriptions.flatten(1).cpu().float().numpy()
     if not np.isfinite(values).all():
         raise ValueError("descriptions: expected finite numbers, got others. Look for the mesh that gives them.")
     told = {name: pa.array([None if row.get(name) is None else kind(row[name]) for row in rows], _ARROW[kind])
             for name, kind in columns.items()}  # fmt: skip
-    scale, precision = np.zeros((len(rows), 1), np.int32), "f4"
-    if values.shape[1] > _MOST_IN_FULL:
-        scale, precision = np.frexp(np.abs(values).max(axis=1, keepdims=True))[1] - 15, "f2"
-    kept = np.hstack([np.ldexp(values, -scale), scale]).astype(precision)
-    numbers = {"vector": kept}
+    is_long = values.shape[1] > _MOST_IN_FULL
+    scale = is_long * (np.frexp(np.abs(values).max(axis=1, keepdims=True))[1] - 15)
+    numbers = {"vector": np.hstack([np.ldexp(values, -scale), scale]).astype("f2" if is_long else "f4")}
     if coder is not None:
         numbers["code"] = coder(values).view(np.uint8).reshape(len(rows), -1)
-    lists = {name: pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(one).ravel()), one.shape[1])
-             for name, one in numbers.items()}  # fmt: skip
+    lists = {name: pa.FixedShapeTensorArray.from_numpy_ndarray(one).storage for name, one in numbers.items()}
     return pa.table({**told, **lists})
-
-
-def _opened(path: Path, name: str) -> Any:
-    table = lancedb.connect(path).open_table(name)
-    if b"embedding_functions" in (table.schema.metadata or {}):  # LanceDB would load the models that they name
-        raise ValueError("it names models to be loaded")
-    return table
 
 
 def exists(path: Path) -> bool:
