@@ -196,6 +196,13 @@ def test_rows_are_added_replaced_and_removed(tmp_path: Path) -> None:
         table.add(rows[:1], [{**told(0), "age": "old"}], {"age": str})
 
 
+@pytest.mark.usefixtures("few_are_many")
+def test_a_column_that_comes_later_is_indexed_too(tmp_path: Path) -> None:
+    table = written(tmp_path / "g.igps", units(1100), "cosine")
+    table.add(units(10), [{**told(i), "site": "A"} for i in range(10)], {"site": str})
+    assert {"id", "site"} <= {one.columns[0] for one in table.table.list_indices()}
+
+
 def test_each_change_is_a_version_to_return_to(tmp_path: Path) -> None:
     rows = units(40)
     table = written(tmp_path / "g.igps", rows[:30], "cosine")
