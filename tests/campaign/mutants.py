@@ -78,10 +78,7 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
             "n_directions: int = 59,",
         ),
         # Points whose classes are not side by side only cost time.
-        (
-            "src/igps/nn/_kernels/count_by_loops.py",
-            "key = key * layout.n_classes - torch.where(own[:, k] > 0, classes[:, k], 0)",
-        ),
+        ("src/igps/nn/_kernels/count_by_loops.py", "key = key * layout.n_classes - torch.where(own > 0, classes, 0)"),
         # No resolution is larger than the finest: one that is asked for is refused before, one that grows is cut.
         ("src/igps/signature/voxels.py", "if min_samples == 0 or resolution == finest:"),
         # Nothing compares two of them.
@@ -93,12 +90,9 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         # Below zero there is only rounding.
         (
             "src/igps/retrieval/graph_reranking.py",
-            "alike = (1 - length[:, None] * alike[:, 1:] * length[lists]).clip( -1)",
+            "return (1 - length[:, None] * alike[:, 1:] * length[lists]).clip( -1)",
         ),
-        (
-            "src/igps/retrieval/graph_reranking.py",
-            "anew = (1 - share) * (1 - smaller / (2 - smaller)).clip( -1) + share * apart / average",
-        ),
+        ("src/igps/retrieval/graph_reranking.py", "return (1 - smaller / (2 - smaller)).clip( -1)"),
     }
 )
 
