@@ -495,6 +495,18 @@ def test_many_labels_as_small_as_they_may_be_are_no_image() -> None:
     assert {body.n_voxels for body in LabelVolume((block,), np.eye(4)).bodies} == {8}
 
 
+def test_a_label_in_pieces_is_one_body_on_its_own_grid() -> None:
+    """Of 2 × 12³ voxels at a distance of six; a grid made for the mesh would say so in its note."""
+    labels = np.zeros((30, 12, 12), dtype=int)
+    labels[:12] = labels[18:] = 1
+    volume = LabelVolume((labels,), np.eye(4))
+    body = label_surface(volume, 1)
+    assert body.notes == ("joined 2 pieces by bars",)
+    assert body.volume == pytest.approx(2 * 12**3, rel=0.02)
+    with pytest.raises(MeshError, match=r"volume#1: .*2 "):
+        label_surface(volume, 1, how="never")
+
+
 def test_labels_of_one_name_are_told_apart_by_their_numbers(tmp_path: Path) -> None:
     labels = two_boxes()
     labels[0, 0:8, 0:3] = 5
