@@ -32,7 +32,7 @@ _PRIOR = 5
 _NORMAL = 1.4826
 # Fewer values have no tail
 _FEW = 10
-# Among fewer nobody knows which is odd
+# Among fewer subjects it cannot be told which is odd
 _FEWEST_SUBJECTS = 5
 # Measures of which less than usual is as odd as more
 _TWO_SIDED = ("volume", "spacing")
@@ -94,8 +94,8 @@ def outliers(
         labels: N classes.
         measures: (N,) each, see `measures_of`; "volume" is compared within classes alone.
         notes: of each body, what was done to it.
-        subjects: of each body, whose it is: all of one may be odd, as by a wrong unit. Heeded where a subject has at
-            most one of a class.
+        subjects: of each body the subject, all of whose bodies may be odd, as by a wrong unit. Heeded where a subject
+            has at most one body of a class.
     """
     names, codes = np.unique(np.asarray(labels), return_inverse=True)
     own, other, nearest = _nearness(np.asarray(distances, dtype=float), codes)
@@ -229,7 +229,7 @@ def _nearness(distances: Floats, codes: Integers) -> tuple[Floats, Floats, Integ
 
 
 def _most_of_a_subject(subjects: Sequence[object], codes: Integers) -> int:
-    """How many bodies one has at most; 1 where it may have several of a class, or all have hardly any fellows."""
+    """The most bodies of one subject; 1 where a subject has several of a class, or where there are few subjects."""
     counts = Counter(subjects)
     is_known = len(set(zip(subjects, codes.tolist(), strict=True))) == len(codes) and len(counts) >= _FEWEST_SUBJECTS
     return max(counts.values()) if is_known else 1

@@ -6,7 +6,7 @@ at random. Kept are the signs of its numbers r, and what estimates inner product
 products are counts of bits.
 
 On a busy machine a query of a million rows took LanceDB 0.40's own IVF_SQ up to twice the processor time.
-Its IVF_RQ, once new rows have come to it, finds 60 % of the nearest ten in large families, and all before.
+Its IVF_RQ found all of the nearest ten when it was built, and 60 % after new rows had been added to it.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ _SPARE = 4  # the grid may make so many times more vertices than are wanted, whi
 _FEWEST = 1500  # vertices that the grid makes at least, if need be by interpolation
 _MOST_REFINED = 4
 _N_LEVELS = 3
-# Radius of the bars between pieces, over the square root of the area: thicker than most cells, and so the same on all
-# grids.
+# Radius of the bars between pieces, over the square root of the area. It is more than most cells, so that bars are as
+# thick on every grid.
 _BAR = 0.02
 # Share of a label that may lie where it is too thin for a coarser grid.
 _THIN = 0.005
@@ -85,7 +85,7 @@ def voxel_surface(
     mask = with_missed_slices(mask[box], notes) if joins else mask[box]
     mask, hollows = _whole(mask, notes, LEAST_VOXELS if cavities else None)
     share, factor = _coarsened(mask, spacing, max_vertices)
-    mask = _joined(share >= 0.5)
+    mask = _with_thick_contacts(share >= 0.5)
     share = np.pad(np.where(mask, np.maximum(share, np.float32(0.5)), share), PAD)
     check_grid(share.size, name)
     sides = spacing * factor / (spacing * factor).min()  # nothing depends on the unit of length
@@ -154,7 +154,7 @@ def _islands(mask: Booleans) -> tuple[NDArray[np.int32], Integers, Integers]:
     return label, np.nonzero(size < _ISLAND * size.sum())[0][1:], size
 
 
-def _joined(mask: Booleans) -> Booleans:
+def _with_thick_contacts(mask: Booleans) -> Booleans:
     """With voxels added beside edges and corners at which pieces only touch."""
     for _ in range(3):
         label, n_pieces = ndimage.label(mask)
