@@ -6,6 +6,8 @@ import igl
 import numpy as np
 import trimesh
 
+from igps.signature.mean_value import extend
+
 Mesh = tuple[np.ndarray, np.ndarray]
 
 
@@ -43,3 +45,8 @@ def exterior_points(mesh: Mesh, n: int, seed: int = 0) -> np.ndarray:
 def smooth_functions(vertices: np.ndarray) -> np.ndarray:
     x, y, z = vertices.T
     return np.stack([np.sin(2 * x), np.cos(3 * y + x), x * y * z, np.exp(z), np.sin(5 * z) * x, x], axis=1)
+
+
+def mean_value_coordinates(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(P, V) at points (P, 3): what extends the vertices' own functions, each 1 at one vertex."""
+    return extend(vertices, faces, np.eye(len(vertices)), points)

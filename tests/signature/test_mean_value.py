@@ -10,11 +10,20 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from bodies import Mesh, bumpy_sphere, cube, exterior_points, interior_points, smooth_functions, torus
+from bodies import (
+    Mesh,
+    bumpy_sphere,
+    cube,
+    exterior_points,
+    interior_points,
+    mean_value_coordinates,
+    smooth_functions,
+    torus,
+)
 from igps.signature import _weight_loops as loops
 from igps.signature import mean_value as coordinates
 from igps.signature._far_field import HatSurface
-from igps.signature.mean_value import extend, mean_value_coordinates
+from igps.signature.mean_value import extend
 
 pytestmark = pytest.mark.usefixtures("approximate_small_meshes")
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 import trimesh
 
+from bodies import mean_value_coordinates
 from conftest import as_mesh
 from igps.data.collation import collate
 from igps.mesh.mesh import Mesh, MeshError
@@ -14,7 +15,6 @@ from igps.nn.axes import InteriorDistance, Potential
 from igps.nn.embedding import barycentroid_potential, interior_distance, spectral_embedding
 from igps.nn.histograms.pairs import PairHistogram
 from igps.signature.laplacian import laplacian
-from igps.signature.mean_value import mean_value_coordinates
 from igps.signature.signature import Samples, Signature, SignatureConfig, compute_signature
 from igps.spectra import ConvergenceError, eigenpairs
 

@@ -22,12 +22,12 @@ from training.studies import paper_figures as paper
 from training.studies.weld import TUBE_FACES, facing_vertices, weld
 from training.study import main
 
+from bodies import mean_value_coordinates
 from conftest import horseshoe
 from igps.data.dataset import SignatureDataset
 from igps.mesh.loading import load_mesh
 from igps.mesh.mesh import Mesh
 from igps.signature.laplacian import laplacian
-from igps.signature.mean_value import mean_value_coordinates
 from igps.signature.signature import SignatureConfig
 from igps.signature.voxels import interior_samples
 

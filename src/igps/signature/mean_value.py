@@ -47,27 +47,6 @@ _SAMPLE_LINE = (0.11, 0.37, 1.0)  # in principal axes, the longest last; oblique
 _ATTEMPTS = 2  # approximations tried before the closed form
 
 
-def mean_value_coordinates(
-    vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
-) -> Floats:
-    """Dense mean value coordinates (P, V) of points (P, 3); rows sum to 1 (Ju, Schaefer, Warren 2005, section 3).
-
-    Vertices (V, 3) and points share one unit; faces (F, 3) are oriented alike, either way. A point on the surface gets
-    the barycentric coordinates in its triangle. Meant for few points: the result holds P·V numbers.
-
-    Raises:
-        ValueError: a shape, an index or a value of an argument is invalid, or the weights of a point sum to zero.
-    """
-    scaled, faces, x = _scaled(vertices, faces, points)
-    surface = HatSurface(scaled, faces)
-    out = np.zeros((len(x), len(scaled)))
-    x = x @ surface.axes
-    for rows in _pieces(np.arange(len(x)), len(surface.order)):
-        weights = _exact_weights(surface, x[rows])
-        out[rows[:, None], surface.order] = _normalised(weights.T, weights.sum(axis=0)[:, None])
-    return out
-
-
 def extend(
     vertices: NDArray[np.floating],
     faces: NDArray[np.integer],
@@ -75,7 +54,10 @@ def extend(
     points: NDArray[np.floating],
     **options: Any,
 ) -> Floats:
-    """(P, K) of surface functions (V, K) at points (P, 3): see `Extension`, whose options and errors it has."""
+    """(P, K) of surface functions (V, K) at points (P, 3): see `Extension`, whose options and errors it has.
+
+    Of the identity (V, V) it gives the coordinates themselves, (P, V); rows sum to 1.
+    """
     return Extension(vertices, faces, functions, **options)(points)
 
 
@@ -165,7 +147,12 @@ class Extension:
         return out
 
     def _values(self, sums: NDArray[np.floating]) -> NDArray[np.floating]:
-        return _normalised(sums[:, : self._n_functions], sums[:, -1:])
+        totals = sums[:, -1:]
+        if not (np.isfinite(totals) & (totals != 0)).all():
+            raise ValueError(
+                "points: expected mean value weights with a sum, got a sum of zero or none; close the mesh"
+            )
+        return sums[:, : self._n_functions] / totals
 
     def _weighted_sums(self, x: Floats, setting: float | None) -> Iterator[tuple[Integers, NDArray[np.floating]]]:
         """Columns (V, K) summed with the weights: (n, K) of n points at a time, with the indices of those points."""
@@ -253,9 +240,3 @@ def _scaled(
     if not scale > 0:
         raise ValueError("vertices: expected distinct vertices, got one place for all; check the mesh")
     return (vertices - centre) / scale, faces, (points - centre) / scale
-
-
-def _normalised(values: NDArray[np.floating], totals: NDArray[np.floating]) -> NDArray[np.floating]:
-    if not (np.isfinite(totals) & (totals != 0)).all():
-        raise ValueError("points: expected mean value weights with a sum, got a sum of zero or none; close the mesh")
-    return values / totals
