@@ -1,6 +1,6 @@
 """Tensors in, numbers out: distances between descriptors, rankings and retrieval scores."""
 
-from igps.retrieval.distances import Distance, chi_square, cosine, euclidean, hellinger
+from igps.retrieval.distances import Distance, chi_square, cosine, euclidean
 from igps.retrieval.graph_reranking import rerank_graph
 from igps.retrieval.ranking import SearchResult, rank, search
 from igps.retrieval.reranking import N_RERANKED, rerank, rerank_found
@@ -22,7 +22,6 @@ __all__ = [
     "chi_square",
     "cosine",
     "euclidean",
-    "hellinger",
     "precision_recall_curve",
     "rank",
     "rerank",

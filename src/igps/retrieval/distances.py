@@ -3,8 +3,8 @@
 Smaller is closer, identical descriptors are at exactly zero, and a distance matrix of a set with itself is exactly
 symmetric. All dimensions after the first are cells, or entries of one vector. All functions are differentiable, χ² any
 number of times and the others once; they run on the device of their inputs, and compute half precision in float32. All
-raise a ValueError for shapes, dtypes or devices that do not fit, for NaN or infinite entries, and those of histograms
-for negative ones; to check that waits for the device once per argument.
+raise a ValueError for shapes, dtypes or devices that do not fit, for NaN or infinite entries, and χ² for negative
+ones; to check that waits for the device once per argument.
 """
 
 import math
@@ -57,16 +57,6 @@ def chi_square(queries: Tensor, gallery: Tensor, weights: Tensor | None = None) 
     a, b = _as_rows(queries, gallery, non_negative=True)
     w = None if weights is None else _cell_weights(weights, queries.shape[1:], a)
     return _ChiSquare.apply(a, b, w)
-
-
-def hellinger(queries: Tensor, gallery: Tensor) -> Tensor:
-    """Hellinger distance √(½ Σ (√a−√b)²) between histograms, over all cells.
-
-    It lies in [0, 1] for histograms that sum to 1. Gradients are set to zero where they are infinite: at an empty cell
-    and at distance zero. Source: Hellinger 1909; Bhattacharyya 1943 for histograms.
-    """
-    a, b = _as_rows(queries, gallery, non_negative=True)
-    return _row_distance(square_root(a), square_root(b)) / math.sqrt(2.0)
 
 
 def euclidean(queries: Tensor, gallery: Tensor) -> Tensor:
