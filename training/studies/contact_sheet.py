@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from igps.report.drawing import BLUE, new_figure, paint
+from igps.report.drawing import new_figure, paint
 from igps.shapes import ArticulatedShapes
 from training.graded import GradedShape, GradedShapes
 
@@ -38,7 +38,7 @@ def contact_sheet(shapes: ArticulatedShapes | GradedShapes, path: str | Path, n_
         axis = figure.add_subplot(rows, columns, place)
         # What mirrors a body turns its faces inside out
         faces = shape.faces if np.linalg.det(motion) > 0 else shape.faces[:, ::-1]
-        paint(axis, shape.vertices @ motion @ view.T, faces, BLUE)
+        paint(axis, shape.vertices @ motion @ view.T, faces, (0.55, 0.72, 0.95))
         axis.set_axis_off()
         axis.set_title(shape.name if n_shown > 1 else shape.label, fontsize=5, pad=1)
     figure.savefig(path, dpi=110)

@@ -44,11 +44,6 @@ class Threshold:
     n_same: int  # pairs that are
     n_found: int  # those of them that it finds
 
-    @property
-    def false_rate(self) -> float:
-        """Share of pairs that are not the same and taken for it: at most so large, with 95 % certainty, if none is."""
-        return max(self.n_false, 3) / self.n_other  # three: Hanley and Lippman-Hand 1983
-
 
 @dataclass(frozen=True)
 class Calibration:

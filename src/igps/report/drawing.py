@@ -21,12 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Colour = tuple[float, float, float]
-
-GREY: Colour = (0.86, 0.88, 0.92)
-BLUE: Colour = (0.55, 0.72, 0.95)
 PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """They stay apart for every kind of colour vision (Okabe and Ito 2008)."""
+GREY = (0.86, 0.88, 0.92)
 _RELEVANT, _IRRELEVANT, _QUERY = PALETTE[1], PALETTE[0], "#444444"
 # A thumbnail shows no more detail than this, and drawing takes time with every face.
 _THUMBNAIL_VERTICES = 800

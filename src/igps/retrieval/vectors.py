@@ -46,11 +46,6 @@ class VectorMap:
         found.fit(features)
         return cls(searched_by, found.mean_.astype(np.float32), found.components_.astype(np.float32))
 
-    @property
-    def changes(self) -> bool:
-        """Whether vectors are other numbers than the descriptions."""
-        return self.components is not None
-
     def __call__(self, descriptions: Singles) -> Singles:
         """(N, F) descriptions to (N, D) vectors."""
         if self.components is None or self.mean is None:
