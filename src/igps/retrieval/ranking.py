@@ -17,8 +17,24 @@ class SearchResult:
 
 
 def rank(distances: Tensor) -> Tensor:
-    """(Q, G) int64 gallery indices, closest first, ties in gallery order, of checked distances (Q, G)."""
-    check_distances(distances)
+    """(Q, G) int64 gallery indices, closest first, ties in gallery order.
+
+    A ValueError unless the distances are a real (Q, G) matrix without NaN and negative entries; infinity may be.
+    """
+    check_tensor("distances", distances)
+    if distances.ndim != 2 or distances.is_complex() or distances.dtype == torch.bool:
+        raise ValueError(
+            f"distances: expected a real matrix (Q, G), got shape {tuple(distances.shape)} of {distances.dtype}; "
+            "compute it with a function of igps.retrieval.distances"
+        )
+    smallest = distances.detach().amin().item() if distances.numel() else 0.0  # NaN if any entry is
+    if smallest != smallest:
+        raise ValueError("distances: expected numbers, got NaN, which has no rank; look for the descriptor that has it")
+    if smallest < 0:
+        raise ValueError(
+            f"distances: expected entries ≥ 0 (smaller is closer), the smallest is {smallest:g}; give distances in "
+            "place of similarities, and clear rounding below zero by .clamp_min(0)"
+        )
     return torch.sort(distances, dim=1, stable=True).indices
 
 
@@ -51,23 +67,3 @@ def search(
     distances = distance(query_descriptors, gallery_descriptors)
     indices = rank(distances)[:, :top]
     return SearchResult(indices=indices, distances=distances.gather(1, indices))
-
-
-def check_distances(distances: Tensor) -> None:
-    """Raise ValueError unless distances is a real (Q, G) matrix without NaN and negative entries; infinity may be."""
-    check_tensor("distances", distances)
-    if distances.ndim != 2 or distances.is_complex() or distances.dtype == torch.bool:
-        raise ValueError(
-            f"distances: expected a real matrix (Q, G), got shape {tuple(distances.shape)} of {distances.dtype}; "
-            "compute it with a function of igps.retrieval.distances"
-        )
-    if distances.numel() == 0:
-        return
-    smallest = distances.detach().amin().item()  # NaN if any entry is
-    if smallest != smallest:
-        raise ValueError("distances: expected numbers, got NaN, which has no rank; look for the descriptor that has it")
-    if smallest < 0:
-        raise ValueError(
-            f"distances: expected entries ≥ 0 (smaller is closer), the smallest is {smallest:g}; give distances in "
-            "place of similarities, and clear rounding below zero by .clamp_min(0)"
-        )
