@@ -27,8 +27,8 @@ def check_share(**values: float | None) -> None:
             raise ValueError(f"{name}: expected a number between 0 and 1, got {value}.")
 
 
-def check_one_of(allowed: Collection[str], **values: str) -> None:
+def check_one_of(allowed: Collection[str | None], **values: str | None) -> None:
     """Raise a ValueError that names the first of the values that is not allowed."""
     for name, value in values.items():
         if value not in allowed:
-            raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {value!r}.")
+            raise ValueError(f"{name}: expected one of {', '.join(map(str, allowed))}, got {value!r}.")

@@ -275,12 +275,12 @@ def test_the_largest_component_of_loose_triangles_is_what_they_make_together(tmp
 
 
 def test_unknown_component_is_refused() -> None:
-    with pytest.raises(ValueError, match="component: expected 'largest' or None, got 'smallest'"):
+    with pytest.raises(ValueError, match="component: expected one of largest, None, got 'smallest'"):
         LoadOptions(component="smallest")  # type: ignore[arg-type]
 
 
 def test_unknown_way_to_mend_is_refused() -> None:
-    with pytest.raises(ValueError, match="mend: expected 'auto', 'never' or 'always', got 'please'"):
+    with pytest.raises(ValueError, match="mend: expected one of auto, never, always, got 'please'"):
         LoadOptions(mend="please")  # type: ignore[arg-type]
 
 

@@ -13,6 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from igps._arrays import Floats, Integers
+from igps._parameters import check_one_of
 from igps.mesh._tidying import tidied, welded, with_small_holes_filled, without_hidden
 from igps.mesh._union import united, without_walls
 from igps.mesh.denoising import denoised, is_noisy
@@ -65,8 +66,7 @@ def mend(
     Raises:
         MeshError: the surface is not a body (with "never"), or nothing can be made of it.
     """
-    if how not in ("auto", "never", "always"):
-        raise ValueError(f"how: expected 'auto', 'never' or 'always', got {how!r}.")
+    check_one_of(get_args(Mending), how=how)
     if how == "never":
         return Mesh(vertices, np.asarray(faces), name=name, notes=notes, cavities=cavities == "keep")
     if faces is None or np.size(faces) == 0:

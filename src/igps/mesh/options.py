@@ -3,6 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 
+from igps._parameters import check_at_least, check_one_of
 from igps.mesh.mending import Cavities, Mending
 
 Component = Literal["largest"]
@@ -54,16 +55,11 @@ class LoadOptions:
     cavities: Cavities = "fill"
 
     def __post_init__(self) -> None:
-        for name, kinds, expected in (
-            ("mend", get_args(Mending), "'auto', 'never' or 'always'"),
-            ("cavities", get_args(Cavities), "'fill' or 'keep'"),
-            ("component", (*get_args(Component), None), "'largest' or None"),
-            ("bodies", (*get_args(BodyKind), None), f"one of {', '.join(get_args(BodyKind))}, or None"),
-        ):
-            if getattr(self, name) not in kinds:
-                raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)!r}.")
-        if self.max_unpacked < 1:
-            raise ValueError(f"max_unpacked: expected a positive number of bytes, got {self.max_unpacked}.")
+        check_one_of(get_args(Mending), mend=self.mend)
+        check_one_of(get_args(Cavities), cavities=self.cavities)
+        check_one_of((*get_args(Component), None), component=self.component)
+        check_one_of((*get_args(BodyKind), None), bodies=self.bodies)
+        check_at_least(1, max_unpacked=self.max_unpacked)
         if not 0 < self.threshold <= 1:
             raise ValueError(f"threshold: expected above 0 and at most 1, got {self.threshold}.")
 
