@@ -14,7 +14,7 @@ from igps.analysis.map import body_map
 from igps.report.explanations import Painted
 from igps.report.results import Results, System
 from igps.report.surfaces import PageSurface
-from igps.retrieval import RetrievalScores
+from igps.retrieval import RetrievalScores, precision_recall_curve, retrieval_scores
 
 N_WORST = 20
 """How many of the rankings that are most wrong the page shows at most."""
@@ -95,9 +95,10 @@ def _of_system(system: System, index: Mapping[str, int], classes: Sequence[str],
     near = order[:, :n_ranked]
     places = np.array([index[name] for name in system.names])
     distances = np.take_along_axis(system.distances.numpy(), near, axis=1)
-    scores, curve = system.scores(), system.curve()
     scored: dict[str, Any] = dict.fromkeys(("scores", "per_class", "per_query", "curve", "worst"))
-    if scores is not None and curve is not None:
+    if system.labels is not None and len(set(system.labels)) < len(system.labels):  # two share a class
+        scores = retrieval_scores(system.distances, system.labels)
+        curve = precision_recall_curve(system.distances, system.labels)
         by_class = {str(label): values for label, values in scores.per_class().items()}
         numbers = {
             "scores": scores.mean(),

@@ -16,7 +16,7 @@ from igps._arrays import Integers
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies, file_name_of
 from igps.mesh.options import LoadOptions
-from igps.retrieval import PrecisionRecallCurve, RetrievalScores, precision_recall_curve, rank, retrieval_scores
+from igps.retrieval import rank
 from igps.signature.signature import SignatureConfig
 
 MESHES_FILE = "meshes.json"
@@ -33,19 +33,6 @@ class System:
     labels: tuple[str, ...] | None  # None where they are not known
     distances: Tensor  # (N, N), a row a query
     seconds_per_mesh: float | None = None  # of processor time for a description; None where it was not measured
-
-    @property
-    def is_scored(self) -> bool:
-        """Whether two meshes share a class."""
-        return self.labels is not None and len(set(self.labels)) < len(self.labels)
-
-    def scores(self) -> RetrievalScores | None:
-        """Leave-one-out; None where no two meshes share a class."""
-        return retrieval_scores(self.distances, self.labels or ()) if self.is_scored else None
-
-    def curve(self) -> PrecisionRecallCurve | None:
-        """Precision and recall; None where there are no scores."""
-        return precision_recall_curve(self.distances, self.labels or ()) if self.is_scored else None
 
     def ranked(self) -> Integers:
         """(N, N − 1) the other meshes, nearest first, ties in the order of the meshes."""
