@@ -37,7 +37,7 @@ from igps.analysis.map import body_map
 from igps.cli import main
 from igps.mesh.mesh import Mesh
 from igps.report.explanations import Painted
-from igps.report.page import write_page
+from igps.report.page import page_of
 from igps.report.results import read_results
 from igps.shapes import ArticulatedShapes
 
@@ -75,7 +75,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "answers": answers_folder(root / "answers"),
     }
     for name, results in made.items():
-        write_page(root / f"{name}.html", read_results(results), pictures, EXPLAINED if name == "answers" else None)
+        page = page_of(read_results(results), pictures, EXPLAINED if name == "answers" else None)
+        (root / f"{name}.html").write_text(page, encoding="utf-8")
     return root
 
 
@@ -152,7 +153,8 @@ def test_bodies_of_one_file_are_shown_together_with_part_unit_and_volume(browser
     (tmp_path / "meshes.json").write_text(json.dumps({"meshes": files}))
     body = as_mesh(trimesh.creation.icosphere(subdivisions=2)).annotated(unit="mm")
     one = next(iter(surfaces(body).values()))
-    write_page(tmp_path / "page.html", read_results(tmp_path), dict.fromkeys(names, one))
+    page = page_of(read_results(tmp_path), dict.fromkeys(names, one))
+    (tmp_path / "page.html").write_text(page, encoding="utf-8")
     with Visit(browser, tmp_path / "page.html") as visit:
         dialog = visit.open(1)
         facts = dialog.locator("#facts").inner_text()
@@ -630,7 +632,7 @@ def test_without_confusions_the_page_says_so(browser: Any, tmp_path: Path) -> No
             names=np.array(NAMES)[some],
             labels=np.array(LABELS)[some],
         )
-    write_page(tmp_path / "right.html", read_results(results), {})
+    (tmp_path / "right.html").write_text(page_of(read_results(results), {}), encoding="utf-8")
     with Visit(browser, tmp_path / "right.html") as visit:
         worst = visit.page.locator("#worst")
         assert "There are no confusions" in worst.inner_text()

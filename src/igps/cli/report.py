@@ -4,7 +4,7 @@ from pathlib import Path
 
 from igps.descriptors import descriptor as descriptor_of
 from igps.report.explanations import keep_explanations, read_explanations
-from igps.report.page import write_page
+from igps.report.page import page_of
 from igps.report.results import read_results, read_sources
 from igps.report.surfaces import keep_surfaces, read_surfaces
 
@@ -41,7 +41,8 @@ def report(
         module = descriptor_of(str(own) if own.is_file() else system.name)
         explanations = keep_explanations(kept, system, dataset, module, surfaces, n_workers=n_workers)
     page = out or results / "report.html"
-    write_page(page, found, surfaces, explanations)
+    page.parent.mkdir(parents=True, exist_ok=True)
+    page.write_text(page_of(found, surfaces, explanations), encoding="utf-8")
     print(f"page of results: {page}")
 
 

@@ -5,7 +5,6 @@ import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 from igps.report.explanations import Painted
@@ -32,14 +31,6 @@ SCORE_MEANINGS = dict(  # noqa: C408
     map="mean average precision",
 )
 """What the scores are, by name."""
-
-
-def write_page(
-    path: Path, results: Results, surfaces: Mapping[str, PageSurface], explanations: Mapping[str, Painted] | None = None
-) -> None:
-    """Write the page of results as an HTML file, see `page_of`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page_of(results, surfaces, explanations), encoding="utf-8")
 
 
 def page_of(
