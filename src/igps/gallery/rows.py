@@ -57,16 +57,12 @@ def further_columns(bodies: Bodies, there: Mapping[str, type] = KNOWN) -> dict[s
     """Further columns of the table of labels, and of which type: numbers where all values are, unless text is there.
 
     Raises:
-        ValueError: one has the name of a column that every gallery or LanceDB has, or a name with a dot.
+        ValueError: one has the name of a column that every gallery has, or a name that none can have.
     """
-    if hidden := [name for name in bodies.columns if name.startswith("_")]:  # one called _rowid makes it unreadable
-        raise ValueError(
-            f"{LABELS_FILE}: a gallery takes no column that begins with an underscore, got {hidden[0]!r}. Rename it."
-        )
-    if dotted := [name for name in bodies.columns if "." in name]:
-        raise ValueError(
-            f"{LABELS_FILE}: a gallery takes no dot in the name of a column, got {dotted[0]!r}. Rename it."
-        )
+    # One called _rowid would make the gallery unreadable, and a dot means a field within a column
+    if wrong := [name for name in bodies.columns if name.startswith("_") or "." in name]:
+        told = f"a gallery takes no column whose name has a dot, or begins with an underscore, got {wrong[0]!r}"
+        raise ValueError(f"{LABELS_FILE}: {told}. Rename it.")
     if taken := bodies.columns.keys() & {*KNOWN, "vector", "code"}:
         raise ValueError(f"{LABELS_FILE}: every gallery has a column {min(taken)!r}. Give the column another name.")
     texts = {
