@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from igps._arrays import Floats, Integers
 from igps.mesh.surface import area_vectors, unit
-
-Array = NDArray[np.float64]
 
 # In units of √area. Of two points of a thin sheet, those whose normals agree are the near ones: a normal counts as so
 # long a step.
@@ -50,12 +49,12 @@ class SurfaceSamples:
     near.
     """
 
-    points: Array
-    normals: Array
+    points: Floats
+    normals: Floats
     surface: Callable[[], TriangleSurface] | None = None
 
     @classmethod
-    def of(cls, points: Array, normals: NDArray[np.floating], area: float) -> SurfaceSamples:
+    def of(cls, points: Floats, normals: NDArray[np.floating], area: float) -> SurfaceSamples:
         """Those of points (P, 3), length, and outward normals (P, 3) of a surface of an area, length²."""
         if points.shape != normals.shape or points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
             raise ValueError(
@@ -70,7 +69,7 @@ class SurfaceSamples:
         return KDTree(_with_normals(self), leafsize=50)  # in six dimensions twice as fast as the default
 
     @cached_property
-    def extents(self) -> Array:
+    def extents(self) -> Floats:
         """(3,) standard deviations along the principal axes, ascending, without unit."""
         return np.sqrt(np.linalg.eigvalsh(np.cov(self.points.T)))
 
@@ -79,7 +78,7 @@ class SurfaceSamples:
         """How far apart neighbours are, about."""
         return 1 / math.sqrt(len(self.points))
 
-    def nearest(self, samples: SurfaceSamples) -> tuple[Array, Array]:
+    def nearest(self, samples: SurfaceSamples) -> tuple[Floats, Floats]:
         """(P, 3) and (P, 3) the nearest of them to each of other samples, whose normal agrees, and its normal."""
         found = self.tree.query(_with_normals(samples))[1]
         return self.points[found], self.normals[found]
@@ -90,7 +89,7 @@ class TriangleSurface:
 
     gap = 0.0
 
-    def __init__(self, vertices: Array, faces: NDArray[np.int64]) -> None:
+    def __init__(self, vertices: Floats, faces: Integers) -> None:
         import igl
 
         self._triangles = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
@@ -98,7 +97,7 @@ class TriangleSurface:
         self._tree = igl.AABB()
         self._tree.init(*self._triangles)
 
-    def nearest(self, samples: SurfaceSamples) -> tuple[Array, Array]:
+    def nearest(self, samples: SurfaceSamples) -> tuple[Floats, Floats]:
         """(P, 3) and (P, 3) the nearest point of it to each of some samples, and the normal there."""
         _, face, points = self._tree.squared_distance(*self._triangles, np.ascontiguousarray(samples.points))
         return np.asarray(points), self._normals[np.asarray(face).ravel()]
@@ -177,7 +176,7 @@ def _mean_square(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurfa
     return float(squares.max() if patch == 1 else squares.mean())
 
 
-def _offsets(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) -> Array:
+def _offsets(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) -> Floats:
     """(P, 3) from each sample to the surface of the target."""
     nearest, normals = target.nearest(samples)
     steps = nearest - samples.points
@@ -187,7 +186,7 @@ def _offsets(samples: SurfaceSamples, target: SurfaceSamples | TriangleSurface) 
     return across + aside * np.maximum(1 - _GAP * target.gap / np.maximum(length, 1e-12), 0)
 
 
-def _scores(samples: SurfaceSamples, target: SurfaceSamples, starts: Array) -> Array:
+def _scores(samples: SurfaceSamples, target: SurfaceSamples, starts: Floats) -> Floats:
     """(S,) how badly each of the starts (S, 3, 3) lays the samples."""
     points, normals = (np.einsum("sij,nj->sni", starts, one) for one in (samples.points, samples.normals))
     placed = SurfaceSamples(points.reshape(-1, 3), normals.reshape(-1, 3))
@@ -199,8 +198,8 @@ def _scores(samples: SurfaceSamples, target: SurfaceSamples, starts: Array) -> A
 class _Placing:
     """How a surface is laid: scale · turn · x + shift; `turn` may mirror."""
 
-    turn: Array
-    shift: Array | float = 0.0
+    turn: Floats
+    shift: Floats | float = 0.0
     scale: float = 1.0
 
     def __call__(self, samples: SurfaceSamples) -> SurfaceSamples:
@@ -209,7 +208,7 @@ class _Placing:
     def inverse(self) -> _Placing:
         return _Placing(self.turn.T, -self.turn.T @ np.broadcast_to(self.shift, 3) / self.scale, 1 / self.scale)
 
-    def then(self, step: Array) -> _Placing:
+    def then(self, step: Floats) -> _Placing:
         """After a further small rotation vector, shift and logarithm of a scale, (7,)."""
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         log_scale = np.clip(math.log(self.scale) + step[6], -MOST_SCALED, MOST_SCALED)
@@ -239,7 +238,7 @@ def _fitted(
     return float(np.sqrt(np.einsum("ni,ni->n", offsets, offsets).mean())), placing
 
 
-def _with_normals(samples: SurfaceSamples) -> Array:
+def _with_normals(samples: SurfaceSamples) -> Floats:
     return np.hstack([samples.points, _NORMAL * samples.normals])
 
 
@@ -249,7 +248,7 @@ def _subset(samples: SurfaceSamples, n: int) -> SurfaceSamples:
     return SurfaceSamples(samples.points[chosen], samples.normals[chosen])
 
 
-def _principal_starts(one: SurfaceSamples, other: SurfaceSamples) -> Array:
+def _principal_starts(one: SurfaceSamples, other: SurfaceSamples) -> Floats:
     """(8, 3, 3): principal axes onto principal axes, each with either sign."""
     of_one, of_other = (np.linalg.eigh(np.cov(samples.points.T))[1] for samples in (one, other))
     return np.stack([of_other @ np.diag(signs) @ of_one.T for signs in product((1.0, -1.0), repeat=3)])
@@ -262,7 +261,7 @@ def _least_step(samples: SurfaceSamples) -> float:
 
 
 @cache
-def _uniform_starts() -> Array:
+def _uniform_starts() -> Floats:
     """(2 · _N_ROTATIONS, 3, 3) rotations, spread evenly, and their mirror images (super-Fibonacci, Alexa 2022)."""
     s = np.arange(_N_ROTATIONS) + 0.5
     phi, psi = math.sqrt(2), 1.533751168755204288118041

@@ -7,13 +7,11 @@ on the surface. So moments that differ by δ take a root mean square of u of at 
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from igps._arrays import Floats, Integers
 from igps.gallery._alignment import MOST_SCALED
 from igps.mesh.surface import area_vectors, directed_edges, face_areas
-
-Array = NDArray[np.float64]
 
 # A rule of six points that integrates polynomials of fourth degree over a triangle (Dunavant 1985)
 _INNER, _OUTER = 0.445948490915965, 0.091576213509771
@@ -23,7 +21,7 @@ _SHARES = np.repeat([0.223381589678011, 0.109951743655322], 3)
 _SECOND_ORDER = 0.03
 
 
-def moments(vertices: Array, faces: NDArray[np.int64], most: float) -> Array:
+def moments(vertices: Floats, faces: Integers, most: float) -> Floats:
     """(7, 6) six numbers of a body in units of √area, and a map of their differences to how far it moved at least.
 
     They are the logarithms of the volume V, of the second moments along principal axes and of ∫ |x|⁴ dV, about the

@@ -16,11 +16,11 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.linalg import orthogonal_procrustes
 from torch import Tensor
 from tqdm import tqdm
 
+from igps._arrays import Floats, Integers
 from igps._parallel import Failed, on_threads
 from igps.data.dataset import Failure, SignatureDataset
 from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
@@ -165,7 +165,7 @@ class Surfaces:
         A MeshError if none can be read.
         """
 
-        def moments_of(i: int) -> NDArray[np.float64] | None:
+        def moments_of(i: int) -> Floats | None:
             with contextlib.suppress(MeshError):  # which is among the failures
                 mesh = self._mesh(i)
                 return moments(self._placed(i, mesh), mesh.faces, most)
@@ -199,7 +199,7 @@ class Surfaces:
         rotation, _ = orthogonal_procrustes(one, other)
         return float(np.linalg.norm(one @ rotation - other, axis=1).max())
 
-    def _as_numbered(self, i: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def _as_numbered(self, i: int) -> tuple[Floats, Integers]:
         """The vertices about their mean, over √area, as they are in the file; and the faces, turned or not."""
         mesh = self._last_mesh(i)
         if "subdivided" in repair_steps(mesh.notes):  # by more or less, as the configuration asks for eigenpairs
@@ -211,7 +211,7 @@ class Surfaces:
         mesh = self._last_mesh(i)
         return TriangleSurface(self._placed(i, mesh), mesh.faces)
 
-    def _placed(self, i: int, mesh: Mesh) -> NDArray[np.float64]:
+    def _placed(self, i: int, mesh: Mesh) -> Floats:
         """The vertices of one about the origin and in the unit of its samples."""
         signature = self._signature(i)
         return (mesh.vertices - signature.surface.points.mean(axis=0)) / math.sqrt(signature.area)
