@@ -1,7 +1,6 @@
 """The benchmark itself: numbered classes and shapes, generated on demand or written to a folder."""
 
 import json
-import logging
 import operator
 import os
 from dataclasses import dataclass
@@ -21,8 +20,6 @@ from igps.shapes.templates import TEMPLATES
 _VERSION = 1  # raised whenever the same arguments would give other meshes
 _MAX_ATTEMPTS = 20
 _POSE, _MOTION = 0, 1  # what a random stream is for: keeps the streams of one seed apart
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +117,6 @@ class ArticulatedShapes:
             vertices, faces, spacing = mesh(body, target)
             vertices = roughen(vertices, faces, spacing * rng.uniform(0.0, 0.12), 10.0 * spacing, rng)
             found = defect(vertices, faces, skeleton.genus, self.n_vertices)
-            _log.debug("%s: attempt %d: %s", name, attempt + 1, found or "sound")
             if found is None:
                 vertices += rng.uniform(-1.0, 1.0, 3)
                 return GeneratedShape(vertices, faces, label, name, skeleton.genus, rotation)
