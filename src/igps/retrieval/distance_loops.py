@@ -11,23 +11,18 @@ TILE = 64
 
 
 @compiled()
-def chi_squares(
-    weights: NDArray[Real], queries: NDArray[Real], gallery: NDArray[Real], distances: NDArray[Real]
-) -> None:
-    """Write the sums of w (a−b)² / (a+b) over the cells, of rows (Q, cells) with rows (G, cells), to (Q, G)."""
+def fill(queries: NDArray[Real], gallery: NDArray[Real], weights: NDArray[Real], distances: NDArray[Real]) -> None:
+    """Write sums over the cells, of rows (Q, cells) with rows (G, cells), to (Q, G).
+
+    They are those of w (a−b)² / (a+b), or of (a−b)² where there are no weights.
+    """
     for begin in range(0, len(gallery), TILE):
         for q in range(len(queries)):
             for g in range(begin, min(begin + TILE, len(gallery))):
-                distances[q, g] = chi_square(queries[q], gallery[g], weights)
-
-
-@compiled()
-def squares(queries: NDArray[Real], gallery: NDArray[Real], distances: NDArray[Real]) -> None:
-    """Write the sums of (a−b)² over the cells, of rows (Q, cells) with rows (G, cells), to (Q, G)."""
-    for begin in range(0, len(gallery), TILE):
-        for q in range(len(queries)):
-            for g in range(begin, min(begin + TILE, len(gallery))):
-                distances[q, g] = square(queries[q], gallery[g])
+                if len(weights):
+                    distances[q, g] = chi_square(queries[q], gallery[g], weights)
+                else:
+                    distances[q, g] = square(queries[q], gallery[g])
 
 
 @compiled(fastmath=SUMS)

@@ -9,16 +9,14 @@ ones; to check that waits for the device once per argument.
 
 import math
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
 from igps._threads import Team
-from igps.retrieval import distance_loops
+from igps.retrieval.distance_loops import fill
 
 Distance = Callable[[Tensor, Tensor], Tensor]
 """A distance function: queries (Q, ...) and gallery (G, ...) to distances (Q, G) ≥ 0, smaller is closer."""
@@ -80,8 +78,7 @@ class _ChiSquare(torch.autograd.Function):
     def forward(ctx: Any, a: Tensor, b: Tensor, w: Tensor | None) -> Tensor:
         ctx.save_for_backward(a, b, w)
         if _is_for_loops(a):
-            weights = (a.new_ones(a.shape[1]) if w is None else w.detach()).contiguous().numpy()
-            return _by_loops(partial(distance_loops.chi_squares, weights), a, b).mul_(0.5)
+            return _by_loops(a, b, a.new_ones(a.shape[1]) if w is None else w).mul_(0.5)
         distances = a.new_zeros(len(a), len(b))
         for q, g, c in _tiles(a, b):
             ratio, difference = _ratio(a[q, c], b[g, c])
@@ -129,16 +126,16 @@ def _is_for_loops(tensor: Tensor) -> bool:
     return tensor.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
-def _by_loops(loop: Callable[[np.ndarray, np.ndarray, np.ndarray], None], a: Tensor, b: Tensor) -> Tensor:
-    """What a compiled loop writes, given queries and gallery: (Q, G). Threads share the longer of both sides."""
+def _by_loops(a: Tensor, b: Tensor, w: Tensor) -> Tensor:
+    """What `distance_loops.fill` writes, (Q, G). Threads share the longer of both sides."""
     found = a.new_empty(len(a), len(b))
-    queries, gallery, result = (tensor.detach().contiguous().numpy() for tensor in (a, b, found))
+    queries, gallery, weights, result = (tensor.detach().contiguous().numpy() for tensor in (a, b, w, found))
 
     def write(part: slice) -> None:
         if len(a) >= len(b):
-            loop(queries[part], gallery, result[part])
+            fill(queries[part], gallery, weights, result[part])
         else:
-            loop(queries, gallery[part], result[:, part])
+            fill(queries, gallery[part], weights, result[:, part])
 
     large = found.numel() * a.shape[1] > 2 * _TRIPLES_PER_THREAD
     with Team(None if large else 1) as team:
@@ -171,7 +168,7 @@ def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
 
 def _row_distance(a: Tensor, b: Tensor) -> Tensor:
     if _is_for_loops(a) and not (_is_derived(a) or _is_derived(b)):
-        return _by_loops(distance_loops.squares, a, b).sqrt_()
+        return _by_loops(a, b, a.new_empty(0)).sqrt_()
     # The faster form by a matrix product cancels: it leaves a diagonal that is not zero.
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
