@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -54,12 +55,10 @@ def near_in_gallery(gallery: Gallery, limit: float, progress: bool) -> NearPairs
 
 def of_one_size(near: NearPairs, dataset: SignatureDataset) -> NearPairs:
     """Those of the pairs that are of one size."""
-    known: dict[int, float] = {}
 
+    @cache
     def log_length(i: int) -> float:
-        if i not in known:
-            signature = dataset[i].signature
-            known[i] = math.log(signature.area) / 2 + math.log(millimetres(signature.unit))
-        return known[i]
+        signature = dataset[i].signature
+        return math.log(signature.area) / 2 + math.log(millimetres(signature.unit))
 
     return (pair for pair in near if abs(log_length(pair[0]) - log_length(pair[1])) < _ONE_SIZE)
