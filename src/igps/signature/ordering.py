@@ -28,7 +28,7 @@ _ANCHOR_SHARES = 0.1 / np.sqrt([1.0, 2.0, 3.0, 5.0])
 
 
 def ordering_keys(
-    eigenfunctions: NDArray[np.floating], eigenvalues: Floats, area: float, marks: Floats | None = None
+    eigenfunctions: NDArray[np.floating], eigenvalues: Floats, area: float, marks: Floats | float = 0.0
 ) -> Floats:
     """One number for each of some points of a body, by which they can be ordered whatever the order they come in.
 
@@ -71,10 +71,8 @@ def canonically_ordered(mesh: Mesh) -> Mesh:
     return replace(mesh, vertices=mesh.vertices[order], faces=corners[np.lexsort(corners.T[::-1])])
 
 
-def _by_anchors(embedding: Floats, marks: Floats | None) -> Floats:
-    found = np.linalg.norm(embedding, axis=1)
-    if marks is not None:
-        found += _MARK_SHARE * marks
+def _by_anchors(embedding: Floats, marks: Floats | float) -> Floats:
+    found = np.linalg.norm(embedding, axis=1) + _MARK_SHARE * marks
     anchor, nearest = int(np.argmax(found)), np.full(len(found), np.inf)
     for share in _ANCHOR_SHARES:
         distance = np.linalg.norm(embedding - embedding[anchor], axis=1)
