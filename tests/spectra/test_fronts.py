@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from igps.spectra._pivots import AT_ONCE, Room, invert_front
+from igps.spectra._pivots import AT_ONCE, Scratch, invert_front
 
 
 def invert(matrix: np.ndarray) -> tuple[int, np.ndarray]:
@@ -16,8 +16,8 @@ def invert(matrix: np.ndarray) -> tuple[int, np.ndarray]:
     front[:, :n] = np.triu(matrix)
     squares = [np.full(n * width, np.nan) for _ in range(3)]
     strips = [np.full(AT_ONCE * (width + AT_ONCE), np.nan) for _ in range(2)]
-    room = Room(np.empty(0, dtype=np.int64), front.ravel(), *squares, *strips)
-    return invert_front(room, n, n + 3, width), room.pivot.reshape(n, width)[:, :n]
+    scratch = Scratch(np.empty(0, dtype=np.int64), front.ravel(), *squares, *strips)
+    return invert_front(scratch, n, n + 3, width), scratch.pivot.reshape(n, width)[:, :n]
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 8, 9, 26, 63, 120])

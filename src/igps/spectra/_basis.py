@@ -59,7 +59,7 @@ class Basis:
                 total.add_(part)
         return first
 
-    def _room(self, n_rows: int) -> torch.Tensor:
+    def _next_rows(self, n_rows: int) -> torch.Tensor:
         """The rows of the basis behind the last, which a block is written to before it is appended."""
         stop = self._stop + n_rows
         if stop > len(self._basis):
@@ -74,9 +74,9 @@ class Basis:
         return self._basis[self._stop : stop]
 
     def _append(self, block: torch.Tensor, *, swept: bool) -> None:
-        room = self._room(len(block))
-        if block.data_ptr() != room.data_ptr():
-            room.copy_(block)
+        rows = self._next_rows(len(block))
+        if block.data_ptr() != rows.data_ptr():
+            rows.copy_(block)
         self._stop += len(block)
         if swept:
             self._mark_swept()

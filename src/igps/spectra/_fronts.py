@@ -6,15 +6,15 @@ import numpy as np
 
 from igps._arrays import Floats
 from igps._compiled import compiled
-from igps.spectra._pivots import AT_ONCE, Room, invert_front
+from igps.spectra._pivots import AT_ONCE, Scratch, invert_front
 from igps.spectra._products import COLUMNS, ONE, ROWS, ZERO, product
 from igps.spectra._tree import Nodes, Structure
 
 
 @compiled(inline="always")
-def assemble(n: int, tree: Structure, values: Floats, shift: float, updates: Floats, room: Room) -> None:
+def assemble(n: int, tree: Structure, values: Floats, shift: float, updates: Floats, scratch: Scratch) -> None:
     """Write the upper triangle of a node's front, (S + B, S + B): of the matrix, and its children's complements."""
-    first, start, place, front = tree.first, tree.start, room.place, room.front
+    first, start, place, front = tree.first, tree.start, scratch.place, scratch.front
     begin, stop = first[n], first[n + 1]
     n_own = stop - begin
     width = n_own + start[n + 1] - start[n]
@@ -50,7 +50,7 @@ def eliminate(
     shift: float,
     updates: Floats,
     blocks: Floats,
-    room: Room,
+    scratch: Scratch,
 ) -> tuple[int, int]:
     """Eliminate the nodes of a range one after another; their negative pivots, and the node at which it stops.
 
@@ -58,15 +58,15 @@ def eliminate(
     unknowns, or whose pivots must be taken in another order.
     """
     n_negative = 0
-    first, start, front, pivot = tree.first, tree.start, room.front, room.pivot
+    first, start, front, pivot = tree.first, tree.start, scratch.front, scratch.pivot
     for n in range(nodes[0], nodes[1]):
-        assemble(n, tree, values, shift, updates, room)
+        assemble(n, tree, values, shift, updates, scratch)
         n_own, n_boundary = first[n + 1] - first[n], start[n + 1] - start[n]
         width = n_own + n_boundary
         if n_own > largest:
             return n_negative, n
         padded = -(-n_own // AT_ONCE) * AT_ONCE
-        negative = invert_front(room, n_own, width, padded)
+        negative = invert_front(scratch, n_own, width, padded)
         if negative < 0:
             return n_negative, n
         n_negative += negative

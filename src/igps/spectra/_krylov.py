@@ -232,7 +232,7 @@ class Krylov(Basis):
     def _factor_quickly(
         self, block: torch.Tensor, squares: torch.Tensor, scale: float
     ) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """As `_factor_rows`, in the room of the basis, given the rows' products; again where rounding asks for it.
+        """As `_factor_rows`, in the next rows of the basis, given the rows' products; again where rounding asks for it.
 
         None if a pivot is small.
         """
@@ -240,7 +240,7 @@ class Krylov(Basis):
         smallest, largest = torch.aminmax(torch.diagonal(first))
         if failed or not smallest > QUICK_PIVOT * scale:
             return None
-        rows = self._room(len(block))
+        rows = self._next_rows(len(block))
         self._multiply(_inverse(first), block, rows)
         if smallest > ROUND_PIVOT * largest:
             return rows, first.T

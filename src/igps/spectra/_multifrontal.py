@@ -40,7 +40,7 @@ from igps._threads import ALONE, Team
 from igps.spectra import _fronts as loops
 from igps.spectra._checks import checked_entries
 from igps.spectra._ordering import LEAF_SIZE, checked_graph, nested_dissection
-from igps.spectra._pivots import Room
+from igps.spectra._pivots import Scratch
 from igps.spectra._tree import Nodes, Structure, tree_structure
 
 # Own unknowns of a node above which its dense algebra is PyTorch's, for which a team can work
@@ -108,10 +108,10 @@ class Tree:
         padded = min(LARGE, int(n_own.max())) + loops.AT_ONCE
         squares = [np.empty(padded**2) for _ in range(3)]
         strips = [np.empty(loops.AT_ONCE * (padded + loops.AT_ONCE)) for _ in range(2)]
-        room = Room(np.empty(len(structure.order), dtype=np.int64), front, *squares, *strips)
+        scratch = Scratch(np.empty(len(structure.order), dtype=np.int64), front, *squares, *strips)
         n_negative, node = 0, begin
         while True:
-            n_more, node = loops.eliminate((node, end), LARGE, structure, values, shift, updates, blocks, room)
+            n_more, node = loops.eliminate((node, end), LARGE, structure, values, shift, updates, blocks, scratch)
             n_negative += n_more
             if node == end:
                 return n_negative

@@ -8,7 +8,7 @@ from igps._compiled import compiled
 from igps.spectra._products import COLUMNS, ONE, ZERO, product
 
 
-class Room(NamedTuple):
+class Scratch(NamedTuple):
     """Flat arrays to compute in."""
 
     place: np.ndarray  # the rows of a boundary in a front
@@ -58,7 +58,7 @@ def invert(matrix: np.ndarray, n: int, width: int, rows: np.ndarray, columns: np
 
     Gauss and Jordan's elimination of AT_ONCE unknowns at a time, of which the width is a multiple. As the pivots are
     taken as they come, the inverse is accurate where the matrix is definite; elsewhere see `invert_front`. What is
-    behind n in a row must be 0; rows (AT_ONCE · width,) and columns ((n + AT_ONCE) · AT_ONCE,) are room.
+    behind n in a row must be 0; rows (AT_ONCE · width,) and columns ((n + AT_ONCE) · AT_ONCE,) are to compute in.
     """
     n_negative = 0
     pivot = columns[n * AT_ONCE :]
@@ -102,35 +102,35 @@ def load(matrix: np.ndarray, front: np.ndarray, n: int, front_width: int, width:
 
 
 @compiled(inline="always")
-def missing(matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, room: np.ndarray) -> float:
+def missing(matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, scratch: np.ndarray) -> float:
     """The Frobenius norm of I − A X."""
-    whole = (room, ZERO, width)
+    whole = (scratch, ZERO, width)
     for i in range(n * width):
-        room[i] = 0.0
+        scratch[i] = 0.0
     for i in range(n):
-        room[i * width + i] = 1.0
+        scratch[i * width + i] = 1.0
     product((n, width, n), -1.0, (matrix, ZERO, width, ONE), (inverse, ZERO, width), True, whole, whole)
     squares = 0.0
     for i in range(n * width):
-        squares += room[i] ** 2
+        squares += scratch[i] ** 2
     return np.sqrt(squares)
 
 
 @compiled(inline="always")
-def invert_front(room: Room, n: int, front_width: int, width: int) -> int:
+def invert_front(scratch: Scratch, n: int, front_width: int, width: int) -> int:
     """Write the inverse (n, width) of a front's pivot block; the negative eigenvalues of that, -1 if it cannot tell.
 
     A definite block is inverted accurately with its pivots in any order. An indefinite one may lose digits in one
     order, rarely in both; I − A X tells how many. Where it is small, the signs of the pivots are right as well: on the
     way from A to the matrix whose inverse X is, no eigenvalue passes zero.
     """
-    inverse = room.pivot
+    inverse = scratch.pivot
     for backwards in (False, True):
-        load(inverse, room.front, n, front_width, width, backwards)
-        n_negative = invert(inverse, n, width, room.rows, room.columns)
+        load(inverse, scratch.front, n, front_width, width, backwards)
+        n_negative = invert(inverse, n, width, scratch.rows, scratch.columns)
         if n_negative > 0:
-            load(room.copy, room.front, n, front_width, width, backwards)
-            if not missing(room.copy, inverse, n, width, room.squares) <= MOST_MISSING:
+            load(scratch.copy, scratch.front, n, front_width, width, backwards)
+            if not missing(scratch.copy, inverse, n, width, scratch.squares) <= MOST_MISSING:
                 continue
         if n_negative >= 0:
             if backwards:
