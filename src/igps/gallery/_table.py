@@ -21,7 +21,7 @@ from torch import Tensor
 
 from igps._threads import one_thread
 from igps.gallery._codes import CODE, Coder, Codes
-from igps.gallery.about import KNOWN, Batch, Row, in_words
+from igps.gallery.about import KNOWN, Batch, Row, engine_errors_as
 from igps.retrieval.distances import Distance
 from igps.retrieval.vectors import SearchDistance
 
@@ -47,14 +47,14 @@ class BodyTable:
         self.path = Path(path)
         if not exists(self.path):
             raise FileNotFoundError(f"{path}: no gallery there, or its building was not finished. Build it.")
-        with self._told(None):
+        with self._errors_told(None):
             self.table = lancedb.connect(self.path).open_table(_BODIES)
-        with in_words(f"version: expected one of those that `igps gallery versions` lists, got {version}"):
+        with engine_errors_as(f"version: expected one of those that `igps gallery versions` lists, got {version}"):
             self.table.checkout(self.table.version if version is None else version)
         self._read_head()
 
     def _read_head(self) -> None:
-        with self._told(None):
+        with self._errors_told(None):
             schema = self.table.schema
             if b"embedding_functions" in schema.metadata:  # LanceDB would load the models that they name
                 raise ValueError("it names models to be loaded")
@@ -75,7 +75,7 @@ class BodyTable:
 
     def batches(self, where: str | None = None, columns: Sequence[str] = ()) -> Iterator[Any]:
         """Arrow tables of the rows, some at a time; of all that `decoded` needs if no columns are named."""
-        with self._told(where):
+        with self._errors_told(where):
             asked = self._asked(where, *(columns or (*self.columns, "vector")))
             yield from (pa.Table.from_batches([one]) for one in asked.to_batches(_ROWS_AT_ONCE) if one.num_rows)
 
@@ -89,7 +89,7 @@ class BodyTable:
 
     def _numbered(self, where: str | None, *columns: str) -> Any:
         """An Arrow table of rows with LanceDB's numbers of them."""
-        with self._told(where):
+        with self._errors_told(where):
             return self._asked(where, "_rowid", *columns).to_arrow()
 
     def decoded(self, rows: Any) -> tuple[Tensor, list[dict[str, Any]]]:
@@ -130,14 +130,14 @@ class BodyTable:
     def _all_codes(self, coder: Coder) -> Codes:
         if self._codes is None:
             rows = self._numbered(None, "code")
-            with self._told(None):
+            with self._errors_told(None):
                 codes = rows["code"].combine_chunks().flatten().to_numpy()
                 self._codes = Codes(coder, codes.view(CODE), rows["_rowid"].to_numpy())
         return self._codes
 
     def _taken(self, row_ids: Any, *columns: str) -> Any:
         """An Arrow table of rows by LanceDB's numbers of them; few columns are read sooner than many."""
-        with self._told(None):
+        with self._errors_told(None):
             return self.table.take_row_ids(np.asarray(row_ids).tolist()).with_row_id().select([*columns]).to_arrow()
 
     def add(self, descriptions: Tensor, rows: Sequence[Row], further: Mapping[str, type]) -> None:
@@ -164,7 +164,7 @@ class BodyTable:
         with alone(self.path):
             self.table.checkout_latest()
             self._read_head()
-            with contextlib.nullcontext() if where is None else self._told(where):
+            with contextlib.nullcontext() if where is None else self._errors_told(where):
                 self._asked(where, "id")
                 yield self.table
             self.table.checkout_latest()
@@ -182,10 +182,10 @@ class BodyTable:
         if (found := tuple(descriptions.shape[1:])) != self.shape:
             raise ValueError(f"descriptions: expected shape {self.shape} as in {self.path}, got {found}.")
 
-    def _told(self, where: str | None) -> contextlib.AbstractContextManager[None]:
+    def _errors_told(self, where: str | None) -> contextlib.AbstractContextManager[None]:
         if where is None:
-            return in_words(f"{self.path}: the gallery is damaged. Restore a version of it, or build it again")
-        return in_words(f"where: expected a condition on the columns {', '.join(self.columns)}, got {where!r}")
+            return engine_errors_as(f"{self.path}: the gallery is damaged. Restore a version of it, or build it again")
+        return engine_errors_as(f"where: expected a condition on the columns {', '.join(self.columns)}, got {where!r}")
 
 
 def check_place(path: Path) -> None:

@@ -68,7 +68,7 @@ def _short(value: Any) -> str:
 
 
 @contextlib.contextmanager
-def in_words(sentence: str) -> Iterator[None]:
+def engine_errors_as(sentence: str) -> Iterator[None]:
     """A sentence, and the first line of what the engine raises."""
     try:
         yield

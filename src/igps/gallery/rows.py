@@ -33,15 +33,15 @@ def described_rows(
     failures: list[Failure], n_workers: int | None, strict: bool, progress: bool,
 ) -> Iterator[Batch]:  # fmt: skip
     """Descriptions and rows of the bodies that are not known by their checksums; failures are added to the list."""
-    dataset = once(dataset)
+    dataset = each_body_once(dataset)
     bodies = dataset.bodies
     with tqdm(desc="descriptions", total=len(dataset), disable=not progress) as bar:
         for start in range(0, len(dataset), _AT_ONCE):
             numbers = range(start, min(start + _AT_ONCE, len(dataset)))
             # Before files are read: one that changes meanwhile is described again next time
-            of_each = told_of(bodies.subset(numbers), kinds, dataset.reading)
+            of_each = known_rows(bodies.subset(numbers), kinds, dataset.reading)
             told = dict(zip(numbers, of_each, strict=True))
-            keys = {i: key_of(dataset, i) for i in numbers}
+            keys = {i: checksum_of(dataset, i) for i in numbers}
             new = [i for i in numbers if not keys[i] or known.get(told[i]["id"]) != keys[i]]
             failed: list[Failure] = []
             descriptions = _described(dataset.subset(new), descriptor, None if strict else failed, n_workers)
@@ -71,7 +71,7 @@ def further_columns(bodies: Bodies, there: Mapping[str, type] = KNOWN) -> dict[s
     return {name: str if name in texts else float for name in bodies.columns}
 
 
-def told_of(bodies: Bodies, kinds: Mapping[str, type], reading: LoadOptions) -> list[dict[str, Any]]:
+def known_rows(bodies: Bodies, kinds: Mapping[str, type], reading: LoadOptions) -> list[dict[str, Any]]:
     """What is known of bodies without reading their files, which are read by the options."""
     files = _files(bodies)
     labels = bodies.labels or [None] * len(bodies)
@@ -86,7 +86,7 @@ def told_of(bodies: Bodies, kinds: Mapping[str, type], reading: LoadOptions) -> 
     return told
 
 
-def once(dataset: SignatureDataset) -> SignatureDataset:
+def each_body_once(dataset: SignatureDataset) -> SignatureDataset:
     """Without what a link to a folder shows again: of the names of a body the first in order stays."""
     bodies = dataset.bodies
     files = list(zip(_files(bodies), bodies.parts, strict=True))
@@ -109,7 +109,7 @@ def _stamp(file: Path, reading: LoadOptions) -> dict[str, int]:
     return {"bytes": n_bytes, "modified": changed if time.time_ns() - changed > _YOUNG else -1}
 
 
-def key_of(dataset: SignatureDataset, i: int) -> str:
+def checksum_of(dataset: SignatureDataset, i: int) -> str:
     """A checksum of a body and of all that its Signature depends on; "" where it cannot be read."""
     try:
         return dataset.key(i)

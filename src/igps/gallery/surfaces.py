@@ -88,17 +88,17 @@ class Surfaces:
         self.nearly: dict[tuple[int, int], float] = {}
         self._tolerance = tolerance
         self._dataset = dataset
-        self._last = lru_cache(_SURFACES)(self.samples)
-        self._last_mesh = lru_cache(_TRIANGLES)(self._mesh)
-        self._last_triangles = lru_cache(_TRIANGLES)(self._triangles)
-        self._numbered = lru_cache(_TRIANGLES)(self._as_numbered)
-        self._known = lru_cache(None)(self._coarseness_and_handles)
+        self._cached_samples = lru_cache(_SURFACES)(self.samples)
+        self._cached_mesh = lru_cache(_TRIANGLES)(self._mesh)
+        self._cached_triangles = lru_cache(_TRIANGLES)(self._triangles)
+        self._cached_vertices = lru_cache(_TRIANGLES)(self._vertices_and_faces)
+        self._cached_coarseness = lru_cache(None)(self._coarseness_and_handles)
 
     def samples(self, i: int) -> SurfaceSamples:
         """Those of one body; a MeshError if it cannot be used, a ValueError if its samples have no directions."""
         signature = self._signature(i)
         found = SurfaceSamples.of(signature.surface.points, signature.surface.attributes[_NORMALS], signature.area)
-        return replace(found, surface=partial(self._last_triangles, i))
+        return replace(found, surface=partial(self._cached_triangles, i))
 
     def coarseness(self, i: int) -> float:
         """How far one is from itself with each vertex in the middle of its neighbours, over √area.
@@ -106,12 +106,12 @@ class Surfaces:
         That is what its level of detail leaves open: how far chords cut round parts off, and other triangles sharp
         edges. On thin triangles, near neighbours count, see `mean_of_neighbours`. A MeshError if it cannot be used.
         """
-        return self._known(i)[0]
+        return self._cached_coarseness(i)[0]
 
     def distance(self, i: int, j: int, calibration: Calibration) -> float:
         """That of two, over √area; infinite where they are not the same, or one cannot be read."""
         try:
-            one, other = self._last(i), self._last(j)
+            one, other = self._cached_samples(i), self._cached_samples(j)
             most, limit = max(calibration.same.distance, self._tolerance), 0.0
             apart = distance_if_alike(one, other, enough=calibration.same.distance, most=most)
             if apart <= calibration.same.distance:
@@ -138,7 +138,8 @@ class Surfaces:
                 return "same file", 0.0
         if (apart := self._farthest_vertex(i, j)) <= _ONE_SURFACE:
             return "same mesh", apart
-        apart = surface_distance(self._last(i), self._last(j), enough=_ONE_SURFACE, hopeless=_HOPELESS, patch=1)
+        samples = map(self._cached_samples, (i, j))
+        apart = surface_distance(*samples, enough=_ONE_SURFACE, hopeless=_HOPELESS, patch=1)
         return ("same surface" if apart <= _ONE_SURFACE else "same at another level of detail"), apart
 
     def length(self, i: int) -> tuple[float, str | None]:
@@ -151,7 +152,7 @@ class Surfaces:
 
         Not at all if one has more handles than the other, or if their vertices are numbered alike and lie elsewhere.
         """
-        (coarseness, handles), (of_other, handles_of_other) = self._known(i), self._known(j)
+        (coarseness, handles), (of_other, handles_of_other) = self._cached_coarseness(i), self._cached_coarseness(j)
         differ = None not in (handles, handles_of_other) and handles != handles_of_other
         if differ or _ROUNDED < self._farthest_vertex(i, j) < math.inf:
             return 0.0
@@ -180,35 +181,35 @@ class Surfaces:
 
     def _coarseness_and_handles(self, i: int) -> tuple[float, int | None]:
         """Handles are None where the mesh is open, and where mending may have made some or closed holes."""
-        mesh = self._last_mesh(i)
+        mesh = self._cached_mesh(i)
         blurred = TriangleSurface(mean_of_neighbours(self._placed(i, mesh), mesh.faces), mesh.faces)
         handles = None
         if not set(repair_steps(mesh.notes)) - _KEEP_HANDLES:
             with contextlib.suppress(MeshError):
                 handles = mesh.genus
-        return offset_in_place(self._last(i), blurred), handles
+        return offset_in_place(self._cached_samples(i), blurred), handles
 
     def _farthest_vertex(self, i: int, j: int) -> float:
         """How far the vertices of two lie apart that are numbered alike; infinite if they are not.
 
         Where faces join the same vertices, no level of detail explains a vertex that has moved.
         """
-        (one, faces), (other, faces_of_other) = self._numbered(i), self._numbered(j)
+        (one, faces), (other, faces_of_other) = self._cached_vertices(i), self._cached_vertices(j)
         if not np.array_equal(faces, faces_of_other):
             return math.inf
         rotation, _ = orthogonal_procrustes(one, other)
         return float(np.linalg.norm(one @ rotation - other, axis=1).max())
 
-    def _as_numbered(self, i: int) -> tuple[Floats, Integers]:
+    def _vertices_and_faces(self, i: int) -> tuple[Floats, Integers]:
         """The vertices about their mean, over √area, as they are in the file; and the faces, turned or not."""
-        mesh = self._last_mesh(i)
+        mesh = self._cached_mesh(i)
         if "subdivided" in repair_steps(mesh.notes):  # by more or less, as the configuration asks for eigenpairs
             body = self._dataset.bodies[i]
             mesh = load_mesh(body.path, self._dataset.pipeline.reading, part=body.part)
         return (mesh.vertices - mesh.vertices.mean(axis=0)) / math.sqrt(mesh.area), np.sort(mesh.faces, axis=1)
 
     def _triangles(self, i: int) -> TriangleSurface:
-        mesh = self._last_mesh(i)
+        mesh = self._cached_mesh(i)
         return TriangleSurface(self._placed(i, mesh), mesh.faces)
 
     def _placed(self, i: int, mesh: Mesh) -> Floats:

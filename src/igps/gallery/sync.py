@@ -8,7 +8,7 @@ from typing import Any
 from igps.data.dataset import Failure, SignatureDataset
 from igps.gallery.about import KNOWN
 from igps.gallery.gallery import Gallery
-from igps.gallery.rows import further_columns, key_of, once, told_of
+from igps.gallery.rows import checksum_of, each_body_once, further_columns, known_rows
 
 # Rows that are removed, or told anew, at once.
 _AT_ONCE = 1000
@@ -36,10 +36,10 @@ def sync(
         How many bodies were described, how many removed, and those that failed, of which the old row stays; as does
         that of a file in a folder that may not be read.
     """
-    dataset = once(dataset)
+    dataset = each_body_once(dataset)
     kinds = further_columns(dataset.bodies, gallery.columns)
     empty = dict.fromkeys(gallery.columns.keys() - KNOWN.keys())  # what the folder tells no more
-    now = [{**empty, **row} for row in told_of(dataset.bodies, kinds, dataset.reading)]
+    now = [{**empty, **row} for row in known_rows(dataset.bodies, kinds, dataset.reading)]
     asked = [name for name in ("checksum", *now[0]) if name in gallery.columns]
     known = {one["id"]: one for one in gallery.rows(*asked)}
     new: list[int] = []
@@ -48,7 +48,7 @@ def sync(
         before = known.get(row["id"], {})
         differs = [name for name, value in row.items() if before.get(name) != value]
         is_known = row["modified"] >= 0 and not {"bytes", "modified"} & set(differs)
-        if not is_known and before.get("checksum") != key_of(dataset, i):
+        if not is_known and before.get("checksum") != checksum_of(dataset, i):
             new.append(i)
         elif differs:
             told[row["id"]] = row

@@ -63,7 +63,7 @@ def places(vertices: Floats) -> Integers:
     return np.asarray(first[index.ravel()])
 
 
-def met(vertices: Floats, faces: Integers) -> Integers:
+def joined_at_free_edges(vertices: Floats, faces: Integers) -> Integers:
     """The faces (F, 3), where vertices at free edges are made one if they are in one place."""
     free, index = _at_free_edges(vertices, faces), np.arange(len(vertices))
     if len(free):

@@ -83,7 +83,7 @@ def voxel_surface(
     low = np.array([side.start for side in box], dtype=np.float64)
     notes: list[str] = []
     mask = with_missed_slices(mask[box], notes) if joins else mask[box]
-    mask, hollows = _whole(mask, notes, LEAST_VOXELS if cavities else None)
+    mask, hollows = _cleaned(mask, notes, LEAST_VOXELS if cavities else None)
     share, factor = _coarsened(mask, spacing, max_vertices)
     mask = _with_thick_contacts(share >= 0.5)
     share = np.pad(np.where(mask, np.maximum(share, np.float32(0.5)), share), PAD)
@@ -125,7 +125,7 @@ def checked_spacing(affine: Floats, name: str) -> Floats:
     return spacing
 
 
-def _whole(mask: Booleans, notes: list[str], least: int | None) -> tuple[Booleans, list[Booleans]]:
+def _cleaned(mask: Booleans, notes: list[str], least: int | None) -> tuple[Booleans, list[Booleans]]:
     """Without islands, and with holes filled; and the holes of at least so many voxels, none if None."""
     label, island, size = _islands(mask)
     if len(island):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from igps._threads import one_thread
-from igps.mesh._tidying import met
+from igps.mesh._tidying import joined_at_free_edges
 from igps.mesh.formats import FORMATS, Format, RawBody, format_of
 from igps.mesh.formats._format import faults, joined, pieces
 from igps.mesh.limits import check_memory
@@ -139,7 +139,8 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
     vertices, faces, notes = raw.vertices, raw.faces, raw.notes
     if options.component == "largest" and len(faces):
         check_arrays(vertices, faces, name)
-        owner, areas = face_parts(vertices, faces if options.mend == "never" else met(vertices, faces))
+        connected = faces if options.mend == "never" else joined_at_free_edges(vertices, faces)
+        owner, areas = face_parts(vertices, connected)
         if len(areas) > 1:
             n_before = len(vertices)
             vertices, faces = compact(vertices, faces[owner == int(np.argmax(areas))])
