@@ -11,26 +11,23 @@ TILE = 64
 
 
 @compiled()
-def fill(queries: NDArray[Real], gallery: NDArray[Real], weights: NDArray[Real], distances: NDArray[Real]) -> None:
-    """Write sums over the cells, of rows (Q, cells) with rows (G, cells), to (Q, G).
-
-    They are those of w (a−b)² / (a+b), or of (a−b)² where there are no weights.
-    """
+def fill(queries: NDArray[Real], gallery: NDArray[Real], is_chi_square: bool, distances: NDArray[Real]) -> None:
+    """Write sums over the cells, of (a−b)² / (a+b) or else of (a−b)², of rows (Q, cells) and (G, cells), to (Q, G)."""
     for begin in range(0, len(gallery), TILE):
         for q in range(len(queries)):
             for g in range(begin, min(begin + TILE, len(gallery))):
-                if len(weights):
-                    distances[q, g] = chi_square(queries[q], gallery[g], weights)
+                if is_chi_square:
+                    distances[q, g] = chi_square(queries[q], gallery[g])
                 else:
                     distances[q, g] = square(queries[q], gallery[g])
 
 
 @compiled(fastmath=SUMS)
-def chi_square(a: NDArray[Real], b: NDArray[Real], weights: NDArray[Real]) -> Real:
-    """The sum of w (a−b)² / (a+b) over the cells."""
+def chi_square(a: NDArray[Real], b: NDArray[Real]) -> Real:
+    """The sum of (a−b)² / (a+b) over the cells."""
     total, one = a.dtype.type(0), a.dtype.type(1)
     for cell in range(np.uint64(len(a))):
-        total += weights[cell] * term(a[cell], b[cell], one)
+        total += term(a[cell], b[cell], one)
     return total
 
 

@@ -30,13 +30,14 @@ _CELLS_PER_TILE = 4096
 _TRIPLES_PER_THREAD = 2**24
 
 
-def chi_square(queries: Tensor, gallery: Tensor, weights: Tensor | None = None) -> Tensor:
-    """χ² distance ½ Σ w (a−b)² / (a+b) between histograms, over all cells, with the factor ½.
+def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
+    """χ² distance ½ Σ (a−b)² / (a+b) between histograms, over all cells, with the factor ½.
 
-    With the ½ (and w = 1) the distance of two histograms that each sum to 1 lies in [0, 1], and is 1 where they have no
-    cell in common. A cell empty in both adds nothing, and the gradients of such a cell are set to zero, where the
-    function has no derivative. Memory beyond inputs, result and gradients stays below 256 MiB, but derivatives of
-    gradients hold all triples of query, gallery and cell. Source: Rustamov 2010 (comparison of histograms by χ²).
+    With the ½ the distance of two histograms that each sum to 1 lies in [0, 1], and is 1 where they have no cell in
+    common. To weigh a cell, multiply it in both by the weight. A cell empty in both adds nothing, and the gradients of
+    such a cell are set to zero, where the function has no derivative. Memory beyond inputs, result and gradients stays
+    below 256 MiB, but derivatives of gradients hold all triples of query, gallery and cell. Source: Rustamov 2010
+    (comparison of histograms by χ²).
 
     Example:
         >>> import torch
@@ -47,14 +48,11 @@ def chi_square(queries: Tensor, gallery: Tensor, weights: Tensor | None = None) 
     Args:
         queries: (Q, ...) histograms, entries ≥ 0.
         gallery: (G, ...) histograms of the same cells.
-        weights: non-negative weight of every cell, of a shape that broadcasts to the cells; None weighs all by 1.
 
     Returns:
         (Q, G) distances, without unit.
     """
-    a, b = _as_rows(queries, gallery, non_negative=True)
-    w = None if weights is None else _cell_weights(weights, queries.shape[1:], a)
-    return _ChiSquare.apply(a, b, w)
+    return _ChiSquare.apply(*_as_rows(queries, gallery, non_negative=True))
 
 
 def euclidean(queries: Tensor, gallery: Tensor) -> Tensor:
@@ -75,50 +73,40 @@ class _ChiSquare(torch.autograd.Function):
     """χ² tile by tile; the backward pass recomputes its tiles, so that no (Q, G, cells) array is ever kept."""
 
     @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor, w: Tensor | None) -> Tensor:
-        ctx.save_for_backward(a, b, w)
+    def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
+        ctx.save_for_backward(a, b)
         if _is_for_loops(a):
-            return _by_loops(a, b, a.new_ones(a.shape[1]) if w is None else w).mul_(0.5)
+            return _by_loops(a, b, chi_square=True).mul_(0.5)
         distances = a.new_zeros(len(a), len(b))
         for q, g, c in _tiles(a, b):
             ratio, difference = _ratio(a[q, c], b[g, c])
-            terms = ratio.mul_(difference)
-            if w is not None:
-                terms.mul_(w[c])
-            distances[q, g] += terms.sum(-1)
+            distances[q, g] += ratio.mul_(difference).sum(-1)
         return distances.mul_(0.5)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        a, b, w = ctx.saved_tensors
+        a, b = ctx.saved_tensors
         if torch.is_grad_enabled():  # derivatives of the gradient are asked for
-            leaves = [one for one, is_needed in zip((a, b, w), ctx.needs_input_grad, strict=True) if is_needed]
-            found = iter(torch.autograd.grad(_all_at_once(a, b, w), leaves, grad, create_graph=True))
+            leaves = [one for one, is_needed in zip((a, b), ctx.needs_input_grad, strict=True) if is_needed]
+            found = iter(torch.autograd.grad(_all_at_once(a, b), leaves, grad, create_graph=True))
             return tuple(next(found) if is_needed else None for is_needed in ctx.needs_input_grad)
         grad_a, grad_b = torch.zeros_like(a), torch.zeros_like(b)
-        grad_w = torch.zeros_like(w) if ctx.needs_input_grad[2] else None
         for q, g, c in _tiles(a, b):
             # With u = (a−b)/(a+b): ∂/∂a (a−b)²/(a+b) = 2u − u², and ∂/∂b = −2u − u².
-            ratio, difference = _ratio(a[q, c], b[g, c])
+            ratio, _ = _ratio(a[q, c], b[g, c])
             first = ratio * grad[q, g, None]
-            if grad_w is not None:
-                grad_w[c] += difference.mul_(first).sum((0, 1))
-            del difference
             second = ratio.mul_(first)
             grad_a[q, c] += first.sum(1) - second.sum(1) / 2
             grad_b[g, c] -= first.sum(0) + second.sum(0) / 2
-        if w is not None:
-            grad_a, grad_b = grad_a * w, grad_b * w
-        return grad_a, grad_b, None if grad_w is None else grad_w / 2
+        return grad_a, grad_b
 
 
-def _all_at_once(a: Tensor, b: Tensor, w: Tensor | None) -> Tensor:
+def _all_at_once(a: Tensor, b: Tensor) -> Tensor:
     """χ² in operations of PyTorch, which hold all (Q, G, cells) and have derivatives of any order."""
     total = a[:, None] + b
     filled = total > 0
     difference = torch.where(filled, a[:, None] - b, 0)
-    terms = difference.square() / torch.where(filled, total, 1)
-    return (terms if w is None else terms * w).sum(dim=-1) / 2
+    return (difference.square() / torch.where(filled, total, 1)).sum(dim=-1) / 2
 
 
 def _is_for_loops(tensor: Tensor) -> bool:
@@ -126,16 +114,16 @@ def _is_for_loops(tensor: Tensor) -> bool:
     return tensor.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
-def _by_loops(a: Tensor, b: Tensor, w: Tensor) -> Tensor:
+def _by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
     """What `distance_loops.fill` writes, (Q, G). Threads share the longer of both sides."""
     found = a.new_empty(len(a), len(b))
-    queries, gallery, weights, result = (tensor.detach().contiguous().numpy() for tensor in (a, b, w, found))
+    queries, gallery, result = (tensor.detach().contiguous().numpy() for tensor in (a, b, found))
 
     def write(part: slice) -> None:
         if len(a) >= len(b):
-            fill(queries[part], gallery, weights, result[part])
+            fill(queries[part], gallery, chi_square, result[part])
         else:
-            fill(queries, gallery[part], weights, result[:, part])
+            fill(queries, gallery[part], chi_square, result[:, part])
 
     large = found.numel() * a.shape[1] > 2 * _TRIPLES_PER_THREAD
     with Team(None if large else 1) as team:
@@ -168,7 +156,7 @@ def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
 
 def _row_distance(a: Tensor, b: Tensor) -> Tensor:
     if _is_for_loops(a) and not (_is_derived(a) or _is_derived(b)):
-        return _by_loops(a, b, a.new_empty(0)).sqrt_()
+        return _by_loops(a, b, chi_square=False).sqrt_()
     # The faster form by a matrix product cancels: it leaves a diagonal that is not zero.
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
@@ -229,19 +217,6 @@ def _as_rows(queries: Tensor, gallery: Tensor, *, non_negative: bool) -> tuple[T
         )
     dtype = torch.promote_types(torch.promote_types(queries.dtype, gallery.dtype), torch.float32)
     return queries.flatten(1).to(dtype), gallery.flatten(1).to(dtype)
-
-
-def _cell_weights(weights: Tensor, cells: torch.Size, rows: Tensor) -> Tensor:
-    """Weights checked and broadcast to (cells,), in the dtype of the rows."""
-    if weights.device != rows.device:
-        raise ValueError(f"weights: expected on {rows.device} as the queries, got {weights.device}; move them")
-    _check_entries("weights", weights, non_negative=True)
-    try:
-        return weights.to(rows.dtype).broadcast_to(cells).reshape(-1)
-    except RuntimeError as error:
-        raise ValueError(
-            f"weights: expected a shape that broadcasts to the cells {tuple(cells)}, got {tuple(weights.shape)}"
-        ) from error
 
 
 def _check_entries(name: str, tensor: Tensor, *, non_negative: bool) -> None:
