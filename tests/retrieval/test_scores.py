@@ -262,19 +262,18 @@ def test_what_cannot_be_scored_is_refused(
 def test_hand_worked_precision_recall_curve() -> None:
     # Hits at ranks 1, 3, 4, 6: precisions 1, 2/3, 3/4, 4/6 at recalls 1/4 … 1, the 2/3 lifted to the 3/4 behind it.
     distances = torch.arange(6.0)[None]
-    curve = precision_recall_curve(distances, ["a"], list("abaaba"), recall_levels=[0, 0.2, 0.25, 0.5, 0.51, 1])
-    assert curve.precision.tolist() == pytest.approx([1, 1, 1, 3 / 4, 3 / 4, 4 / 6])
-    assert curve.recall.tolist() == [0, 0.2, 0.25, 0.5, 0.51, 1]
+    curve = precision_recall_curve(distances, ["a"], list("abaaba"))
+    assert curve.precision.tolist() == pytest.approx([1] * 5 + [3 / 4] * 10 + [4 / 6] * 5)
+    assert curve.recall.tolist() == [i / 20 for i in range(1, 21)]
     assert curve.n_queries == 1
 
 
-@pytest.mark.parametrize("levels", [[i / 10 for i in range(11)], None])
-def test_precision_recall_curve_agrees_with_loops(levels: list[float] | None) -> None:
+def test_precision_recall_curve_agrees_with_loops() -> None:
     distances, labels = random_case(n=41, n_classes=2, seed=10)
     labels = torch.cat([labels[:-1], torch.tensor([9])])  # the last query has no relevant entry
-    curve = precision_recall_curve(distances, labels, **({} if levels is None else {"recall_levels": levels}))
+    curve = precision_recall_curve(distances, labels)
     expected = []
-    for level in levels or [i / 20 for i in range(1, 21)]:
+    for level in [i / 20 for i in range(1, 21)]:
         best = []
         for query in range(40):
             relevant = ranked_relevance(distances, labels.tolist(), query)
@@ -290,18 +289,11 @@ def test_precision_recall_curve_agrees_with_loops(levels: list[float] | None) ->
 
 
 def test_a_recall_level_that_is_a_number_of_hits_is_not_rounded_up() -> None:
-    # Three of ten hits lead, then a miss: the precision at a recall of 0.3 is 1, above it 10/11.
-    labels = [1] * 3 + [0] + [1] * 7
-    level = 3 * 0.1
-    assert level * 10 > 3  # in binary
-    curve = precision_recall_curve(torch.arange(11.0)[None], [1], labels, recall_levels=[level, 0.31])
-    assert curve.precision.tolist() == [1.0, 10 / 11]
-
-
-@pytest.mark.parametrize("levels", [[], [0.5, 0.1], [0.1, 0.1], [-0.1, 0.5], [0.5, 1.1], [float("nan")]])
-def test_wrong_recall_levels_are_refused(levels: list[float]) -> None:
-    with pytest.raises(ValueError, match="recall_levels: expected ascending"):
-        precision_recall_curve(torch.zeros(2, 2), [0, 0], recall_levels=levels)
+    # 55 of 100 hits lead, then a miss: the precision at a recall of 0.55 is 1, above it 100/101.
+    labels = [1] * 55 + [0] + [1] * 45
+    assert 11 / 20 * 100 > 55  # in binary
+    curve = precision_recall_curve(torch.arange(101.0)[None], [1], labels)
+    assert curve.precision.tolist() == [1.0] * 11 + [100 / 101] * 9
 
 
 @pytest.mark.parametrize("distance", [chi_square, euclidean])

@@ -24,9 +24,6 @@ SCORE_NAMES = ("nn", "ft", "st", "e", "dcg", "adr", "adr_self", "map")
 E_MEASURE_RANKS = 32
 """Ranks the E-measure looks at (Shilane et al. 2004)."""
 
-STANDARD_RECALL_LEVELS = tuple(level / 20 for level in range(1, 21))
-"""Recall levels 0.05, 0.10, …, 1 of a precision-recall curve."""
-
 
 @dataclass(frozen=True, eq=False)
 class RetrievalScores:
@@ -77,10 +74,10 @@ class RetrievalScores:
 
 @dataclass(frozen=True, eq=False)
 class PrecisionRecallCurve:
-    """Interpolated precision at given recall levels, mean over the scored queries."""
+    """Interpolated precision at levels of recall, mean over the scored queries."""
 
-    recall: Tensor  # (L,) float64 recall levels, ascending
-    precision: Tensor  # (L,) float64, never ascending
+    recall: Tensor  # (20,) float64: 0.05, 0.10, …, 1
+    precision: Tensor  # (20,) float64, never ascending
     n_queries: int  # in the mean
 
 
@@ -150,28 +147,20 @@ def retrieval_scores(
 
 
 def precision_recall_curve(
-    distances: Tensor | NDArray[Any],
-    query_labels: Labels,
-    gallery_labels: Labels | None = None,
-    *,
-    recall_levels: Sequence[float] = STANDARD_RECALL_LEVELS,
+    distances: Tensor | NDArray[Any], query_labels: Labels, gallery_labels: Labels | None = None
 ) -> PrecisionRecallCurve:
-    """Interpolated precision at standard recall levels, mean over the queries that have a relevant entry.
+    """Interpolated precision at 20 recall levels, 0.05, 0.10, …, 1, mean over the queries with a relevant entry.
 
-    The precision at level r is the highest of all precisions at a recall of r or more. The default is the 20 levels
-    0.05, 0.10, …, 1 of the Princeton Shape Benchmark (Shilane et al. 2004); the 11 levels 0, 0.1, …, 1 are the other
-    usual choice. Distances and labels, and errors, as for retrieval_scores.
+    The precision at level r is the highest of all precisions at a recall of r or more (Princeton Shape Benchmark,
+    Shilane et al. 2004). Distances and labels, and errors, as for retrieval_scores.
     """
-    recall = torch.tensor(list(recall_levels), dtype=torch.float64, device="cpu")
-    valid = recall.numel() > 0 and bool(((recall >= 0) & (recall <= 1)).all()) and bool((recall.diff() > 0).all())
-    if not valid:
-        raise ValueError(f"recall_levels: expected ascending numbers in [0, 1], got {list(recall_levels)}")
+    recall = torch.arange(1, 21, dtype=torch.float64, device="cpu") / 20
     relevant, _ = _ranked_relevance(distances, query_labels, gallery_labels)
     hits = relevant[relevant.any(1)].cumsum(1)
     n_relevant = hits[:, -1:]
     precision = hits / torch.arange(1, hits.shape[1] + 1, dtype=torch.float64, device="cpu")
     interpolated = precision.flip(1).cummax(1).values.flip(1)
-    # A level of 3 · 0.1 of ten is three hits, although it rounds to more than 0.3.
+    # A level of 0.55 of a hundred is 55 hits, although the product is rounded up.
     hits_needed = (recall * n_relevant - 1e-6).ceil()
     first_rank = torch.searchsorted(hits, hits_needed)
     return PrecisionRecallCurve(recall, interpolated.gather(1, first_rank).mean(0), n_queries=len(hits))
