@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from igps._parameters import check_at_least
 from igps.retrieval.distances import Distance, check_tensor
 from igps.retrieval.graph_reranking import MOST_WHOLE, rerank_graph
 from igps.retrieval.ranking import SearchResult, rank
@@ -65,13 +66,9 @@ def rerank(
         raise ValueError(f"distances: expected those of a collection to itself, (N, N), got {tuple(distances.shape)}.")
     if not bool((distances >= 0).all() and torch.isfinite(distances).all()):
         raise ValueError("distances: expected finite numbers ≥ 0.")
-    if n_neighbours < 1 or n_expanded < 1 or not 0 <= share <= 1:
-        raise ValueError(
-            f"n_neighbours, n_expanded, share: expected at least 1, at least 1, and 0 to 1, got {n_neighbours}, "
-            f"{n_expanded} and {share}."
-        )
-    if not 0 <= diffusion < 1:
-        raise ValueError(f"diffusion: expected 0 to less than 1, got {diffusion}.")
+    check_at_least(1, n_neighbours=n_neighbours, n_expanded=n_expanded)
+    if not (0 <= share <= 1 and 0 <= diffusion < 1):
+        raise ValueError(f"share, diffusion: expected 0 to 1, and 0 to less than 1, got {share} and {diffusion}.")
     n = len(distances)
     if n < 2:
         return torch.zeros_like(distances)
