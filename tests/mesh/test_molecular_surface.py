@@ -40,13 +40,6 @@ def test_the_excluded_surface_of_two_balls_is_two_caps_and_a_saddle(radii: tuple
     assert mesh.genus == 0
 
 
-@pytest.mark.parametrize("apart", [5.2, 5.8])
-def test_where_the_saddle_crosses_itself_two_balls_are_apart_with_a_cusp_each(apart: float) -> None:
-    mesh = molecular_surface(molecule([0 * ASLANT, apart * ASLANT], [1.7, 1.7]), spacing=0.5, pieces="largest")
-    area, volume = excluded_of_two(1.7, 1.7, apart, PROBE)
-    assert (mesh.area, mesh.volume) == pytest.approx((area / 2, volume / 2), rel=0.01)
-
-
 @pytest.mark.parametrize("radii", [(1.7, 1.7), (1.9, 1.5)])
 @pytest.mark.parametrize("apart", [5.2, 5.35, 5.5, 5.8, 6.2])
 def test_where_the_neck_is_too_thin_for_the_grid_or_none_a_thread_adds_hardly_any_area(
@@ -58,12 +51,9 @@ def test_where_the_neck_is_too_thin_for_the_grid_or_none_a_thread_adds_hardly_an
     assert mesh.genus == 0
 
 
-def test_far_balls_are_joined_by_threads_or_the_largest_is_kept() -> None:
+def test_far_balls_are_joined_by_threads() -> None:
     radii = [1.7, 2.5, 2.0]
     apart = molecule([0 * ASLANT, 9 * ASLANT, [20, 0, 0]], radii)
-    kept = molecular_surface(apart, spacing=0.5, pieces="largest")
-    assert (kept.area, kept.volume) == pytest.approx(ball(2.5), rel=0.01)
-    assert any("the largest of 3 pieces" in note for note in kept.notes)
     whole = molecular_surface(apart, spacing=0.5, max_vertices=600)
     assert (whole.area, whole.volume) == pytest.approx(np.sum([ball(r) for r in radii], axis=0).tolist(), rel=0.01)
     assert whole.genus == 0
@@ -160,7 +150,6 @@ def test_stray_atoms_are_named_with_the_remedy() -> None:
         ({"probe": -1.0}, "probe: expected"),
         ({"probe": float("nan")}, "probe: expected"),
         ({"spacing": 0.0}, "spacing: expected"),
-        ({"pieces": "all"}, "pieces: expected"),
     ],
 )
 def test_wrong_parameters_are_named(wrong: dict[str, object], said: str) -> None:

@@ -24,7 +24,6 @@ from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import connected, face_areas, signed_volume, stacked, sums, vertex_normals
 
 SurfaceKind = Literal["excluded", "accessible", "van_der_waals"]
-Pieces = Literal["joined", "largest"]
 
 # Cells around the balls, and on both sides of the surface, in which distances are computed.
 _MARGIN = 2.5
@@ -42,9 +41,11 @@ _N_ROUNDS = 2
 @one_thread()
 def molecular_surface(
     molecule: Molecule, kind: SurfaceKind = "excluded", *, probe: float = 1.4, spacing: float = 0.8,
-    max_vertices: int | None = 3000, pieces: Pieces = "joined",
+    max_vertices: int | None = 3000,
 ) -> Mesh:  # fmt: skip
     """The closed surface of a molecule, in ångström; hollows inside that it does not open to are filled.
+
+    Pieces are joined by threads where the gaps are narrowest, and specks left out.
 
     At a spacing of 0.5 the area and volume of the excluded surface are within 1 % of closed forms, before vertices are
     taken away; afterwards the volume still is. Threads between pieces, such as two balls that each end in a cusp, add
@@ -62,14 +63,12 @@ def molecular_surface(
         probe: radius, Å; that of water is 1.4.
         spacing: of the grid, Å.
         max_vertices: larger surfaces are simplified to so many; None keeps all.
-        pieces: "joined" by threads where the gaps are narrowest, without specks; or the "largest" alone.
 
     Raises:
         ValueError: a parameter out of range.
         MeshError: the balls lie too far apart for a grid, or give no closed surface.
     """
     check_one_of(get_args(SurfaceKind), kind=kind)
-    check_one_of(get_args(Pieces), pieces=pieces)
     check_positive(spacing=spacing)
     if not 0 <= probe < math.inf:
         raise ValueError(f"probe: expected a radius of at least 0 Å, got {probe}.")
@@ -90,7 +89,7 @@ def molecular_surface(
         notes.append(f"{n_hollows} hollows inside were filled")
     vertices, faces = level_surface(field.copy(), molecule.name)
     vertices = _settled(np.where(field == clear, exact, field), vertices, faces)
-    vertices, faces = _one_piece(vertices, faces, pieces, max_vertices, notes)
+    vertices, faces = _one_piece(vertices, faces, max_vertices, notes)
     return Mesh(vertices * spacing + low, faces, name=molecule.name, notes=(*molecule.notes, *notes), unit="Å")
 
 
@@ -131,16 +130,12 @@ def _neighbours(centres: Floats, radii: Floats) -> tuple[Integers, Integers]:
     return first, other[np.lexsort((np.r_[apart, apart], one))].astype(np.int64)
 
 
-def _one_piece(
-    vertices: Floats, faces: Integers, pieces: Pieces, max_vertices: int | None, notes: list[str]
-) -> Surface:
-    """The surface of the largest piece, or of all but specks, joined; each with its share of the vertices."""
+def _one_piece(vertices: Floats, faces: Integers, max_vertices: int | None, notes: list[str]) -> Surface:
+    """The surface of all pieces but specks, joined; each with its share of the vertices."""
     parts = connected(vertices, faces)
     sizes = np.array([abs(signed_volume(*part)) for part in parts])
-    small = sizes < (sizes.max() if pieces == "largest" else SPECK_VOLUME * sizes.sum())
-    if len(parts) > 1 and pieces == "largest":
-        notes.append(f"the largest of {len(parts)} pieces was kept")
-    elif sizes[small].sum() > _MOST_SPECKS * sizes.sum():  # as of a membrane, which is all small molecules
+    small = sizes < SPECK_VOLUME * sizes.sum()
+    if sizes[small].sum() > _MOST_SPECKS * sizes.sum():  # as of a membrane, which is all small molecules
         small[:] = False
     elif small.any():
         notes.append(f"left out {small.sum()} specks")
