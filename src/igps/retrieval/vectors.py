@@ -58,8 +58,7 @@ class VectorMap:
 
     def arrays(self) -> dict[str, Any]:
         """Its arrays by name, for `numpy.savez`."""
-        kept = {"mean": self.mean, "components": self.components}
-        return {"searched_by": np.array(self.searched_by), **{k: v for k, v in kept.items() if v is not None}}
+        return {name: value for name, value in vars(self).items() if value is not None}
 
     @classmethod
     def of_arrays(cls, arrays: Any) -> VectorMap:
