@@ -5,6 +5,7 @@ import json
 import os
 import re
 from html.parser import HTMLParser
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,14 @@ class Elements(HTMLParser):
 def page(tmp_path: Path, blob: Mesh) -> str:
     """A page of a labelled collection, with pictures."""
     return page_of(read_results(retrieval_folder(tmp_path)), surfaces(blob))
+
+
+def test_no_script_or_style_closes_its_own_element() -> None:
+    """They are written into the page as they are."""
+    sources = [one for one in (files("igps.report") / "template").iterdir() if one.name.endswith((".js", ".css"))]
+    assert len(sources) >= 7
+    for source in sources:
+        assert not re.search(r"</(script|style)", source.read_text("utf-8"), re.IGNORECASE), source
 
 
 def test_rankings_and_scores_are_those_of_a_loop(tmp_path: Path) -> None:

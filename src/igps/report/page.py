@@ -2,7 +2,6 @@
 
 import base64
 import hashlib
-import re
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from typing import Any
@@ -49,9 +48,6 @@ def page_of(
     # A policy that names the page's own scripts and style by content: no other can run, wherever it came from.
     scripts = [(_TEMPLATE / name).read_text(encoding="utf-8").strip() + "\n" for name in _SCRIPTS]
     style = (_TEMPLATE / "page.css").read_text(encoding="utf-8")
-    for source in (*scripts, style):
-        if re.search(r"</(script|style)", source, re.IGNORECASE):
-            raise AssertionError("a script of the page closes its own element.")
     policy = (
         f"default-src 'none'; script-src {' '.join(map(_fingerprint, scripts))}; style-src {_fingerprint(style)}; "
         "img-src data:; base-uri 'none'; form-action 'none'"
