@@ -71,8 +71,8 @@ def checked_stiffness(
         )
 
     transpose = sparse.csr_array(stiffness.T)
-    parts = [(stiffness.indptr, transpose.indptr), (stiffness.indices, transpose.indices)]
-    exact = all(np.array_equal(*both) for both in [*parts, (stiffness.data, transpose.data)])
+    arrays = ((matrix.indptr, matrix.indices, matrix.data) for matrix in (stiffness, transpose))
+    exact = all(map(np.array_equal, *arrays))
     magnitude = abs(stiffness)
     if not exact and abs(stiffness - transpose).max() > SLOPPINESS * magnitude.max():
         raise ValueError("stiffness must be symmetric")
