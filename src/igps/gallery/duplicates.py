@@ -96,7 +96,7 @@ def duplicates(
         n_workers: threads; all cores if None.
 
     Raises:
-        ValueError: the calibration is of another descriptor.
+        ValueError: the calibration is of another descriptor, or the tolerance is out of range.
         MeshError: none of the meshes can be described.
     """
     calibration = calibration or Calibration.load()
