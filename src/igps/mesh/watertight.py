@@ -117,8 +117,6 @@ def _without_specks(vertices: Floats, faces: Integers, notes: list[str]) -> Inte
     occupied = np.zeros(index.max(axis=0) + 2, dtype=bool)
     occupied[tuple(index.T)] = True
     label, count = ndimage.label(occupied, structure=np.ones((3, 3, 3)))
-    if count == 1:
-        return faces
     group = np.zeros(len(faces), dtype=np.int64)
     group[face] = label[tuple(index.T)]
     area = face_areas(vertices, faces)
