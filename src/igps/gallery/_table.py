@@ -41,7 +41,7 @@ _ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bytes: pa.bina
 
 
 class BodyTable:
-    """The last version of the rows, or an earlier one, of the gallery in a folder; `Gallery` tells what is raised."""
+    """The rows of the gallery in a folder, of the last version or an earlier one; errors are those of `Gallery`."""
 
     def __init__(self, path: str | Path, version: int | None = None) -> None:
         self.path = Path(path)

@@ -1,4 +1,4 @@
-"""What a gallery records: of each body, and of how its descriptions were made, which others are compared by."""
+"""What a gallery records: of each body, and how its descriptions were made, so that others are not compared."""
 
 import contextlib
 import json

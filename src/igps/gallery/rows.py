@@ -24,7 +24,7 @@ from igps.signature.signature import Signature
 
 # So many descriptions are in memory at once; pixels of a side of a thumbnail, which shows the samples of the surface.
 _AT_ONCE, _PIXELS = 256, 40
-# Nanoseconds.
+# A file that was changed so few nanoseconds ago may change again at what the clock calls the same time.
 _YOUNG = 2 * 10**9
 
 

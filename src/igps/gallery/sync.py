@@ -10,7 +10,7 @@ from igps.gallery.about import KNOWN
 from igps.gallery.gallery import Gallery
 from igps.gallery.rows import checksum_of, each_body_once, further_columns, known_rows
 
-# Rows that are removed, or told anew, at once.
+# Rows that are removed, or changed, in one commit.
 _AT_ONCE = 1000
 
 

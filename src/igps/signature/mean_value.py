@@ -62,7 +62,7 @@ def extend(
 
 
 class Extension:
-    """Functions on a surface, to be extended to points: `extend` in two steps, between which the functions may go.
+    """Functions on a surface, to be extended to points: `extend` in two steps. It has its own copy of the functions.
 
     Memory beside arguments and result: at most 256 MiB of weights at a time and thread, and three times the functions.
 

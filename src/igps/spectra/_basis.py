@@ -20,7 +20,7 @@ class Basis:
     """Rows of a basis, a copy of them in single precision, and the matrix of the problem projected on them.
 
     The columns are cut into pieces, which a team works on side by side; how many depends on their number alone, so that
-    a team changes no bit. One that `loses_basis` is so large that it must make place for the eigenvectors.
+    a team changes no bit. Where `loses_basis` is true, it is so large that the eigenvectors must take its place.
     """
 
     def __init__(self, first_row: np.ndarray, capacity: int, team: Team = ALONE) -> None:
