@@ -7,8 +7,6 @@ thread of theirs (`one_thread`). What is large is divided into jobs for threads 
 each and sleep while they wait (`igps._parallel.on_threads`), at most `n_threads` of them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys
@@ -18,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache, partial
 from queue import SimpleQueue
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import joblib
 import threadpoolctl
@@ -81,7 +79,7 @@ class Team:
         self.n_threads = max(1, n_threads() if most is None else most)
         self._pool: ThreadPoolExecutor | None = None
 
-    def __enter__(self) -> Team:
+    def __enter__(self) -> Self:
         if self.n_threads > 1:
             self._pool = ThreadPoolExecutor(self.n_threads - 1, initializer=stay_on_one_thread)
         return self

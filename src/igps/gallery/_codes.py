@@ -9,8 +9,6 @@ On a busy machine a query of a million rows took LanceDB 0.40's own IVF_SQ up to
 Its IVF_RQ found all of the nearest ten when it was built, and 60 % after new rows had been added to it.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from typing import Any, Self

@@ -1,12 +1,10 @@
 """The bodies of a collection in a database, with the descriptor that they were described by."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -160,7 +158,7 @@ class Gallery:
         n_workers: int | None = None,
         strict: bool = False,
         progress: bool = False,
-    ) -> tuple[Gallery, list[Failure]]:
+    ) -> tuple[Self, list[Failure]]:
         """Describe the bodies of a dataset into a gallery; also returns those that failed.
 
         A gallery that is there keeps its state until the new one is complete, and becomes an earlier version of it.
@@ -213,7 +211,7 @@ class Gallery:
         descriptor: str | Descriptor | None = None,
         *,
         progress: bool = False,
-    ) -> Gallery:
+    ) -> Self:
         """A gallery of the bodies of others, which stay as they are, added to that at `path`, if there is one.
 
         Raises:

@@ -1,7 +1,5 @@
 """Measures of the voxels of a label, before a surface is made."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -20,6 +18,15 @@ _SMALL = 1 << 20
 _BLOCK = 96
 
 
+@dataclass(frozen=True)
+class VoxelMeasures:
+    """Of a label: how many voxels, pieces that share no corner, and the thickness of the thinnest part in voxels."""
+
+    n_voxels: int
+    n_pieces: int
+    thinnest: int
+
+
 @dataclass(frozen=True, eq=False)
 class LabelVoxels:
     """A label in its grid."""
@@ -32,15 +39,6 @@ class LabelVoxels:
     def measures(self) -> VoxelMeasures:
         n_pieces = ndimage.label(self.mask, np.ones((3, 3, 3)))[1]
         return VoxelMeasures(int(np.count_nonzero(self.mask)), int(n_pieces), thinnest_part(self.mask))
-
-
-@dataclass(frozen=True)
-class VoxelMeasures:
-    """Of a label: how many voxels, pieces that share no corner, and the thickness of the thinnest part in voxels."""
-
-    n_voxels: int
-    n_pieces: int
-    thinnest: int
 
 
 def thinnest_part(mask: Booleans) -> int:

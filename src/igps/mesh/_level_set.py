@@ -3,11 +3,9 @@
 It is made of the exact distances of the grid's points to the triangles.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +36,7 @@ class Grid:
     shape: tuple[int, int, int]
 
     @classmethod
-    def around(cls, vertices: Floats, faces: Integers, cell: float) -> Grid:
+    def around(cls, vertices: Floats, faces: Integers, cell: float) -> Self:
         low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
         counts = np.ceil((high - low) / cell).astype(int) + 1 + 2 * MARGIN
         # The body in the middle, so that moving it moves the grid.

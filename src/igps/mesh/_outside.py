@@ -11,10 +11,8 @@ with about a cell of wall. A wall with two sides, as of a vase that was modelled
 width of its mouth, since the winding number behind is near zero. Openings narrower than a cell are always closed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +50,7 @@ class OrientedSurface:
     is_nearly_closed: bool
 
     @classmethod
-    def of(cls, vertices: Floats, faces: Integers) -> OrientedSurface:
+    def of(cls, vertices: Floats, faces: Integers) -> Self:
         import igl
 
         _, first, index = np.unique(np.round(vertices, 4), axis=0, return_index=True, return_inverse=True)
@@ -102,7 +100,7 @@ class OrientedSurface:
         number = igl.winding_number if few else igl.fast_winding_number
         return np.asarray(number(self.vertices, self.faces, points.astype(np.float64)))
 
-    def _without_hidden(self) -> OrientedSurface:
+    def _without_hidden(self) -> Self:
         """Without the faces that have the inside on both sides, such as walls between solids put together.
 
         Solids that share some of their outer surface are each open there, which spoils the winding numbers around.
@@ -112,7 +110,7 @@ class OrientedSurface:
         faces = self.faces[least <= 0.5]
         if not len(faces):
             return self
-        bare = OrientedSurface(self.vertices, faces, False)
+        bare = replace(self, faces=faces)
         defect = _defect(bare.winding(_beside(self.vertices, faces)))
         return replace(bare, is_nearly_closed=defect < _NEARLY_CLOSED)
 

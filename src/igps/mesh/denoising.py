@@ -10,9 +10,8 @@ surface is looked at and smoothed along the fine rims, where noise wrinkles it, 
 sharp. The normals of such triangles say little where noise is as wide as they are: there smoothing is all.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from scipy import sparse
@@ -89,8 +88,8 @@ class Neighbours:
     length: Floats  # (V,): of a vertex's edges
     stretch: Floats  # (V,): mean length of a vertex's edges over that of the near ones
 
-    @staticmethod
-    def of(vertices: Floats, faces: Integers) -> Neighbours:
+    @classmethod
+    def of(cls, vertices: Floats, faces: Integers) -> Self:
         n = len(vertices)
         edges, edge_of = undirected_edges(faces, n)
         rows, columns = edges.T.ravel(), edges[:, ::-1].T.ravel()
@@ -106,7 +105,7 @@ class Neighbours:
             weights, of_vertex = near, of_near
         total = np.bincount(rows, weights=weights, minlength=n)
         averaging = sparse.csr_array((weights / total[rows], (rows, columns)), shape=(n, n))
-        return Neighbours(edges, edge_of, averaging, of_vertex, stretch)
+        return cls(edges, edge_of, averaging, of_vertex, stretch)
 
     @property
     def faces_at_sides(self) -> Integers:

@@ -1,13 +1,11 @@
 """The checked triangle mesh that everything else trusts."""
 
-from __future__ import annotations
-
 import copy
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -122,7 +120,7 @@ class Mesh:
         object.__setattr__(self, "faces", faces)
 
     @classmethod
-    def of(cls, body: Any, spacing: Sequence[float] | None = None) -> Mesh:
+    def of(cls, body: Any, spacing: Sequence[float] | None = None) -> Self:
         """The Mesh of a body as another library keeps it; a Mesh is given back as it is.
 
         Example:
@@ -145,23 +143,23 @@ class Mesh:
         name, raw = raw_of(body, spacing)
         return cls(raw.vertices, raw.faces, name=name, unit=raw.unit, notes=raw.notes)
 
-    def annotated(self, *, notes: tuple[str, ...] = (), unit: str | None = None) -> Mesh:
+    def annotated(self, *, notes: tuple[str, ...] = (), unit: str | None = None) -> Self:
         """The same mesh with more notes, before its own, and with a unit if one is given; nothing is checked again."""
         return self._changed(notes=(*notes, *self.notes), unit=unit or self.unit)
 
-    def numbered_by_faces(self) -> Mesh:
+    def numbered_by_faces(self) -> Self:
         """The same mesh with its vertices in the order in which the faces first use them."""
         used, first = np.unique(self.faces, return_index=True)
         order = used[np.argsort(first)]
         return self._changed(vertices=self.vertices[order], faces=np.argsort(order)[self.faces])
 
-    def _changed(self, **fields: object) -> Mesh:
+    def _changed(self, **fields: object) -> Self:
         other = copy.copy(self)
         for name, value in fields.items():
             object.__setattr__(other, name, value)
         return other
 
-    def outer(self) -> tuple[Mesh, Booleans]:
+    def outer(self) -> tuple[Self, Booleans]:
         """The body without its cavities, and which of the vertices (V,) belong to it."""
         surfaces = connected(self.vertices, self.faces) if self.cavities else []
         if len(surfaces) < 2:

@@ -1,9 +1,7 @@
 """Short vectors of descriptions, for engines that find nearest neighbours by Euclidean distances alone."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -34,7 +32,7 @@ class VectorMap:
     components: Singles | None = None  # (D, F) orthonormal directions
 
     @classmethod
-    def fit(cls, descriptions: Singles, searched_by: SearchDistance, seed: int = 0) -> VectorMap:
+    def fit(cls, descriptions: Singles, searched_by: SearchDistance, seed: int = 0) -> Self:
         """The map of descriptions (N, F) such as these; a few thousand are enough."""
         if searched_by == "cosine" and descriptions.shape[1] <= MOST_NUMBERS:
             return cls(searched_by)
@@ -61,7 +59,7 @@ class VectorMap:
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @classmethod
-    def of_arrays(cls, arrays: Any) -> VectorMap:
+    def of_arrays(cls, arrays: Any) -> Self:
         """The map of such arrays."""
         names = [name for name in ("mean", "components") if name in arrays]
         return cls(str(arrays["searched_by"]), **{name: arrays[name] for name in names})  # type: ignore[arg-type]

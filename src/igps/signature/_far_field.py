@@ -13,9 +13,8 @@ point y and h that to its tangent plane. From afar the kernel is expanded in a T
   |e|²·(e_i, e_i e_j, e_i e_j e_k), 19 terms that depend on the point, with 19 sums of f that do not.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,8 +145,8 @@ class HatClusters:
     sums: NDArray[np.floating]  # (C, 19, K) of the functions
     n_hats: int  # V
 
-    @staticmethod
-    def of(hats: Floats, functions: NDArray[np.floating], team: Team = ALONE) -> HatClusters:
+    @classmethod
+    def of(cls, hats: Floats, functions: NDArray[np.floating], team: Team = ALONE) -> Self:
         """Of functions (V, K) at hats (V, 24)."""
         n_hats = len(hats)
         sizes = [_LEAF]
@@ -172,7 +171,7 @@ class HatClusters:
                 np.matmul(terms[part].T, functions[part], out=sums[cluster])
 
         team.each(fill, range(len(sizes)))
-        return HatClusters(np.concatenate(centres), np.concatenate(radii), first, sums, n_hats)
+        return cls(np.concatenate(centres), np.concatenate(radii), first, sums, n_hats)
 
     def seen_from(self, x: Floats, ratio: float) -> tuple[Integers, Integers]:
         """The clusters that are `ratio` radii or more away from the box of points x (3, n), and the other hats."""

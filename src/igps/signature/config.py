@@ -1,11 +1,9 @@
 """Every parameter that a Signature depends on."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, get_args
+from typing import Any, ClassVar, Self, get_args
 
 from igps._parameters import check_at_least, check_one_of, check_share
 from igps.signature.attributes import AttributeName, check_attributes
@@ -78,7 +76,7 @@ class SignatureConfig:
         check_attributes(self.attributes)
 
     @classmethod
-    def paper(cls) -> SignatureConfig:
+    def paper(cls) -> Self:
         """Rustamov 2010: 250 eigenpairs and a 32-voxel grid that is never refined."""
         return cls(n_eigenpairs=250, min_samples=0)
 
@@ -92,11 +90,11 @@ class SignatureConfig:
         """`least_vertices`, or what the eigenpairs need where it is None."""
         return self.n_kept + 2 if self.least_vertices is None else self.least_vertices
 
-    def resolved(self) -> SignatureConfig:
+    def resolved(self) -> Self:
         """The same with a number of eigenpairs."""
         return replace(self, n_eigenpairs=self.n_kept)
 
-    def with_eigenpairs(self, n_eigenpairs: int) -> SignatureConfig:
+    def with_eigenpairs(self, n_eigenpairs: int) -> Self:
         """The same where only the first so many eigenpairs are needed, unless a number of them is given already.
 
         Meshes are subdivided as for the default number, so that this is the beginning of that Signature.
@@ -108,7 +106,7 @@ class SignatureConfig:
             return replace(self, n_eigenpairs=n_computed)
         return replace(self, n_eigenpairs=n_computed, least_vertices=self.n_vertices_read)
 
-    def larger(self) -> Iterator[SignatureConfig]:
+    def larger(self) -> Iterator[Self]:
         """Configurations whose Signatures begin with this one's, the smallest first, among those that caches may hold.
 
         For a mesh that is subdivided that holds only of those with as many `n_vertices_read`.
