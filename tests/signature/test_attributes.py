@@ -13,6 +13,7 @@ from igps.signature.attributes import (
     surface_attributes,
     surface_direction,
 )
+from igps.signature.config import SignatureConfig
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +100,6 @@ def test_attributes_do_not_change_with_scale_or_place(box: Mesh, points: np.ndar
 
 
 @pytest.mark.parametrize("names", [("height",), ("depth", "depth")])
-def test_unknown_or_repeated_names_are_refused(box: Mesh, points: np.ndarray, names: tuple[str, ...]) -> None:
+def test_unknown_or_repeated_names_are_refused(names: tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match="attributes: expected different ones of depth, electrostatic_potential"):
-        interior_attributes(box, points, names)  # type: ignore[arg-type]
+        SignatureConfig(attributes=names)  # type: ignore[arg-type]

@@ -1,7 +1,7 @@
 """Scalars and directions of samples that a histogram may be split by, beside the potential."""
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
@@ -14,8 +14,7 @@ AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
 
 
 def interior_attributes(mesh: Mesh, points: Floats, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
-    """Named attributes, see `check_attributes`, of points inside, (P,) or (P, 3), free of scale and motion."""
-    check_attributes(names)
+    """The named attributes of points inside, (P,) or (P, 3), free of scale and motion."""
     functions = {
         "depth": depth,
         "electrostatic_potential": electrostatic_potential,
@@ -26,18 +25,10 @@ def interior_attributes(mesh: Mesh, points: Floats, names: Sequence[AttributeNam
 
 def surface_attributes(mesh: Mesh, faces: Integers, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
     """Those of the named attributes that points on these faces (P,) have: "surface_direction", the outward normal."""
-    check_attributes(names)
     if "surface_direction" not in names:
         return {}
     normals = area_vectors(mesh.vertices, mesh.faces)[faces]
     return {"surface_direction": unit(normals).astype(np.float32)}
-
-
-def check_attributes(names: Sequence[str]) -> None:
-    """Raise a ValueError that says which names there are, unless all of `names` are known and none comes twice."""
-    known = get_args(AttributeName)
-    if not set(names) <= set(known) or len(set(names)) < len(names):
-        raise ValueError(f"attributes: expected different ones of {', '.join(known)}, got {', '.join(names)}.")
 
 
 def depth(mesh: Mesh, points: Floats) -> Floats:

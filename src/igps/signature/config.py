@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Self, get_args
 
 from igps._parameters import check_at_least, check_one_of, check_share
-from igps.signature.attributes import AttributeName, check_attributes
+from igps.signature.attributes import AttributeName
 from igps.signature.laplacian import Backend
 
 # The order of the samples, see `ordering_keys`, depends on about so many eigenpairs. With as many or more of one body
@@ -72,8 +72,10 @@ class SignatureConfig:
                 f"max_vertices: expected more than n_eigenpairs + 1 = {self.n_kept + 1}, got {self.max_vertices}."
             )
         check_share(accuracy=self.accuracy)
-        object.__setattr__(self, "attributes", tuple(self.attributes))  # JSON and YAML have lists
-        check_attributes(self.attributes)
+        names, known = tuple(self.attributes), get_args(AttributeName)  # JSON and YAML have lists
+        object.__setattr__(self, "attributes", names)
+        if not set(names) <= set(known) or len(set(names)) < len(names):
+            raise ValueError(f"attributes: expected different ones of {', '.join(known)}, got {', '.join(names)}.")
 
     @classmethod
     def paper(cls) -> Self:
