@@ -14,7 +14,6 @@ from igps.mesh.loading import load_mesh
 from igps.mesh.mending import Mending
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
-from igps.mesh.surface import genus
 from training.studies.paper import pose_curves, potential_slice, weld_change
 
 
@@ -93,7 +92,7 @@ def topology(
 
     draw_weld_change(found.before, found.after, found.change, out)
     print(found.after.notes[-1])
-    print(f"genus {_genus(found.before)} before, {_genus(found.after)} after")
+    print(f"genus {found.before.genus} before, {found.after.genus} after")
     print(f"{found.n_samples} interior samples, {len(found.change)} pairs, {n_eigenpairs} eigenpairs")
     for limit, reported in ((3, "99.6 %"), (10, None), (14, "all")):
         beside = f" (Rustamov 2010, for Homer: {reported})" if reported else ""
@@ -104,7 +103,7 @@ def topology(
         print(f"first eigenvalues {when}: " + ", ".join(f"{value:.4g}" for value in values[:3]))
     print(f"written to {out}")
     return {
-        "genus": [_genus(one) for one in (found.before, found.after)],
+        "genus": [one.genus for one in (found.before, found.after)],
         "n_samples": found.n_samples,
         "changed_below": {str(limit / 100): float(np.mean(found.change < limit / 100)) for limit in (3, 10, 14)},
         "largest_change": float(found.change.max()),
@@ -141,10 +140,6 @@ def potential(
     print(f"potential {found.least:.4f} at the barycentroid, up to {found.largest:.4f} at the samples")
     print(f"written to {out}")
     return {"n_samples": found.n_samples, "least": found.least, "largest": found.largest}
-
-
-def _genus(mesh: Mesh) -> int:
-    return genus(mesh.faces, len(mesh.vertices))
 
 
 def _median(values: NDArray[np.float32]) -> str:

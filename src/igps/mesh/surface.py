@@ -149,11 +149,6 @@ def stacked(surfaces: Sequence[Surface]) -> Surface:
     return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(faces)
 
 
-def genus(faces: Integers, n_vertices: int) -> int:
-    """Handles of a closed surface of C pieces, by Euler's formula V − E + F = 2 C − 2 genus with 2E = 3F."""
-    return components(faces, n_vertices)[0] - (n_vertices - len(faces) // 2) // 2
-
-
 def has_area(corners: Floats) -> Booleans:
     """(F,) whether triangles of corners (F, 3, 3) are more than lines: their height is not lost beside their length."""
     sides = corners - np.roll(corners, 1, axis=1)
