@@ -17,7 +17,7 @@ from igps.mesh import mesh as geometry
 from igps.signature import _far_field as far_field
 from igps.signature import mean_value as coordinates
 from igps.signature._far_field import HatClusters, HatSurface
-from igps.signature._weight_loops import fill_hats
+from igps.signature._weight_loops import fill_clusters, fill_hats
 from igps.signature.laplacian import laplacian
 from igps.signature.mean_value import Extension, extend
 from igps.signature.ordering import spatial_order
@@ -226,7 +226,7 @@ def test_clusters_of_point_elements_leave_an_error_of_third_order() -> None:
     for distance in (200.0, 400.0, 800.0):
         x = distance * np.array([0.3, -0.5, -0.8]) / np.sqrt(0.98)
         terms = np.empty((19 * 2, 1))
-        tree.fill_terms(x[:, None], clusters, terms)
+        fill_clusters(x[:, None], clusters, tree.centres, tree.radii, terms)
         r = np.stack([centres + offsets, centres - offsets]) - x
         kernel = (np.stack([one, two]) * r).sum(axis=-1) / np.square(r).sum(axis=-1) ** 2
         exact = kernel.sum(axis=0) @ functions
@@ -247,7 +247,7 @@ def test_cluster_error_falls_with_the_third_power() -> None:
     for distance in (2.0, 4.0, 8.0, 16.0):
         x = distance * surface.axes.T @ [[0.3], [-0.5], [-0.8]] / np.sqrt(0.98)
         terms = np.empty((19 * len(clusters), 1))
-        tree.fill_terms(x, clusters, terms)
+        fill_clusters(x, clusters, tree.centres, tree.radii, terms)
         far = terms[:, 0] @ tree.sums[clusters].reshape(-1, functions.shape[1])
         weights = all_weights(surface, x, np.inf)[:, 0]
         scale = np.abs(weights) @ np.abs(functions)

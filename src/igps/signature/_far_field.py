@@ -23,7 +23,7 @@ from scipy import sparse
 from igps._arrays import Floats, Integers
 from igps._threads import ALONE, Team
 from igps.mesh.surface import has_area
-from igps.signature._weight_loops import fill_cluster_terms, fill_clusters, fill_hats, replace_near, seen_from
+from igps.signature._weight_loops import fill_cluster_terms, fill_hats, replace_near, seen_from
 from igps.signature.ordering import principal_axes, spatial_order
 
 _LEAF = 32  # hats in the smallest clusters; one costs as much as 19
@@ -176,7 +176,3 @@ class HatClusters:
     def seen_from(self, x: Floats, ratio: float) -> tuple[Integers, Integers]:
         """The clusters that are `ratio` radii or more away from the box of points x (3, n), and the other hats."""
         return seen_from(x.min(axis=1), x.max(axis=1), self.centres, self.radii, self.first, ratio, _LEAF, self.n_hats)
-
-    def fill_terms(self, x: Floats, clusters: Integers, out: Floats) -> None:
-        """Fill the terms (19 c, n) of clusters (c,) at points x (3, n)."""
-        fill_clusters(x, clusters, self.centres, self.radii, out)

@@ -25,6 +25,7 @@ from igps._parameters import check_share
 from igps._threads import Team
 from igps.mesh.winding import checked_places
 from igps.signature._far_field import HatClusters, HatSurface
+from igps.signature._weight_loops import fill_clusters
 from igps.signature.ordering import spatial_order
 
 logger = logging.getLogger(__name__)
@@ -171,7 +172,7 @@ class Extension:
                 here = np.ascontiguousarray(x[rows].T)
                 weights = np.empty((len(values), len(rows)))
                 if clusters is not None:
-                    clusters.fill_terms(here, far, weights)
+                    fill_clusters(here, far, clusters.centres, clusters.radii, weights)
                 surface.weights(here, hats, hat_ratio, weights)
                 found.append((rows, weights.astype(columns.dtype, copy=False).T @ values))
             return found
