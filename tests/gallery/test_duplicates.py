@@ -148,8 +148,8 @@ def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_cr
 
     def labels(side: float) -> np.ndarray:
         x, y, z = np.meshgrid(*(np.arange(0, n, side) for n in (60, 36, 30)), indexing="ij")
-        one = (x - 18) ** 2 / 14**2 + (y - 18) ** 2 / 11**2 + (z - 14 - (x - 18) ** 2 / 60) ** 2 / 8**2 < 1
-        other = (x - 45) ** 2 / 9**2 + (y - 18) ** 2 / 15**2 + (z - 15 + (y - 18) ** 2 / 50) ** 2 / 10**2 < 1
+        one = (x - 18) ** 2 / 14**2 + (y - 18) ** 2 / 11**2 + (z - 12 - (x - 8) * y / 90) ** 2 / 8**2 < 1
+        other = (x - 45) ** 2 / 9**2 + (y - 18) ** 2 / 15**2 + (z - 15 + (y - 18) * (x - 39) / 70) ** 2 / 10**2 < 1
         return np.select([one, other], [1, 2]).astype(np.uint8)
 
     given, turn = labels(1.0), np.zeros((4, 4))
