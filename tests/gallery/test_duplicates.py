@@ -142,6 +142,36 @@ def test_pairs_are_graded(tmp_path: Path) -> None:
     assert 0.001 < found[3][1] < 0.005
 
 
+def test_labels_of_a_volume_are_the_same_mesh_in_any_format_order_of_axes_and_crop(tmp_path: Path) -> None:
+    """On another grid they are other bodies, as near as a fraction of a voxel, and never those of another label."""
+    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+
+    def labels(side: float) -> np.ndarray:
+        x, y, z = np.meshgrid(*(np.arange(0, n, side) for n in (60, 36, 30)), indexing="ij")
+        one = (x - 18) ** 2 / 14**2 + (y - 18) ** 2 / 11**2 + (z - 12 - (x - 8) * y / 90) ** 2 / 8**2 < 1
+        other = (x - 45) ** 2 / 9**2 + (y - 18) ** 2 / 15**2 + (z - 15 + (y - 18) * (x - 39) / 70) ** 2 / 10**2 < 1
+        return np.select([one, other], [1, 2]).astype(np.uint8)
+
+    given, turn = labels(1.0), np.zeros((4, 4))
+    turn[[0, 1, 2, 3], [1, 2, 0, 3]] = (-1, 1, 1, 1)  # of indices: the first axis runs back, and comes second
+    turn[0, 3] = len(given) - 1
+    inner = given[2:, 1:-1, 3:]
+    nibabel.save(nibabel.Nifti1Image(given, np.eye(4)), tmp_path / "given.nii.gz")
+    nibabel.save(nibabel.MGHImage(given, np.eye(4)), tmp_path / "mgh.mgz")
+    nibabel.save(nibabel.Nifti1Image(given[::-1].transpose(2, 0, 1), turn), tmp_path / "turned.nii")
+    shifted = np.eye(4)
+    shifted[:3, 3] = (2, 1, 3)
+    nibabel.save(nibabel.Nifti1Image(inner, shifted), tmp_path / "cropped.nii")
+    nibabel.save(nibabel.Nifti1Image(labels(1.4), np.diag([1.4, 1.4, 1.4, 1])), tmp_path / "sampled.nii")
+    found = duplicates(SignatureDataset(tmp_path, CONFIG), tolerance=0.01)
+    names = ("given.nii.gz", "mgh.mgz", "turned.nii", "cropped.nii")
+    assert grouped(found.groups) == {frozenset(f"{name}#{label}" for name in names) for label in (1, 2)}
+    assert set(found.grades.values()) == {"same mesh"}
+    assert {pair for pair in found.nearly if "sampled" in str(pair)} == {
+        tuple(sorted((f"{name}#{label}", f"sampled.nii#{label}"))) for name in names for label in (1, 2)
+    }
+
+
 def test_fine_surfaces_tell_a_part_that_is_a_little_longer(tmp_path: Path) -> None:
     """One half moves on by a hundredth: as far as coarse copies are apart, and much farther than fine ones.
 

@@ -142,6 +142,43 @@ def test_a_label_keeps_its_cavities() -> None:
     assert notes != full[2]
 
 
+def test_labels_of_a_file_have_walls_cores_and_rings(tmp_path: Path) -> None:
+    """A ball with a core that is another label, as a kidney with a cyst, and a ring around both."""
+    nibabel = pytest.importorskip("nibabel", reason="the extra [volumes]")
+    x, y, z = np.meshgrid(np.arange(57) - 28, np.arange(57) - 28, 1.5 * np.arange(28) - 20.25, indexing="ij")
+    radius = np.sqrt(x**2 + y**2 + z**2)
+    labels = np.select([radius < 8, radius < 15, (np.hypot(x, y) - 22) ** 2 + z**2 < 5**2], [2, 1, 3])
+    for name, of in (("x", labels), ("full", labels * (labels != 2) + (labels == 2))):
+        nibabel.save(nibabel.Nifti1Image(of.astype(np.uint8), np.diag([1.0, 1, 1.5, 1])), tmp_path / f"{name}.nii")
+    ball = load_mesh(tmp_path / "full.nii", part="1")
+    expected = {"1": 4 / 3 * np.pi * (15**3 - 8**3), "2": 4 / 3 * np.pi * 8**3, "3": 2 * np.pi**2 * 22 * 5**2}
+    for part, volume in expected.items():
+        kept = load_mesh(tmp_path / "x.nii", LoadOptions(cavities="keep"), part=part)
+        filled = load_mesh(tmp_path / "x.nii", part=part)
+        assert kept.volume == pytest.approx(volume, rel=0.04)  # as well as voxels of this size tell it
+        assert kept.volume == pytest.approx(1.5 * np.count_nonzero(labels == int(part)), rel=1e-3)
+        assert filled.genus == (part == "3")
+        of = ball if part == "1" else kept
+        np.testing.assert_array_equal(filled.vertices, of.vertices)
+        np.testing.assert_array_equal(filled.faces, of.faces)
+    wall = load_mesh(tmp_path / "x.nii", LoadOptions(cavities="keep"), part="1")
+    assert wall.area == pytest.approx(4 * np.pi * (15**2 + 8**2), rel=0.03)
+    signature = compute_signature(wall, SignatureConfig(n_eigenpairs=30))
+    from_middle = np.linalg.norm(signature.interior.points - [28, 28, 20.25], axis=1)
+    assert from_middle.min() > 7
+    assert from_middle.max() < 16
+    assert signature.volume == pytest.approx(wall.volume)
+
+
+def test_a_piece_of_a_label_in_its_cavity_is_told() -> None:
+    """A seed in its shell was left out without a word."""
+    radius = np.linalg.norm(np.indices((41, 41, 41)) - 20.0, axis=0)
+    shell, seed = (radius > 14) & (radius < 18), radius < 8
+    vertices, faces, notes = voxel_surface(shell | seed, cavities=True)
+    assert Mesh(vertices, faces, cavities=True).volume == pytest.approx(np.count_nonzero(shell), rel=1e-3)
+    assert notes == (f"in a cavity: filled holes of {np.count_nonzero(seed)} voxels",)
+
+
 def test_the_larger_the_cavity_the_farther_from_the_ball() -> None:
     bodies = [Mesh(*ball(1))]
     bodies += [Mesh(*joined(ball(1), ball(radius, inwards=True)), cavities=True) for radius in (0.2, 0.5, 0.8)]

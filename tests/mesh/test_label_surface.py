@@ -14,8 +14,10 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from scipy.special import elliprg
 
+from igps.mesh.formats.volumes import LabelVolume, label_bodies
 from igps.mesh.label_surface import voxel_surface
 from igps.mesh.mesh import Mesh, MeshError
+from igps.mesh.options import LoadOptions
 from igps.mesh.surface import components, largest
 
 Array = NDArray[np.float64]
@@ -226,6 +228,21 @@ def test_small_pieces_apart_are_dropped_and_large_ones_stay() -> None:
     assert components(faces, len(vertices))[0] == 2
     assert notes == ("dropped 1 small piece apart of 8 voxels, 0.1% of the label",)
     assert Mesh(*largest(vertices, faces)).volume == pytest.approx(16**3, rel=0.01)
+
+
+@pytest.mark.parametrize(("more", "lost"), [(0, "100% of the voxels lie in 121"), (20, "94% of the voxels lie in 120")])
+def test_a_label_that_is_mostly_small_pieces_is_refused(more: int, lost: str) -> None:
+    """Lesions: all were dropped, which failed on a division, or all but one, which was the body."""
+    mask = np.zeros((54, 54, 36), dtype=np.uint8)
+    mask[:5, :4, : 4 + more] = 1
+    for corner in np.ndindex(5, 6, 4):
+        x, y, z = 9 * np.array(corner) + (9, 0, 0)
+        mask[x : x + 4, y : y + 4, z : z + 4] = 1
+    with pytest.raises(MeshError, match=rf"lesions: {lost} pieces apart, each below 2% .* --bodies pieces; or"):
+        voxel_surface(mask, joins=True, name="lesions")
+    pieces = label_bodies(LabelVolume((mask,), np.eye(4)), LoadOptions(bodies="pieces"))
+    assert len(pieces) == 121
+    assert pieces[0].made().fault is None
 
 
 def rod_across(angle: float, radius: float = 6.0, length: float = 30.0, n: int = 52) -> NDArray[np.bool_]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import re
+import struct
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -60,10 +61,14 @@ def write_itk(path: Path, labels: NDArray[Any]) -> None:
 
 
 def write_dicom(path: Path, labels: NDArray[Any]) -> None:
-    write_segmentation(path, labels, ["left part", "right part"])
+    write_segmentation(path, masks_of(labels), ["left part", "right part"], "BINARY")
 
 
-def write_segmentation(path: Path, labels: NDArray[Any], names: list[str], overlap: bool = False) -> None:
+def masks_of(labels: NDArray[Any]) -> NDArray[np.uint8]:
+    return np.stack([labels == value for value in np.unique(labels)[1:]], axis=-1).astype(np.uint8)
+
+
+def write_segmentation(path: Path, masks: NDArray[Any], names: list[str], *kind: Any) -> None:
     """Planes of a scanner whose axes are those of the affine, as highdicom writes them."""
     pytest.importorskip("highdicom", reason="the extra [volumes]")
     from highdicom.seg import Segmentation, SegmentDescription
@@ -74,7 +79,7 @@ def write_segmentation(path: Path, labels: NDArray[Any], names: list[str], overl
     lps = np.diag([-1, -1, 1, 1]) @ AFFINE
     spacing = np.linalg.norm(lps[:3, :3], axis=0)
     planes, study, series, frame = [], generate_uid(), generate_uid(), generate_uid()
-    for k in range(labels.shape[2]):
+    for k in range(masks.shape[2]):
         plane = Dataset()
         plane.file_meta = FileMetaDataset()
         plane.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
@@ -83,7 +88,7 @@ def write_segmentation(path: Path, labels: NDArray[Any], names: list[str], overl
         plane.PatientID, plane.PatientName, plane.PatientBirthDate, plane.PatientSex = "1", "A^B", "", ""
         plane.StudyDate, plane.StudyTime, plane.StudyID, plane.AccessionNumber = "20200101", "000000", "1", ""
         plane.ReferringPhysicianName, plane.SeriesNumber, plane.InstanceNumber, plane.Modality = "", 1, k + 1, "CT"
-        plane.Rows, plane.Columns = labels.shape[1], labels.shape[0]
+        plane.Rows, plane.Columns = masks.shape[1], masks.shape[0]
         plane.PixelSpacing = [spacing[1], spacing[0]]
         plane.SliceThickness = spacing[2]
         plane.ImageOrientationPatient = [*(lps[:3, 0] / spacing[0]), *(lps[:3, 1] / spacing[1])]
@@ -91,16 +96,15 @@ def write_segmentation(path: Path, labels: NDArray[Any], names: list[str], overl
         plane.BitsAllocated = plane.BitsStored = 16
         plane.SamplesPerPixel, plane.PhotometricInterpretation, plane.PixelRepresentation = 1, "MONOCHROME2", 0
         planes.append(plane)
-    masks = np.stack([labels == value for value in np.unique(labels)[1:]], axis=-1)
-    if overlap:
-        masks[..., 1] |= masks[..., 0]
     described = [
         SegmentDescription(number, name, codes.SCT.Organ, codes.SCT.Organ, "MANUAL")
         for number, name in enumerate(names, start=1)
     ]
+    method, *fractions = kind
+    how = dict(zip(("fractional_type", "max_fractional_value"), fractions, strict=False))
     Segmentation(
-        planes, masks.transpose(2, 1, 0, 3).astype(np.uint8), "BINARY", described, generate_uid(), 1, generate_uid(), 1,
-        "maker", "model", "1", "1",
+        planes, masks.transpose(2, 1, 0, 3), method, described, generate_uid(), 1, generate_uid(), 1, "maker", "model",
+        "1", "1", **how,
     ).save_as(path)  # fmt: skip
 
 
@@ -228,6 +232,52 @@ def test_a_nrrd_axis_without_a_direction_is_refused(lost: str, tmp_path: Path) -
         read_label_volume(tmp_path / "x.nrrd")
 
 
+@pytest.mark.parametrize("kind", ["Nifti1Image", "Nifti1Pair", "Nifti2Image", "Nifti2Pair"])
+@pytest.mark.parametrize(("unit", "side"), [("meter", 1e-3), ("mm", 1), ("micron", 1e3), ("unknown", 1)])
+def test_lengths_of_nifti_are_in_its_unit(kind: str, unit: str, side: float) -> None:
+    """Pairs of a header and its voxels, too, which nibabel reads."""
+    image = getattr(nibabel, kind)(two_boxes(), np.diag([side, side, side, 1.0]) @ AFFINE)
+    image.header.set_xyzt_units(unit)
+    np.testing.assert_allclose(volume_in_memory(image).affine, AFFINE, rtol=1e-6)
+
+
+@pytest.mark.parametrize("order", ["RAS", "LPS", "ASR", "PIL"])
+@pytest.mark.parametrize("suffix", ["nii.gz", "nrrd", "mha"])
+def test_the_order_of_the_axes_in_a_file_is_no_matter(order: str, suffix: str, tmp_path: Path) -> None:
+    sitk.WriteImage(sitk.DICOMOrient(itk_image(two_boxes()), order), str(tmp_path / f"x.{suffix}"))
+    expected = label_surface(LabelVolume((two_boxes(),), AFFINE), 3)
+    found = load_mesh(tmp_path / f"x.{suffix}", part="3")
+    np.testing.assert_allclose(found.vertices, expected.vertices, atol=1e-5)
+    np.testing.assert_array_equal(found.faces, expected.faces)
+
+
+@pytest.mark.parametrize(
+    ("space", "axes"),
+    [("left-posterior-superior", (-1, -1, 1)), ("right-anterior-superior", (1, 1, 1)), ("LAS", (-1, 1, 1))],
+)
+@pytest.mark.parametrize("last", [False, True])
+def test_a_list_of_layers_in_a_nrrd_file_may_be_any_axis(
+    space: str, axes: tuple[int, int, int], last: bool, tmp_path: Path
+) -> None:
+    layers = [two_boxes() * (two_boxes() == value) for value in (3, 7)]
+    vectors = [f"({','.join(map(str, axis * axes))})" for axis in (*AFFINE[:3, :3].T, AFFINE[:3, 3])]
+    kinds, directions = ["domain"] * 3, vectors[:3]
+    kinds.insert(3 * last, "list")
+    directions.insert(3 * last, "none")
+    sizes = (14, 12, 10, 2) if last else (2, 14, 12, 10)
+    header = [
+        "NRRD0005", "type: uint8", "dimension: 4", f"space: {space}", f"sizes: {' '.join(map(str, sizes))}",
+        f"space directions: {' '.join(directions)}", f"kinds: {' '.join(kinds)}", "encoding: raw",
+        f"space origin: {vectors[3]}", "Segment0_Name:=liver", "Segment0_LabelValue:=3", "Segment0_Layer:=0",
+        "Segment1_Name:=spleen", "Segment1_LabelValue:=7", "Segment1_Layer:=1",
+    ]  # fmt: skip
+    voxels = np.stack(layers, axis=3 if last else 0).tobytes(order="F")
+    (tmp_path / "x.seg.nrrd").write_bytes("\n".join(header).encode() + b"\n\n" + voxels)
+    volume = read_label_volume(tmp_path / "x.seg.nrrd")
+    assert label_bodies(volume) == [(3, "liver", 384), (7, "spleen", 320)]
+    np.testing.assert_allclose(volume.affine, AFFINE, atol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["x.mha", "x.nrrd", "x.nii.gz", "x.mgz"])
 def test_suffixes_may_be_upper_case(name: str, tmp_path: Path) -> None:
     WRITERS.get(name, write_itk)(tmp_path / name, two_boxes())
@@ -290,11 +340,51 @@ def test_segments_of_slicer_before_4_11_each_have_a_layer(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("overlap", [False, True])
 def test_segments_of_dicom_have_names_and_may_overlap(overlap: bool, tmp_path: Path) -> None:
-    write_segmentation(tmp_path / "x.dcm", two_boxes(), ["liver", "spleen"], overlap)
+    masks = masks_of(two_boxes())
+    masks[..., 1] |= overlap * masks[..., 0]
+    write_segmentation(tmp_path / "x.dcm", masks, ["liver", "spleen"], "BINARY")
     assert label_bodies(read_label_volume(tmp_path / "x.dcm")) == [
         (1, "liver", 384),
         (2, "spleen", 704 if overlap else 320),
     ]
+
+
+@pytest.mark.parametrize("most", [255, 100])
+def test_fractional_segments_of_dicom_are_cut_at_the_threshold(most: int, tmp_path: Path) -> None:
+    """Three that overlap, in other slices each, the last all or nothing; the frames are read by pydicom."""
+    place = np.moveaxis(np.indices((24, 20, 16)), 0, -1)
+    soft = (((9, 9, 6), 5), ((14, 10, 9), 4))
+    shares = [np.clip(1.5 - np.linalg.norm(place - centre, axis=-1) / radius, 0, 1) for centre, radius in soft]
+    shares.append(np.linalg.norm(place - (8, 9, 8), axis=-1) < 4)
+    names = ["liver", "tumour  (left)", "vessel"]
+    path = tmp_path / "x.dcm"
+    write_segmentation(path, np.stack(shares, axis=-1).astype(np.float32), names, "FRACTIONAL", "PROBABILITY", most)
+    import pydicom
+
+    dataset = pydicom.dcmread(path)
+    assert dataset.MaximumFractionalValue == most
+    shared = dataset.SharedFunctionalGroupsSequence[0]
+    axes = np.reshape(shared.PlaneOrientationSequence[0].ImageOrientationPatient, (2, 3)).astype(float)
+    between_rows, between_columns = (float(side) for side in shared.PixelMeasuresSequence[0].PixelSpacing)
+    thick = float(shared.PixelMeasuresSequence[0].SpacingBetweenSlices)
+    for threshold in (0.5, 0.25, 0.9):
+        volume = read_label_volume(path, LoadOptions(threshold=threshold))
+        found = {}
+        for part in volume.bodies:
+            index = np.argwhere(volume.mask(part.label)) + [side.start for side in part.box]
+            found[part.name] = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+        assert list(found) == ["liver", "tumour (left)", "vessel"]
+        assert abs(np.linalg.det(volume.affine)) == pytest.approx(between_rows * between_columns * thick)
+        for number, points in enumerate(found.values(), 1):
+            expected = []
+            for frame, about in zip(dataset.pixel_array, dataset.PerFrameFunctionalGroupsSequence, strict=True):
+                if about.SegmentIdentificationSequence[0].ReferencedSegmentNumber == number:
+                    row, column = np.nonzero(frame >= threshold * most)
+                    corner = np.array(about.PlanePositionSequence[0].ImagePositionPatient, dtype=float)
+                    steps = np.stack([column * between_columns, row * between_rows], axis=1)
+                    expected.append((corner + steps @ axes) * [-1, -1, 1])
+            sets = [np.unique(np.round(one, 2), axis=0) for one in (points, np.concatenate(expected))]
+            np.testing.assert_allclose(*sets, atol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -338,6 +428,42 @@ def test_names_come_from_the_header_and_a_given_table_goes_first(tmp_path: Path)
     (tmp_path / "names.csv").write_text("label,name\n7,spleen\n")
     given = read_label_volume(tmp_path / "x.nii.gz", LoadOptions(names=str(tmp_path / "names.csv")))
     assert [body.name for body in given.bodies] == ["3", "spleen"]
+
+
+def mgh_tags(names: dict[int, bytes], n_names: int | None = None) -> bytes:
+    """What FreeSurfer puts behind the voxels: a transform, a colour table, and the command that made the file."""
+    table = struct.pack(">iii", -2, max(names) + 1, 8) + b"LUT.txt\0" + struct.pack(">i", n_names or len(names))
+    for label, name in names.items():
+        table += struct.pack(">ii", label, len(name) + 1) + name + struct.pack(">x4i", 220, 20, 60, 0)
+    transform, command = b"talairach.xfm\0", b"mri_convert\0"
+    tags = struct.pack(">iq", 31, len(transform)) + transform + struct.pack(">i", 1) + table
+    return tags + struct.pack(">iq", 3, len(command)) + command
+
+
+@pytest.mark.parametrize("kind", ["mgh", "mgz"])
+def test_an_mgh_file_has_names_in_its_colour_table(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"x.{kind}"
+    write_nibabel(path, two_boxes())
+    opened = gzip.open if kind == "mgz" else open
+    content = opened(path, "rb").read()  # type: ignore[operator]
+
+    def names(tags: bytes) -> list[str]:
+        with opened(path, "wb") as file:  # type: ignore[operator]
+            file.write(content + tags)
+        return [body.name for body in read_label_volume(path).bodies]
+
+    given = {0: b"Unknown", 3: b"Left-Hippocampus", 7: "Corne d’Ammon".encode()}
+    assert names(mgh_tags(given)) == ["Left-Hippocampus", "Corne d’Ammon"]
+    assert names(b"") == names(struct.pack(">i", 1)) == names(struct.pack(">iq", 31, 2**62)) == ["3", "7"]
+    assert names(struct.pack(">iq", 31, -5) + bytes(99)) == ["3", "7"]
+    # A table that is cut short, or announces more than there is, gives what it has
+    for n_names in (2**31 - 1, -1):
+        assert len(names(mgh_tags(given, n_names))) == 2
+    for n in range(0, len(mgh_tags(given)), 7):
+        assert len(names(mgh_tags(given)[:n])) == 2
+    (tmp_path / "x.csv").write_text("label,name\n3,liver\n")
+    assert names(mgh_tags(given)) == ["Left-Hippocampus", "Corne d’Ammon"]
+    assert names(b"") == ["liver", "7"]
 
 
 def test_a_mask_without_names_is_called_by_its_file(tmp_path: Path) -> None:

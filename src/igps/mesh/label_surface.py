@@ -68,7 +68,7 @@ def voxel_surface(
         Vertices (V, 3) in the world, faces (F, 3) of one or several closed pieces, and notes of what was done.
 
     Raises:
-        MeshError: too few voxels, or an affine that is singular.
+        MeshError: too few voxels, most of them in small pieces, or an affine that is singular.
     """
     mask = np.asarray(inside, dtype=bool)
     if mask.ndim != 3:
@@ -83,7 +83,7 @@ def voxel_surface(
     low = np.array([side.start for side in box], dtype=np.float64)
     notes: list[str] = []
     mask = with_missed_slices(mask[box], notes) if joins else mask[box]
-    mask, hollows = _cleaned(mask, notes, LEAST_VOXELS if cavities else None)
+    mask, hollows = _cleaned(mask, notes, LEAST_VOXELS if cavities else None, name)
     share, factor = _coarsened(mask, spacing, max_vertices)
     mask = _with_thick_contacts(share >= 0.5)
     share = np.pad(np.where(mask, np.maximum(share, np.float32(0.5)), share), PAD)
@@ -109,7 +109,8 @@ def voxel_surface(
     surfaces = [(index @ matrix[:3, :3].T + matrix[:3, 3], faces)]
     matrix = matrix @ np.block([[np.eye(3), low[:, None]], [np.zeros(3), 1]])
     for hollow in hollows:
-        points, inwards, _ = voxel_surface(hollow, matrix, max_vertices=max_vertices, name=name)
+        points, inwards, told = voxel_surface(hollow, matrix, max_vertices=max_vertices, name=name)
+        notes += [f"in a cavity: {note}" for note in told]
         surfaces.append((points, inwards[:, ::-1]))
     return *stacked(surfaces), tuple(notes)
 
@@ -125,12 +126,16 @@ def checked_spacing(affine: Floats, name: str) -> Floats:
     return spacing
 
 
-def _cleaned(mask: Booleans, notes: list[str], least: int | None) -> tuple[Booleans, list[Booleans]]:
+def _cleaned(mask: Booleans, notes: list[str], least: int | None, name: str) -> tuple[Booleans, list[Booleans]]:
     """Without islands, and with holes filled; and the holes of at least so many voxels, none if None."""
     label, island, size = _islands(mask)
     if len(island):
-        mask = mask & ~np.isin(label, island)
         lost = int(size[island].sum())
+        if 2 * lost >= size.sum():  # lesions
+            scattered = f"{name}: {lost / size.sum():.0%} of the voxels lie in {len(island)} pieces apart, each below"
+            remedy = 'Take pieces for bodies: LoadOptions(bodies="pieces"), --bodies pieces; or connect them.'
+            raise MeshError(f"{scattered} {_ISLAND:.0%} of the label: no one body. {remedy}")
+        mask = mask & ~np.isin(label, island)
         pieces = "1 small piece" if len(island) == 1 else f"{len(island)} small pieces"
         notes.append(f"dropped {pieces} apart of {lost} voxels, {lost / size.sum():.1%} of the label")
     # Voxels outside are connected by faces.

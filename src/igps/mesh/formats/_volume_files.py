@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from igps._arrays import Floats
-from igps.mesh.formats.label_names import names_in_extensions
+from igps.mesh.formats.label_names import names_in_extensions, names_in_tags
 from igps.mesh.limits import check_fits
 from igps.mesh.mesh import MILLIMETRES, MeshError
 
@@ -23,6 +23,7 @@ _EXPORT = "Export the labels."
 _NRRD, _META = (".nrrd", ".nhdr"), (".mha", ".mhd")
 _MITK = "org.mitk.multilabel.segmentation.labelgroups"
 _MOST_HEADER = 1 << 24
+_MGH_FOOTER = 20  # bytes between voxels and tags
 # Where a header says that the voxels lie; MetaImage takes ":" for "=", and blanks before it.
 _DATA_FILE = re.compile(
     rb"(?:ElementDataFile[ \t]*[=:]|^data ?file:)[ \t]*(?:\./)?(.*?)[ \t]*\r?$", re.MULTILINE | re.IGNORECASE
@@ -94,12 +95,16 @@ def of_nibabel(image: Any, path: str | Path) -> RawVolume:
     check_voxels(path, image.shape, max(dtype.itemsize, 1))
     values = np.asanyarray(image.dataobj).reshape(image.shape[:3])
     affine, names = np.array(image.affine, dtype=np.float64), {}
-    if isinstance(image, nibabel.Nifti1Image):
+    if isinstance(image, nibabel.Nifti1Pair):  # of which those in one file are some
         affine[:3] *= {1: 1e3, 3: 1e-3}.get(int(image.header["xyzt_units"]) % 8, 1.0)  # metres, micrometres
         names = names_in_extensions(
             bytes(one.get_content_bytes()) if hasattr(one, "get_content_bytes") else str(one.get_content()).encode()
             for one in image.header.extensions
         )
+    elif isinstance(image, nibabel.MGHImage) and image.file_map["image"].filename:
+        with image.file_map["image"].get_prepare_fileobj("rb") as file:  # nibabel leaves the tags out
+            file.seek(image.header.get_footer_offset() + _MGH_FOOTER)
+            names = names_in_tags(file.read(_MOST_HEADER))
     return RawVolume([values], affine, names)
 
 

@@ -1,7 +1,8 @@
-"""Names of labels: by a table of ITK-SNAP, 3D Slicer, FreeSurfer, FSLeyes, nnU-Net, by CSV, or a NIfTI extension."""
+"""Names of labels: by a table of ITK-SNAP, 3D Slicer, FreeSurfer, FSLeyes, nnU-Net, by CSV, or of NIfTI or MGH."""
 
 import csv
 import html
+import io
 import json
 import logging
 import re
@@ -23,6 +24,7 @@ _FSLEYES = re.compile(r"(\d+)(?:\s+[\d.]+){3}\s+(?![\d.\s]*$)(.+)")
 _COLOURS = re.compile(r'(\d+)\s+("[^"]*"|\S+)(?:\s+[\d.]+){3,4}')
 _WORKBENCH = re.compile(rb"<Label\b([^>]*)>(.*?)</Label>", re.DOTALL)
 _KEY = re.compile(rb"""\bKey\s*=\s*["'](\d+)["']""")
+_COLOUR_TABLE, _NEW_LAYOUT = 1, -2  # in an MGH file
 
 
 def read_label_names(path: str | Path) -> dict[int, str]:
@@ -80,6 +82,31 @@ def names_in_extensions(contents: Iterable[bytes]) -> dict[int, str]:
             if key := _KEY.search(attributes):
                 inner = re.sub(rb"<!\[CDATA\[(.*?)\]\]>", rb"\1", name, flags=re.DOTALL)
                 names[int(key[1])] = html.unescape(inner.decode("utf-8", "replace"))
+    return cleaned(names)
+
+
+def names_in_tags(content: bytes) -> dict[int, str]:
+    """Those of the colour table among the tags at the end of an MGH file, as FreeSurfer writes it; or none.
+
+    Big-endian numbers: a tag and the bytes that follow it, but for the table, which begins at once.
+    """
+    stream = io.BytesIO(content)
+
+    def number(size: int = 4) -> int:
+        return int.from_bytes(stream.read(size), "big", signed=True)  # 0 at the end
+
+    def words() -> bytes:
+        return stream.read(max(number(), 0))
+
+    while (tag := number()) not in (0, _COLOUR_TABLE):
+        stream.seek(min(max(number(8), 0), len(content)), io.SEEK_CUR)
+    names: dict[int, str] = {}
+    if tag and number() == _NEW_LAYOUT:
+        number(), words()  # the largest label, the file of the table
+        for _ in range(min(number(), len(content) // 24)):  # a label without a name takes as many bytes
+            label, name = number(), words()
+            names[label] = name.rstrip(b"\0").decode("utf-8", "replace")
+            stream.read(16)  # the colour
     return cleaned(names)
 
 

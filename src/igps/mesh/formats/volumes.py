@@ -120,9 +120,10 @@ class LabelVolume:
 def read_label_volume(path: str | Path, options: LoadOptions = LoadOptions()) -> LabelVolume:
     """Read a label volume: `.nii`, `.nii.gz`, `.mgh`, `.mgz`, `.nrrd`, `.nhdr`, `.mha`, `.mhd`, `.dcm` (SEG), `.tif`.
 
-    Names of labels come from `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, extensions of NIfTI), else
-    from a table beside it (see `table_beside`); without one a label is its number, and the only label of a mask, 1 or
-    255, has the name of the file. A MeshError of a file that is missing, cut short, too large, or holds no labels.
+    Names of labels come from `options.names`, else from the file (`.seg.nrrd`, DICOM SEG, extensions of NIfTI, tags of
+    MGH), else from a table beside it (see `table_beside`); without one a label is its number, and the only label of a
+    mask, 1 or 255, has the name of the file. A MeshError of a file that is missing, cut short, too large, or holds no
+    labels.
     """
     path = Path(path)
     if not path.is_file():
