@@ -108,6 +108,17 @@ def tarred(path: Path) -> None:
         archive.add(path.parent / "a.off", "a.off")
 
 
+def strips_ply(order: str) -> bytes:
+    """A list of strips of one triangle each, as text without an order."""
+    kind = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    head = f"ply\nformat {kind} 1.0\nelement vertex {len(VERTICES)}\nproperty float x\nproperty float y\n"
+    head += "property float z\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    row = np.concatenate([[4 * len(FACES)], np.column_stack([FACES, np.full(len(FACES), -1)]).ravel()])
+    if not order:
+        return (head + lines(VERTICES) + lines(row[None])).encode()
+    return head.encode() + VERTICES.astype(f"{order}f4").tobytes() + row.astype(f"{order}i4").tobytes()
+
+
 SOLID = trimesh.Trimesh(VERTICES, FACES, process=False)
 CELLS = meshio.Mesh(VERTICES, [("triangle", FACES)])
 WRITERS: dict[str, Callable[[Path], object]] = {
@@ -115,6 +126,9 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "relative.obj": lambda path: path.write_text(relative_obj()),
     "binary.ply": lambda path: SOLID.export(path),
     "text.ply": lambda path: meshio.write(path, CELLS, binary=False),
+    "strips.ply": lambda path: path.write_bytes(strips_ply("")),
+    "little_strips.ply": lambda path: path.write_bytes(strips_ply("<")),
+    "big_strips.ply": lambda path: path.write_bytes(strips_ply(">")),
     "binary.stl": lambda path: SOLID.export(path),
     "text.stl": lambda path: SOLID.export(path, file_type="stl_ascii"),
     "scene.glb": lambda path: SOLID.export(path),
@@ -207,6 +221,16 @@ def test_volumes_of_cells_give_the_surface_around_them(tmp_path: Path) -> None:
             assert not any("inside out" in note for note in mesh.notes)
 
 
+def test_a_strip_of_a_ply_file_turns_its_triangles_alike(tmp_path: Path) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    (tmp_path / "a.ply").write_text(head + "0 0 0\n1 0 0\n0 1 0\n0 0 1\n9 1 0 2 3 1 0 -1 0 1\n")  # the last is none
+    mesh = load_mesh(tmp_path / "a.ply", LoadOptions(mend="never"))
+    strip = trimesh.util.triangle_strips_to_faces([[1, 0, 2, 3, 1, 0]])
+    np.testing.assert_array_equal(mesh.faces, strip)
+    assert mesh.volume == pytest.approx(1 / 6)
+
+
 def test_strips_and_polygons_of_vtk_files(tmp_path: Path) -> None:
     """A tetrahedron as a strip, and a prism of two pentagons and five quadrilaterals."""
     head = "# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\n"
@@ -227,6 +251,8 @@ def test_strips_and_polygons_of_vtk_files(tmp_path: Path) -> None:
 
 FAULTY = {
     "four.off": (b"4" + off().replace("\n3 ", " 2\n3 ").encode(), "4OFF"),
+    "binary.off": (b"OFF BINARY\n\0\0\0\4\0\0\0\4\0\0\0\0" + bytes(112), "OFF BINARY"),
+    "strips.ply": (strips_ply("")[:-40], "announces faces"),
     "cut.ply": (trimesh.exchange.ply.export_ply(SOLID, encoding="ascii")[:-40], "announced"),
     "cut.vtk": (polydata("3.0")[:4000].encode(), "announced"),
     "huge.vtk": (b"# vtk DataFile Version 3.0\nx\nBINARY\nDATASET POLYDATA\nPOINTS 1000000000000 float\n", "announced"),
@@ -237,6 +263,10 @@ FAULTY = {
         b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 6 float\n" + b"0 0 1\n" * 6
         + b"CELLS 1 7\n6 0 1 2 3 4 5\nCELL_TYPES 1\n22\n",
         "kind 22",
+    ),
+    "axes.gii": (
+        b"<GIFTI><DataArray Intent='NIFTI_INTENT_POINTSET' DataType='NIFTI_TYPE_INT32' Dimensionality='7'/></GIFTI>",
+        "7 axes",
     ),
     "map.gii": (b"<GIFTI><DataArray Intent='NIFTI_INTENT_SHAPE'/></GIFTI>", "points or triangles"),
     "lh.white": (b"\xff\xff\xfemade\n\n" + b"\x7f\xff\xff\xff" * 2, "announced"),
