@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import re
 import tarfile
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -283,6 +285,20 @@ def test_what_is_wrong_with_a_file_is_told_in_a_sentence_that_names_it(name: str
     (tmp_path / name).write_bytes(content)
     with pytest.raises(MeshError, match=rf"{name}: not readable as .*{words}.*\. .*[Ee]xport"):
         load_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["text.vtp", "polygons3.vtk", "text.stl"])
+def test_one_long_number_does_not_widen_all_others(name: str, tmp_path: Path) -> None:
+    WRITERS[name](tmp_path / name)
+    content = (tmp_path / name).read_bytes()
+    word = re.findall(rb"\d\.\d{6,}", content)[5]  # those before may be of a normal
+    (tmp_path / name).write_bytes(content.replace(word, word + b"0" * 30_000, 1))
+    tracemalloc.start()
+    mesh = load_mesh(tmp_path / name)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
+    assert peak < 8e6
 
 
 def test_an_array_that_promises_too_much_is_not_unpacked(tmp_path: Path) -> None:

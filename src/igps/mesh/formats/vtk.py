@@ -75,7 +75,7 @@ class _Legacy:
         if len(words) != n:
             raise ValueError(f"{n} numbers announced, {len(words)} there")
         self._at = len(self._content) - len(rest)
-        return np.array(words, dtype="S").astype(kind) if n else np.zeros(0, kind)
+        return np.array(words, dtype=kind)
 
     def cells(self, n: int, size: int) -> tuple[Integers, Integers]:
         """Corners of n cells laid end to end, and how many each has; written as two arrays, or as rows before VTK 5."""
