@@ -19,7 +19,7 @@ import trimesh
 from igps import SignatureConfig, compute_signature
 from igps.mesh.formats import FORMATS, format_of, is_searched
 from igps.mesh.formats.stl import merged
-from igps.mesh.loading import load_mesh, read_surface
+from igps.mesh.loading import list_bodies, load_mesh, read_surface
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature
@@ -299,6 +299,15 @@ def test_one_long_number_does_not_widen_all_others(name: str, tmp_path: Path) ->
     tracemalloc.stop()
     np.testing.assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
     assert peak < 8e6
+
+
+def test_arrays_in_one_place_count_as_often_as_they_are_named(tmp_path: Path) -> None:
+    head, piece, tail = re.split(rb"(<Piece>.*</Piece>)", vtp("raw"), maxsplit=1)
+    (tmp_path / "a.vtp").write_bytes(head + 20 * piece + tail)
+    once = 12 * len(VERTICES) + 32 * len(FACES)
+    assert len(list_bodies(tmp_path / "a.vtp", LoadOptions(bodies="objects", max_unpacked=20 * once))) == 20
+    with pytest.raises(MeshError, match=r"a\.vtp: unpacks to .*max_unpacked="):
+        load_mesh(tmp_path / "a.vtp", LoadOptions(max_unpacked=10 * once))
 
 
 def test_an_array_that_promises_too_much_is_not_unpacked(tmp_path: Path) -> None:

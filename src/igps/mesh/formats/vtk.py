@@ -183,6 +183,7 @@ class _Xml:
     def __init__(self, path: Path, options: LoadOptions) -> None:
         content = path.read_bytes()
         self._path, self._options, self._appended = path, options, b""
+        self._n_made = -len(content)  # bytes of arrays beyond those of the file
         start = content.find(b"<AppendedData")
         self._is_raw = start >= 0 and b'"raw"' in content[start : content.find(b">", start)]
         if start >= 0:
@@ -218,10 +219,14 @@ class _Xml:
         kind = kind.newbyteorder(self._order)
         where, text = element.get("format"), element.text or ""
         if where == "ascii":
-            return _xml.from_text(text, kind)
-        if where == "appended":
-            return np.frombuffer(self._block(self._appended[int(element.get("offset", "0")) :], self._is_raw), kind)
-        return np.frombuffer(self._block("".join(text.split()).encode(), False), kind)
+            values = _xml.from_text(text, kind)
+        elif where == "appended":
+            values = np.frombuffer(self._block(self._appended[int(element.get("offset", "0")) :], self._is_raw), kind)
+        else:
+            values = np.frombuffer(self._block("".join(text.split()).encode(), False), kind)
+        self._n_made += values.nbytes  # of all arrays: thousands may be said to lie in one place
+        check_unpacked(self._n_made, self._path, self._options.max_unpacked)
+        return values
 
     def _block(self, content: bytes, is_raw: bool) -> bytes:
         """The bytes behind a header of their size, or of the sizes of their compressed blocks."""
