@@ -164,22 +164,25 @@ def test_coordinates_that_would_be_taken_for_others_are_refused(
         ({"extensionsRequired": ["EXT_meshopt_compression"]}, "not readable as .*compressed by EXT_meshopt"),
         ({"mode": 6}, "not readable as .*fans of triangles"),
         ({"count": 10**9}, "unpacks to .*max_unpacked="),
+        ({"primitives": 10**4}, "unpacks to .*max_unpacked="),
     ],
 )
 def test_a_scene_that_is_packed_otherwise_is_told(
     changed: dict[str, object], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An array of a count without bytes is one that an extension would unpack."""
+    """An array without bytes is one that an extension would unpack. A mesh that stands nowhere uses one array often."""
     monkeypatch.setitem(sys.modules, "DracoPy", None)
     scene = json.loads(gltf("numbers.bin"))
-    if "count" in changed:
+    if "primitives" in changed:
+        scene["meshes"].append({"primitives": 10**4 * scene["meshes"][0]["primitives"]})
+    elif "count" in changed:
         scene["accessors"].append({"componentType": 5126, "type": "VEC3", **changed})
     else:
         (scene["meshes"][0]["primitives"][0] if "mode" in changed else scene).update(changed)
     (tmp_path / "a.gltf").write_text(json.dumps(scene))
     (tmp_path / "numbers.bin").write_bytes(bytes(96))
     with pytest.raises(MeshError, match=rf"a\.gltf: {told}"):
-        load_mesh(tmp_path / "a.gltf")
+        load_mesh(tmp_path / "a.gltf", LoadOptions(max_unpacked=LIMIT))
 
 
 def test_a_scene_reads_files_beside_it_and_none_elsewhere(tmp_path: Path) -> None:

@@ -41,16 +41,17 @@ def read_gltf(path: Path, options: LoadOptions, part: str | None) -> list[RawBod
     for name in scene.get("extensionsRequired", []):
         if name.endswith("_compression") and (name != _DRACO or find_spec("DracoPy") is None):
             raise ValueError(f"it is compressed by {name}, which is not read; export it uncompressed")
-    # Of an array without bytes trimesh makes zeros
-    n_items = sum(abs(one["count"]) for one in scene.get("accessors", []) if "bufferView" not in one)
-    check_unpacked(_LARGEST_ITEM * n_items, path, options.max_unpacked)
+    # Of an array without bytes trimesh makes zeros, and for every use of one a copy
+    n_bytes = sum(_LARGEST_ITEM * abs(one["count"]) for one in scene.get("accessors", []) if "bufferView" not in one)
     for primitive in (one for mesh in scene.get("meshes", []) for one in mesh["primitives"]):
         if primitive.get("mode") == _FAN:  # which trimesh passes over
             raise ValueError("it holds fans of triangles, which are not read; export it as plain triangles")
-        used = [primitive["attributes"].get("POSITION"), primitive.get("indices")]
-        arrays = [scene["accessors"][number] for number in used if number is not None]
+        used = ((primitive["attributes"].get("POSITION"), 24), (primitive.get("indices"), 8))
+        arrays = [scene["accessors"][number] for number, _ in used if number is not None]
+        n_bytes += sum(size * abs(scene["accessors"][number]["count"]) for number, size in used if number is not None)
         if any("sparse" in one or one.get("normalized") for one in arrays):  # trimesh reads other numbers
             raise ValueError("its coordinates are sparse or normalized, which is not read; export it uncompressed")
+    check_unpacked(n_bytes, path, options.max_unpacked)
     return [replace(body, unit="m") for body in objects(path, options)]
 
 
