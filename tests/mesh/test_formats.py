@@ -69,6 +69,12 @@ def polydata_of_vtk_9() -> bytes:
     return head + VERTICES.astype(">f4").tobytes() + notes + cells + FACES.astype(">i4").tobytes() + b"\n"
 
 
+def polydata_of_windows() -> bytes:
+    """Text with notes about an array, and carriage returns, also in the blank line behind the notes."""
+    notes = "METADATA\nINFORMATION 1\nNAME L2_NORM_RANGE LOCATION vtkDataArray\nDATA 2 0 1 \n\nPOLYGONS"
+    return polydata("5.1").replace("POLYGONS", notes).replace("\n", "\r\n").encode()
+
+
 def vtp(form: str) -> bytes:
     arrays = {
         "points": VERTICES.astype("<f4"),
@@ -141,6 +147,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "polygons5.vtk": lambda path: path.write_text(polydata("5.1")),
     "binary.vtk": lambda path: path.write_bytes(binary_polydata()),
     "binary5.vtk": lambda path: path.write_bytes(polydata_of_vtk_9()),
+    "windows.vtk": lambda path: path.write_bytes(polydata_of_windows()),
     "text.vtp": lambda path: path.write_bytes(vtp("ascii")),
     "raw.vtp": lambda path: path.write_bytes(vtp("raw")),
     "zlib.vtu": lambda path: meshio.write(path, CELLS, compression="zlib"),

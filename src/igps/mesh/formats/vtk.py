@@ -5,6 +5,7 @@ promises too much.
 """
 
 import base64
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ _LEGACY_TYPES = {  # VTK writes its identifiers as int
     "float": "f4", "double": "f8", "int": "i4", "unsigned_int": "u4", "long": "i8", "vtktypeint64": "i8",
     "vtktypeint32": "i4", "short": "i2", "unsigned_short": "u2", "char": "i1", "unsigned_char": "u1", "vtkidtype": "i4",
 }  # fmt: skip
+_BLANK_LINE = re.compile(rb"\n\r?\n")
 _CELLS = {"POLYGONS": _vtk_cells.POLYGON, "TRIANGLE_STRIPS": _vtk_cells.STRIP}
 _POLYS = {"Polys": _vtk_cells.POLYGON, "Strips": _vtk_cells.STRIP}
 _COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
@@ -55,8 +57,8 @@ class _Legacy:
             end = len(self._content) if end < 0 else end
             text, self._at = self._content[self._at : end].decode("latin-1").strip(), end + 1
             if text == "METADATA":  # up to a blank line
-                blank = self._content.find(b"\n\n", self._at)
-                self._at = len(self._content) if blank < 0 else blank
+                blank = _BLANK_LINE.search(self._content, self._at)
+                self._at = len(self._content) if blank is None else blank.start()
             elif text:
                 return text
         return ""
