@@ -41,8 +41,7 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
 
 
 def _polygons(head: str, body: bytes) -> Surface | None:
-    """The surface of polygons of several sizes, or of strips of triangles, which trimesh folds, cannot read or passes
-    over; None where all are triangles."""
+    """The surface of strips of triangles, or of polygons of several sizes; None where all are triangles."""
     order: str | None = None
     elements: list[tuple[str, int, list[Property]]] = []
     for words in map(str.split, head.splitlines()):

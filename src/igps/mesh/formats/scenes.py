@@ -20,7 +20,7 @@ from igps.mesh.surface import signed_volume
 
 # How far triangles may be from a curved face, over the length of its edges, and the angle between two, radians.
 _DEFLECTION, _ANGLE = 0.005, 0.2
-_DRACO = "KHR_draco_mesh_compression"  # which trimesh unpacks where this module is installed
+_DRACO = "KHR_draco_mesh_compression"  # which trimesh unpacks where DracoPy is installed
 _FAN, _LARGEST_ITEM = 6, 64  # a mode of primitives; bytes of a matrix of 4 x 4
 _CONVERT = (
     "import sys, cascadio; cascadio.step_to_glb(*sys.argv[1:], "
