@@ -203,10 +203,7 @@ class VertexAttribute(FileAttribute):
             return ImageAttribute(self.path, self.root).values(body, file, name, points)
         raw = read_surface(body.path, self.reading, part=body.part)
         given = vertex_values.chosen(vertex_values.read(file), name, file)
-        if len(given) != len(raw.vertices) and self.reading.bodies in (
-            "pieces",
-            "objects",
-        ):  # of the whole file
+        if len(given) != len(raw.vertices) and self.reading.bodies in ("pieces", "objects"):
             raw = read_surface(body.path, replace(self.reading, bodies="whole"))
         if len(given) != len(raw.vertices):
             counts = f"{len(given)} values, its surface {len(raw.vertices)} vertices"
