@@ -31,7 +31,7 @@ from igps.data.attributes import FunctionAttribute
 from igps.data.dataset import SignatureDataset
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import MeshError
-from igps.mesh.options import LoadOptions
+from igps.mesh.options import BodyKind, LoadOptions
 from igps.signature.signature import SignatureConfig
 
 CONFIG = SignatureConfig(n_eigenpairs=20, resolution=10, min_samples=0, n_surface_samples=50)
@@ -253,6 +253,25 @@ def test_values_at_vertices_survive_mending(tmp_path: Path) -> None:
     write_ply(tmp_path / "ball.ply", open_ball, linear(open_ball.vertices))
     found = VertexAttribute("{file}#height")(BodyRef(tmp_path / "ball.ply"), INSIDE)
     np.testing.assert_allclose(found, linear(INSIDE), atol=1e-2)
+
+
+@pytest.mark.parametrize("bodies", ["pieces", "objects"])
+def test_values_at_the_vertices_of_a_whole_file_serve_each_of_its_bodies(bodies: BodyKind, tmp_path: Path) -> None:
+    """Two balls in one file, whose values jump between them; then values of the second ball alone."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    away = trimesh.Trimesh(ball.vertices + np.array([5, 0, 0]), ball.faces, process=False)
+    both = trimesh.util.concatenate([ball, away])
+    values = np.concatenate([linear(ball.vertices), linear(ball.vertices) + 100])
+    write_ply(tmp_path / "both.ply", both, values)
+    write_ply(tmp_path / "b.ply", away, linear(ball.vertices) + 7)
+    rows = ["".join(f"v {x} {y} {z}\n" for x, y, z in both.vertices.tolist())]
+    rows += ["".join(f"f {a} {b} {c}\n" for a, b, c in (both.faces[k : k + 1280] + 1).tolist()) for k in (0, 1280)]
+    (tmp_path / "two.obj").write_text(f"{rows[0]}o a\n{rows[1]}o b\n{rows[2]}")
+    parts = ("piece 1", "piece 2") if bodies == "pieces" else ("a", "b")
+    for name, part, shift, added in (("both", parts[0], 0, 0), ("both", parts[1], 5, 100), ("b", parts[1], 5, 7)):
+        source = VertexAttribute(f"{name}.ply#height", reading=LoadOptions(bodies=bodies))
+        found = source(BodyRef(tmp_path / "two.obj", part), INSIDE + np.array([shift, 0, 0]))
+        np.testing.assert_allclose(found, linear(INSIDE) + added, atol=1e-3)
 
 
 def test_values_at_the_vertices_of_a_cavity_count(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gzip
 import pickle
 import shutil
 from dataclasses import replace
@@ -96,6 +97,19 @@ def test_keys_are_told_apart_by_content_reading_parameters_and_suffix_alone(
         pipeline.key(BodyRef(other)),
     ]
     assert len(set(keys)) == len(keys)
+
+
+def test_packed_lines_of_atoms_may_be_two_formats_with_radii_of_their_own(
+    pipeline: SignaturePipeline, tmp_path: Path
+) -> None:
+    """Without elements a line of PDB is one of PQR, too: its occupancy a charge, and its B-factor a radius."""
+    line = b"ATOM      1  CA  ALA A   1      11.104   6.134  -6.504  1.00  4.00\n"
+    names = [f"a.{kind}{packed}" for kind in ("pqr", "pdb", "PQR") for packed in (".gz", "")]
+    for name in names:
+        (tmp_path / name).write_bytes(gzip.compress(line, mtime=0) if name.endswith(".gz") else line)
+    keys = [pipeline.key(BodyRef(tmp_path / name)) for name in names]
+    assert keys[4:] == keys[:2]
+    assert len(set(keys)) == 4
 
 
 def test_keys_are_those_of_the_caches_that_exist(pipeline: SignaturePipeline, tmp_path: Path) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import re
 import tarfile
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +19,7 @@ import trimesh
 from igps import SignatureConfig, compute_signature
 from igps.mesh.formats import FORMATS, format_of, is_searched
 from igps.mesh.formats.stl import merged
-from igps.mesh.loading import load_mesh, read_surface
+from igps.mesh.loading import list_bodies, load_mesh, read_surface
 from igps.mesh.mesh import MeshError
 from igps.mesh.options import LoadOptions
 from igps.signature.signature import Signature
@@ -67,6 +69,12 @@ def polydata_of_vtk_9() -> bytes:
     return head + VERTICES.astype(">f4").tobytes() + notes + cells + FACES.astype(">i4").tobytes() + b"\n"
 
 
+def polydata_of_windows() -> bytes:
+    """Text with notes about an array, and carriage returns, also in the blank line behind the notes."""
+    notes = "METADATA\nINFORMATION 1\nNAME L2_NORM_RANGE LOCATION vtkDataArray\nDATA 2 0 1 \n\nPOLYGONS"
+    return polydata("5.1").replace("POLYGONS", notes).replace("\n", "\r\n").encode()
+
+
 def vtp(form: str) -> bytes:
     arrays = {
         "points": VERTICES.astype("<f4"),
@@ -108,6 +116,17 @@ def tarred(path: Path) -> None:
         archive.add(path.parent / "a.off", "a.off")
 
 
+def strips_ply(order: str) -> bytes:
+    """A list of strips of one triangle each, as text without an order."""
+    kind = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    head = f"ply\nformat {kind} 1.0\nelement vertex {len(VERTICES)}\nproperty float x\nproperty float y\n"
+    head += "property float z\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    row = np.concatenate([[4 * len(FACES)], np.column_stack([FACES, np.full(len(FACES), -1)]).ravel()])
+    if not order:
+        return (head + lines(VERTICES) + lines(row[None])).encode()
+    return head.encode() + VERTICES.astype(f"{order}f4").tobytes() + row.astype(f"{order}i4").tobytes()
+
+
 SOLID = trimesh.Trimesh(VERTICES, FACES, process=False)
 CELLS = meshio.Mesh(VERTICES, [("triangle", FACES)])
 WRITERS: dict[str, Callable[[Path], object]] = {
@@ -115,6 +134,9 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "relative.obj": lambda path: path.write_text(relative_obj()),
     "binary.ply": lambda path: SOLID.export(path),
     "text.ply": lambda path: meshio.write(path, CELLS, binary=False),
+    "strips.ply": lambda path: path.write_bytes(strips_ply("")),
+    "little_strips.ply": lambda path: path.write_bytes(strips_ply("<")),
+    "big_strips.ply": lambda path: path.write_bytes(strips_ply(">")),
     "binary.stl": lambda path: SOLID.export(path),
     "text.stl": lambda path: SOLID.export(path, file_type="stl_ascii"),
     "scene.glb": lambda path: SOLID.export(path),
@@ -125,6 +147,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "polygons5.vtk": lambda path: path.write_text(polydata("5.1")),
     "binary.vtk": lambda path: path.write_bytes(binary_polydata()),
     "binary5.vtk": lambda path: path.write_bytes(polydata_of_vtk_9()),
+    "windows.vtk": lambda path: path.write_bytes(polydata_of_windows()),
     "text.vtp": lambda path: path.write_bytes(vtp("ascii")),
     "raw.vtp": lambda path: path.write_bytes(vtp("raw")),
     "zlib.vtu": lambda path: meshio.write(path, CELLS, compression="zlib"),
@@ -207,6 +230,16 @@ def test_volumes_of_cells_give_the_surface_around_them(tmp_path: Path) -> None:
             assert not any("inside out" in note for note in mesh.notes)
 
 
+def test_a_strip_of_a_ply_file_turns_its_triangles_alike(tmp_path: Path) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    (tmp_path / "a.ply").write_text(head + "0 0 0\n1 0 0\n0 1 0\n0 0 1\n9 1 0 2 3 1 0 -1 0 1\n")  # the last is none
+    mesh = load_mesh(tmp_path / "a.ply", LoadOptions(mend="never"))
+    strip = trimesh.util.triangle_strips_to_faces([[1, 0, 2, 3, 1, 0]])
+    np.testing.assert_array_equal(mesh.faces, strip)
+    assert mesh.volume == pytest.approx(1 / 6)
+
+
 def test_strips_and_polygons_of_vtk_files(tmp_path: Path) -> None:
     """A tetrahedron as a strip, and a prism of two pentagons and five quadrilaterals."""
     head = "# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\n"
@@ -227,6 +260,8 @@ def test_strips_and_polygons_of_vtk_files(tmp_path: Path) -> None:
 
 FAULTY = {
     "four.off": (b"4" + off().replace("\n3 ", " 2\n3 ").encode(), "4OFF"),
+    "binary.off": (b"OFF BINARY\n\0\0\0\4\0\0\0\4\0\0\0\0" + bytes(112), "OFF BINARY"),
+    "strips.ply": (strips_ply("")[:-40], "announces faces"),
     "cut.ply": (trimesh.exchange.ply.export_ply(SOLID, encoding="ascii")[:-40], "announced"),
     "cut.vtk": (polydata("3.0")[:4000].encode(), "announced"),
     "huge.vtk": (b"# vtk DataFile Version 3.0\nx\nBINARY\nDATASET POLYDATA\nPOINTS 1000000000000 float\n", "announced"),
@@ -237,6 +272,10 @@ FAULTY = {
         b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 6 float\n" + b"0 0 1\n" * 6
         + b"CELLS 1 7\n6 0 1 2 3 4 5\nCELL_TYPES 1\n22\n",
         "kind 22",
+    ),
+    "axes.gii": (
+        b"<GIFTI><DataArray Intent='NIFTI_INTENT_POINTSET' DataType='NIFTI_TYPE_INT32' Dimensionality='7'/></GIFTI>",
+        "7 axes",
     ),
     "map.gii": (b"<GIFTI><DataArray Intent='NIFTI_INTENT_SHAPE'/></GIFTI>", "points or triangles"),
     "lh.white": (b"\xff\xff\xfemade\n\n" + b"\x7f\xff\xff\xff" * 2, "announced"),
@@ -253,6 +292,29 @@ def test_what_is_wrong_with_a_file_is_told_in_a_sentence_that_names_it(name: str
     (tmp_path / name).write_bytes(content)
     with pytest.raises(MeshError, match=rf"{name}: not readable as .*{words}.*\. .*[Ee]xport"):
         load_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["text.vtp", "polygons3.vtk", "text.stl"])
+def test_one_long_number_does_not_widen_all_others(name: str, tmp_path: Path) -> None:
+    WRITERS[name](tmp_path / name)
+    content = (tmp_path / name).read_bytes()
+    word = re.findall(rb"\d\.\d{6,}", content)[5]  # those before may be of a normal
+    (tmp_path / name).write_bytes(content.replace(word, word + b"0" * 30_000, 1))
+    tracemalloc.start()
+    mesh = load_mesh(tmp_path / name)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_array_equal(mesh.vertices[mesh.faces], VERTICES[FACES])
+    assert peak < 8e6
+
+
+def test_arrays_in_one_place_count_as_often_as_they_are_named(tmp_path: Path) -> None:
+    head, piece, tail = re.split(rb"(<Piece>.*</Piece>)", vtp("raw"), maxsplit=1)
+    (tmp_path / "a.vtp").write_bytes(head + 20 * piece + tail)
+    once = 12 * len(VERTICES) + 32 * len(FACES)
+    assert len(list_bodies(tmp_path / "a.vtp", LoadOptions(bodies="objects", max_unpacked=20 * once))) == 20
+    with pytest.raises(MeshError, match=r"a\.vtp: unpacks to .*max_unpacked="):
+        load_mesh(tmp_path / "a.vtp", LoadOptions(max_unpacked=10 * once))
 
 
 def test_an_array_that_promises_too_much_is_not_unpacked(tmp_path: Path) -> None:

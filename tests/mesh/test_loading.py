@@ -332,3 +332,20 @@ def test_a_format_without_its_module_says_which_extra_has_it(tmp_path: Path, mon
     monkeypatch.setattr(trimesh, "load_scene", missing)
     with pytest.raises(MeshError, match=r"part\.dae.*collada.*interior-gps\[formats\]"):
         load_mesh(tmp_path / "part.dae")
+
+
+@pytest.mark.parametrize("where", ["far", "far in double precision", "at the origin"])
+def test_places_that_single_precision_rounds_off_are_told(where: str, tmp_path: Path) -> None:
+    """In coordinates of maps an object of some metres has steps of half a metre, which bend its surface."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
+    vertices = ball.vertices + (0.0 if where == "at the origin" else np.array([5e5, 5.4e6, 0.0]))
+    if where == "far in double precision":
+        text = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in vertices.tolist())
+        (tmp_path / "a.obj").write_text(text + "".join(f"f {a} {b} {c}\n" for a, b, c in (ball.faces + 1).tolist()))
+        assert load_mesh(tmp_path / "a.obj").notes == ()
+        return
+    trimesh.Trimesh(vertices, ball.faces, process=False).export(tmp_path / "a.ply")
+    mesh = load_mesh(tmp_path / "a.ply")
+    steps = np.diff(np.unique(mesh.vertices[:, 1]))
+    told = [note for note in mesh.notes if "coordinates are rounded to 0.5, 1.4% of the size" in note]
+    assert bool(told) == (steps.min() == 0.5) == (where == "far")

@@ -207,6 +207,22 @@ def test_water_is_left_out_and_ligands_as_said(tmp_path: Path) -> None:
         read_molecule(written(tmp_path, water, "water.pdb"))
 
 
+def test_what_the_file_says_is_of_a_polymer_is_none_of_its_ligands(tmp_path: Path) -> None:
+    """A nucleotide whose name gemmi does not know, by the sequence that the file lists; else TER may mean anything."""
+    import gemmi
+
+    sugar = [("P", 0.0, 0.0), ("O5'", 1.5, 0.0), ("C5'", 2.2, 1.2), ("C1'", 3.0, 2.0), ("N9", 4.0, 2.0)]
+    chain = residue(1, "A", sugar) + residue(2, "QQQ", sugar, record="HETATM") + residue(3, "U", sugar) + "TER\n"
+    atoms = chain + residue(4, "QQX", sugar, record="HETATM") + residue(5, "NH2", [("N", 9.0, 9.0)], record="HETATM")
+    listed = written(tmp_path, "SEQRES   1 A    3    A QQQ   U\n" + atoms, "listed.pdb")
+    structure = gemmi.read_structure(str(listed))
+    structure.setup_entities()
+    mmcif = written(tmp_path, structure.make_mmcif_document().as_string(), "listed.cif")
+    for path in (listed, mmcif):
+        assert read_molecule(path)[0].residue_names == ("A", "QQQ", "U")
+    assert read_molecule(written(tmp_path, atoms))[0].residue_names == ("A", "U")
+
+
 def test_water_and_ions_of_simulations_belong_to_no_polymer(tmp_path: Path) -> None:
     water = [("OW", 9.0, 9.0), ("HW1", 9.5, 9.0), ("HW2", 9.0, 9.5), ("MW", 9.1, 9.1)]
     text = residue(1) + residue(2, "SOL", water) + residue(3, "SOD", [("NA", 9.0, 0.0)]) + residue(4, "QQQ")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import sys
 import tarfile
 import zipfile
 from pathlib import Path
@@ -23,9 +24,9 @@ OBJECTS = LoadOptions(bodies="objects")
 LIMIT, BOMB = 10**6, b"# " + bytes(2 * 10**6)
 
 
-def tar_of(members: dict[str, bytes], compressed: bool) -> bytes:
+def tar_of(members: dict[str, bytes], compression: str = "") -> bytes:
     out = io.BytesIO()
-    with tarfile.open(fileobj=out, mode="w:gz" if compressed else "w") as archive:
+    with tarfile.open(fileobj=out, mode=f"w:{compression}") as archive:
         for name, content in members.items():
             info = tarfile.TarInfo(name)
             info.size = len(content)
@@ -42,10 +43,11 @@ def zip_of(members: dict[str, bytes]) -> bytes:
 
 
 def packed(content: dict[str, bytes]) -> dict[str, bytes]:
-    return {"a.zip": zip_of(content), "a.tar.gz": tar_of(content, True), "a.tar": tar_of(content, False)}
+    tars = {"a.tar.gz": tar_of(content, "gz"), "a.tar.xz": tar_of(content, "xz"), "a.txz": tar_of(content, "xz")}
+    return {"a.zip": zip_of(content), "a.tar": tar_of(content), **tars}
 
 
-@pytest.mark.parametrize("name", ["a.zip", "a.tar.gz", "a.tar", "a.off.gz", "a.3mf", "a.zae"])
+@pytest.mark.parametrize("name", ["a.zip", "a.tar.gz", "a.tar.xz", "a.tar", "a.off.gz", "a.3mf", "a.zae"])
 def test_more_than_is_allowed_is_refused_and_the_remedy_named(name: str, tmp_path: Path) -> None:
     contents = packed({"a.off": BOMB}) | {
         "a.off.gz": gzip.compress(BOMB),
@@ -67,7 +69,7 @@ def test_a_size_that_lies_does_not_help(tmp_path: Path) -> None:
         load_mesh(tmp_path / "a.zip", LoadOptions(max_unpacked=LIMIT))
 
 
-@pytest.mark.parametrize("name", ["a.zip", "a.tar.gz", "a.tar"])
+@pytest.mark.parametrize("name", ["a.zip", "a.tar.gz", "a.tar.xz", "a.txz", "a.tar"])
 def test_files_in_an_archive_are_bodies_and_none_is_written_outside(name: str, tmp_path: Path) -> None:
     stl = trimesh.creation.icosphere(subdivisions=1).export(file_type="stl")
     outside = tmp_path / "outside"
@@ -153,6 +155,34 @@ def test_coordinates_that_would_be_taken_for_others_are_refused(
             load_mesh(tmp_path / f"a.{suffix}")
     else:
         assert load_mesh(tmp_path / f"a.{suffix}").volume == pytest.approx(9**3 / 6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "not readable as .*compressed by KHR_draco"),
+        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "not readable as .*compressed by EXT_meshopt"),
+        ({"mode": 6}, "not readable as .*fans of triangles"),
+        ({"count": 10**9}, "unpacks to .*max_unpacked="),
+        ({"primitives": 10**4}, "unpacks to .*max_unpacked="),
+    ],
+)
+def test_a_scene_that_is_packed_otherwise_is_told(
+    changed: dict[str, object], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An array without bytes is one that an extension would unpack. A mesh that stands nowhere uses one array often."""
+    monkeypatch.setitem(sys.modules, "DracoPy", None)
+    scene = json.loads(gltf("numbers.bin"))
+    if "primitives" in changed:
+        scene["meshes"].append({"primitives": 10**4 * scene["meshes"][0]["primitives"]})
+    elif "count" in changed:
+        scene["accessors"].append({"componentType": 5126, "type": "VEC3", **changed})
+    else:
+        (scene["meshes"][0]["primitives"][0] if "mode" in changed else scene).update(changed)
+    (tmp_path / "a.gltf").write_text(json.dumps(scene))
+    (tmp_path / "numbers.bin").write_bytes(bytes(96))
+    with pytest.raises(MeshError, match=rf"a\.gltf: {told}"):
+        load_mesh(tmp_path / "a.gltf", LoadOptions(max_unpacked=LIMIT))
 
 
 def test_a_scene_reads_files_beside_it_and_none_elsewhere(tmp_path: Path) -> None:

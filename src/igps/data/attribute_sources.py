@@ -34,7 +34,6 @@ from igps.signature.residue_attributes import RESIDUE_ATTRIBUTES, residue_attrib
 
 logger = logging.getLogger(__name__)
 
-
 # A value beyond stands for none, such as the 7e18 at the border of some grids.
 _LARGEST = 1e15
 _MOST_MISSING = 0.1
@@ -191,8 +190,8 @@ class VertexAttribute(FileAttribute):
     """Values at the vertices of the body's file, carried inside by mean value coordinates as the eigenfunctions are.
 
     PLY, VTK (.vtk, .vtp), GIFTI (.shape.gii, .func.gii), FreeSurfer (lh.thickness, lh.curv): one row for each vertex of
-    the body as its file has it. Where the mesh was mended, a new vertex has the value of the nearest place of the old
-    surface.
+    the body as its file has it, or of the whole file where bodies are its pieces or objects. Where the mesh was mended,
+    a new vertex has the value of the nearest place of the old surface.
     """
 
     reading: LoadOptions = LoadOptions()
@@ -202,21 +201,22 @@ class VertexAttribute(FileAttribute):
 
         if file.name.lower().endswith(images.SUFFIXES):  # of a pattern that ends in {file}
             return ImageAttribute(self.path, self.root).values(body, file, name, points)
-        raw = read_surface(body.path, LoadOptions(), part=body.part)
+        raw = read_surface(body.path, self.reading, part=body.part)
         given = vertex_values.chosen(vertex_values.read(file), name, file)
+        if len(given) != len(raw.vertices) and self.reading.bodies in ("pieces", "objects"):
+            raw = read_surface(body.path, replace(self.reading, bodies="whole"))
         if len(given) != len(raw.vertices):
             counts = f"{len(given)} values, its surface {len(raw.vertices)} vertices"
             raise MeshError(f"{body}: {file} has {counts}. Give the values of this surface.")
         columns = fill_missing(given.reshape(len(given), -1), raw.vertices, str(file))
         mesh = load_mesh(body.path, self.reading, part=body.part)
-        vertices = mesh.vertices
-        if not np.array_equal(vertices, raw.vertices):
+        if not np.array_equal(mesh.vertices, raw.vertices):
             faces = np.ascontiguousarray(raw.faces)
-            _, face, nearest = igl.point_mesh_squared_distance(vertices, np.ascontiguousarray(raw.vertices), faces)
+            _, face, nearest = igl.point_mesh_squared_distance(mesh.vertices, np.ascontiguousarray(raw.vertices), faces)
             corners = [np.ascontiguousarray(raw.vertices[faces[face, i]]) for i in range(3)]
             shares = np.nan_to_num(igl.barycentric_coordinates(np.ascontiguousarray(nearest), *corners), nan=1 / 3)
             columns = np.einsum("vi,vid->vd", shares, columns[faces[face]])
-        return extend(vertices, mesh.faces, columns, points).reshape(len(points), *given.shape[1:])
+        return extend(mesh.vertices, mesh.faces, columns, points).reshape(len(points), *given.shape[1:])
 
 
 @dataclass(frozen=True)

@@ -242,7 +242,9 @@ class SignaturePipeline:
         # The version of the mending counts where anything was done to the mesh: a new one leaves the others as they are
         # The suffix chooses the reader, so the same bytes under another suffix are another mesh.
         versions = config.ALGORITHM_VERSION, MENDING_VERSION if mended else None
-        how = _parameters(body.path.suffix.lower(), body.part, self.reading, config, versions)
+        name = body.path.name.lower()
+        suffix = ".pqr.gz" if name.endswith(".pqr.gz") else Path(name).suffix  # the same lines may be a .pdb.gz
+        how = _parameters(suffix, body.part, self.reading, config, versions)
         return hashlib.sha256(how + file.digest).hexdigest()
 
     def _attribute_key(self, body: BodyRef, key: str, name: str) -> str:

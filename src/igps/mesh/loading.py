@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from igps._arrays import Floats
 from igps._threads import one_thread
 from igps.mesh._tidying import joined_at_free_edges
 from igps.mesh.formats import FORMATS, Format, RawBody, format_of
@@ -16,9 +17,12 @@ from igps.mesh.limits import check_memory
 from igps.mesh.mending import mend
 from igps.mesh.mesh import Mesh, MeshError, check_arrays
 from igps.mesh.options import BodyKind, LoadOptions
-from igps.mesh.surface import compact, face_parts
+from igps.mesh.surface import compact, diagonal, face_parts
 
 logger = logging.getLogger(__name__)
+
+# Steps of coordinates, over the size, that make eigenvalues wrong by about a hundredth.
+_COARSE = 0.004
 
 
 @dataclass(frozen=True)
@@ -146,6 +150,7 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
             vertices, faces = compact(vertices, faces[owner == int(np.argmax(areas))])
             kept = f"{len(vertices)} of {n_before} vertices"
             notes = (*notes, f"kept the largest of {len(areas)} components ({kept})")
+    notes = (*notes, *_rounding(vertices, name))
     if options.allow_open and options.mend != "always":
         try:
             return Mesh(vertices, faces, name=name, allow_open=True, notes=notes, unit=raw.unit)
@@ -157,6 +162,19 @@ def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(
         cavities=options.cavities, denoise=raw.denoise, name=name, notes=notes,
     )  # fmt: skip
     return mesh.annotated(unit=raw.unit)
+
+
+def _rounding(vertices: Floats, name: str) -> list[str]:
+    """A note of numbers in single precision so far from the origin that their last digits are seen in the shape."""
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused later
+        single = vertices.astype(np.float32)
+        step = float(np.spacing(np.abs(single).max(initial=0)))
+        size = diagonal(vertices) if len(vertices) else 0.0
+    if not _COARSE * size < step < size or (single != vertices).any():
+        return []
+    note = f"coordinates are rounded to {step:.2g}, {step / size:.1%} of the size, so far from the origin"
+    logger.warning("%s: %s. Move the body to the origin before it is written.", name, note)
+    return [note]
 
 
 def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[RawBody]:

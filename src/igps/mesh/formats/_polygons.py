@@ -26,6 +26,15 @@ def triangles(corners: Integers, n_corners: Integers) -> Integers:
     return np.concatenate(pieces)
 
 
+def of_strip(corners: Integers) -> Integers:
+    """The triangles (n - 2, 3) of a strip (n,): each has a side of the one before, and is turned like it."""
+    if len(corners) < 3:
+        return np.zeros((0, 3), dtype=np.int64)
+    found = np.lib.stride_tricks.sliding_window_view(corners, 3).copy()
+    found[1::2] = found[1::2, ::-1]
+    return found
+
+
 def flat_triangles(corners: Integers, n_corners: Integers, vertices: Floats) -> Integers:
     """The same, but polygons that would fold over themselves are cut ear by ear (Meisters 1975), and come last.
 

@@ -44,7 +44,7 @@ def read_structures(path: Path) -> dict[str, gemmi.Structure]:
     gemmi = gemmi_module()
     try:
         if suffix(path) in (".pdb", ".ent"):
-            return {"": gemmi.read_pdb_string(_as_models(_ATOM_LINE.sub(_with_numbers, text)))}
+            return {"": _pdb(_as_models(_ATOM_LINE.sub(_with_numbers, text)))}
         document = gemmi.cif.read_string(text.decode("utf-8", "replace"))
         blocks = [block for block in document if block.find_values("_atom_site.id")] or [document[0]]
         for block in blocks:
@@ -106,6 +106,18 @@ def _text(path: Path) -> bytes:
     if not text.strip():
         raise MeshError(f"{path}: the file is empty. Export it again.")
     return text.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+
+
+def _pdb(text: bytes) -> gemmi.Structure:
+    """A structure in which no residue is told to be of a polymer unless the file lists the polymers' sequences.
+
+    Before TER, where gemmi takes all for polymers, some programs write ligands, too.
+    """
+    structure = gemmi_module().read_pdb_string(text)
+    if not any(entity.full_sequence for entity in structure.entities):
+        for residue in (residue for model in structure for chain in model for residue in chain):
+            residue.entity_type = gemmi_module().EntityType.Unknown
+    return structure
 
 
 def _with_numbers(line: re.Match[bytes]) -> bytes:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from igps._arrays import Floats, Integers
-from igps.mesh.formats._polygons import flat_triangles, triangles
+from igps.mesh.formats._polygons import flat_triangles, of_strip, triangles
 
 TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, TETRAHEDRON = 5, 6, 7, 8, 9, 10
 # Sides of volumes, seen from outside, as VTK orders their corners: of tetrahedra, voxels, hexahedra, wedges, pyramids.
@@ -34,10 +34,7 @@ def surface(corners: Integers, n_corners: Integers, kinds: Integers, vertices: F
     pixels = starts[kinds == PIXEL, None]
     found.append(triangles(corners[pixels + np.array([0, 1, 3, 2])].ravel(), np.full(len(pixels), 4)))
     for strip in np.flatnonzero(kinds == STRIP):
-        row = corners[starts[strip] : starts[strip] + n_corners[strip]]
-        three = np.lib.stride_tricks.sliding_window_view(row, 3).copy()
-        three[1::2] = three[1::2, ::-1]
-        found.append(three)
+        found.append(of_strip(corners[starts[strip] : starts[strip] + n_corners[strip]]))
     sides: dict[int, list[Integers]] = {3: [], 4: []}
     for kind, of_kind in _SIDES.items():
         at = starts[kinds == kind, None]

@@ -40,7 +40,7 @@ def _refuse(name: str, *_: object) -> None:
 
 def from_text(text: str, kind: np.dtype) -> NDArray[np.generic]:
     """Numbers separated by white space."""
-    return np.array(text.split(), dtype="U").astype(kind) if text.split() else np.zeros(0, kind)
+    return np.array(text.split(), dtype=kind)  # as an array of words it would be as wide as the longest
 
 
 def inflated(content: bytes, n_bytes: int, name: str = "zlib") -> bytes:

@@ -69,9 +69,9 @@ def _unpacked(path: Path, folder: Path, options: LoadOptions) -> list[tuple[str,
     with _members(path, options) as members:
         for name, stream in members:
             inside = PurePosixPath(name.replace("\\", "/"))
-            if inside.is_absolute() or any(one.startswith(".") for one in inside.parts) or not inside.name:
+            place = folder / inside  # elsewhere, of a name that begins with a slash, or on Windows with a drive
+            if not place.is_relative_to(folder) or any(one.startswith(".") for one in inside.parts) or not inside.name:
                 continue  # a Mac adds a hidden file of the same suffix to each
-            place = folder / inside
             place.parent.mkdir(parents=True, exist_ok=True)
             _copy(stream, place)
             found.append((name, place))
@@ -86,7 +86,8 @@ def _members(path: Path, options: LoadOptions) -> Iterator[Iterator[tuple[str, I
             check_unpacked(sum(one.file_size for one in files), path, options.max_unpacked)  # no more is read of any
             yield ((one.filename, archive.open(one)) for one in files)
         return
-    opener = _OPENERS.get({".tgz": ".gz", ".tbz2": ".bz2"}.get(path.suffix.lower(), path.suffix.lower()), open)
+    last = path.suffix.lower()
+    opener = _OPENERS.get({".tgz": ".gz", ".tbz2": ".bz2", ".txz": ".xz"}.get(last, last), open)
     with opener(path, "rb") as stream, tarfile.open(fileobj=_Counted(stream, path, options), mode="r|") as packed:
         yield ((one.name, file) for one in packed if one.isreg() and (file := packed.extractfile(one)))
 
@@ -110,7 +111,9 @@ def _copy(stream: Any, place: Path) -> None:
 
 
 ARCHIVE = Format(
-    *("an archive", (".zip", ".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2"), read),
+    "an archive",
+    (".zip", ".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz"),
+    read,
     bodies=("whole", "objects"),
     is_searched=False,
 )

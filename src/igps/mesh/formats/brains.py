@@ -16,6 +16,7 @@ from igps.mesh.options import LoadOptions
 
 _TYPES = {"NIFTI_TYPE_FLOAT32": "f4", "NIFTI_TYPE_FLOAT64": "f8", "NIFTI_TYPE_INT32": "i4", "NIFTI_TYPE_UINT8": "u1"}
 _POINTS, _TRIANGLES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
+_MOST_AXES = 6
 _MAGIC = b"\xff\xff\xfe"
 # A mark of those whose points are in the coordinates of images.
 _IN_SCANNER = np.array([2, 1], ">i4").tobytes()
@@ -48,7 +49,9 @@ def gifti_values(path: Path, options: LoadOptions) -> dict[str, NDArray[np.gener
 
 
 def _array(element: Element, path: Path, options: LoadOptions) -> NDArray[np.generic]:
-    shape = [int(element.get(f"Dim{i}", "0")) for i in range(int(element.get("Dimensionality", "2")))]
+    if (n_axes := int(element.get("Dimensionality", "2"))) > _MOST_AXES:
+        raise ValueError(f"an array of {n_axes} axes, of which GIFTI has {_MOST_AXES} at most")
+    shape = [int(element.get(f"Dim{i}", "0")) for i in range(n_axes)]
     kind = np.dtype(_TYPES[element.get("DataType", "")])
     n_bytes = prod(shape) * kind.itemsize
     check_unpacked(n_bytes, path, options.max_unpacked)

@@ -172,13 +172,15 @@ class _Builder:
 
     def _add_residue(self, residue: gemmi.Residue, atoms: list[gemmi.Atom]) -> bool:
         """Whether the residue belongs to the molecule."""
-        kind = gemmi_module().find_tabulated_residue(residue.name)
+        gemmi = gemmi_module()
+        kind = gemmi.find_tabulated_residue(residue.name)
         name = _standard(residue.name, kind)
         named = {atom.name for atom in atoms}
         is_known = name != residue.name or (kind.is_amino_acid() or kind.is_nucleic_acid())
         # An ion of an unknown name is a single atom, which is no polymer; the name of calcium is that of Cα.
         is_alone = len(atoms) == 1 and (not named & {"CA", "P"} or atoms[0].element.name == "Ca")
-        in_polymer = is_known or {"N", "CA", "C"} <= named or (residue.het_flag == "A" and not is_alone)
+        is_linked = residue.het_flag == "A" or residue.entity_type == gemmi.EntityType.Polymer
+        in_polymer = is_known or {"N", "CA", "C"} <= named or (is_linked and not is_alone)
         if not atoms or not (in_polymer or self.ligands):
             self._count["ligand"] += bool(atoms)
             return False

@@ -22,6 +22,8 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     lines = [line for line in rest.splitlines() if line and not line.isspace()]
     if not lines:
         raise ValueError("no OFF with the numbers of vertices and faces behind it")
+    if "BINARY" in lines[0]:
+        raise ValueError("numbers as bytes (OFF BINARY), of which text is expected; export it as text, or as PLY")
     if "4" in kind:
         raise ValueError("four coordinates for each vertex (4OFF), of which three are expected")
     n_vertices, n_faces, *_ = map(int, lines[0].split())

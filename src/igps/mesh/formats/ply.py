@@ -1,5 +1,6 @@
 """PLY: vertices and polygons, or points with normals, as text or bytes."""
 
+import re
 import struct
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from igps._arrays import Floats, Surface
 from igps.mesh.formats._format import Format, RawBody
-from igps.mesh.formats._polygons import flat_triangles
+from igps.mesh.formats._polygons import flat_triangles, of_strip
 from igps.mesh.formats._trimesh import objects
 from igps.mesh.options import LoadOptions
 
@@ -18,6 +19,7 @@ _KINDS = {
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _CORNERS = ("vertex_index", "vertex_indices")
+_HAS_FACES = re.compile(rb"element\s+(face|tristrips)\s+0*[1-9]")
 Polygons = tuple[Floats, list[tuple[int, ...]]]  # vertices (V, 3), and the corners of each
 Property = tuple[str, str, str]  # its name; its kind; of a list also the kind of its length, else ""
 
@@ -32,11 +34,14 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
         return [RawBody(*polygons)]
     # trimesh takes the header for UTF-8, and would split vertices at the seams of textures
     content = head.decode("latin-1").encode("ascii", "replace") + end + body
-    return objects(path, options, content, fix_texture=False)
+    found = objects(path, options, content, fix_texture=False)
+    if _HAS_FACES.search(head) and not any(len(one.faces) for one in found):  # the points are no cloud
+        raise ValueError("it announces faces, of which none can be read; export it as triangles, in text")
+    return found
 
 
 def _polygons(head: str, body: bytes) -> Surface | None:
-    """The surface of polygons of several sizes, which trimesh folds or cannot read; None where all are triangles."""
+    """The surface of strips of triangles, or of polygons of several sizes; None where all are triangles."""
     order: str | None = None
     elements: list[tuple[str, int, list[Property]]] = []
     for words in map(str.split, head.splitlines()):
@@ -47,9 +52,9 @@ def _polygons(head: str, body: bytes) -> Surface | None:
         elif words[:1] == ["property"]:
             name, kind, *length = words[:0:-1]
             elements[-1][2].append((name, _KINDS[kind], _KINDS[length[0]] if len(length) > 1 else ""))
-    if [name for name, _, _ in elements[:2]] != ["vertex", "face"]:
+    if [name for name, _, _ in elements[:2]] not in (["vertex", "face"], ["vertex", "tristrips"]):
         return None
-    (_, n_vertices, of_vertex), (_, n_faces, of_face) = elements[:2]
+    (_, n_vertices, of_vertex), (kind_of_face, n_faces, of_face) = elements[:2]
     at = next((i for i, (name, _, _) in enumerate(of_face) if name in _CORNERS), -1)
     other = [length for _, _, length in of_vertex + of_face[:at] + of_face[at + 1 :]]
     if any(other) or at < 0 or min(n_vertices, n_faces) < 1:
@@ -62,6 +67,10 @@ def _polygons(head: str, body: bytes) -> Surface | None:
     if found is None:
         return None
     vertices, polygons = found
+    if kind_of_face == "tristrips":  # -1 ends one within a list
+        lists = [np.array(one, dtype=np.int64) for one in polygons]
+        parts = [part for one in lists for part in np.split(one, np.flatnonzero(one < 0))]
+        return vertices, np.concatenate([of_strip(part[part >= 0]) for part in parts])
     n_corners = np.array([len(one) for one in polygons], dtype=np.int64)
     corners = np.array([corner for one in polygons for corner in one], dtype=np.int64)
     return vertices, flat_triangles(corners, n_corners, vertices)

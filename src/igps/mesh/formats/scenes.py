@@ -7,6 +7,7 @@ import sys
 import tempfile
 import zipfile
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from igps.mesh.surface import signed_volume
 
 # How far triangles may be from a curved face, over the length of its edges, and the angle between two, radians.
 _DEFLECTION, _ANGLE = 0.005, 0.2
+_DRACO = "KHR_draco_mesh_compression"  # which trimesh unpacks where DracoPy is installed
+_FAN, _LARGEST_ITEM = 6, 64  # a mode of primitives; bytes of a matrix of 4 x 4
 _CONVERT = (
     "import sys, cascadio; cascadio.step_to_glb(*sys.argv[1:], "
     f"tol_linear={_DEFLECTION}, tol_relative=True, tol_angular={_ANGLE}, merge_primitives=True)"
@@ -35,11 +38,20 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
 def read_gltf(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
     """The objects of a glTF scene, which is in metres."""
     scene = _scene(path)
+    for name in scene.get("extensionsRequired", []):
+        if name.endswith("_compression") and (name != _DRACO or find_spec("DracoPy") is None):
+            raise ValueError(f"it is compressed by {name}, which is not read; export it uncompressed")
+    # Of an array without bytes trimesh makes zeros, and for every use of one a copy
+    n_bytes = sum(_LARGEST_ITEM * abs(one["count"]) for one in scene.get("accessors", []) if "bufferView" not in one)
     for primitive in (one for mesh in scene.get("meshes", []) for one in mesh["primitives"]):
-        used = [primitive["attributes"].get("POSITION"), primitive.get("indices")]
-        arrays = [scene["accessors"][number] for number in used if number is not None]
+        if primitive.get("mode") == _FAN:  # which trimesh passes over
+            raise ValueError("it holds fans of triangles, which are not read; export it as plain triangles")
+        used = ((primitive["attributes"].get("POSITION"), 24), (primitive.get("indices"), 8))
+        arrays = [scene["accessors"][number] for number, _ in used if number is not None]
+        n_bytes += sum(size * abs(scene["accessors"][number]["count"]) for number, size in used if number is not None)
         if any("sparse" in one or one.get("normalized") for one in arrays):  # trimesh reads other numbers
             raise ValueError("its coordinates are sparse or normalized, which is not read; export it uncompressed")
+    check_unpacked(n_bytes, path, options.max_unpacked)
     return [replace(body, unit="m") for body in objects(path, options)]
 
 

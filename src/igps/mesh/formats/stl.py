@@ -26,8 +26,7 @@ def read(path: Path, options: LoadOptions, part: str | None) -> list[RawBody]:
 
 
 def _text(content: bytes) -> tuple[Floats, tuple[str, ...]]:
-    rows = b"\n".join(_VERTEX.findall(content)).split()
-    corners = np.array(rows, dtype="S").astype(np.float64) if rows else np.zeros(0)
+    corners = np.array(b"\n".join(_VERTEX.findall(content)).split(), dtype=np.float64)
     if len(corners) % 9:
         raise ValueError(f"{len(corners) // 3} vertices are no triangles; the file is cut short")
     return corners.reshape(-1, 3), ()

@@ -5,6 +5,7 @@ promises too much.
 """
 
 import base64
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ _LEGACY_TYPES = {  # VTK writes its identifiers as int
     "float": "f4", "double": "f8", "int": "i4", "unsigned_int": "u4", "long": "i8", "vtktypeint64": "i8",
     "vtktypeint32": "i4", "short": "i2", "unsigned_short": "u2", "char": "i1", "unsigned_char": "u1", "vtkidtype": "i4",
 }  # fmt: skip
+_BLANK_LINE = re.compile(rb"\n\r?\n")
 _CELLS = {"POLYGONS": _vtk_cells.POLYGON, "TRIANGLE_STRIPS": _vtk_cells.STRIP}
 _POLYS = {"Polys": _vtk_cells.POLYGON, "Strips": _vtk_cells.STRIP}
 _COMPRESSORS = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
@@ -55,8 +57,8 @@ class _Legacy:
             end = len(self._content) if end < 0 else end
             text, self._at = self._content[self._at : end].decode("latin-1").strip(), end + 1
             if text == "METADATA":  # up to a blank line
-                blank = self._content.find(b"\n\n", self._at)
-                self._at = len(self._content) if blank < 0 else blank
+                blank = _BLANK_LINE.search(self._content, self._at)
+                self._at = len(self._content) if blank is None else blank.start()
             elif text:
                 return text
         return ""
@@ -75,7 +77,7 @@ class _Legacy:
         if len(words) != n:
             raise ValueError(f"{n} numbers announced, {len(words)} there")
         self._at = len(self._content) - len(rest)
-        return np.array(words, dtype="S").astype(kind) if n else np.zeros(0, kind)
+        return np.array(words, dtype=kind)
 
     def cells(self, n: int, size: int) -> tuple[Integers, Integers]:
         """Corners of n cells laid end to end, and how many each has; written as two arrays, or as rows before VTK 5."""
@@ -183,6 +185,7 @@ class _Xml:
     def __init__(self, path: Path, options: LoadOptions) -> None:
         content = path.read_bytes()
         self._path, self._options, self._appended = path, options, b""
+        self._n_made = -len(content)  # bytes of arrays beyond those of the file
         start = content.find(b"<AppendedData")
         self._is_raw = start >= 0 and b'"raw"' in content[start : content.find(b">", start)]
         if start >= 0:
@@ -218,10 +221,14 @@ class _Xml:
         kind = kind.newbyteorder(self._order)
         where, text = element.get("format"), element.text or ""
         if where == "ascii":
-            return _xml.from_text(text, kind)
-        if where == "appended":
-            return np.frombuffer(self._block(self._appended[int(element.get("offset", "0")) :], self._is_raw), kind)
-        return np.frombuffer(self._block("".join(text.split()).encode(), False), kind)
+            values = _xml.from_text(text, kind)
+        elif where == "appended":
+            values = np.frombuffer(self._block(self._appended[int(element.get("offset", "0")) :], self._is_raw), kind)
+        else:
+            values = np.frombuffer(self._block("".join(text.split()).encode(), False), kind)
+        self._n_made += values.nbytes  # of all arrays: thousands may be said to lie in one place
+        check_unpacked(self._n_made, self._path, self._options.max_unpacked)
+        return values
 
     def _block(self, content: bytes, is_raw: bool) -> bytes:
         """The bytes behind a header of their size, or of the sizes of their compressed blocks."""
