@@ -215,7 +215,7 @@ def _rig(bones: Sequence[Bone], motion: Motion, direction: Floats) -> Rig:
         plate = bones[0].solid
         assert isinstance(plate, Plate)
         axis = np.cross(np.array([0.0, 0.0, 1.0]), direction)
-        return strip(bones, direction, axis, plate.thick, np.radians(_ROLL), 0.0)
+        return strip(bones, direction, axis, plate.thick, np.radians(_ROLL))
     return limbs(bones, hinged=motion == "hinges")
 
 

@@ -210,14 +210,14 @@ def _stiffened(rod: Rod, held: float, half: float) -> Rod:
     return replace(rod, girth=np.where(near, np.maximum(rod.girth, 1.5 * half), rod.girth))
 
 
-def strip(bones: Sequence[Bone], direction: Floats, axis: Floats, thickness: float, curl: float, twist: float) -> Rig:
+def strip(bones: Sequence[Bone], direction: Floats, axis: Floats, thickness: float, curl: float) -> Rig:
     """One rod for a whole body, such as a sheet, which is bent about ``axis`` along ``direction``.
 
     Args:
         bones: at rest.
         direction, axis: (3,) unit vectors, perpendicular.
         thickness: of the body in the direction in which it bends.
-        curl, twist: radians over the whole length.
+        curl: radians over the whole length.
     """
     corners = np.concatenate([np.stack(bone.placed.bounds()) for bone in bones])
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -226,7 +226,7 @@ def strip(bones: Sequence[Bone], direction: Floats, axis: Floats, thickness: flo
     points = centre + (along - half)[:, None] * direction
     sides = np.tile(np.stack([axis, np.cross(direction, axis)], axis=1), (len(along), 1, 1))
     radii = np.full(len(along), 0.5 * thickness)
-    rod = Rod(-1, 0.0, points, along, radii, radii, sides, (), curl, twist)
+    rod = Rod(-1, 0.0, points, along, radii, radii, sides, curl=curl)
     return Rig((rod,), np.zeros(len(bones), dtype=np.int64))
 
 

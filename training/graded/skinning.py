@@ -59,12 +59,6 @@ def moved(motions: Motions, points: Floats) -> Floats:
     return _rotated(motions.real, points) + 2.0 * product(motions.dual, conjugate)[..., 1:]
 
 
-def same_side(motions: Motions, real: Floats) -> Motions:
-    """The same motions with the signs that bring their real parts nearest to ``real`` (..., 4), to be blended."""
-    sign = np.where((motions.real * real).sum(axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
-    return Motions(sign * motions.real, sign * motions.dual)
-
-
 def product(a: Floats, b: Floats) -> Floats:
     """Products of quaternions (..., 4)."""
     aw, ax, ay, az = (a[..., i] for i in range(4))

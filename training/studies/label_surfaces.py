@@ -68,12 +68,6 @@ def solid(kind: str, thickness: float) -> Solid:
     return Solid(lambda p: np.asarray((abs(p) < half).all(-1)), half, 8 * a * b * c, 8 * (a * b + b * c + a * c))
 
 
-def edges_of(kind: str, thickness: float) -> float:
-    """The length of the edges of a solid, at which two faces meet in a right angle."""
-    r = thickness / 2
-    return {"rod": 4 * np.pi * r, "plate": 8 * r * float(SIDES.sum())}.get(kind, 0.0)
-
-
 def exact_mesh(kind: str, thickness: float) -> Mesh:
     """The surface of a solid in a few thousand triangles."""
     r = thickness / 2
