@@ -12,8 +12,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, stdev
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +19,6 @@ import torch
 from torch import Tensor
 from training.graded import GradedShape, GradedShapes, body_of
 from training.studies import individuals, pretraining
-from training.studies.ablation import split_families
 
 import igps
 from igps.data.datamodule import SignatureDataModule
@@ -217,26 +214,6 @@ def test_ablation_prints_every_head_of_every_layout(root: Path) -> None:
     scores = expected(igps.describe(dataset, module).flatten(1), dataset.labels, split, module.part_cells)
     wanted = [scores[head]["ft"] for head in ("none", "whitened", "kernel")]
     assert [float(x) for x in found["interior", "nothing"]] == pytest.approx(wanted, abs=0.06)
-
-
-def test_no_family_is_on_both_sides_of_a_split_of_families() -> None:
-    classes = [
-        "beast-2-stand-horned-014",
-        "beast-3-fins-029",
-        "biped",
-        "coil-2-disc-026",
-        "coil-4-disc-041",
-        "hand",
-    ]
-    labels = torch.arange(6).repeat_interleave(3)
-    dataset: Any = SimpleNamespace(classes=classes, labels=labels)
-    splits = [split_families(dataset, seed) for seed in range(8)]
-    for split in splits:
-        sides = [{classes[int(labels[i])].split("-")[0] for i in part} for part in (split.train, split.test)]
-        assert not sides[0] & sides[1]
-        assert len(sides[0]) == len(sides[1]) == 2
-        assert sorted((*split.train, *split.test)) == list(range(18))
-    assert len(set(splits)) > 1
 
 
 class QuickShapes(GradedShapes):
