@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from igps.cli import Commands
 from igps.cli import main as run
-from training.studies.damage_command import damage
+from training.studies.damage import damage_command
 from training.studies.figure_command import pose, potential, topology
 from training.studies.label_surfaces import surfaces
-from training.studies.robustness_command import robustness
+from training.studies.robustness import robustness_command
 from training.studies.scales import scales
 
 COMMANDS: Commands = {
-    "robustness": robustness,
-    "damage": damage,
+    "robustness": robustness_command,
+    "damage": damage_command,
     "scales": scales,
     "surfaces": surfaces,
     "figure": {"pose": pose, "topology": topology, "potential": potential},
