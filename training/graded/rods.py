@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
@@ -140,7 +139,7 @@ class Rig:
     """Rods, parents before children, and (solids,) the rod of each solid."""
 
     rods: tuple[Rod, ...]
-    owner: NDArray[np.int64]
+    owner: Integers
 
 
 @dataclass(frozen=True)
@@ -318,8 +317,8 @@ def bend(vertices: Floats, rig: Rig, binding: Binding, carried: Sequence[Motions
 class Gaps:
     """Which elements may not come together: pairs of them that are apart at rest, and the radii of all."""
 
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
+    first: Integers
+    second: Integers
     reach: Floats
 
     @classmethod

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tqdm import tqdm
 
+from igps._arrays import Singles
 from igps._parallel import Failed, one_thread, run
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
@@ -21,7 +21,7 @@ from igps.signature.signature import compute_signature
 Way = Callable[[Mesh], Mesh]
 """Does something to a mesh; picklable."""
 
-Answer = NDArray[np.float32] | str
+Answer = Singles | str
 """What a descriptor says of a body, or why it says nothing."""
 
 

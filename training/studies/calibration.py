@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 
 import igps
+from igps._arrays import Booleans, Floats
 from igps._parallel import on_threads
 from igps.descriptors.fingerprint import fingerprint
 from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained
@@ -95,10 +95,10 @@ def calibrate(
 
     surfaces, surfaces_of_copies = (_Measured(one, n_workers) for one in (shapes, copied))
 
-    def among(chosen: NDArray[np.bool_]) -> list[_Pair]:
+    def among(chosen: Booleans) -> list[_Pair]:
         return [(surfaces, i[k], surfaces, j[k]) for k in np.flatnonzero(chosen)]
 
-    def of_made(chosen: NDArray[np.bool_]) -> list[_Pair]:
+    def of_made(chosen: Booleans) -> list[_Pair]:
         return [(surfaces, originals[n], surfaces_of_copies, n) for n in np.flatnonzero(chosen).tolist()]
 
     # The hard ones tell the rate: other poses of bodies that bend, and other bodies of the class.
@@ -202,7 +202,7 @@ class _Measured:
 _Pair = tuple[_Measured, int, _Measured, int]
 
 
-def _apart(pairs: list[_Pair], n_workers: int | None) -> NDArray[np.float64]:
+def _apart(pairs: list[_Pair], n_workers: int | None) -> Floats:
     """(N, 2) how far apart the surfaces of pairs are; and that over what their levels of detail leave open."""
 
     def one(pair: _Pair) -> tuple[float, float]:
@@ -215,11 +215,11 @@ def _apart(pairs: list[_Pair], n_workers: int | None) -> NDArray[np.float64]:
 
 def _print(
     calibration: Calibration,
-    same: NDArray[np.float64],
-    others: NDArray[np.float64],
-    longer: NDArray[np.float64],
+    same: Floats,
+    others: Floats,
+    longer: Floats,
     ways: list[str],
-    to_copies: NDArray[np.float64],
+    to_copies: Floats,
 ) -> None:
     print(calibration.made_of)
     for way in SUFFIXES:

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
+from igps._arrays import Floats, Integers
 from igps.descriptors._geodesics import edge_graph
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.simplification import simplify
@@ -200,5 +200,5 @@ def _check_share(share: float) -> None:
         raise ValueError(f"share: expected a number between 0 and 1, got {share}.")
 
 
-def _changed(mesh: Mesh, vertices: NDArray[np.float64], faces: NDArray[np.int64], note: str) -> Mesh:
+def _changed(mesh: Mesh, vertices: Floats, faces: Integers, note: str) -> Mesh:
     return replace(mesh, vertices=vertices, faces=faces, notes=(*mesh.notes, note))

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats
 from igps.analysis.explanation import explain, on_surface
 from igps.data.collation import collate
 from igps.data.requirements import Requirements
@@ -23,8 +23,6 @@ from training.graded.shapes import GradedShapes
 ALTERATIONS = ("bump", "dent", "limb", "hole")
 # Of √area: what an alteration reaches, at least, and how large it is
 _REACH, _SIZES = 0.1, (0.005, 0.05)
-
-Points = NDArray[np.float64]
 
 
 def explaining(
@@ -87,7 +85,7 @@ def explaining(
             print(f"{name} {how}: {np.mean(some):.3f} of {len(some)}, by pairs alone {np.mean(pairs):.3f}")
 
 
-def alter(mesh: Mesh, how: str, size: float, random: np.random.Generator) -> tuple[Mesh, Points, float]:
+def alter(mesh: Mesh, how: str, size: float, random: np.random.Generator) -> tuple[Mesh, Floats, float]:
     """A mesh altered in one place, the centre of that place, and its radius.
 
     Args:
@@ -117,10 +115,10 @@ def alter(mesh: Mesh, how: str, size: float, random: np.random.Generator) -> tup
     return Mesh(moved, mesh.faces), centre + step * outward, reach
 
 
-def _along(direction: Points, centre: Points) -> Points:
+def _along(direction: Floats, centre: Floats) -> Floats:
     """The motion of z onto a direction through a place."""
     import trimesh
 
-    motion: Points = trimesh.geometry.align_vectors([0, 0, 1], direction)
+    motion: Floats = trimesh.geometry.align_vectors([0, 0, 1], direction)
     motion[:3, 3] = centre
     return motion

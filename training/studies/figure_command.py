@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Singles
 from igps.cli.reading import signatures
 from igps.data.sources import find_bodies
 from igps.mesh.loading import load_mesh
@@ -147,5 +147,5 @@ def _genus(mesh: Mesh) -> int:
     return genus(mesh.faces, len(mesh.vertices))
 
 
-def _median(values: NDArray[np.float32]) -> str:
+def _median(values: Singles) -> str:
     return f"{np.median(values):6.3f}" if values.size else f"{'-':>6}"

@@ -12,16 +12,15 @@ from itertools import combinations
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import elliprg
 
 from igps import Mesh, SignatureConfig, collate, compute_signature
+from igps._arrays import Booleans, Floats
 from igps.data.requirements import Requirements
 from igps.descriptors import descriptor
 from igps.mesh.label_surface import voxel_surface
 
-Array = NDArray[np.float64]
 KINDS = ("ball", "ellipsoid", "torus", "capsule", "rod", "plate")
 AXES = np.array([1, 1.3, 2])  # of an ellipsoid
 SIDES = np.array([3, 4, 1])  # of a plate
@@ -32,8 +31,8 @@ RING = 2.5  # of a torus, over the radius of its tube
 class Solid:
     """A body about the origin: which points (..., 3) it holds, half its box, its volume, area and handles."""
 
-    holds: Callable[[Array], NDArray[np.bool_]]
-    half: Array
+    holds: Callable[[Floats], Booleans]
+    half: Floats
     volume: float
     area: float
     genus: int = 0
@@ -90,7 +89,7 @@ def exact_mesh(kind: str, thickness: float) -> Mesh:
     return Mesh(np.asarray(surface.vertices), np.asarray(surface.faces), name=kind)
 
 
-def voxels(body: Solid, matrix: Array, rng: np.random.Generator) -> tuple[NDArray[np.bool_], Array]:
+def voxels(body: Solid, matrix: Floats, rng: np.random.Generator) -> tuple[Booleans, Floats]:
     """The body, turned and moved at random, at the centres of voxels: (X, Y, Z), and the affine (4, 4)."""
     turn = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
     size = np.linalg.norm(body.half)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Booleans, Floats
 from igps.analysis.groups import squared_distances
 from igps.analysis.outliers import Outlier, measures_of, outliers
 from igps.data.dataset import SignatureDataset
@@ -20,9 +20,6 @@ from igps.report.answers import write_answer
 from training.studies.mask_damages import DAMAGES, VARIED, damaged, varied
 
 _LEAST_VOXELS = 50
-
-Mask = NDArray[np.bool_]
-Values = NDArray[np.float64]
 
 
 def outlying(
@@ -107,7 +104,7 @@ def areas(rows: Sequence[dict[str, object]]) -> dict[str, float]:
     return found
 
 
-def _write(path: Path, mask: Mask, spacing: Values) -> Path:
+def _write(path: Path, mask: Booleans, spacing: Floats) -> Path:
     import nibabel
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -115,7 +112,7 @@ def _write(path: Path, mask: Mask, spacing: Values) -> Path:
     return path
 
 
-def _given(volumes: Path) -> dict[str, tuple[Mask, Values]]:
+def _given(volumes: Path) -> dict[str, tuple[Booleans, Floats]]:
     """The masks of at least fifty voxels, by class and name; the classes are the names without side and number."""
     import nibabel
 
@@ -131,7 +128,7 @@ def _given(volumes: Path) -> dict[str, tuple[Mask, Values]]:
     return found
 
 
-def generated(seed: int = 0) -> dict[str, tuple[Mask, Values]]:
+def generated(seed: int = 0) -> dict[str, tuple[Booleans, Floats]]:
     """One subject in a grid, and a body of many subjects, each in a grid of its own with thick slices.
 
     Bodies touch, none overlaps, and the border of the grid cuts some: single ones, pairs of sides, a series of thin
@@ -139,9 +136,9 @@ def generated(seed: int = 0) -> dict[str, tuple[Mask, Values]]:
     """
     random = np.random.default_rng(seed + 100)
     spacing, room = np.full(3, 3.0), np.array([110, 90, 110]) * 3.0
-    found = dict[str, tuple[Mask, Values]]()
+    found = dict[str, tuple[Booleans, Floats]]()
     taken = np.zeros((110, 90, 110), dtype=bool)
-    drawn: list[tuple[str, Values, Values]] = []
+    drawn: list[tuple[str, Floats, Floats]] = []
     for level in range(6):
         angle, wide, long = np.linspace(0.2, 2.6 + 0.1 * level, 60), 60 + 8 * level, 50 + 4 * level
         arc = [wide * np.sin(angle), long * np.cos(angle) + 120, 290 - 22 * level - 14 * angle]
@@ -181,7 +178,7 @@ def generated(seed: int = 0) -> dict[str, tuple[Mask, Values]]:
     return found
 
 
-def _curve(random: np.random.Generator) -> tuple[Values, Values]:
+def _curve(random: np.random.Generator) -> tuple[Floats, Floats]:
     """A smooth curve of random length about the origin, and the radii of balls along it."""
     t, size = np.linspace(0, 1, 60), np.exp(random.uniform(np.log(25), np.log(170)))
     waves = sum(random.normal(0, 0.5 / k**2, (3, 1)) * np.cos(np.pi * k * t + random.uniform(0, 6)) for k in (1, 2, 3))
@@ -189,13 +186,13 @@ def _curve(random: np.random.Generator) -> tuple[Values, Values]:
     return size * np.asarray(waves).T, np.maximum(radius * (1 - np.abs(2 * t - 1) ** 6) ** 0.5, 4.0)
 
 
-def _jittered(points: Values, random: np.random.Generator) -> Values:
+def _jittered(points: Floats, random: np.random.Generator) -> Floats:
     """Moved by smooth noise along each axis."""
-    moved: Values = points + 1.5 * np.sin(points[:, ::-1] / 25 + random.uniform(0, 6, 3))
+    moved: Floats = points + 1.5 * np.sin(points[:, ::-1] / 25 + random.uniform(0, 6, 3))
     return moved
 
 
-def _tube(curve: Values, radii: Values, spacing: Values, random: np.random.Generator, free: Mask) -> Mask:
+def _tube(curve: Floats, radii: Floats, spacing: Floats, random: np.random.Generator, free: Booleans) -> Booleans:
     """Free voxels in balls along a curve, with a border as rough as that of segmentations; the largest piece."""
     from scipy.ndimage import gaussian_filter, label
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 from tqdm import tqdm
 
+from igps._arrays import Floats, Singles
 from igps._threads import one_thread
 from igps.data.dataset import SignatureDataset
 from igps.mesh.mesh import Mesh
@@ -45,10 +45,10 @@ class PoseCurves:
         to_others: by class, those from its meshes to the meshes of the other classes.
     """
 
-    curves: dict[str, NDArray[np.float32]]
-    centres: NDArray[np.float32]
-    within: dict[str, NDArray[np.float32]]
-    to_others: dict[str, NDArray[np.float32]]
+    curves: dict[str, Singles]
+    centres: Singles
+    within: dict[str, Singles]
+    to_others: dict[str, Singles]
 
 
 def pose_curves(dataset: SignatureDataset, classes: Sequence[str], n_bins: int = 64) -> PoseCurves:
@@ -87,8 +87,8 @@ class WeldChange:
     before: Mesh
     after: Mesh
     n_samples: int
-    change: NDArray[np.float64]
-    eigenvalues: tuple[NDArray[np.float64], NDArray[np.float64]]
+    change: Floats
+    eigenvalues: tuple[Floats, Floats]
 
 
 @one_thread()
@@ -144,10 +144,10 @@ class PotentialSlice:
         n_samples: interior samples, near the best of which the barycentroid was searched.
     """
 
-    axes: tuple[NDArray[np.float64], NDArray[np.float64]]
-    values: NDArray[np.float64]
-    section: NDArray[np.float64]
-    barycentroid: NDArray[np.float64]
+    axes: tuple[Floats, Floats]
+    values: Floats
+    section: Floats
+    barycentroid: Floats
     least: float
     largest: float
     n_samples: int
@@ -205,14 +205,14 @@ def _embedding(mesh: Mesh, spectrum: Spectrum) -> Extension:
     return Extension(mesh.vertices, mesh.faces, spectrum.eigenfunctions, divisors=roots, accuracy=1e-3)
 
 
-def _around(mesh: Mesh, point: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+def _around(mesh: Mesh, point: Floats, reach: float) -> Floats:
     """Points of a fine cubic grid around a point in the body, those inside: (P, 3), with the point itself."""
     x, y, z = point[:, None] + reach * np.linspace(-1, 1, 9)
     index = np.nonzero(inside_grid(mesh, (x, y, z)))
     return np.stack([axis[i] for axis, i in zip((x, y, z), index, strict=True)], axis=1)
 
 
-def _section(mesh: Mesh, height: float) -> NDArray[np.float64]:
+def _section(mesh: Mesh, height: float) -> Floats:
     """(S, 2, 2) segments in which the plane z = height cuts the surface."""
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     segments = trimesh.intersections.mesh_plane(surface, plane_normal=[0, 0, 1], plane_origin=[0, 0, height])
