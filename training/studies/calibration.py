@@ -25,9 +25,9 @@ from igps.gallery.calibration import (
 from igps.gallery.surfaces import Surfaces, distance_if_alike
 from igps.mesh.mesh import Mesh
 from igps.nn.description import describe
-from igps.nn.descriptor import Descriptor
 from training.graded import GradedShapes, body_of
 from training.studies.disturbances import move, remesh, scale, simplified
+from training.studies.individuals import generated
 from training.studies.thresholds import quantiles, threshold_at, threshold_between
 
 SUFFIXES = {"triangles": ".off", "half": ".off", "motion": ".ply", "format": ".stl", "all": ".obj", "longer": ".off"}
@@ -65,10 +65,11 @@ def calibrate(
         n_workers: processes; all cores if not given.
     """
     descriptor = pretrained(model)
-    shapes = _generated(root, descriptor, n_classes, seed, cache_dir, n_workers)
+    bodies_in_poses = GradedShapes(n_classes, 4, 4, seed)
+    shapes = generated(bodies_in_poses, root, descriptor, cache_dir, n_workers)
     bodies = np.array([body_of(name) for name in shapes.bodies.names])
     classes = np.array(shapes.bodies.labels)
-    is_rigid = np.isin(classes, _still(GradedShapes(n_classes, 4, 4, seed)))
+    is_rigid = np.isin(classes, _still(bodies_in_poses))
 
     made = _copies(shapes, copies, n_copied, seed)
     copied = igps.SignatureDataset([path for _, _, path in made], shapes.config, cache_dir)
@@ -132,18 +133,6 @@ def _still(shapes: GradedShapes) -> list[str]:
         if np.abs(pose.bent - pose.rest).max() < 1e-6 * np.ptp(pose.rest, axis=0).max():
             found.append(name)
     return found
-
-
-def _generated(
-    root: Path, descriptor: Descriptor, n_classes: int, seed: int, cache_dir: Path | None, n_workers: int | None
-) -> igps.SignatureDataset:
-    """The shapes, those that are not there yet written first."""
-    try:
-        GradedShapes(n_classes, 4, 4, seed).write(root, progress=True, n_workers=n_workers)
-    except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
-        print(error)
-    shapes = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=descriptor)
-    return shapes.usable(shapes.precompute(n_workers=n_workers))
 
 
 def _copies(shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: int) -> list[tuple[int, str, Path]]:

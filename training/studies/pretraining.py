@@ -17,7 +17,7 @@ from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
 from training.graded import GradedShapes, body_of, family_of, looks_alike
-from training.studies.individuals import dealt, fit_individuals, numbers, usable
+from training.studies.individuals import dealt, fit_individuals, generated, numbers, usable
 from training.studies.transfer import curve, few_labels, level_scores, report
 
 # Of two classes each part has a single direction, and its vectors are signs, which may cancel.
@@ -78,15 +78,10 @@ def pretrain(
         save(kept.head)
         return
 
-    shapes = GradedShapes(n_classes, n_bodies, n_poses, seed)
-    try:
-        shapes.write(root, progress=True, n_workers=n_workers)
-    except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
-        print(error)
-    generated = usable(root, descriptor, cache_dir, n_workers)
-    histograms, labels = describe(generated, descriptor, progress=True, n_workers=n_workers), generated.labels
-    bodies = numbers([body_of(name) for name in generated.bodies.names])
-    parts = dealt([family_of(name) for name in generated.classes], n_parts, seed)
+    shapes = generated(GradedShapes(n_classes, n_bodies, n_poses, seed), root, descriptor, cache_dir, n_workers)
+    histograms, labels = describe(shapes, descriptor, progress=True, n_workers=n_workers), shapes.labels
+    bodies = numbers([body_of(name) for name in shapes.bodies.names])
+    parts = dealt([family_of(name) for name in shapes.classes], n_parts, seed)
 
     def fit(n: int, seed: int, among: Tensor) -> TwoLevelHead:
         """The metric, of n classes drawn by the seed."""
@@ -102,7 +97,7 @@ def pretrain(
         level_scores(name, [(d, bodies[chosen], labels[chosen]) for d, chosen in zip(distances, scored, strict=True)])
 
     print(f"{n_parts} parts of the families, each scored by a metric that was fitted to the others:")
-    alike = torch.tensor([looks_alike(name) for name in generated.classes])
+    alike = torch.tensor([looks_alike(name) for name in shapes.classes])
     strangers = [among[~alike[among]] for among in others]
     ways = [("pretrained", others, others)]
     if min(len(among) for among in strangers) >= _FEWEST:
@@ -122,7 +117,7 @@ def pretrain(
         ]
         score(name, [other.distances(one, one) for one in described])
 
-    everything = torch.arange(len(generated.classes))
+    everything = torch.arange(len(shapes.classes))
     head = fit(len(everything), seed, everything)
     print(f"fitted to all {len(everything)} classes")
     head = save(head)
