@@ -1,12 +1,15 @@
-"""Studies of the library: `python -m training.study {robustness,damage,scales,surfaces,figure}`, `--help` for each."""
+"""Studies of the library: `python -m training.study` and the name of one, `--help` for each."""
 
 from __future__ import annotations
 
 from igps.cli import Commands
 from igps.cli import main as run
 from training.studies.damage import damage_command
+from training.studies.explaining import explaining
 from training.studies.figure_command import pose, potential, topology
 from training.studies.label_surfaces import surfaces
+from training.studies.outlying import outlying
+from training.studies.power import power
 from training.studies.robustness import robustness_command
 from training.studies.scales import scales
 
@@ -15,6 +18,9 @@ COMMANDS: Commands = {
     "damage": damage_command,
     "scales": scales,
     "surfaces": surfaces,
+    "power": power,
+    "explaining": explaining,
+    "outlying": outlying,
     "figure": {"pose": pose, "topology": topology, "potential": potential},
 }
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 from itertools import product
+from operator import or_
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,6 @@ import numpy as np
 from igps._arrays import Floats
 from igps.analysis.explanation import explain, on_surface
 from igps.data.collation import collate
-from igps.data.requirements import Requirements
 from igps.descriptors import descriptor as descriptor_of
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors
@@ -30,7 +31,6 @@ def explaining(
     descriptors: Sequence[str] = ("interior", "rich", "pretrained"),
     n_bodies: int = 50,
     seed: int = 0,
-    same_pose: bool = False,
 ) -> None:
     """Areas under the curve of the painted difference on the altered body against the true place.
 
@@ -39,24 +39,21 @@ def explaining(
         descriptors: names.
         n_bodies: each is altered in each way.
         seed: of the bodies; other seeds give other bodies.
-        same_pose: alter the very same mesh in place of one in another pose.
     """
     from sklearn.metrics import roc_auc_score
 
     chosen = {name: descriptor_of(name) for name in descriptors}
-    needs = Requirements()
-    for one in chosen.values():
-        needs = needs | one.requirements
+    config = reduce(or_, (one.requirements for one in chosen.values())).apply_to(SignatureConfig())
     shapes, rows = GradedShapes(24, -(-n_bodies // 24), 2, seed=seed), list[dict[str, Any]]()
     random = np.random.default_rng(seed)
     places = random.permutation(len(shapes) // 2)[:n_bodies].tolist()
     for place, how in product(places, ALTERATIONS):
         size = float(np.exp(random.uniform(*np.log(_SIZES))))
         try:
-            drawn = [shapes[2 * place + pose] for pose in (int(same_pose), 1)]
+            drawn = [shapes[2 * place + pose] for pose in (0, 1)]
             before, after = (Mesh(shape.vertices, shape.faces) for shape in drawn)
             altered, centre, reach = alter(after, how, size, random)
-            signatures = [compute_signature(mesh, needs.apply_to(SignatureConfig())) for mesh in (before, altered)]
+            signatures = [compute_signature(mesh, config) for mesh in (before, altered)]
         except (MeshError, ValueError) as error:
             print(f"{shapes.names[2 * place]}: {error}")
             continue

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import combinations
+from operator import or_
 
 import numpy as np
 import torch
@@ -133,10 +135,7 @@ def measure(
         seed: of these.
     """
     modules = {name: descriptor(name) for name in descriptors}
-    needs = Requirements()
-    for module in modules.values():
-        needs = needs | module.requirements
-    config = needs.apply_to(SignatureConfig())
+    config = reduce(or_, (one.requirements for one in modules.values()), Requirements()).apply_to(SignatureConfig())
 
     def described(mesh: Mesh) -> dict[str, torch.Tensor]:
         batch = collate([compute_signature(mesh, config)])

@@ -27,7 +27,6 @@ def outlying(
     out: Path = Path("build/outlying"),
     cache_dir: Path | None = None,
     seed: int = 0,
-    anywhere: bool = False,
     vary: bool = False,
 ) -> None:
     """Score masks as they are, and each with one damage in its place; the area under the curve tells them apart.
@@ -37,7 +36,6 @@ def outlying(
         out: folder for the masks, outlying.csv and outlying.json.
         cache_dir: of the signatures.
         seed: of the damages, and of the generated bodies.
-        anywhere: bodies leak at any place, in place of where another one is near, if any is.
         vary: damages are of other kinds, and of random sizes, places and directions, see `varied`.
     """
     masks = generated(seed) if volumes is None else _given(volumes)
@@ -51,7 +49,7 @@ def outlying(
         mask, spacing = masks[name]
         others = np.zeros_like(mask)
         for other, (near, _) in masks.items():
-            if other != name and near.shape == mask.shape and not anywhere:
+            if other != name and near.shape == mask.shape:
                 others |= near
         paths.append(_write(out / f"{i}_damaged.nii.gz", *damage_of(mask, spacing, damage, random, others)))
     chosen = descriptor_of("pretrained")
