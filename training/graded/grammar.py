@@ -1,30 +1,16 @@
-"""Classes of articulated shapes beyond the named templates: one structure after another of the grammar's families.
-
-The grammar's classes are tried out when they are made, since drawn proportions may let limbs touch.
-"""
+"""The grammar: families of skeletons, each a builder and the structures that it can build."""
 
 from __future__ import annotations
 
 import itertools
-import logging
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from igps.shapes import ArticulatedShapes
-from igps.shapes.meshing import defect, mesh
-from igps.shapes.skeleton import Skeleton, pose
-from igps.shapes.templates import TEMPLATES
+from igps.shapes.skeleton import Skeleton
 from training.graded.artefacts import stack, table, tongs, tool, vessel, wheel
 from training.graded.creatures import beast, chain, comb, serpent, star, tree
 
-_MAX_DRAWS = 20
-_CLASS, _FAMILY, _TRIAL = 2, 3, 4  # what a random stream is for, beside those of `ArticulatedShapes`
-_TRIAL_VERTICES = 3000  # the same whatever resolution is asked for: a class does not depend on it
 _LAYERS = ("ball", "block", "plate", "post", "hoop")
-
-_log = logging.getLogger(__name__)
 
 
 class Family(NamedTuple):
@@ -115,47 +101,3 @@ _ALL = (
     ),
 )
 FAMILIES = {family.build.__name__: family for family in _ALL}
-
-
-class GrammarShapes(ArticulatedShapes):
-    """`ArticulatedShapes` with further classes, which are drawn from the grammar."""
-
-    most_classes = None
-
-    def _class_name(self, index: int) -> str:
-        return super()._class_name(index) if index < len(TEMPLATES) else _structure(self.seed, index)[0]
-
-    def _skeleton(self, index: int) -> Skeleton:
-        return super()._skeleton(index) if index < len(TEMPLATES) else _sound_skeleton(self.seed, index)
-
-
-def _sound_skeleton(seed: int, index: int) -> Skeleton:
-    """The structure of a class in the first proportions that pass a trial pose.
-
-    Raises:
-        ValueError: no proportions did.
-    """
-    name, build, structure = _structure(seed, index)
-    found: str | None = None
-    for draw in range(_MAX_DRAWS):
-        skeleton = build(np.random.default_rng([seed, _CLASS, index, draw]), *structure)
-        body = pose(skeleton, np.random.default_rng([seed, _TRIAL, index, draw]), 1.0, np.eye(3))
-        vertices, faces, _ = mesh(body, _TRIAL_VERTICES)
-        found = defect(vertices, faces, skeleton.genus, _TRIAL_VERTICES)
-        if found is None:
-            return skeleton
-        _log.debug("%s: draw %d: %s", name, draw + 1, found)
-    raise ValueError(
-        f"seed={seed}: no sound class {name} in {_MAX_DRAWS} draws, the last had {found}; try another seed"
-    )
-
-
-def _structure(seed: int, index: int) -> tuple[str, Callable[..., Skeleton], tuple[Any, ...]]:
-    """Name, builder and structure of a class of the grammar."""
-    turn, place = divmod(index - len(TEMPLATES), len(FAMILIES))
-    family, (build, structures) = list(FAMILIES.items())[place]
-    # One walk through the shuffled structures keeps classes of a family apart, however many are asked for.
-    order = np.random.default_rng([seed, _FAMILY, place]).permutation(len(structures))
-    structure = structures[order[turn % len(structures)]]
-    words = [str(word) for choice in structure for word in (choice if isinstance(choice, tuple) else (choice,))]
-    return "-".join([family, *words, f"{index:03d}"]), build, structure
