@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from training.graded.grammar import FAMILIES
+from training.graded.kinds import KINDS
 from training.graded.rods import Binding, Rig, Rod, at_rest, bend, bind, carry, limbs
 from training.graded.skinning import Motions, after, motion, moved, normalized, product, turn_about
 
@@ -165,7 +165,7 @@ def test_weights_are_shares_and_follow_the_nearest_rod() -> None:
 
 def test_trunks_bend_and_frames_do_not() -> None:
     """A wheel without limbs has no joint at all; the trunk of a four-legged animal is a rod, its legs too."""
-    wheel = FAMILIES["wheel"].build(np.random.default_rng(0), 4, 3, "none", "plain")
+    wheel = KINDS["wheel"].build(np.random.default_rng(0), 4, 3, "none", "plain")
     assert all(len(rod.along) == 1 for rod in limbs(at_rest(wheel, {})).rods)
     rods = limbs(at_rest(TEMPLATES["quadruped"](), {})).rods
     assert len(rods[0].joints) == 1  # the spine

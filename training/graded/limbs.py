@@ -1,4 +1,4 @@
-"""The limbs of the grammar's bodies: their kinds, and what sits at their ends."""
+"""The limbs of drawn bodies: their kinds, and what sits at their ends."""
 
 from __future__ import annotations
 
