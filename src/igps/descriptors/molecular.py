@@ -66,9 +66,6 @@ class Shares(PointAxis):
         self.memberships(values[mask])
         return largest_members(values, mask)
 
-    def extra_repr(self) -> str:
-        return f"{self.name!r}, {self.n_classes}"
-
 
 class SizedHistograms(HistogramDescriptor):
     """Histograms and the size of a body: χ² distances d become d·s / (0.3 + s) by the difference s in size.
