@@ -34,7 +34,7 @@ class DamageResult:
     Args:
         n_given: meshes that were damaged.
         scores: means over the damaged meshes that could be described, each as a query of the clean others; fractions.
-            None where no two of them are of one class.
+            none where no two of them are of one class.
         clean: the same of their clean twins.
         notes: why others could not be described, by name.
     """

@@ -57,7 +57,7 @@ def draw_weld_change(mesh: Mesh, welded: Mesh, change: NDArray[np.floating], out
 
     Args:
         mesh: the body before.
-        welded: by `training.studies.disturbances.weld`, with the tube as its last faces.
+        welded: by `training.studies.weld.weld`, with the tube as its last faces.
         change: (pairs,) relative change of each distance.
         out: the PNG file.
     """
