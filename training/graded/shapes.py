@@ -16,6 +16,7 @@ from tqdm import tqdm
 from igps._arrays import Floats, Integers
 from igps._files import whole_file
 from igps._parallel import Failed, run
+from igps._parameters import check_at_least
 from igps.mesh.mesh import Mesh, MeshError
 from igps.shapes.benchmark import is_whole_off, off_text, shapes_folder
 from training.graded.bodies import Body, Pose, draw_body, draw_pose
@@ -91,15 +92,8 @@ class GradedShapes:
         look_alikes: bool = True,
         n_individuals: int = 0,
     ) -> None:
-        for name, value, least in (
-            ("n_classes", n_classes, 1),
-            ("n_bodies", n_bodies, 1),
-            ("n_poses", n_poses, 1),
-            ("seed", seed, 0),
-            ("n_individuals", n_individuals, 0),
-        ):
-            if operator.index(value) < least:
-                raise ValueError(f"{name}: expected at least {least}, got {value}.")
+        check_at_least(1, n_classes=n_classes, n_bodies=n_bodies, n_poses=n_poses)
+        check_at_least(0, seed=seed, n_individuals=n_individuals)
         if not 1500 <= n_vertices[0] <= n_vertices[1]:
             raise ValueError(f"n_vertices: expected two numbers, the first at least 1500 and no more than the second, "
                              f"got {n_vertices}.")  # fmt: skip
@@ -117,10 +111,7 @@ class GradedShapes:
         return self.n_classes * self.n_bodies * max(self.n_individuals, 1) * self.n_poses
 
     def __repr__(self) -> str:
-        return (
-            f"GradedShapes({self.n_classes}, {self.n_bodies}, {self.n_poses}, seed={self.seed}, "
-            f"n_vertices={self.n_vertices}, look_alikes={self.look_alikes}, n_individuals={self.n_individuals})"
-        )
+        return f"GradedShapes({', '.join(f'{name}={value!r}' for name, value in self.__getstate__().items())})"
 
     @property
     def class_names(self) -> list[str]:
