@@ -8,11 +8,11 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import igps
-from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained_head, pretrained_parts, save_pretrained
+from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained_head, pretrained_parts
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
@@ -137,6 +137,15 @@ def pretrain(
     # Two of each class are left to find each other.
     for n in (n for n in (1, 3, 5) if n + 2 <= int(classes.bincount().min())):
         few_labels(n, found, classes, head, descriptor.part_cells)
+
+
+def save_pretrained(module: EmbeddedDescriptor, path: str | Path) -> None:
+    """Write a fitted `pretrained_parts` under `pretrained_head` to a safetensors file, the head in half precision."""
+    state = {
+        name: (tensor.half() if name.startswith("head.") and tensor.is_floating_point() else tensor).contiguous()
+        for name, tensor in module.state_dict().items()
+    }
+    save_file(state, path)
 
 
 def _drawn(classes: Sequence[int], n: int, seed: int) -> list[int]:
