@@ -8,8 +8,6 @@ plain descriptors. The second scores that metric on a labelled collection too, b
 fitted to and with a few labels of it.
 """
 
-from __future__ import annotations
-
 from jsonargparse import auto_cli
 
 from igps.cli import faults_in_a_sentence

@@ -1,7 +1,5 @@
 """Studies of the library: `python -m training.study` and the name of one, `--help` for each."""
 
-from __future__ import annotations
-
 from igps.cli import Commands
 from igps.cli import main as run
 from training.studies.damage import damage_command

@@ -3,8 +3,6 @@
 A builder draws its proportions from ``g``; its other arguments are the structure that tells classes apart.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

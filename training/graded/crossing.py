@@ -1,7 +1,5 @@
 """Whether a surface crosses itself."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import cKDTree
 

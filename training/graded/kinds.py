@@ -4,8 +4,6 @@ A class is a kind and some of its builder's structural choices. Its bodies draw 
 so that two bodies of a class differ as two chairs do, and two poses of a body as a cat does from itself.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple

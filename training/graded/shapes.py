@@ -1,7 +1,5 @@
 """Graded shapes: classes of bodies, bodies in poses."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import operator

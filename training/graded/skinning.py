@@ -5,8 +5,6 @@ translation times ``real``. The weighted mean of several, over its length, is a 
 neither collapses nor loses volume when it is twisted (Kavan, Collins, Žára and O'Sullivan 2007).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

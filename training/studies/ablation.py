@@ -1,7 +1,5 @@
 """What each learned part gives: bins, spectral filter, dimensions and head, over several seeded splits."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from pathlib import Path

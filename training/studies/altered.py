@@ -1,7 +1,5 @@
 """Descriptions of meshes to which something was done before, on many processes."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """Measure what the distances of `pretrained` mean, on generated bodies that it was not fitted to."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What damaged files cost: damaged meshes as queries against the gallery of their clean twins."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

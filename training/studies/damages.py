@@ -4,8 +4,6 @@ Unlike the disturbances, which lead from body to body, these are for what reads 
 with their usual strength.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

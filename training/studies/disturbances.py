@@ -4,8 +4,6 @@ Each function returns a new, checked `Mesh` and says in its notes what was done.
 descriptors are tried against, with the strength that is usual here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Whether an explanation lies where two bodies differ: generated pairs in other poses, altered in one place."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import reduce
 from itertools import product

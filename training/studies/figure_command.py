@@ -1,7 +1,5 @@
 """The figures of Rustamov 2010: `python -m training.study figure {pose,topology,potential}`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The level of individuals of the descriptor `pretrained`: its check on held-out families, and its fit."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 from pathlib import Path

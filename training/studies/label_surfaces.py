@@ -3,8 +3,6 @@
 Balls, ellipsoids, tori, capsules, rods and plates are turned and moved at random and sampled at the centres of voxels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce

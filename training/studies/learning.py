@@ -1,7 +1,5 @@
 """Retrieval scores over several seeded splits, and of a trained checkpoint."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

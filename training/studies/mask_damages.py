@@ -1,7 +1,5 @@
 """Masks damaged as segmentations are: in the six ways that the figures are of, and in others to choose measures on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether damaged segmentations are found: the outlier scores of given masks and of the same damaged in six ways."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Tables of the documentation: each is written from a file of results, which says by what and when it was measured."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import platform

@@ -1,7 +1,5 @@
 """What the figures of Rustamov 2010 show: poses, a change of topology, and the potential on a slice."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

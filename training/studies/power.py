@@ -1,7 +1,5 @@
 """How small a difference in one proportion the tests of groups find, beside the spectra of LaPy's ShapeDNA."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import reduce
 from itertools import product

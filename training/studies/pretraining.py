@@ -1,7 +1,5 @@
 """Fit the metric of the descriptor `pretrained` to generated shapes, and measure it where it was not fitted."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 from functools import partial

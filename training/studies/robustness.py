@@ -1,7 +1,5 @@
 """How far descriptions move when a mesh is disturbed, or a body takes another pose."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """How a metric that was fitted to generated shapes does on others: what pretrain.py prints."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import mean, stdev

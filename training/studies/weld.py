@@ -1,7 +1,5 @@
 """A tube between two places of a body that face each other across a gap: what touching parts do to a scan."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Iterator
 from dataclasses import replace
