@@ -237,17 +237,15 @@ def test_pretraining_saves_a_metric_and_measures_it(
         "--n_parts", 2, "--n_scored", 4, "--individuals", "[4, 2, 2, 2]",
         "--cache_dir", root / "cache", "--data", root / "meshes",
         "--plain", '["shape_dna"]',
-        "--out", tmp_path / "metric.safetensors", "--figures", tmp_path / "figures",
+        "--out", tmp_path / "metric.safetensors",
     )  # fmt: skip
     vectors = igps.describe(
         igps.SignatureDataset(root / "meshes", cache_dir=root / "cache", descriptor=pretrained()),
         pretrained(tmp_path / "metric.safetensors"),
     )
     torch.testing.assert_close(vectors.norm(dim=1), torch.ones(len(vectors)), atol=1e-4, rtol=0)
-    assert (tmp_path / "figures" / "pretrain.png").stat().st_size > 5_000
     assert "2 parts of the families" in out
     assert re.search(r"shape_dna +body NN \d+\.\d FT \d+\.\d ± \d+\.\d", out)
     assert out.count("without look-alikes") == 2
-    assert "  23 generated classes: FT" in out
     assert "1 labels a class" in out
     assert "5 labels a class" not in out  # a single shape of each class would be left to score

@@ -2,7 +2,6 @@
 
 import random
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -16,7 +15,7 @@ from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
 from training.graded import GradedShapes, body_of, family_of, looks_alike
 from training.studies.individuals import dealt, fit_individuals, generated, numbers, usable
-from training.studies.transfer import curve, few_labels, level_scores, report
+from training.studies.transfer import few_labels, level_scores, report
 
 # Of two classes each part has a single direction, and its vectors are signs, which may cancel.
 _FEWEST = 3
@@ -36,7 +35,6 @@ def pretrain(
     cache_dir: Path | None = None,
     plain: Sequence[str] = ("gps", "interior", "multiscale", "rich", "shape_dna"),
     data: Path | None = None,
-    figures: Path = Path("build"),
     n_workers: int | None = None,
 ) -> None:
     """Generate shapes, check the metric on families that it was not fitted to, fit it to all, and save it.
@@ -53,10 +51,8 @@ def pretrain(
         cache_dir: folder of cached signatures; the user's cache directory if not given.
         plain: descriptors to score on the same classes beside the metric.
         data: a labelled collection to measure the transfer on.
-        figures: folder of pretrain.png, FT on `data` against the number of generated classes.
         n_workers: processes; all cores if not given.
     """
-    figures.mkdir(parents=True, exist_ok=True)
     out.parent.mkdir(parents=True, exist_ok=True)
     descriptor = pretrained_parts().eval()
 
@@ -130,8 +126,6 @@ def pretrain(
     for name, among in both:
         title = f"{data}, fitted to {len(unlike)} classes {name}"
         report(title, found, classes, fit(len(unlike), seed, among))
-    counts = [n for n in (10, 30, 100) if n < len(everything)] + [len(everything)]
-    curve(partial(fit, among=everything), counts, found, classes, figures / "pretrain.png")
     # Two of each class are left to find each other.
     for n in (n for n in (1, 3, 5) if n + 2 <= int(classes.bincount().min())):
         few_labels(n, found, classes, head, descriptor.part_cells)
