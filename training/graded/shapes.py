@@ -26,7 +26,6 @@ _VERSION = 2  # raised whenever the same arguments would give other meshes
 _MAX_ATTEMPTS = 6
 _KIN, _BODY, _POSE, _INDIVIDUAL = 10, 11, 12, 13  # what a random stream is for: keeps the streams of one seed apart
 _SIBLINGS = 2  # bodies in a row with one skeleton, whose likeness makes bodies hard to tell apart
-BODIES_FILE = "bodies.csv"
 
 _log = logging.getLogger(__name__)
 
@@ -122,11 +121,6 @@ class GradedShapes:
         return [name for name in self.class_names for _ in range(len(self) // self.n_classes)]
 
     @property
-    def bodies(self) -> list[str]:
-        """The body of every shape, ``class/number``."""
-        return [body_of(name) for name in self.names]
-
-    @property
     def names(self) -> list[str]:
         """The unique name of every shape, ``class/body/pose``, or ``class/body/individual/pose``."""
         return [
@@ -179,10 +173,9 @@ class GradedShapes:
     def write(self, root: str | os.PathLike[str], progress: bool = False, n_workers: int | None = 1) -> None:
         """Write every shape to ``root/<class>/<body>/<pose>.off``, leaving out what is there already.
 
-        A folder that is read again (`igps.SignatureDataset`) has the classes as labels; ``root/bodies.csv`` tells the
-        body of each file (columns ``file,label``), as `body_of` does. Each file appears whole or not at all, so that an
-        interrupted run is resumed by the same call. ``root/shapes.json`` records the settings; classes, bodies and
-        poses may be added later.
+        A folder that is read again (`igps.SignatureDataset`) has the classes as labels, and `body_of` tells the body of
+        a file. Each file appears whole or not at all, so that an interrupted run is resumed by the same call.
+        ``root/shapes.json`` records the settings; classes, bodies and poses may be added later.
 
         Args:
             root: folder, made where absent.
@@ -202,7 +195,6 @@ class GradedShapes:
             **({"individuals": True} if self.n_individuals else {}),
         )
         names = self.names
-        _record_bodies(folder / BODIES_FILE, names)
         missing = [i for i, name in enumerate(names) if not is_whole_off(folder / f"{name}.off")]
         # A body at a time, so that it is drawn once for all its poses.
         jobs: dict[int, list[int]] = {}
@@ -291,14 +283,6 @@ def family_of(label: str) -> str:
 def looks_alike(label: str) -> bool:
     """Whether a class, by its name, resembles one of SHREC'07 (see `training.graded.kinds`)."""
     return label in LOOK_ALIKE_TEMPLATES or family_of(label) in LOOK_ALIKE_FAMILIES
-
-
-def _record_bodies(path: Path, names: list[str]) -> None:
-    """Name the body of each file, beside those that are named there already."""
-    before = path.read_text(encoding="utf-8").splitlines()[1:] if path.exists() else []
-    rows = dict.fromkeys([*before, *(f"{name}.off,{body_of(name)}" for name in names)])
-    with whole_file(path) as file:
-        file.write(("\n".join(["file,label", *rows]) + "\n").encode())
 
 
 def _write(shapes: GradedShapes, folder: Path, indices: list[int]) -> None:
