@@ -59,22 +59,14 @@ class Warp:
 
 @dataclass(frozen=True)
 class Body:
-    """One body of a class.
+    """One body of a class."""
 
-    bones: at rest.
-    rig: its rods, of the surface before the warp.
-    genus: handles of the surface.
-    motion: how it moves.
-    warp: what changes the whole surface at rest.
-    relief: amplitude and wavelength of bumps on it, and the seed of their places.
-    """
-
-    bones: Sequence[Bone]
-    rig: Rig
-    genus: int
-    motion: Motion
-    warp: Callable[[Floats], Floats]
-    relief: tuple[float, float, int]
+    bones: Sequence[Bone]  # at rest
+    rig: Rig  # its rods, of the surface before the warp
+    genus: int  # handles of the surface
+    motion: Motion  # how it moves
+    warp: Callable[[Floats], Floats]  # what changes the whole surface at rest
+    relief: tuple[float, float, int]  # amplitude and wavelength of bumps on it, and the seed of their places
 
     @property
     def placed(self) -> list[Placed]:

@@ -47,18 +47,12 @@ LOOK_ALIKE_FAMILIES = {
 
 
 class Kind(NamedTuple):
-    """A way to build bodies.
+    """A way to build bodies."""
 
-    build: of a random generator and a structure.
-    structures: all that can be built, in each of which two classes may differ.
-    loose: position of the choice in a structure that is a body's own and not its class's; None if none is.
-    motion: how the bodies of a structure move.
-    """
-
-    build: Callable[..., Skeleton]
-    structures: Sequence[tuple[Any, ...]]
-    loose: int | None
-    motion: Callable[[tuple[Any, ...]], Motion]
+    build: Callable[..., Skeleton]  # of a random generator and a structure
+    structures: Sequence[tuple[Any, ...]]  # all that can be built, in each of which two classes may differ
+    loose: int | None  # position of the choice in a structure that is a body's own and not its class's; None if none is
+    motion: Callable[[tuple[Any, ...]], Motion]  # how the bodies of a structure move
 
 
 class BodyClass(NamedTuple):

@@ -27,20 +27,14 @@ _CLEAN = "clean"
 
 @dataclass(frozen=True)
 class DamageResult:
-    """What one damage costs one descriptor.
+    """What one damage costs one descriptor."""
 
-    Args:
-        n_given: meshes that were damaged.
-        scores: means over the damaged meshes that could be described, each as a query of the clean others; fractions.
-            none where no two of them are of one class.
-        clean: the same of their clean twins.
-        notes: why others could not be described, by name.
-    """
-
-    n_given: int
+    n_given: int  # meshes that were damaged
+    # Means over the damaged meshes that could be described, each as a query of the clean others, fractions; none where
+    # no two of them are of one class
     scores: Mapping[str, float]
-    clean: Mapping[str, float]
-    notes: Mapping[str, str]
+    clean: Mapping[str, float]  # the same of their clean twins
+    notes: Mapping[str, str]  # why others could not be described, by name
 
     @property
     def usable(self) -> float:

@@ -26,15 +26,10 @@ _N_PATCHES, _N_FINS = 3, 30
 
 @dataclass(frozen=True)
 class Damage:
-    """Something that a surface may suffer.
+    """Something that a surface may suffer."""
 
-    Args:
-        description: what is done, and how much of it.
-        apply: does it to a mesh, given a seed.
-    """
-
-    description: str
-    apply: Callable[[Mesh, int], Surface]
+    description: str  # what is done, and how much of it
+    apply: Callable[[Mesh, int], Surface]  # does it to a mesh, given a seed
 
 
 def holes(mesh: Mesh, seed: int = 0) -> Surface:

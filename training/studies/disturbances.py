@@ -22,15 +22,10 @@ from training.studies.weld import weld_gap
 
 @dataclass(frozen=True)
 class Disturbance:
-    """A change of the mesh that should change a description little.
+    """A change of the mesh that should change a description little."""
 
-    Args:
-        description: what is done, and how much of it.
-        apply: does it.
-    """
-
-    description: str
-    apply: Callable[[Mesh], Mesh]
+    description: str  # what is done, and how much of it
+    apply: Callable[[Mesh], Mesh]  # does it
 
 
 def noise(mesh: Mesh, amplitude: float = 0.005, seed: int = 0) -> Mesh:

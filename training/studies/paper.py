@@ -34,19 +34,12 @@ _SLICE_PARTS = 4
 
 @dataclass(frozen=True, eq=False)
 class PoseCurves:
-    """The distribution of interior distances of every mesh of some classes (figure 1).
+    """The distribution of interior distances of every mesh of some classes (figure 1)."""
 
-    Args:
-        curves: by class, (N, B) histograms of one potential class.
-        centres: (B,) of the bins.
-        within: by class, the χ² distances between two of its meshes.
-        to_others: by class, those from its meshes to the meshes of the other classes.
-    """
-
-    curves: dict[str, Singles]
-    centres: Singles
-    within: dict[str, Singles]
-    to_others: dict[str, Singles]
+    curves: dict[str, Singles]  # by class, (N, B) histograms of one potential class
+    centres: Singles  # (B,) of the bins
+    within: dict[str, Singles]  # by class, the χ² distances between two of its meshes
+    to_others: dict[str, Singles]  # by class, those from its meshes to the meshes of the other classes
 
 
 def pose_curves(dataset: SignatureDataset, classes: Sequence[str], n_bins: int = 64) -> PoseCurves:
@@ -130,25 +123,15 @@ def weld_change(
 
 @dataclass(frozen=True, eq=False)
 class PotentialSlice:
-    """The barycentroid potential on a plane through the barycentroid (section 4).
+    """The barycentroid potential on a plane through the barycentroid (section 4)."""
 
-    Args:
-        axes: (X,) and (Y,) of the slice, length.
-        values: (X, Y) potential, NaN outside the body.
-        section: (S, 2, 2) segments in which the plane cuts the surface.
-        barycentroid: (2,) on the slice.
-        least: potential at the barycentroid.
-        largest: potential at the samples.
-        n_samples: interior samples, near the best of which the barycentroid was searched.
-    """
-
-    axes: tuple[Floats, Floats]
-    values: Floats
-    section: Floats
-    barycentroid: Floats
-    least: float
-    largest: float
-    n_samples: int
+    axes: tuple[Floats, Floats]  # (X,) and (Y,) of the slice, length
+    values: Floats  # (X, Y) potential, NaN outside the body
+    section: Floats  # (S, 2, 2) segments in which the plane cuts the surface
+    barycentroid: Floats  # (2,) on the slice
+    least: float  # potential at the barycentroid
+    largest: float  # potential at the samples
+    n_samples: int  # interior samples, near the best of which the barycentroid was searched
 
 
 @one_thread()

@@ -32,15 +32,10 @@ _AS_IT_IS = "as it is"
 
 @dataclass(frozen=True)
 class Movement:
-    """How far a description moves.
+    """How far a description moves."""
 
-    Args:
-        distances: of each mesh or pair by name, over the median distance between classes.
-        notes: why others are missing, by name.
-    """
-
-    distances: Mapping[str, float]
-    notes: Mapping[str, str]
+    distances: Mapping[str, float]  # of each mesh or pair by name, over the median distance between classes
+    notes: Mapping[str, str]  # why others are missing, by name
 
     @property
     def mean(self) -> float | None:
@@ -50,15 +45,10 @@ class Movement:
 
 @dataclass(frozen=True)
 class Robustness:
-    """How far each descriptor moves.
+    """How far each descriptor moves."""
 
-    Args:
-        movements: by descriptor, then by disturbance or `POSE`.
-        units: the median distance between classes of each descriptor; NaN where there is none.
-    """
-
-    movements: Mapping[str, Mapping[str, Movement]]
-    units: Mapping[str, float]
+    movements: Mapping[str, Mapping[str, Movement]]  # by descriptor, then by disturbance or `POSE`
+    units: Mapping[str, float]  # the median distance between classes of each descriptor; NaN where there is none
 
     def as_dict(self) -> dict[str, Any]:
         """For a JSON file."""
