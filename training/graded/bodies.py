@@ -32,16 +32,12 @@ _CLOSE_SHARE, _CLOSE_DRAWS = 0.3, 5
 
 @dataclass(frozen=True)
 class Warp:
-    """A smooth change of the whole body: a stretch along each axis and slow waves.
+    """A smooth change of the whole body: a stretch along each axis and slow waves."""
 
-    stretch: (3,) factors.
-    waves: (W,3) wave vectors; steps: (W,3) amplitudes; phases: (W,).
-    """
-
-    stretch: Floats
-    waves: Floats
-    steps: Floats
-    phases: Floats
+    stretch: Floats  # (3,) factors
+    waves: Floats  # (W,3) wave vectors
+    steps: Floats  # (W,3) amplitudes
+    phases: Floats  # (W,)
 
     @classmethod
     def draw(cls, rng: np.random.Generator, size: float, strength: float) -> Warp:

@@ -49,17 +49,13 @@ _APART = 1.7
 
 @dataclass(frozen=True, eq=False)
 class Bone:
-    """A part of a skeleton at rest.
-
-    parent: number of the bone that holds it, −1 of the root.
-    origin: (3,) its joint in the world; frame: (3,3) its axes as columns.
-    """
+    """A part of a skeleton at rest."""
 
     part: Part
     placed: Placed
-    parent: int
-    origin: Floats
-    frame: Floats
+    parent: int  # number of the bone that holds it, −1 of the root
+    origin: Floats  # (3,) its joint in the world
+    frame: Floats  # (3,3) its axes as columns
 
     @property
     def solid(self) -> Solid:
@@ -88,46 +84,30 @@ class Bone:
 
 @dataclass(frozen=True)
 class Joint:
-    """Where a rod is bent on purpose.
+    """Where a rod is bent on purpose."""
 
-    at: arc length along the rod.
-    axes: (3,2) axes of raise and swing at rest.
-    low, high: (2,) limits of the angles, radians.
-    is_root: the rod is bent beyond this place, not around it.
-    """
-
-    at: float
-    axes: Floats
-    low: Floats
-    high: Floats
-    is_root: bool
+    at: float  # arc length along the rod
+    axes: Floats  # (3,2) axes of raise and swing at rest
+    low: Floats  # (2,) limits of the angles, radians
+    high: Floats  # likewise
+    is_root: bool  # the rod is bent beyond this place, not around it
 
 
 @dataclass(frozen=True)
 class Rod:
-    """A centre line at rest.
+    """A centre line at rest."""
 
-    parent: number of the rod that carries it, −1 of the first.
-    held: arc length along the parent where it is carried.
-    points: (n,3) of the centre line; along: (n,) their arc lengths; radii: (n,).
-    girth: (n,) the radii with those of whatever sits stiffly on the rod, which is not bent there.
-    sides: (n,3,2) two directions across the rod.
-    joints: where it bends.
-    curl, twist: radians, the most that it curls and twists over its whole length.
-    is_hinge: its first joint is a hinge: all of it turns as one.
-    """
-
-    parent: int
-    held: float
-    points: Floats
-    along: Floats
-    radii: Floats
-    girth: Floats
-    sides: Floats
-    joints: tuple[Joint, ...] = ()
-    curl: float = 0.0
-    twist: float = 0.0
-    is_hinge: bool = False
+    parent: int  # number of the rod that carries it, −1 of the first
+    held: float  # arc length along the parent where it is carried
+    points: Floats  # (n,3) of the centre line
+    along: Floats  # (n,) their arc lengths
+    radii: Floats  # (n,)
+    girth: Floats  # (n,) the radii with those of whatever sits stiffly on the rod, which is not bent there
+    sides: Floats  # (n,3,2) two directions across the rod
+    joints: tuple[Joint, ...] = ()  # where it bends
+    curl: float = 0.0  # radians, the most that it curls over its whole length
+    twist: float = 0.0  # radians, the most that it is twisted over its whole length
+    is_hinge: bool = False  # its first joint is a hinge: all of it turns as one
 
     @property
     def length(self) -> float:

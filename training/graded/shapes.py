@@ -32,24 +32,18 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class GradedShape:
-    """One pose of one body of a class.
+    """One pose of one body of a class."""
 
-    vertices: (V,3) float64; faces: (F,3) int64, outward.
-    label: name of the class; body: name of the body, ``class/00``; name: ``class/00/03``.
-    genus: number of handles of the surface.
-    motion: (3,3) orthogonal, what turned, and perhaps mirrored, the shape out of its upright frame;
-        ``vertices @ motion`` stands upright again.
-    notes: what was done to the surface, in words.
-    """
-
-    vertices: Floats
-    faces: Integers
-    label: str
-    body: str
-    name: str
-    genus: int
+    vertices: Floats  # (V,3) float64
+    faces: Integers  # (F,3) int64, outward
+    label: str  # name of the class
+    body: str  # name of the body, ``class/00``
+    name: str  # ``class/00/03``
+    genus: int  # number of handles of the surface
+    # (3,3) orthogonal, what turned, and perhaps mirrored, the shape out of its upright frame: ``vertices @ motion``
+    # stands upright again
     motion: Floats
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what was done to the surface, in words
 
 
 class GradedShapes:

@@ -66,20 +66,13 @@ def pose_curves(dataset: SignatureDataset, classes: Sequence[str], n_bins: int =
 
 @dataclass(frozen=True, eq=False)
 class WeldChange:
-    """What a weld does to a body (figure 2).
-
-    Args:
-        before, after: the body without and with the weld.
-        n_samples: interior samples, the same in both.
-        change: of each pair of them, the relative change of its interior distance.
-        eigenvalues: (K,) before and after, 1/length².
-    """
+    """What a weld does to a body (figure 2)."""
 
     before: Mesh
-    after: Mesh
-    n_samples: int
-    change: Floats
-    eigenvalues: tuple[Floats, Floats]
+    after: Mesh  # with the weld
+    n_samples: int  # interior samples, the same in both
+    change: Floats  # of each pair of them, the relative change of its interior distance
+    eigenvalues: tuple[Floats, Floats]  # (K,) before and after, 1/length²
 
 
 @one_thread()
