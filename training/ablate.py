@@ -6,8 +6,6 @@ Bins and filter are trained on the training part through a `WhitenedHead`; then 
 the test part is scored once.
 """
 
-from __future__ import annotations
-
 from jsonargparse import auto_cli
 
 from igps.cli import faults_in_a_sentence

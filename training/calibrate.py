@@ -8,8 +8,6 @@ which distance on two files are not the same. To tell a part from one that is a 
 2 % of the root of their area too. The bodies are those of another seed than pretrain.py's.
 """
 
-from __future__ import annotations
-
 from jsonargparse import auto_cli
 
 from igps.cli import faults_in_a_sentence

@@ -6,8 +6,6 @@
 With a checkpoint the features are the histograms of its learned bins and filter, on the checkpoint's own split.
 """
 
-from __future__ import annotations
-
 from jsonargparse import auto_cli
 
 from igps.cli import faults_in_a_sentence

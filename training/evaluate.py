@@ -8,8 +8,6 @@ Nothing is chosen here: the heads are fitted to the training part with fixed par
 Of a descriptor with a metric, such as `pretrained`, that is the heads' prior.
 """
 
-from __future__ import annotations
-
 from jsonargparse import auto_cli
 
 from igps.cli import faults_in_a_sentence

@@ -4,11 +4,8 @@
     python -m training.pretrain --config configs/pretrain.yaml --data DATA
 
 The first makes the file that the package ships; its only check is on held-out families of generated classes, beside the
-plain descriptors. The second scores that metric on a labelled collection too, by the number of generated classes it is
-fitted to and with a few labels of it.
+plain descriptors. The second scores that metric on a labelled collection too, alone and with a few labels of it.
 """
-
-from __future__ import annotations
 
 from jsonargparse import auto_cli
 

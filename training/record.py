@@ -1,7 +1,5 @@
 """Write a table of the documentation from results: `python -m training.record NAME KIND RESULTS "COMMAND"`."""
 
-from __future__ import annotations
-
 from jsonargparse import auto_cli
 
 from igps.cli import faults_in_a_sentence

@@ -1,7 +1,5 @@
 """A run of training: a few values in one YAML, a curve, an early end, and going on after an interruption."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from statistics import mean

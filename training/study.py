@@ -1,20 +1,24 @@
-"""Studies of the library: `python -m training.study {robustness,damage,scales,surfaces,figure}`, `--help` for each."""
-
-from __future__ import annotations
+"""Studies of the library: `python -m training.study` and the name of one, `--help` for each."""
 
 from igps.cli import Commands
 from igps.cli import main as run
-from training.studies.damage_command import damage
+from training.studies.damage import damage_command
+from training.studies.explaining import explaining
 from training.studies.figure_command import pose, potential, topology
 from training.studies.label_surfaces import surfaces
-from training.studies.robustness_command import robustness
+from training.studies.outlying import outlying
+from training.studies.power import power
+from training.studies.robustness import robustness_command
 from training.studies.scales import scales
 
 COMMANDS: Commands = {
-    "robustness": robustness,
-    "damage": damage,
+    "robustness": robustness_command,
+    "damage": damage_command,
     "scales": scales,
     "surfaces": surfaces,
+    "power": power,
+    "explaining": explaining,
+    "outlying": outlying,
     "figure": {"pose": pose, "topology": topology, "potential": potential},
 }
 

@@ -8,8 +8,6 @@ Every option of the learner, the data and the trainer can be set in the file or 
 the configuration too: `RetrievalLearner.load_from_checkpoint` and `SignatureDataModule.load_from_checkpoint` read it.
 """
 
-from __future__ import annotations
-
 from igps.cli import faults_in_a_sentence
 from training.running import Run
 

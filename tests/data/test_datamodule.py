@@ -100,7 +100,7 @@ def test_needs_classes(root: Path) -> None:
 
 
 def test_impossible_protocols_are_refused(root: Path) -> None:
-    with pytest.raises(ValueError, match="protocol: expected 'seen' or 'unseen', got 'some'"):
+    with pytest.raises(ValueError, match="protocol: expected one of seen, unseen, got 'some'"):
         SignatureDataModule(root, "some")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="n_test: expected None with protocol 'seen'"):
         SignatureDataModule(root, "seen", n_test=2)

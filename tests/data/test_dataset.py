@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 
 import igps
 import igps.data.pipeline as pipeline_module
-from igps._parallel import Failed, Limits, MachineError
+from igps._parallel import Limits, MachineError
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import Failure, SignatureDataset
@@ -496,4 +496,4 @@ def test_slow_meshes_are_listed(dataset: SignatureDataset, tmp_path: Path) -> No
 def test_a_failure_names_its_file_once(dataset: SignatureDataset) -> None:
     path = dataset.bodies.paths[2]
     expected = Failure("egg/1.off", path, f"{path}: bad")
-    assert dataset.failure(2, Failed("bad")) == dataset.failure(2, Failed(f"{path}: bad")) == expected
+    assert Failure.of(dataset.bodies, 2, "bad") == Failure.of(dataset.bodies, 2, f"{path}: bad") == expected

@@ -14,7 +14,7 @@ from igps.analysis.explanation import explain
 from igps.analysis.fitting import histograms_and_prior
 from igps.data.collation import collate
 from igps.descriptors import NAMES, descriptor
-from igps.descriptors.molecular import MOLECULAR_ATTRIBUTES, Shares, molecular
+from igps.descriptors.molecular import Shares, molecular
 from igps.mesh.formats.molecules import Molecule
 from igps.mesh.molecular_surface import molecular_surface
 from igps.mesh.residues import CHARGED_ATOMS, VOLUMES, residue_ball
@@ -52,7 +52,7 @@ def signature_of(molecule: Molecule) -> Signature:
     surface = molecular_surface(molecule, spacing=1.0, max_vertices=1200)
 
     def added(samples: Samples) -> Samples:
-        found = {name: residue_attribute(molecule, samples.points, name) for name in MOLECULAR_ATTRIBUTES}
+        found = {name: residue_attribute(molecule, samples.points, name) for name in molecular().requirements.sources}
         return samples.with_attributes(found)
 
     return compute_signature(surface, CONFIG).map_samples(added)

@@ -10,7 +10,6 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from training.graded import GradedShapes
-from training.graded.grammar import GrammarShapes
 from training.graded.polygons import Prism
 from training.studies.contact_sheet import contact_sheet
 
@@ -18,8 +17,6 @@ from igps.shapes import ArticulatedShapes, GeneratedShape
 from igps.shapes.solids import Arc, Box, Cone, Ring, Solid
 
 DEFAULTS = ["biped", "quadruped", "octopus", "spider", "hand", "snake", "plier", "mug"]
-# Of the grammar: one class of every family, with and without handles.
-GRAMMAR = range(12, 24)
 
 
 @pytest.fixture(scope="module")
@@ -29,15 +26,10 @@ def default_shapes() -> list[GeneratedShape]:
 
 
 @pytest.fixture(scope="module")
-def grammar_shapes() -> list[GeneratedShape]:
-    """One shape of one class of every family."""
-    shapes = GrammarShapes(n_classes=GRAMMAR.stop, n_per_class=1, seed=3)
-    return [shapes[i] for i in GRAMMAR]
-
-
-@pytest.fixture(scope="module")
-def all_shapes(default_shapes: list[GeneratedShape], grammar_shapes: list[GeneratedShape]) -> list[GeneratedShape]:
-    return default_shapes + grammar_shapes
+def all_shapes(default_shapes: list[GeneratedShape]) -> list[GeneratedShape]:
+    """These, and one of each of the other four classes."""
+    shapes = ArticulatedShapes(n_classes=12, n_per_class=1, seed=3)
+    return default_shapes + [shapes[i] for i in range(8, 12)]
 
 
 def directed_edges(faces: NDArray[np.int64]) -> list[tuple[int, int]]:
@@ -113,10 +105,10 @@ def test_same_seed_same_arrays_other_seed_others(default_shapes: list[GeneratedS
     )
 
 
-def test_a_shape_does_not_depend_on_the_others(grammar_shapes: list[GeneratedShape]) -> None:
-    """Neither on those made before nor on how many there are: class 14 of 24 or 15, shape 0 of 1 or 4."""
-    alone = GrammarShapes(n_classes=15, n_per_class=4, seed=3)[14 * 4]
-    among = grammar_shapes[14 - GRAMMAR.start]
+def test_a_shape_does_not_depend_on_the_others(all_shapes: list[GeneratedShape]) -> None:
+    """Neither on those made before nor on how many there are: class 10 of 11 or 12, shape 0 of 1 or 4."""
+    alone = ArticulatedShapes(n_classes=11, n_per_class=4, seed=3)[10 * 4]
+    among = all_shapes[24 + 2]
     assert alone.name == among.name
     np.testing.assert_array_equal(alone.vertices, among.vertices)
     np.testing.assert_array_equal(alone.faces, among.faces)
@@ -162,12 +154,7 @@ def test_names_and_labels() -> None:
     assert shapes.names[:3] == ["biped/00", "biped/01", "quadruped/00"]
     last = shapes[-1]
     assert (last.label, last.name) == ("mug", "mug/01")
-    many = GrammarShapes(n_classes=200, n_per_class=1)
-    assert len(set(many.class_names)) == 200
-    # The structure that the name tells, without its number, is not repeated either.
-    assert len({name.rsplit("-", 1)[0] for name in many.class_names}) == 200
-    assert many.class_names[:8] == DEFAULTS
-    assert GrammarShapes(n_classes=30).class_names == many.class_names[:30]
+    assert ArticulatedShapes(n_classes=12).class_names[:8] == DEFAULTS
 
 
 @pytest.mark.parametrize("index", [16, -17])

@@ -108,8 +108,3 @@ def test_noise(sphere: Mesh) -> None:
     np.testing.assert_array_equal(faces, sphere.faces)
     moved = np.linalg.norm(vertices, axis=1) - 1
     assert moved.std() == pytest.approx(0.002 * 2 * np.sqrt(3), rel=0.05)
-
-
-def test_shares_are_checked(blob: Mesh) -> None:
-    with pytest.raises(ValueError, match="share"):
-        damage.holes(blob, share=1.5)

@@ -1,7 +1,7 @@
 """Generated classes of bodies in poses, on which the library's metric is trained and its choices are made.
 
 A class has bodies, and a body has poses, which bend the one surface that it has at rest. Each module uses only those
-before it: polygons, plates, limbs, creatures, artefacts, grammar, kinds (the classes), skinning, rods (how a body is
+before it: polygons, plates, limbs, creatures, artefacts, kinds (the classes), skinning, rods (how a body is
 bent), crossing, bodies, individuals, scans (what else happens to a surface), shapes.
 """
 

@@ -1,9 +1,7 @@
-"""Families of the grammar that are made: vessels, furniture, tools.
+"""Kinds of bodies that are made: vessels, furniture, tools.
 
 A builder draws its proportions from ``g``; its other arguments are the structure that tells classes apart.
 """
-
-from __future__ import annotations
 
 from dataclasses import replace
 

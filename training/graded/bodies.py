@@ -32,16 +32,12 @@ _CLOSE_SHARE, _CLOSE_DRAWS = 0.3, 5
 
 @dataclass(frozen=True)
 class Warp:
-    """A smooth change of the whole body: a stretch along each axis and slow waves.
+    """A smooth change of the whole body: a stretch along each axis and slow waves."""
 
-    stretch: (3,) factors.
-    waves: (W,3) wave vectors; steps: (W,3) amplitudes; phases: (W,).
-    """
-
-    stretch: Floats
-    waves: Floats
-    steps: Floats
-    phases: Floats
+    stretch: Floats  # (3,) factors
+    waves: Floats  # (W,3) wave vectors
+    steps: Floats  # (W,3) amplitudes
+    phases: Floats  # (W,)
 
     @classmethod
     def draw(cls, rng: np.random.Generator, size: float, strength: float) -> Warp:
@@ -59,22 +55,14 @@ class Warp:
 
 @dataclass(frozen=True)
 class Body:
-    """One body of a class.
+    """One body of a class."""
 
-    bones: at rest.
-    rig: its rods, of the surface before the warp.
-    genus: handles of the surface.
-    motion: how it moves.
-    warp: what changes the whole surface at rest.
-    relief: amplitude and wavelength of bumps on it, and the seed of their places.
-    """
-
-    bones: Sequence[Bone]
-    rig: Rig
-    genus: int
-    motion: Motion
-    warp: Callable[[Floats], Floats]
-    relief: tuple[float, float, int]
+    bones: Sequence[Bone]  # at rest
+    rig: Rig  # its rods, of the surface before the warp
+    genus: int  # handles of the surface
+    motion: Motion  # how it moves
+    warp: Callable[[Floats], Floats]  # what changes the whole surface at rest
+    relief: tuple[float, float, int]  # amplitude and wavelength of bumps on it, and the seed of their places
 
     @property
     def placed(self) -> list[Placed]:
@@ -215,7 +203,7 @@ def _rig(bones: Sequence[Bone], motion: Motion, direction: Floats) -> Rig:
         plate = bones[0].solid
         assert isinstance(plate, Plate)
         axis = np.cross(np.array([0.0, 0.0, 1.0]), direction)
-        return strip(bones, direction, axis, plate.thick, np.radians(_ROLL), 0.0)
+        return strip(bones, direction, axis, plate.thick, np.radians(_ROLL))
     return limbs(bones, hinged=motion == "hinges")
 
 

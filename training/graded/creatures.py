@@ -1,9 +1,7 @@
-"""Families of the grammar that grow: limbs around a hub, along a spine or out of a trunk.
+"""Kinds of bodies that grow: limbs around a hub, along a spine or out of a trunk.
 
 A builder draws its proportions from ``g``; its other arguments are the structure that tells classes apart.
 """
-
-from __future__ import annotations
 
 from dataclasses import replace
 

@@ -1,15 +1,12 @@
 """Whether a surface crosses itself."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from igps._arrays import Floats, Integers
+from igps._arrays import Booleans, Floats, Integers
 
 
-def crossing_faces(vertices: Floats, faces: Integers) -> NDArray[np.int64]:
+def crossing_faces(vertices: Floats, faces: Integers) -> Integers:
     """Pairs of faces (N,2) without a common vertex of which an edge of one passes through the other.
 
     Pairs are tried whose bounding boxes overlap, found by their circumscribed balls. Faces that merely touch, or lie in
@@ -32,7 +29,7 @@ def crossing_faces(vertices: Floats, faces: Integers) -> NDArray[np.int64]:
     return np.stack([i[crossed], j[crossed]], axis=1)
 
 
-def _near(corners: Floats) -> NDArray[np.int64]:
+def _near(corners: Floats) -> Integers:
     """Pairs (N,2), the smaller number first, of faces whose balls around their centres may overlap."""
     centres = corners.mean(axis=1)
     reach = np.sqrt(((corners - centres[:, None]) ** 2).sum(axis=2).max(axis=1))
@@ -49,7 +46,7 @@ def _near(corners: Floats) -> NDArray[np.int64]:
     return np.sort(np.concatenate(found), axis=1)
 
 
-def _passes(start: Floats, end: Floats, triangle: Floats) -> NDArray[np.bool_]:
+def _passes(start: Floats, end: Floats, triangle: Floats) -> Booleans:
     """Whether segments (N,3) to (N,3) pass through triangles (N,3,3), by the signs of five tetrahedra."""
     a, b, c = triangle[:, 0], triangle[:, 1], triangle[:, 2]
     normal = np.cross(b - a, c - a)

@@ -23,22 +23,16 @@ class Change:
     """A smooth change of space: waves through the whole body; places that swell, and limbs that grow longer.
 
     A change that is only a motion or a scale is none, so the similarity that is nearest is taken off.
-
-    waves: of the whole.
-    centres, axes: (L,3) of the places; radii: (L,).
-    swells, grows: (L,) across the axis, and along it beyond the centre.
-    similarity: (7,), what is taken off, of the columns that `_columns` makes.
-    step: factor of all.
     """
 
-    waves: Warp
-    centres: Floats
-    axes: Floats
-    radii: Floats
-    swells: Floats
-    grows: Floats
-    similarity: Floats
-    step: float
+    waves: Warp  # of the whole
+    centres: Floats  # (L,3) of the places
+    axes: Floats  # (L,3)
+    radii: Floats  # (L,)
+    swells: Floats  # (L,) across the axis
+    grows: Floats  # (L,) along it beyond the centre
+    similarity: Floats  # (7,) what is taken off, of the columns that `_columns` makes
+    step: float  # factor of all
 
     @classmethod
     def draw(cls, rng: np.random.Generator, vertices: Floats, faces: Integers) -> Change:

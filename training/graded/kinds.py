@@ -4,8 +4,6 @@ A class is a kind and some of its builder's structural choices. Its bodies draw 
 so that two bodies of a class differ as two chairs do, and two poses of a body as a cat does from itself.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
@@ -14,7 +12,8 @@ import numpy as np
 
 from igps.shapes.skeleton import Skeleton
 from igps.shapes.templates import TEMPLATES
-from training.graded.grammar import FAMILIES
+from training.graded.artefacts import stack, table, tongs, tool, vessel, wheel
+from training.graded.creatures import beast, chain, comb, serpent, star, tree
 from training.graded.plates import MACHINES, SHEETS, coil, machine, sheet
 
 Motion = Literal["limbs", "hinges", "sheet", "rigid"]
@@ -48,18 +47,12 @@ LOOK_ALIKE_FAMILIES = {
 
 
 class Kind(NamedTuple):
-    """A way to build bodies.
+    """A way to build bodies."""
 
-    build: of a random generator and a structure.
-    structures: all that can be built.
-    loose: positions of the choices in a structure that are a body's own and not its class's.
-    motion: how the bodies of a structure move.
-    """
-
-    build: Callable[..., Skeleton]
-    structures: Sequence[tuple[Any, ...]]
-    loose: tuple[int, ...]
-    motion: Callable[[tuple[Any, ...]], Motion]
+    build: Callable[..., Skeleton]  # of a random generator and a structure
+    structures: Sequence[tuple[Any, ...]]  # all that can be built, in each of which two classes may differ
+    loose: int | None  # position of the choice in a structure that is a body's own and not its class's; None if none is
+    motion: Callable[[tuple[Any, ...]], Motion]  # how the bodies of a structure move
 
 
 class BodyClass(NamedTuple):
@@ -91,7 +84,7 @@ def body_classes(seed: int, look_alikes: bool = True) -> list[BodyClass]:
             continue
         groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
         for structure in kind.structures:
-            groups.setdefault(tuple(c for i, c in enumerate(structure) if i not in kind.loose), []).append(structure)
+            groups.setdefault(tuple(c for i, c in enumerate(structure) if i != kind.loose), []).append(structure)
         order = np.random.default_rng([seed, place]).permutation(len(groups))
         keys = list(groups)
         queues.append([(name, kind, keys[i], groups[keys[i]]) for i in order])
@@ -104,11 +97,18 @@ def body_classes(seed: int, look_alikes: bool = True) -> list[BodyClass]:
 
 def _template(name: str) -> Kind:
     motions: dict[str, Motion] = {"plier": "hinges", "mug": "rigid", "chair": "rigid"}
-    return Kind(lambda _: TEMPLATES[name](), [()], (), lambda _: motions.get(name, "limbs"))
+    return Kind(lambda _: TEMPLATES[name](), [()], None, lambda _: motions.get(name, "limbs"))
 
 
-def _of(family: str, loose: tuple[int, ...], motion: Motion | Callable[[tuple[Any, ...]], Motion]) -> Kind:
-    build, structures = FAMILIES[family]
+def _kind(
+    build: Callable[..., Skeleton],
+    *choices: Sequence[Any],
+    loose: int | None = None,
+    motion: Motion | Callable[[tuple[Any, ...]], Motion] = "limbs",
+    where: Callable[..., bool] = lambda *_: True,
+) -> Kind:
+    """The kind of all combinations of structural choices that can be built; one of the choices may be loose."""
+    structures = [structure for structure in itertools.product(*choices) if where(*structure)]
     return Kind(build, structures, loose, motion if callable(motion) else lambda _: motion)
 
 
@@ -120,26 +120,115 @@ def _comb(structure: tuple[Any, ...]) -> Motion:
     return "rigid" if structure[1] == "ladder" else "limbs"
 
 
-KINDS: dict[str, Kind] = {
-    "star": _of("star", (0,), "limbs"),
-    "tree": _of("tree", (3,), "limbs"),
-    "beast": _of("beast", (3,), "limbs"),
-    "chain": _of("chain", (0,), "limbs"),
-    "vessel": _of("vessel", (2,), "rigid"),
-    "wheel": _of("wheel", (3,), "limbs"),
-    "table": _of("table", (0,), "rigid"),
-    "tool": _of("tool", (2,), _tool),
-    "tongs": _of("tongs", (1,), "hinges"),
-    "stack": _of("stack", (1,), "rigid"),
-    "comb": _of("comb", (0,), _comb),
-    "serpent": _of("serpent", (0,), "limbs"),
-    "sheet": Kind(sheet, list(itertools.product(SHEETS, (0, 1, 2, 4))), (), lambda _: "sheet"),
-    "machine": Kind(
-        machine,
-        list(itertools.product(MACHINES, ("plain", "collar", "shaft", "ear", "pins"), (2, 3, 4))),
-        (2,),
-        lambda _: "rigid",
+_LAYERS = ("ball", "block", "plate", "post", "hoop")
+_ALL = (
+    _kind(
+        star,
+        ("orb", "disc", "hoop", "drum", "prism"),
+        (3, 4, 5, 6, 7),
+        ("straight", "jointed", "bent", "tentacle"),
+        ("plain", "knob", "ring", "paddle", "fork", "hook"),
+        loose=0,
     ),
-    "coil": Kind(coil, list(itertools.product((1.5, 2.5, 3.5, 4.5), ("plain", "knob", "disc"))), (), lambda _: "limbs"),
-}
+    _kind(
+        tree,
+        (2, 3, 4, 5),
+        (0, 2, 3),
+        ("plain", "knob", "ring", "cup", "disc"),
+        ("bare", "plate", "bulb", "tripod"),
+        where=lambda branches, twigs, end, _: branches * twigs <= (9 if end == "plain" else 6),
+        loose=3,
+    ),
+    _kind(
+        beast,
+        (1, 2, 3, 4),
+        ("stand", "sprawl", "fins"),
+        ("round", "horned", "bill", "looped", "long"),
+        ("bare", "whip", "fluke", "loop", "club"),
+        loose=3,
+    ),
+    _kind(
+        chain,
+        (3, 4, 5, 6, 7),
+        ("beads", "boxes", "plates", "tubes", "shrinking", "rings", "crossed"),
+        ("plain", "fork", "hook", "ring", "hammer"),
+        loose=0,
+    ),
+    _kind(
+        vessel,
+        ("cup", "bowl", "vase", "bottle", "pipe"),
+        (0, 1, 2, 3),
+        ("flat", "legs", "stem"),
+        ("smooth", "spout", "knobs"),
+        where=lambda body, _handles, foot, _extra: not (body == "pipe" and foot == "stem"),
+        loose=2,
+        motion="rigid",
+    ),
+    _kind(
+        wheel,
+        (3, 4, 5, 6),
+        (0, 2, 3, 6),
+        ("none", "rays", "legs", "mast"),
+        ("plain", "knob", "fork"),
+        where=lambda n, spokes, limbs, end: spokes <= n and (limbs != "none" or end == "plain"),
+        loose=3,
+    ),
+    _kind(
+        table,
+        ("round", "square", "long", "triangle", "hoop"),
+        (1, 3, 4, 6),
+        ("open", "panel", "arch", "post", "horns"),
+        loose=0,
+        motion="rigid",
+    ),
+    _kind(
+        tool,
+        ("straight", "bent", "jointed", "tentacle"),
+        ("hammer", "fork", "ring", "paddle", "cup", "hook", "disc", "claw"),
+        ("plain", "knob", "ring", "hammer", "fork"),
+        loose=2,
+        motion=_tool,
+    ),
+    _kind(
+        tongs,
+        ("plain", "hook", "paddle", "ring", "knob", "hammer", "fork"),
+        ("plain", "ring", "knob", "bow", "paddle"),
+        (2, 3),
+        loose=1,
+        motion="hinges",
+    ),
+    _kind(
+        stack,
+        [*itertools.permutations(_LAYERS, 3), *itertools.permutations(_LAYERS, 4)],
+        ("bare", "arms", "pegs", "hoops"),
+        loose=1,
+        motion="rigid",
+    ),
+    _kind(
+        comb,
+        (3, 4, 5),
+        ("one", "both", "zigzag", "ladder"),
+        ("plain", "knob", "ring", "paddle", "disc", "hook"),
+        loose=0,
+        motion=_comb,
+    ),
+    _kind(
+        serpent,
+        (3, 4, 5, 6, 7),
+        ("sail", "fins", "bulge", "collar"),
+        ("plain", "knob", "fork", "ring", "paddle", "claw"),
+        loose=0,
+    ),
+    _kind(sheet, SHEETS, (0, 1, 2, 4), motion="sheet"),
+    _kind(
+        machine,
+        MACHINES,
+        ("plain", "collar", "shaft", "ear", "pins"),
+        (2, 3, 4),
+        loose=2,
+        motion="rigid",
+    ),
+    _kind(coil, (1.5, 2.5, 3.5, 4.5), ("plain", "knob", "disc")),
+)
+KINDS = {kind.build.__name__: kind for kind in _ALL}
 """The kinds of bodies by name."""

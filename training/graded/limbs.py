@@ -1,4 +1,4 @@
-"""The limbs of the grammar's bodies: their kinds, and what sits at their ends."""
+"""The limbs of drawn bodies: their kinds, and what sits at their ends."""
 
 from __future__ import annotations
 
@@ -48,23 +48,15 @@ def ending(kind: str, r: float, group: str, at: Vector = ORIGIN, turn: Floats | 
 
 @dataclass(frozen=True)
 class LimbStyle:
-    """What the limbs of one class have in common.
+    """What the limbs of one class have in common."""
 
-    kind: stub, straight, bent, jointed or tentacle.
-    ending: what sits at the end, see `ending`.
-    length: of the whole limb; a stub has 0.3 of it.
-    start, end: radii.
-    curl: radians; of a bent tube's sweep, or of a jointed limb's knee.
-    swing: limit of the first joint, degrees; later ones bend more.
-    """
-
-    kind: str
-    ending: str
-    length: float
-    start: float
-    end: float
-    curl: float
-    swing: float
+    kind: str  # stub, straight, bent, jointed or tentacle
+    ending: str  # what sits at the end, see `ending`
+    length: float  # of the whole limb; a stub has 0.3 of it
+    start: float  # radius
+    end: float  # radius
+    curl: float  # radians; of a bent tube's sweep, or of a jointed limb's knee
+    swing: float  # limit of the first joint, degrees; later ones bend more
 
     @classmethod
     def draw(

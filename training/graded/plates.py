@@ -3,8 +3,6 @@
 A builder draws its proportions from ``g``; its other arguments are the structure that tells classes apart.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,20 +18,13 @@ Hole = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Plate(Solid):
-    """A plate in the x-y plane, its outline a union of bars and discs, with round holes.
+    """A plate in the x-y plane, its outline a union of bars and discs, with round holes."""
 
-    bars: (x, y) to (x, y) and the half widths at both ends; a disc is a bar without length.
-    holes: (x, y) and radius.
-    thick: the plate's thickness.
-    loops: handles that bars make which meet again; holes come on top.
-    fillet: how far corners between bars are filled.
-    """
-
-    bars: tuple[Bar, ...]
-    holes: tuple[Hole, ...]
-    thick: float
-    loops: int = 0
-    fillet: float = 0.06
+    bars: tuple[Bar, ...]  # (x, y) to (x, y) and the half widths at both ends; a disc is a bar without length
+    holes: tuple[Hole, ...]  # (x, y) and radius
+    thick: float  # the plate's thickness
+    loops: int = 0  # handles that bars make which meet again; holes come on top
+    fillet: float = 0.06  # how far corners between bars are filled
 
     @property
     def genus(self) -> int:

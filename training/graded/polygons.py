@@ -1,7 +1,5 @@
 """Solids with corners: regular prisms and frames, which only drawn bodies have."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

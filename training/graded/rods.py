@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
@@ -50,17 +49,13 @@ _APART = 1.7
 
 @dataclass(frozen=True, eq=False)
 class Bone:
-    """A part of a skeleton at rest.
-
-    parent: number of the bone that holds it, −1 of the root.
-    origin: (3,) its joint in the world; frame: (3,3) its axes as columns.
-    """
+    """A part of a skeleton at rest."""
 
     part: Part
     placed: Placed
-    parent: int
-    origin: Floats
-    frame: Floats
+    parent: int  # number of the bone that holds it, −1 of the root
+    origin: Floats  # (3,) its joint in the world
+    frame: Floats  # (3,3) its axes as columns
 
     @property
     def solid(self) -> Solid:
@@ -89,46 +84,30 @@ class Bone:
 
 @dataclass(frozen=True)
 class Joint:
-    """Where a rod is bent on purpose.
+    """Where a rod is bent on purpose."""
 
-    at: arc length along the rod.
-    axes: (3,2) axes of raise and swing at rest.
-    low, high: (2,) limits of the angles, radians.
-    is_root: the rod is bent beyond this place, not around it.
-    """
-
-    at: float
-    axes: Floats
-    low: Floats
-    high: Floats
-    is_root: bool
+    at: float  # arc length along the rod
+    axes: Floats  # (3,2) axes of raise and swing at rest
+    low: Floats  # (2,) limits of the angles, radians
+    high: Floats  # likewise
+    is_root: bool  # the rod is bent beyond this place, not around it
 
 
 @dataclass(frozen=True)
 class Rod:
-    """A centre line at rest.
+    """A centre line at rest."""
 
-    parent: number of the rod that carries it, −1 of the first.
-    held: arc length along the parent where it is carried.
-    points: (n,3) of the centre line; along: (n,) their arc lengths; radii: (n,).
-    girth: (n,) the radii with those of whatever sits stiffly on the rod, which is not bent there.
-    sides: (n,3,2) two directions across the rod.
-    joints: where it bends.
-    curl, twist: radians, the most that it curls and twists over its whole length.
-    is_hinge: its first joint is a hinge: all of it turns as one.
-    """
-
-    parent: int
-    held: float
-    points: Floats
-    along: Floats
-    radii: Floats
-    girth: Floats
-    sides: Floats
-    joints: tuple[Joint, ...] = ()
-    curl: float = 0.0
-    twist: float = 0.0
-    is_hinge: bool = False
+    parent: int  # number of the rod that carries it, −1 of the first
+    held: float  # arc length along the parent where it is carried
+    points: Floats  # (n,3) of the centre line
+    along: Floats  # (n,) their arc lengths
+    radii: Floats  # (n,)
+    girth: Floats  # (n,) the radii with those of whatever sits stiffly on the rod, which is not bent there
+    sides: Floats  # (n,3,2) two directions across the rod
+    joints: tuple[Joint, ...] = ()  # where it bends
+    curl: float = 0.0  # radians, the most that it curls over its whole length
+    twist: float = 0.0  # radians, the most that it is twisted over its whole length
+    is_hinge: bool = False  # its first joint is a hinge: all of it turns as one
 
     @property
     def length(self) -> float:
@@ -140,7 +119,7 @@ class Rig:
     """Rods, parents before children, and (solids,) the rod of each solid."""
 
     rods: tuple[Rod, ...]
-    owner: NDArray[np.int64]
+    owner: Integers
 
 
 @dataclass(frozen=True)
@@ -210,14 +189,14 @@ def _stiffened(rod: Rod, held: float, half: float) -> Rod:
     return replace(rod, girth=np.where(near, np.maximum(rod.girth, 1.5 * half), rod.girth))
 
 
-def strip(bones: Sequence[Bone], direction: Floats, axis: Floats, thickness: float, curl: float, twist: float) -> Rig:
+def strip(bones: Sequence[Bone], direction: Floats, axis: Floats, thickness: float, curl: float) -> Rig:
     """One rod for a whole body, such as a sheet, which is bent about ``axis`` along ``direction``.
 
     Args:
         bones: at rest.
         direction, axis: (3,) unit vectors, perpendicular.
         thickness: of the body in the direction in which it bends.
-        curl, twist: radians over the whole length.
+        curl: radians over the whole length.
     """
     corners = np.concatenate([np.stack(bone.placed.bounds()) for bone in bones])
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -226,7 +205,7 @@ def strip(bones: Sequence[Bone], direction: Floats, axis: Floats, thickness: flo
     points = centre + (along - half)[:, None] * direction
     sides = np.tile(np.stack([axis, np.cross(direction, axis)], axis=1), (len(along), 1, 1))
     radii = np.full(len(along), 0.5 * thickness)
-    rod = Rod(-1, 0.0, points, along, radii, radii, sides, (), curl, twist)
+    rod = Rod(-1, 0.0, points, along, radii, radii, sides, curl=curl)
     return Rig((rod,), np.zeros(len(bones), dtype=np.int64))
 
 
@@ -318,8 +297,8 @@ def bend(vertices: Floats, rig: Rig, binding: Binding, carried: Sequence[Motions
 class Gaps:
     """Which elements may not come together: pairs of them that are apart at rest, and the radii of all."""
 
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
+    first: Integers
+    second: Integers
     reach: Floats
 
     @classmethod

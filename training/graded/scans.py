@@ -24,25 +24,16 @@ _RESOLUTION = 72
 
 @dataclass(frozen=True)
 class Scan:
-    """What happens to the surface of one pose.
+    """What happens to the surface of one pose."""
 
-    n_vertices: that it has afterwards, about.
-    is_simplified: from more vertices; otherwise it is meshed with as many.
-    noise: standard deviation along the normals, over the root of the mean area of a face; 0 for none.
-    is_mirrored: left and right are exchanged.
-    is_watertight: it is made again from a grid of distances.
-    motion: (3,3) orthogonal, a rotation or, of a mirrored surface, a rotation and a reflection.
-    scale: factor of all lengths; offset: (3,) in units of the scaled size.
-    """
-
-    n_vertices: int
-    is_simplified: bool
-    noise: float
-    is_mirrored: bool
-    is_watertight: bool
-    motion: Floats
-    scale: float
-    offset: Floats
+    n_vertices: int  # that it has afterwards, about
+    is_simplified: bool  # from more vertices; otherwise it is meshed with as many
+    noise: float  # standard deviation along the normals, over the root of the mean area of a face; 0 for none
+    is_mirrored: bool  # left and right are exchanged
+    is_watertight: bool  # it is made again from a grid of distances
+    motion: Floats  # (3,3) orthogonal: a rotation, of a mirrored surface with a reflection
+    scale: float  # factor of all lengths
+    offset: Floats  # (3,) in units of the scaled size
 
     @classmethod
     def draw(cls, rng: np.random.Generator, n_vertices: tuple[int, int]) -> Scan:

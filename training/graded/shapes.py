@@ -1,7 +1,5 @@
 """Graded shapes: classes of bodies, bodies in poses."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import operator
@@ -16,6 +14,7 @@ from tqdm import tqdm
 from igps._arrays import Floats, Integers
 from igps._files import whole_file
 from igps._parallel import Failed, run
+from igps._parameters import check_at_least
 from igps.mesh.mesh import Mesh, MeshError
 from igps.shapes.benchmark import is_whole_off, off_text, shapes_folder
 from training.graded.bodies import Body, Pose, draw_body, draw_pose
@@ -27,31 +26,24 @@ _VERSION = 2  # raised whenever the same arguments would give other meshes
 _MAX_ATTEMPTS = 6
 _KIN, _BODY, _POSE, _INDIVIDUAL = 10, 11, 12, 13  # what a random stream is for: keeps the streams of one seed apart
 _SIBLINGS = 2  # bodies in a row with one skeleton, whose likeness makes bodies hard to tell apart
-BODIES_FILE = "bodies.csv"
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class GradedShape:
-    """One pose of one body of a class.
+    """One pose of one body of a class."""
 
-    vertices: (V,3) float64; faces: (F,3) int64, outward.
-    label: name of the class; body: name of the body, ``class/00``; name: ``class/00/03``.
-    genus: number of handles of the surface.
-    motion: (3,3) orthogonal, what turned, and perhaps mirrored, the shape out of its upright frame;
-        ``vertices @ motion`` stands upright again.
-    notes: what was done to the surface, in words.
-    """
-
-    vertices: Floats
-    faces: Integers
-    label: str
-    body: str
-    name: str
-    genus: int
+    vertices: Floats  # (V,3) float64
+    faces: Integers  # (F,3) int64, outward
+    label: str  # name of the class
+    body: str  # name of the body, ``class/00``
+    name: str  # ``class/00/03``
+    genus: int  # number of handles of the surface
+    # (3,3) orthogonal, what turned, and perhaps mirrored, the shape out of its upright frame: ``vertices @ motion``
+    # stands upright again
     motion: Floats
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what was done to the surface, in words
 
 
 class GradedShapes:
@@ -91,15 +83,8 @@ class GradedShapes:
         look_alikes: bool = True,
         n_individuals: int = 0,
     ) -> None:
-        for name, value, least in (
-            ("n_classes", n_classes, 1),
-            ("n_bodies", n_bodies, 1),
-            ("n_poses", n_poses, 1),
-            ("seed", seed, 0),
-            ("n_individuals", n_individuals, 0),
-        ):
-            if operator.index(value) < least:
-                raise ValueError(f"{name}: expected at least {least}, got {value}.")
+        check_at_least(1, n_classes=n_classes, n_bodies=n_bodies, n_poses=n_poses)
+        check_at_least(0, seed=seed, n_individuals=n_individuals)
         if not 1500 <= n_vertices[0] <= n_vertices[1]:
             raise ValueError(f"n_vertices: expected two numbers, the first at least 1500 and no more than the second, "
                              f"got {n_vertices}.")  # fmt: skip
@@ -117,10 +102,7 @@ class GradedShapes:
         return self.n_classes * self.n_bodies * max(self.n_individuals, 1) * self.n_poses
 
     def __repr__(self) -> str:
-        return (
-            f"GradedShapes({self.n_classes}, {self.n_bodies}, {self.n_poses}, seed={self.seed}, "
-            f"n_vertices={self.n_vertices}, look_alikes={self.look_alikes}, n_individuals={self.n_individuals})"
-        )
+        return f"GradedShapes({', '.join(f'{name}={value!r}' for name, value in self.__getstate__().items())})"
 
     @property
     def class_names(self) -> list[str]:
@@ -131,11 +113,6 @@ class GradedShapes:
     def labels(self) -> list[str]:
         """The class of every shape."""
         return [name for name in self.class_names for _ in range(len(self) // self.n_classes)]
-
-    @property
-    def bodies(self) -> list[str]:
-        """The body of every shape, ``class/number``."""
-        return [body_of(name) for name in self.names]
 
     @property
     def names(self) -> list[str]:
@@ -190,10 +167,9 @@ class GradedShapes:
     def write(self, root: str | os.PathLike[str], progress: bool = False, n_workers: int | None = 1) -> None:
         """Write every shape to ``root/<class>/<body>/<pose>.off``, leaving out what is there already.
 
-        A folder that is read again (`igps.SignatureDataset`) has the classes as labels; ``root/bodies.csv`` tells the
-        body of each file (columns ``file,label``), as `body_of` does. Each file appears whole or not at all, so that an
-        interrupted run is resumed by the same call. ``root/shapes.json`` records the settings; classes, bodies and
-        poses may be added later.
+        A folder that is read again (`igps.SignatureDataset`) has the classes as labels, and `body_of` tells the body of
+        a file. Each file appears whole or not at all, so that an interrupted run is resumed by the same call.
+        ``root/shapes.json`` records the settings; classes, bodies and poses may be added later.
 
         Args:
             root: folder, made where absent.
@@ -213,7 +189,6 @@ class GradedShapes:
             **({"individuals": True} if self.n_individuals else {}),
         )
         names = self.names
-        _record_bodies(folder / BODIES_FILE, names)
         missing = [i for i, name in enumerate(names) if not is_whole_off(folder / f"{name}.off")]
         # A body at a time, so that it is drawn once for all its poses.
         jobs: dict[int, list[int]] = {}
@@ -302,14 +277,6 @@ def family_of(label: str) -> str:
 def looks_alike(label: str) -> bool:
     """Whether a class, by its name, resembles one of SHREC'07 (see `training.graded.kinds`)."""
     return label in LOOK_ALIKE_TEMPLATES or family_of(label) in LOOK_ALIKE_FAMILIES
-
-
-def _record_bodies(path: Path, names: list[str]) -> None:
-    """Name the body of each file, beside those that are named there already."""
-    before = path.read_text(encoding="utf-8").splitlines()[1:] if path.exists() else []
-    rows = dict.fromkeys([*before, *(f"{name}.off,{body_of(name)}" for name in names)])
-    with whole_file(path) as file:
-        file.write(("\n".join(["file,label", *rows]) + "\n").encode())
 
 
 def _write(shapes: GradedShapes, folder: Path, indices: list[int]) -> None:

@@ -5,8 +5,6 @@ translation times ``real``. The weighted mean of several, over its length, is a 
 neither collapses nor loses volume when it is twisted (Kavan, Collins, Žára and O'Sullivan 2007).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -57,12 +55,6 @@ def moved(motions: Motions, points: Floats) -> Floats:
     # component along the real part too.
     conjugate = motions.real * np.array([1.0, -1.0, -1.0, -1.0])
     return _rotated(motions.real, points) + 2.0 * product(motions.dual, conjugate)[..., 1:]
-
-
-def same_side(motions: Motions, real: Floats) -> Motions:
-    """The same motions with the signs that bring their real parts nearest to ``real`` (..., 4), to be blended."""
-    sign = np.where((motions.real * real).sum(axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
-    return Motions(sign * motions.real, sign * motions.dual)
 
 
 def product(a: Floats, b: Floats) -> Floats:

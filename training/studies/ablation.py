@@ -1,9 +1,6 @@
 """What each learned part gives: bins, spectral filter, dimensions and head, over several seeded splits."""
 
-from __future__ import annotations
-
 import logging
-import random
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, stdev
@@ -13,7 +10,6 @@ from pytorch_lightning import Trainer, seed_everything
 
 import igps
 from igps.data.datamodule import SignatureDataModule
-from igps.data.splits import Split
 from igps.nn.axes import EuclideanDistance, InteriorDistance, PairCosines, Potential
 from igps.nn.description import describe
 from igps.nn.descriptor import HistogramDescriptor
@@ -22,7 +18,6 @@ from igps.nn.heads.closed_form import WhitenedHead
 from igps.nn.heads.learned import BlendedDistance
 from igps.nn.histograms.pairs import PairHistogram
 from igps.nn.learner import RetrievalLearner
-from training.graded import family_of
 from training.studies.learning import Row, score
 
 HEADS: tuple[Row, ...] = ("none", "whitened", "kernel")
@@ -48,7 +43,6 @@ def ablate(
     n_training_samples: int = 300,
     cache_dir: Path | None = None,
     dimensions: Sequence[str] = ("interior", "euclidean", "oriented"),
-    families: bool = False,
 ) -> None:
     """FT of each head on each descriptor, trained or not: mean ± standard deviation over splits.
 
@@ -61,46 +55,28 @@ def ablate(
         n_training_samples: of each shape in training, drawn anew at each step.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
         dimensions: which rows, by their first word.
-        families: of generated shapes half of the families train and the others test, whatever `n_train`. A kernel head
-            knows only its own classes, and is left out.
     """
-    heads = HEADS[:2] if families else HEADS
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
     config = layout("oriented", False, False, n_training_samples).requirements.apply_to(igps.SignatureConfig())
-    print(f"{'dimensions':<14}{'learned':<16}" + "".join(f"{head:>14}" for head in heads))
+    print(f"{'dimensions':<14}{'learned':<16}" + "".join(f"{head:>14}" for head in HEADS))
     for name, bins, spectrum in ROWS:
         if name not in dimensions:
             continue
-        found: dict[str, list[float]] = {head: [] for head in heads}
+        found: dict[str, list[float]] = {head: [] for head in HEADS}
         for seed in range(first_seed, first_seed + n_splits):
             seed_everything(seed, verbose=False)
-            data = SignatureDataModule(
-                root, "seen", 1 if families else n_train, 0, split_seed=seed, config=config, cache_dir=cache_dir
-            )
-            if families:
-                data.split = split_families(data.dataset, seed)
+            data = SignatureDataModule(root, "seen", n_train, 0, split_seed=seed, config=config, cache_dir=cache_dir)
             data.prepare_data()
             descriptor = layout(name, bins, spectrum, n_training_samples)
             if bins or spectrum:
                 train(descriptor, data, n_epochs)
             histograms = describe(data.dataset, descriptor.eval()).flatten(1)
-            for head in heads:
+            for head in HEADS:
                 scores = score(histograms, data.dataset.labels, data.split, head, descriptor.part_cells)
                 found[head].append(100 * scores["ft"])
         learned = " + ".join(part for part, on in (("bins", bins), ("spectrum", spectrum)) if on) or "nothing"
         cells = "".join(f"{mean(v):>8.1f} ± {stdev(v) if n_splits > 1 else 0:>3.1f}" for v in found.values())
         print(f"{name:<14}{learned:<16}{cells}", flush=True)
-
-
-def split_families(dataset: igps.SignatureDataset, seed: int) -> Split:
-    """Half of the families of generated shapes train, the others test."""
-    families = [family_of(name) for name in dataset.classes]
-    names = sorted(set(families))
-    train = set(random.Random(seed).sample(names, len(names) // 2))
-    parts: tuple[list[int], list[int]] = ([], [])
-    for i, label in enumerate(dataset.labels.tolist()):
-        parts[families[label] not in train].append(i)
-    return Split(tuple(parts[0]), (), tuple(parts[1]))
 
 
 def layout(dimensions: str, bins: bool, spectrum: bool, n_training_samples: int) -> HistogramDescriptor:

@@ -1,16 +1,13 @@
 """Descriptions of meshes to which something was done before, on many processes."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tqdm import tqdm
 
+from igps._arrays import Singles
 from igps._parallel import Failed, one_thread, run
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
@@ -21,7 +18,7 @@ from igps.signature.signature import compute_signature
 Way = Callable[[Mesh], Mesh]
 """Does something to a mesh; picklable."""
 
-Answer = NDArray[np.float32] | str
+Answer = Singles | str
 """What a descriptor says of a body, or why it says nothing."""
 
 
@@ -45,7 +42,7 @@ def describe_altered(
     Returns:
         N dicts: by way, by descriptor, the description or the reason why there is none.
     """
-    jobs = [_Job(dataset.subset([i]), way, descriptors) for i in range(len(dataset)) for way in ways.values()]
+    jobs = [(dataset.subset([i]), way, descriptors) for i in range(len(dataset)) for way in ways.values()]
     places = [(i, name) for i in range(len(dataset)) for name in ways]
     found: list[dict[str, dict[str, Answer]]] = [{} for _ in range(len(dataset))]
     outcomes = run(_describe, jobs, n_workers=n_workers)
@@ -60,23 +57,16 @@ def describe_altered(
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """One mesh, and what is done to it, for all descriptors."""
-
-    dataset: SignatureDataset
-    way: Way | None
-    descriptors: Sequence[Descriptor]
-
-
-def _describe(job: _Job) -> dict[str, Answer]:
-    if job.way is None:
-        batch = job.dataset.batch([0], meshes=any(one.requirements.mesh for one in job.descriptors))
+def _describe(job: tuple[SignatureDataset, Way | None, Sequence[Descriptor]]) -> dict[str, Answer]:
+    """What descriptors say of the one mesh of a dataset, after something was done to it."""
+    dataset, way, descriptors = job
+    if way is None:
+        batch = dataset.batch([0], meshes=any(one.requirements.mesh for one in descriptors))
     else:
-        mesh = job.way(job.dataset.mesh(0))
-        batch = collate([compute_signature(mesh, job.dataset.config)], [mesh])
+        mesh = way(dataset.mesh(0))
+        batch = collate([compute_signature(mesh, dataset.config)], [mesh])
     answers: dict[str, Answer] = {}
-    for descriptor in job.descriptors:
+    for descriptor in descriptors:
         try:
             with one_thread(), torch.inference_mode():
                 description = descriptor(batch)[0].numpy()

@@ -1,7 +1,5 @@
 """Measure what the distances of `pretrained` mean, on generated bodies that it was not fitted to."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 
 import igps
+from igps._arrays import Booleans, Floats
 from igps._parallel import on_threads
 from igps.descriptors.fingerprint import fingerprint
 from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained
@@ -25,9 +23,9 @@ from igps.gallery.calibration import (
 from igps.gallery.surfaces import Surfaces, distance_if_alike
 from igps.mesh.mesh import Mesh
 from igps.nn.description import describe
-from igps.nn.descriptor import Descriptor
 from training.graded import GradedShapes, body_of
 from training.studies.disturbances import move, remesh, scale, simplified
+from training.studies.individuals import generated
 from training.studies.thresholds import quantiles, threshold_at, threshold_between
 
 SUFFIXES = {"triangles": ".off", "half": ".off", "motion": ".ply", "format": ".stl", "all": ".obj", "longer": ".off"}
@@ -65,10 +63,11 @@ def calibrate(
         n_workers: processes; all cores if not given.
     """
     descriptor = pretrained(model)
-    shapes = _generated(root, descriptor, n_classes, seed, cache_dir, n_workers)
+    bodies_in_poses = GradedShapes(n_classes, 4, 4, seed)
+    shapes = generated(bodies_in_poses, root, descriptor, cache_dir, n_workers)
     bodies = np.array([body_of(name) for name in shapes.bodies.names])
     classes = np.array(shapes.bodies.labels)
-    is_rigid = np.isin(classes, _still(GradedShapes(n_classes, 4, 4, seed)))
+    is_rigid = np.isin(classes, _still(bodies_in_poses))
 
     made = _copies(shapes, copies, n_copied, seed)
     copied = igps.SignatureDataset([path for _, _, path in made], shapes.config, cache_dir)
@@ -95,10 +94,10 @@ def calibrate(
 
     surfaces, surfaces_of_copies = (_Measured(one, n_workers) for one in (shapes, copied))
 
-    def among(chosen: NDArray[np.bool_]) -> list[_Pair]:
+    def among(chosen: Booleans) -> list[_Pair]:
         return [(surfaces, i[k], surfaces, j[k]) for k in np.flatnonzero(chosen)]
 
-    def of_made(chosen: NDArray[np.bool_]) -> list[_Pair]:
+    def of_made(chosen: Booleans) -> list[_Pair]:
         return [(surfaces, originals[n], surfaces_of_copies, n) for n in np.flatnonzero(chosen).tolist()]
 
     # The hard ones tell the rate: other poses of bodies that bend, and other bodies of the class.
@@ -132,18 +131,6 @@ def _still(shapes: GradedShapes) -> list[str]:
         if np.abs(pose.bent - pose.rest).max() < 1e-6 * np.ptp(pose.rest, axis=0).max():
             found.append(name)
     return found
-
-
-def _generated(
-    root: Path, descriptor: Descriptor, n_classes: int, seed: int, cache_dir: Path | None, n_workers: int | None
-) -> igps.SignatureDataset:
-    """The shapes, those that are not there yet written first."""
-    try:
-        GradedShapes(n_classes, 4, 4, seed).write(root, progress=True, n_workers=n_workers)
-    except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
-        print(error)
-    shapes = igps.SignatureDataset(root, cache_dir=cache_dir, descriptor=descriptor)
-    return shapes.usable(shapes.precompute(n_workers=n_workers))
 
 
 def _copies(shapes: igps.SignatureDataset, folder: Path, n_bodies: int, seed: int) -> list[tuple[int, str, Path]]:
@@ -202,7 +189,7 @@ class _Measured:
 _Pair = tuple[_Measured, int, _Measured, int]
 
 
-def _apart(pairs: list[_Pair], n_workers: int | None) -> NDArray[np.float64]:
+def _apart(pairs: list[_Pair], n_workers: int | None) -> Floats:
     """(N, 2) how far apart the surfaces of pairs are; and that over what their levels of detail leave open."""
 
     def one(pair: _Pair) -> tuple[float, float]:
@@ -215,11 +202,11 @@ def _apart(pairs: list[_Pair], n_workers: int | None) -> NDArray[np.float64]:
 
 def _print(
     calibration: Calibration,
-    same: NDArray[np.float64],
-    others: NDArray[np.float64],
-    longer: NDArray[np.float64],
+    same: Floats,
+    others: Floats,
+    longer: Floats,
     ways: list[str],
-    to_copies: NDArray[np.float64],
+    to_copies: Floats,
 ) -> None:
     print(calibration.made_of)
     for way in SUFFIXES:

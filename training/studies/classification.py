@@ -1,7 +1,5 @@
 """Classification accuracy over several seeded splits, on fixed or on trained histograms."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, stdev

@@ -1,7 +1,5 @@
 """A picture of generated shapes, saved as PNG."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -4,17 +4,15 @@ Each function returns a new, checked `Mesh` and says in its notes what was done.
 descriptors are tried against, with the strength that is usual here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
+from igps._arrays import Floats, Integers
 from igps.descriptors._geodesics import edge_graph
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.simplification import simplify
@@ -24,15 +22,10 @@ from training.studies.weld import weld_gap
 
 @dataclass(frozen=True)
 class Disturbance:
-    """A change of the mesh that should change a description little.
+    """A change of the mesh that should change a description little."""
 
-    Args:
-        description: what is done, and how much of it.
-        apply: does it.
-    """
-
-    description: str
-    apply: Callable[[Mesh], Mesh]
+    description: str  # what is done, and how much of it
+    apply: Callable[[Mesh], Mesh]  # does it
 
 
 def noise(mesh: Mesh, amplitude: float = 0.005, seed: int = 0) -> Mesh:
@@ -200,5 +193,5 @@ def _check_share(share: float) -> None:
         raise ValueError(f"share: expected a number between 0 and 1, got {share}.")
 
 
-def _changed(mesh: Mesh, vertices: NDArray[np.float64], faces: NDArray[np.int64], note: str) -> Mesh:
+def _changed(mesh: Mesh, vertices: Floats, faces: Integers, note: str) -> Mesh:
     return replace(mesh, vertices=vertices, faces=faces, notes=(*mesh.notes, note))

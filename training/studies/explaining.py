@@ -1,18 +1,17 @@
 """Whether an explanation lies where two bodies differ: generated pairs in other poses, altered in one place."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
+from functools import reduce
 from itertools import product
+from operator import or_
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats
 from igps.analysis.explanation import explain, on_surface
 from igps.data.collation import collate
-from igps.data.requirements import Requirements
 from igps.descriptors import descriptor as descriptor_of
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors
@@ -24,15 +23,12 @@ ALTERATIONS = ("bump", "dent", "limb", "hole")
 # Of √area: what an alteration reaches, at least, and how large it is
 _REACH, _SIZES = 0.1, (0.005, 0.05)
 
-Points = NDArray[np.float64]
-
 
 def explaining(
     out: Path = Path("build/explaining"),
     descriptors: Sequence[str] = ("interior", "rich", "pretrained"),
     n_bodies: int = 50,
     seed: int = 0,
-    same_pose: bool = False,
 ) -> None:
     """Areas under the curve of the painted difference on the altered body against the true place.
 
@@ -41,24 +37,21 @@ def explaining(
         descriptors: names.
         n_bodies: each is altered in each way.
         seed: of the bodies; other seeds give other bodies.
-        same_pose: alter the very same mesh in place of one in another pose.
     """
     from sklearn.metrics import roc_auc_score
 
     chosen = {name: descriptor_of(name) for name in descriptors}
-    needs = Requirements()
-    for one in chosen.values():
-        needs = needs | one.requirements
+    config = reduce(or_, (one.requirements for one in chosen.values())).apply_to(SignatureConfig())
     shapes, rows = GradedShapes(24, -(-n_bodies // 24), 2, seed=seed), list[dict[str, Any]]()
     random = np.random.default_rng(seed)
     places = random.permutation(len(shapes) // 2)[:n_bodies].tolist()
     for place, how in product(places, ALTERATIONS):
         size = float(np.exp(random.uniform(*np.log(_SIZES))))
         try:
-            drawn = [shapes[2 * place + pose] for pose in (int(same_pose), 1)]
+            drawn = [shapes[2 * place + pose] for pose in (0, 1)]
             before, after = (Mesh(shape.vertices, shape.faces) for shape in drawn)
             altered, centre, reach = alter(after, how, size, random)
-            signatures = [compute_signature(mesh, needs.apply_to(SignatureConfig())) for mesh in (before, altered)]
+            signatures = [compute_signature(mesh, config) for mesh in (before, altered)]
         except (MeshError, ValueError) as error:
             print(f"{shapes.names[2 * place]}: {error}")
             continue
@@ -87,7 +80,7 @@ def explaining(
             print(f"{name} {how}: {np.mean(some):.3f} of {len(some)}, by pairs alone {np.mean(pairs):.3f}")
 
 
-def alter(mesh: Mesh, how: str, size: float, random: np.random.Generator) -> tuple[Mesh, Points, float]:
+def alter(mesh: Mesh, how: str, size: float, random: np.random.Generator) -> tuple[Mesh, Floats, float]:
     """A mesh altered in one place, the centre of that place, and its radius.
 
     Args:
@@ -117,10 +110,10 @@ def alter(mesh: Mesh, how: str, size: float, random: np.random.Generator) -> tup
     return Mesh(moved, mesh.faces), centre + step * outward, reach
 
 
-def _along(direction: Points, centre: Points) -> Points:
+def _along(direction: Floats, centre: Floats) -> Floats:
     """The motion of z onto a direction through a place."""
     import trimesh
 
-    motion: Points = trimesh.geometry.align_vectors([0, 0, 1], direction)
+    motion: Floats = trimesh.geometry.align_vectors([0, 0, 1], direction)
     motion[:3, 3] = centre
     return motion

@@ -1,13 +1,11 @@
 """The figures of Rustamov 2010: `python -m training.study figure {pose,topology,potential}`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Singles
 from igps.cli.reading import signatures
 from igps.data.sources import find_bodies
 from igps.mesh.loading import load_mesh
@@ -142,5 +140,5 @@ def potential(
     return {"n_samples": found.n_samples, "least": found.least, "largest": found.largest}
 
 
-def _median(values: NDArray[np.float32]) -> str:
+def _median(values: Singles) -> str:
     return f"{np.median(values):6.3f}" if values.size else f"{'-':>6}"

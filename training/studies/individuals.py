@@ -1,7 +1,5 @@
 """The level of individuals of the descriptor `pretrained`: its check on held-out families, and its fit."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,11 +40,7 @@ def fit_individuals(
     """
     n_classes, n_bodies, n_individuals, n_poses = counts
     shapes = GradedShapes(n_classes, n_bodies, n_poses, seed, n_vertices=_N_VERTICES, n_individuals=n_individuals)
-    try:
-        shapes.write(root, progress=True, n_workers=n_workers)
-    except ValueError as error:
-        print(error)
-    data = usable(root, descriptor, cache_dir, n_workers)
+    data = generated(shapes, root, descriptor, cache_dir, n_workers)
     histograms = describe(data, descriptor, progress=True, n_workers=n_workers)
     individuals, bodies = (numbers([of(name) for name in data.bodies.names]) for of in (individual_of, body_of))
 
@@ -73,6 +67,17 @@ def fit_individuals(
         if len(described) == len(data):
             score(name, [other.distances(described[part], described[part]) for part in parts])
     return fitted(everything)
+
+
+def generated(
+    shapes: GradedShapes, root: Path, descriptor: Descriptor, cache_dir: Path | None, n_workers: int | None
+) -> igps.SignatureDataset:
+    """The dataset of generated shapes, which are written to a folder where they are not there yet, see `usable`."""
+    try:
+        shapes.write(root, progress=True, n_workers=n_workers)
+    except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
+        print(error)
+    return usable(root, descriptor, cache_dir, n_workers)
 
 
 def usable(

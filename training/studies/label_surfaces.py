@@ -3,25 +3,24 @@
 Balls, ellipsoids, tori, capsules, rods and plates are turned and moved at random and sampled at the centres of voxels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import combinations
+from operator import or_
 
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import elliprg
 
 from igps import Mesh, SignatureConfig, collate, compute_signature
+from igps._arrays import Booleans, Floats
 from igps.data.requirements import Requirements
 from igps.descriptors import descriptor
 from igps.mesh.label_surface import voxel_surface
 
-Array = NDArray[np.float64]
 KINDS = ("ball", "ellipsoid", "torus", "capsule", "rod", "plate")
 AXES = np.array([1, 1.3, 2])  # of an ellipsoid
 SIDES = np.array([3, 4, 1])  # of a plate
@@ -32,8 +31,8 @@ RING = 2.5  # of a torus, over the radius of its tube
 class Solid:
     """A body about the origin: which points (..., 3) it holds, half its box, its volume, area and handles."""
 
-    holds: Callable[[Array], NDArray[np.bool_]]
-    half: Array
+    holds: Callable[[Floats], Booleans]
+    half: Floats
     volume: float
     area: float
     genus: int = 0
@@ -68,12 +67,6 @@ def solid(kind: str, thickness: float) -> Solid:
     return Solid(lambda p: np.asarray((abs(p) < half).all(-1)), half, 8 * a * b * c, 8 * (a * b + b * c + a * c))
 
 
-def edges_of(kind: str, thickness: float) -> float:
-    """The length of the edges of a solid, at which two faces meet in a right angle."""
-    r = thickness / 2
-    return {"rod": 4 * np.pi * r, "plate": 8 * r * float(SIDES.sum())}.get(kind, 0.0)
-
-
 def exact_mesh(kind: str, thickness: float) -> Mesh:
     """The surface of a solid in a few thousand triangles."""
     r = thickness / 2
@@ -96,7 +89,7 @@ def exact_mesh(kind: str, thickness: float) -> Mesh:
     return Mesh(np.asarray(surface.vertices), np.asarray(surface.faces), name=kind)
 
 
-def voxels(body: Solid, matrix: Array, rng: np.random.Generator) -> tuple[NDArray[np.bool_], Array]:
+def voxels(body: Solid, matrix: Floats, rng: np.random.Generator) -> tuple[Booleans, Floats]:
     """The body, turned and moved at random, at the centres of voxels: (X, Y, Z), and the affine (4, 4)."""
     turn = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
     size = np.linalg.norm(body.half)
@@ -140,10 +133,7 @@ def measure(
         seed: of these.
     """
     modules = {name: descriptor(name) for name in descriptors}
-    needs = Requirements()
-    for module in modules.values():
-        needs = needs | module.requirements
-    config = needs.apply_to(SignatureConfig())
+    config = reduce(or_, (one.requirements for one in modules.values()), Requirements()).apply_to(SignatureConfig())
 
     def described(mesh: Mesh) -> dict[str, torch.Tensor]:
         batch = collate([compute_signature(mesh, config)])

@@ -1,8 +1,5 @@
 """What a descriptor has learned, against where it started."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,26 +57,3 @@ def _centres(histogram: PairHistogram) -> dict[str, OrderedCentres]:
         for name, module in axis.named_modules()
         if isinstance(module, OrderedCentres)
     }
-
-
-def transfer_curve(curve: Mapping[int, Sequence[float]], plain: float, path: str | Path) -> None:
-    """Save a picture of the first tier against the number of generated classes that a metric was fitted to.
-
-    Args:
-        curve: FT, fractions, of several draws by the number of classes.
-        plain: FT of the plain distance.
-        path: of the picture.
-    """
-    figure = new_figure(4.5, 3.2)
-    axes = figure.subplots()
-    counts = sorted(curve)
-    means = [100 * sum(curve[n]) / len(curve[n]) for n in counts]
-    axes.axhline(100 * plain, color="#888888", linestyle="--", label="plain distance")
-    axes.plot(counts, means, color="#0072B2", label="pretrained, mean of the draws")
-    for n in counts:
-        axes.plot([n] * len(curve[n]), [100 * value for value in curve[n]], ".", color="#0072B2")
-    axes.set(xscale="log", xlabel="generated classes fitted to", ylabel="first tier (percent)")
-    axes.set_xticks(counts, [str(n) for n in counts])
-    axes.minorticks_off()
-    axes.legend(frameon=False)
-    figure.savefig(path, dpi=150)

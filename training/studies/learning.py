@@ -1,7 +1,5 @@
 """Retrieval scores over several seeded splits, and of a trained checkpoint."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,7 +34,6 @@ def splits(
     descriptor: str = "interior",
     protocol: SplitProtocol = "seen",
     n_train: int = 10,
-    n_test: int | None = None,
     n_splits: int = 5,
     first_seed: int = 100,
     cache_dir: Path | None = None,
@@ -49,7 +46,6 @@ def splits(
         descriptor: what is compared.
         protocol: seen splits every class, unseen splits the classes.
         n_train: shapes of each class (seen) or classes (unseen) to fit to.
-        n_test: classes to test (unseen); all others if not given.
         n_splits: how many splits, with the seeds from `first_seed` on.
         first_seed: see n_splits.
         cache_dir: folder of cached signatures; the user's cache directory if not given.
@@ -68,10 +64,7 @@ def splits(
             continue
         results = []
         for seed in range(first_seed, first_seed + n_splits):
-            if protocol == "seen":
-                split = split_seen(labels, n_train, seed=seed)
-            else:
-                split = split_unseen(labels, n_train, n_test=n_test, seed=seed)
+            split = (split_seen if protocol == "seen" else split_unseen)(labels, n_train, seed=seed)
             results.append(score(histograms, labels, split, head, cells, prior))
         values = {name: [one[name] for one in results] for name in COLUMNS}
         found = {name: {"mean": mean(v), "stdev": stdev(v) if n_splits > 1 else 0.0} for name, v in values.items()}

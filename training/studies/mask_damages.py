@@ -1,20 +1,18 @@
 """Masks damaged as segmentations are: in the six ways that the figures are of, and in others to choose measures on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
+
+from igps._arrays import Booleans, Floats
 
 DAMAGES = ("slices", "hole", "leak", "island", "label", "half")
 VARIED = ("slices", "tunnel", "cavity", "leak", "island", "label", "blocks")
 
-Mask = NDArray[np.bool_]
-Values = NDArray[np.float64]
 
-
-def damaged(whole: Mask, spacing: Values, how: str, random: np.random.Generator, others: Mask) -> tuple[Mask, Values]:
+def damaged(
+    whole: Booleans, spacing: Floats, how: str, random: np.random.Generator, others: Booleans
+) -> tuple[Booleans, Floats]:
     """A mask and its spacing after one of the `DAMAGES`; "label" leaves both. Others are what it may leak into."""
     from scipy.ndimage import binary_dilation, distance_transform_edt
 
@@ -39,7 +37,9 @@ def damaged(whole: Mask, spacing: Values, how: str, random: np.random.Generator,
     return changed, spacing
 
 
-def varied(whole: Mask, spacing: Values, how: str, random: np.random.Generator, others: Mask) -> tuple[Mask, Values]:
+def varied(
+    whole: Booleans, spacing: Floats, how: str, random: np.random.Generator, others: Booleans
+) -> tuple[Booleans, Floats]:
     """As `damaged`, in one of the ways `VARIED`: for choosing measures on other damages than those of the report."""
     from scipy.ndimage import binary_dilation, distance_transform_edt
 
@@ -75,14 +75,14 @@ def varied(whole: Mask, spacing: Values, how: str, random: np.random.Generator, 
     return changed, spacing
 
 
-def _radius(mask: Mask, spacing: Values) -> float:
+def _radius(mask: Booleans, spacing: Floats) -> float:
     """Of the ball of the same volume."""
     return float(np.cbrt(3 / (4 * np.pi) * mask.sum() * spacing.prod()))
 
 
 def _surroundings(
-    whole: Mask, spacing: Values
-) -> tuple[tuple[slice, ...], Mask, Values, Callable[[Values, float], Mask]]:
+    whole: Booleans, spacing: Floats
+) -> tuple[tuple[slice, ...], Booleans, Floats, Callable[[Floats, float], Booleans]]:
     """A box about a body, the body in it, where its voxels are, and balls of a radius over its."""
     found = np.argwhere(whole)
     low, high = np.maximum(found.min(axis=0) - 8, 0), found.max(axis=0) + 9
@@ -91,14 +91,14 @@ def _surroundings(
     radius = _radius(mask, spacing)
     grid = np.stack(np.meshgrid(*map(np.arange, mask.shape), indexing="ij"), axis=-1) * spacing
 
-    def ball(middle: Values, size: float) -> Mask:
-        inside: Mask = ((grid - middle) ** 2).sum(axis=-1) <= max(size * radius, 1.01 * spacing.max()) ** 2
+    def ball(middle: Floats, size: float) -> Booleans:
+        inside: Booleans = ((grid - middle) ** 2).sum(axis=-1) <= max(size * radius, 1.01 * spacing.max()) ** 2
         return inside
 
     return box, mask, grid, ball
 
 
-def _on_skin(mask: Mask, spacing: Values, random: np.random.Generator, others: Mask) -> Values:
+def _on_skin(mask: Booleans, spacing: Floats, random: np.random.Generator, others: Booleans) -> Floats:
     """A voxel of the border, near another body if any is."""
     from scipy.ndimage import binary_erosion, distance_transform_edt
 
@@ -107,5 +107,5 @@ def _on_skin(mask: Mask, spacing: Values, random: np.random.Generator, others: M
         near = skin & (distance_transform_edt(~others, spacing) <= 0.3 * _radius(mask, spacing))
         skin = near if near.any() else skin
     places = np.argwhere(skin) * spacing
-    chosen: Values = places[random.integers(len(places))]
+    chosen: Floats = places[random.integers(len(places))]
     return chosen

@@ -1,7 +1,5 @@
 """Whether damaged segmentations are found: the outlier scores of given masks and of the same damaged in six ways."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence
@@ -9,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Booleans, Floats
 from igps.analysis.groups import squared_distances
 from igps.analysis.outliers import Outlier, measures_of, outliers
 from igps.data.dataset import SignatureDataset
@@ -21,16 +19,12 @@ from training.studies.mask_damages import DAMAGES, VARIED, damaged, varied
 
 _LEAST_VOXELS = 50
 
-Mask = NDArray[np.bool_]
-Values = NDArray[np.float64]
-
 
 def outlying(
     volumes: Path | None = None,
     out: Path = Path("build/outlying"),
     cache_dir: Path | None = None,
     seed: int = 0,
-    anywhere: bool = False,
     vary: bool = False,
 ) -> None:
     """Score masks as they are, and each with one damage in its place; the area under the curve tells them apart.
@@ -40,7 +34,6 @@ def outlying(
         out: folder for the masks, outlying.csv and outlying.json.
         cache_dir: of the signatures.
         seed: of the damages, and of the generated bodies.
-        anywhere: bodies leak at any place, in place of where another one is near, if any is.
         vary: damages are of other kinds, and of random sizes, places and directions, see `varied`.
     """
     masks = generated(seed) if volumes is None else _given(volumes)
@@ -54,7 +47,7 @@ def outlying(
         mask, spacing = masks[name]
         others = np.zeros_like(mask)
         for other, (near, _) in masks.items():
-            if other != name and near.shape == mask.shape and not anywhere:
+            if other != name and near.shape == mask.shape:
                 others |= near
         paths.append(_write(out / f"{i}_damaged.nii.gz", *damage_of(mask, spacing, damage, random, others)))
     chosen = descriptor_of("pretrained")
@@ -107,7 +100,7 @@ def areas(rows: Sequence[dict[str, object]]) -> dict[str, float]:
     return found
 
 
-def _write(path: Path, mask: Mask, spacing: Values) -> Path:
+def _write(path: Path, mask: Booleans, spacing: Floats) -> Path:
     import nibabel
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -115,7 +108,7 @@ def _write(path: Path, mask: Mask, spacing: Values) -> Path:
     return path
 
 
-def _given(volumes: Path) -> dict[str, tuple[Mask, Values]]:
+def _given(volumes: Path) -> dict[str, tuple[Booleans, Floats]]:
     """The masks of at least fifty voxels, by class and name; the classes are the names without side and number."""
     import nibabel
 
@@ -131,7 +124,7 @@ def _given(volumes: Path) -> dict[str, tuple[Mask, Values]]:
     return found
 
 
-def generated(seed: int = 0) -> dict[str, tuple[Mask, Values]]:
+def generated(seed: int = 0) -> dict[str, tuple[Booleans, Floats]]:
     """One subject in a grid, and a body of many subjects, each in a grid of its own with thick slices.
 
     Bodies touch, none overlaps, and the border of the grid cuts some: single ones, pairs of sides, a series of thin
@@ -139,9 +132,9 @@ def generated(seed: int = 0) -> dict[str, tuple[Mask, Values]]:
     """
     random = np.random.default_rng(seed + 100)
     spacing, room = np.full(3, 3.0), np.array([110, 90, 110]) * 3.0
-    found = dict[str, tuple[Mask, Values]]()
+    found = dict[str, tuple[Booleans, Floats]]()
     taken = np.zeros((110, 90, 110), dtype=bool)
-    drawn: list[tuple[str, Values, Values]] = []
+    drawn: list[tuple[str, Floats, Floats]] = []
     for level in range(6):
         angle, wide, long = np.linspace(0.2, 2.6 + 0.1 * level, 60), 60 + 8 * level, 50 + 4 * level
         arc = [wide * np.sin(angle), long * np.cos(angle) + 120, 290 - 22 * level - 14 * angle]
@@ -181,7 +174,7 @@ def generated(seed: int = 0) -> dict[str, tuple[Mask, Values]]:
     return found
 
 
-def _curve(random: np.random.Generator) -> tuple[Values, Values]:
+def _curve(random: np.random.Generator) -> tuple[Floats, Floats]:
     """A smooth curve of random length about the origin, and the radii of balls along it."""
     t, size = np.linspace(0, 1, 60), np.exp(random.uniform(np.log(25), np.log(170)))
     waves = sum(random.normal(0, 0.5 / k**2, (3, 1)) * np.cos(np.pi * k * t + random.uniform(0, 6)) for k in (1, 2, 3))
@@ -189,13 +182,13 @@ def _curve(random: np.random.Generator) -> tuple[Values, Values]:
     return size * np.asarray(waves).T, np.maximum(radius * (1 - np.abs(2 * t - 1) ** 6) ** 0.5, 4.0)
 
 
-def _jittered(points: Values, random: np.random.Generator) -> Values:
+def _jittered(points: Floats, random: np.random.Generator) -> Floats:
     """Moved by smooth noise along each axis."""
-    moved: Values = points + 1.5 * np.sin(points[:, ::-1] / 25 + random.uniform(0, 6, 3))
+    moved: Floats = points + 1.5 * np.sin(points[:, ::-1] / 25 + random.uniform(0, 6, 3))
     return moved
 
 
-def _tube(curve: Values, radii: Values, spacing: Values, random: np.random.Generator, free: Mask) -> Mask:
+def _tube(curve: Floats, radii: Floats, spacing: Floats, random: np.random.Generator, free: Booleans) -> Booleans:
     """Free voxels in balls along a curve, with a border as rough as that of segmentations; the largest piece."""
     from scipy.ndimage import gaussian_filter, label
 

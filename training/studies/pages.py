@@ -1,7 +1,5 @@
 """Tables of the documentation: each is written from a file of results, which says by what and when it was measured."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import platform
@@ -34,14 +32,6 @@ def scores(source: Path) -> Table:
     return ["descriptor", *(TITLES[name] for name in shown), "s/body"], rows
 
 
-def movements(source: Path) -> Table:
-    """Of `python -m training.study robustness --out`: mean movements in percent, a row a descriptor."""
-    found: Mapping[str, Mapping[str, Any]] = _read(source, "robustness.json")["movements"]
-    columns = list(next(iter(found.values())))
-    rows = [[f"`{name}`", *(_percent(of[column]["mean"]) for column in columns)] for name, of in found.items()]
-    return ["descriptor", *columns], rows
-
-
 def splits(source: Path) -> Table:
     """Of `python -m training.evaluate splits --out`: a row a head, mean and standard deviation over splits."""
     found = _read(source, "splits.json")
@@ -52,25 +42,7 @@ def splits(source: Path) -> Table:
     return ["descriptor, classes", "head", "FT", "NN", "DCG"], rows
 
 
-def bench(source: Path) -> Table:
-    """Of `make bench`: a row a figure."""
-    found: Mapping[str, Mapping[str, Any]] = _read(source, "bench.json")
-    rows = [
-        [
-            f"`{name}`",
-            f"{row['value']:.3g} {row['unit']}",
-            f"{row['baseline_name']} {row['baseline']:.3g}",
-            f"{row['ratio']:.1f}×",
-            f"{row['peak_gib']:.1f} GiB",
-        ]
-        for name, row in found.items()
-    ]
-    return ["figure", "ours", "baseline", "ratio", "peak"], rows
-
-
-KINDS: Mapping[str, Callable[[Path], Table]] = {
-    "scores": scores, "movements": movements, "splits": splits, "bench": bench,
-}  # fmt: skip
+KINDS: Mapping[str, Callable[[Path], Table]] = {"scores": scores, "splits": splits}
 """What a table can be made of, by name."""
 
 
@@ -79,7 +51,7 @@ def record(name: str, kind: str, source: Path, command: str) -> None:
 
     Args:
         name: of the table, as pages name it.
-        kind: one of scores, movements, splits, bench.
+        kind: scores or splits.
         source: the folder or file of results.
         command: what was run.
 

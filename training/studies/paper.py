@@ -1,17 +1,15 @@
 """What the figures of Rustamov 2010 show: poses, a change of topology, and the potential on a slice."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 from tqdm import tqdm
 
+from igps._arrays import Floats, Singles
 from igps._threads import one_thread
 from igps.data.dataset import SignatureDataset
 from igps.mesh.mesh import Mesh
@@ -36,19 +34,12 @@ _SLICE_PARTS = 4
 
 @dataclass(frozen=True, eq=False)
 class PoseCurves:
-    """The distribution of interior distances of every mesh of some classes (figure 1).
+    """The distribution of interior distances of every mesh of some classes (figure 1)."""
 
-    Args:
-        curves: by class, (N, B) histograms of one potential class.
-        centres: (B,) of the bins.
-        within: by class, the χ² distances between two of its meshes.
-        to_others: by class, those from its meshes to the meshes of the other classes.
-    """
-
-    curves: dict[str, NDArray[np.float32]]
-    centres: NDArray[np.float32]
-    within: dict[str, NDArray[np.float32]]
-    to_others: dict[str, NDArray[np.float32]]
+    curves: dict[str, Singles]  # by class, (N, B) histograms of one potential class
+    centres: Singles  # (B,) of the bins
+    within: dict[str, Singles]  # by class, the χ² distances between two of its meshes
+    to_others: dict[str, Singles]  # by class, those from its meshes to the meshes of the other classes
 
 
 def pose_curves(dataset: SignatureDataset, classes: Sequence[str], n_bins: int = 64) -> PoseCurves:
@@ -75,20 +66,13 @@ def pose_curves(dataset: SignatureDataset, classes: Sequence[str], n_bins: int =
 
 @dataclass(frozen=True, eq=False)
 class WeldChange:
-    """What a weld does to a body (figure 2).
-
-    Args:
-        before, after: the body without and with the weld.
-        n_samples: interior samples, the same in both.
-        change: of each pair of them, the relative change of its interior distance.
-        eigenvalues: (K,) before and after, 1/length².
-    """
+    """What a weld does to a body (figure 2)."""
 
     before: Mesh
-    after: Mesh
-    n_samples: int
-    change: NDArray[np.float64]
-    eigenvalues: tuple[NDArray[np.float64], NDArray[np.float64]]
+    after: Mesh  # with the weld
+    n_samples: int  # interior samples, the same in both
+    change: Floats  # of each pair of them, the relative change of its interior distance
+    eigenvalues: tuple[Floats, Floats]  # (K,) before and after, 1/length²
 
 
 @one_thread()
@@ -132,25 +116,15 @@ def weld_change(
 
 @dataclass(frozen=True, eq=False)
 class PotentialSlice:
-    """The barycentroid potential on a plane through the barycentroid (section 4).
+    """The barycentroid potential on a plane through the barycentroid (section 4)."""
 
-    Args:
-        axes: (X,) and (Y,) of the slice, length.
-        values: (X, Y) potential, NaN outside the body.
-        section: (S, 2, 2) segments in which the plane cuts the surface.
-        barycentroid: (2,) on the slice.
-        least: potential at the barycentroid.
-        largest: potential at the samples.
-        n_samples: interior samples, near the best of which the barycentroid was searched.
-    """
-
-    axes: tuple[NDArray[np.float64], NDArray[np.float64]]
-    values: NDArray[np.float64]
-    section: NDArray[np.float64]
-    barycentroid: NDArray[np.float64]
-    least: float
-    largest: float
-    n_samples: int
+    axes: tuple[Floats, Floats]  # (X,) and (Y,) of the slice, length
+    values: Floats  # (X, Y) potential, NaN outside the body
+    section: Floats  # (S, 2, 2) segments in which the plane cuts the surface
+    barycentroid: Floats  # (2,) on the slice
+    least: float  # potential at the barycentroid
+    largest: float  # potential at the samples
+    n_samples: int  # interior samples, near the best of which the barycentroid was searched
 
 
 @one_thread()
@@ -205,14 +179,14 @@ def _embedding(mesh: Mesh, spectrum: Spectrum) -> Extension:
     return Extension(mesh.vertices, mesh.faces, spectrum.eigenfunctions, divisors=roots, accuracy=1e-3)
 
 
-def _around(mesh: Mesh, point: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+def _around(mesh: Mesh, point: Floats, reach: float) -> Floats:
     """Points of a fine cubic grid around a point in the body, those inside: (P, 3), with the point itself."""
     x, y, z = point[:, None] + reach * np.linspace(-1, 1, 9)
     index = np.nonzero(inside_grid(mesh, (x, y, z)))
     return np.stack([axis[i] for axis, i in zip((x, y, z), index, strict=True)], axis=1)
 
 
-def _section(mesh: Mesh, height: float) -> NDArray[np.float64]:
+def _section(mesh: Mesh, height: float) -> Floats:
     """(S, 2, 2) segments in which the plane z = height cuts the surface."""
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     segments = trimesh.intersections.mesh_plane(surface, plane_normal=[0, 0, 1], plane_origin=[0, 0, height])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from igps._arrays import Floats, Integers
 from igps.mesh.mesh import Mesh
 from igps.mesh.surface import longest_side
 from igps.report.drawing import GREY, PALETTE, new_figure, paint
@@ -56,7 +57,7 @@ def draw_weld_change(mesh: Mesh, welded: Mesh, change: NDArray[np.floating], out
 
     Args:
         mesh: the body before.
-        welded: by `training.studies.disturbances.weld`, with the tube as its last faces.
+        welded: by `training.studies.weld.weld`, with the tube as its last faces.
         change: (pairs,) relative change of each distance.
         out: the PNG file.
     """
@@ -92,10 +93,10 @@ def draw_weld_change(mesh: Mesh, welded: Mesh, change: NDArray[np.floating], out
 
 
 def draw_potential_slice(
-    axes_of_slice: tuple[NDArray[np.float64], NDArray[np.float64]],
+    axes_of_slice: tuple[Floats, Floats],
     potential: NDArray[np.floating],
-    outline: NDArray[np.float64],
-    barycentroid: NDArray[np.float64],
+    outline: Floats,
+    barycentroid: Floats,
     out: Path,
 ) -> None:
     """Draw the barycentroid potential on a plane through a body.
@@ -131,14 +132,14 @@ def draw_potential_slice(
     _save(figure, out)
 
 
-def upright(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+def upright(vertices: Floats) -> Floats:
     """(V, 3) turned: the longest principal axis up, the next to the right, each as its largest component points."""
     axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     up, right = (axis * np.sign(axis[np.argmax(np.abs(axis))]) for axis in axes[:2])
     return vertices @ np.stack([right, up, np.cross(right, up)], axis=1)
 
 
-def _zoom(axis: Axes, welded: Mesh, tube: NDArray[np.int64]) -> None:
+def _zoom(axis: Axes, welded: Mesh, tube: Integers) -> None:
     """Draw the surroundings of the tube, which lies across the picture, as seen from outside the body."""
     a, b = welded.vertices[tube[:, 0]].mean(axis=0), welded.vertices[tube[:, 2]].mean(axis=0)
     middle = (a + b) / 2

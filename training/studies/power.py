@@ -1,7 +1,5 @@
 """How small a difference in one proportion the tests of groups find, beside the spectra of LaPy's ShapeDNA."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import reduce
 from itertools import product
@@ -10,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from igps._arrays import Floats, Integers
 from igps.analysis.groups import group_test
 from igps.data.collation import collate
 from igps.descriptors import descriptor as descriptor_of
@@ -24,8 +22,6 @@ PROPORTIONS = ("width", "depth", "height", "waist")
 _SCATTER = 0.02
 _N_EIGENVALUES = 30
 _LAPY = "ShapeDNA (LaPy)"
-
-Rows = NDArray[np.float64]
 
 
 def power(
@@ -63,12 +59,12 @@ def power(
 
 
 def shares(
-    first: Mapping[str, Rows], second: Mapping[str, Rows], n_each: int, n_draws: int, seed: int
+    first: Mapping[str, Floats], second: Mapping[str, Floats], n_each: int, n_draws: int, seed: int
 ) -> list[dict[str, Any]]:
     """Of draws from two pools of vectors by descriptor, in which each test rejects."""
     rows: list[dict[str, Any]] = []
     for name in first:
-        random, orders = np.random.default_rng(seed), list[list[NDArray[np.int64]]]()
+        random, orders = np.random.default_rng(seed), list[list[Integers]]()
         while len(orders) < n_draws:
             mixed = [random.permutation(len(side[name])) for side in (first, second)]
             count = min(map(len, mixed)) // n_each
@@ -91,13 +87,13 @@ def shares(
 
 def pool(
     proportion: str, difference: float, n_pool: int, descriptors: Sequence[str], random: np.random.Generator
-) -> dict[str, Rows]:
+) -> dict[str, Floats]:
     """Vectors (n_pool, D) of subjects, by descriptor, and LaPy's."""
     from lapy import TriaMesh, shapedna  # the extra `studies`
 
     chosen = [descriptor_of(name) for name in descriptors]
     config = reduce(or_, [one.requirements for one in chosen]).apply_to(SignatureConfig())
-    found: dict[str, list[Rows]] = {name: [] for name in (*descriptors, _LAPY)}
+    found: dict[str, list[Floats]] = {name: [] for name in (*descriptors, _LAPY)}
     for _ in range(n_pool):
         mesh = subject(proportion, difference, random)
         batch = collate([compute_signature(mesh, config)])

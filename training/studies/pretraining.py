@@ -1,24 +1,21 @@
 """Fit the metric of the descriptor `pretrained` to generated shapes, and measure it where it was not fitted."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import igps
-from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained_head, pretrained_parts, save_pretrained
+from igps.descriptors.pretrained.descriptor import PRETRAINED, pretrained_head, pretrained_parts
 from igps.nn.description import describe
 from igps.nn.descriptor import EmbeddedDescriptor
 from igps.nn.heads.two_level import TwoLevelHead
 from training.graded import GradedShapes, body_of, family_of, looks_alike
-from training.studies.individuals import dealt, fit_individuals, numbers, usable
-from training.studies.transfer import curve, few_labels, level_scores, report
+from training.studies.individuals import dealt, fit_individuals, generated, numbers, usable
+from training.studies.transfer import few_labels, level_scores, report
 
 # Of two classes each part has a single direction, and its vectors are signs, which may cancel.
 _FEWEST = 3
@@ -38,7 +35,6 @@ def pretrain(
     cache_dir: Path | None = None,
     plain: Sequence[str] = ("gps", "interior", "multiscale", "rich", "shape_dna"),
     data: Path | None = None,
-    figures: Path = Path("build"),
     n_workers: int | None = None,
 ) -> None:
     """Generate shapes, check the metric on families that it was not fitted to, fit it to all, and save it.
@@ -55,10 +51,8 @@ def pretrain(
         cache_dir: folder of cached signatures; the user's cache directory if not given.
         plain: descriptors to score on the same classes beside the metric.
         data: a labelled collection to measure the transfer on.
-        figures: folder of pretrain.png, FT on `data` against the number of generated classes.
         n_workers: processes; all cores if not given.
     """
-    figures.mkdir(parents=True, exist_ok=True)
     out.parent.mkdir(parents=True, exist_ok=True)
     descriptor = pretrained_parts().eval()
 
@@ -78,15 +72,10 @@ def pretrain(
         save(kept.head)
         return
 
-    shapes = GradedShapes(n_classes, n_bodies, n_poses, seed)
-    try:
-        shapes.write(root, progress=True, n_workers=n_workers)
-    except ValueError as error:  # a body whose thin parts no grid resolves: the others are there
-        print(error)
-    generated = usable(root, descriptor, cache_dir, n_workers)
-    histograms, labels = describe(generated, descriptor, progress=True, n_workers=n_workers), generated.labels
-    bodies = numbers([body_of(name) for name in generated.bodies.names])
-    parts = dealt([family_of(name) for name in generated.classes], n_parts, seed)
+    shapes = generated(GradedShapes(n_classes, n_bodies, n_poses, seed), root, descriptor, cache_dir, n_workers)
+    histograms, labels = describe(shapes, descriptor, progress=True, n_workers=n_workers), shapes.labels
+    bodies = numbers([body_of(name) for name in shapes.bodies.names])
+    parts = dealt([family_of(name) for name in shapes.classes], n_parts, seed)
 
     def fit(n: int, seed: int, among: Tensor) -> TwoLevelHead:
         """The metric, of n classes drawn by the seed."""
@@ -102,7 +91,7 @@ def pretrain(
         level_scores(name, [(d, bodies[chosen], labels[chosen]) for d, chosen in zip(distances, scored, strict=True)])
 
     print(f"{n_parts} parts of the families, each scored by a metric that was fitted to the others:")
-    alike = torch.tensor([looks_alike(name) for name in generated.classes])
+    alike = torch.tensor([looks_alike(name) for name in shapes.classes])
     strangers = [among[~alike[among]] for among in others]
     ways = [("pretrained", others, others)]
     if min(len(among) for among in strangers) >= _FEWEST:
@@ -122,7 +111,7 @@ def pretrain(
         ]
         score(name, [other.distances(one, one) for one in described])
 
-    everything = torch.arange(len(generated.classes))
+    everything = torch.arange(len(shapes.classes))
     head = fit(len(everything), seed, everything)
     print(f"fitted to all {len(everything)} classes")
     head = save(head)
@@ -137,11 +126,18 @@ def pretrain(
     for name, among in both:
         title = f"{data}, fitted to {len(unlike)} classes {name}"
         report(title, found, classes, fit(len(unlike), seed, among))
-    counts = [n for n in (10, 30, 100) if n < len(everything)] + [len(everything)]
-    curve(partial(fit, among=everything), counts, found, classes, figures / "pretrain.png")
     # Two of each class are left to find each other.
     for n in (n for n in (1, 3, 5) if n + 2 <= int(classes.bincount().min())):
         few_labels(n, found, classes, head, descriptor.part_cells)
+
+
+def save_pretrained(module: EmbeddedDescriptor, path: str | Path) -> None:
+    """Write a fitted `pretrained_parts` under `pretrained_head` to a safetensors file, the head in half precision."""
+    state = {
+        name: (tensor.half() if name.startswith("head.") and tensor.is_floating_point() else tensor).contiguous()
+        for name, tensor in module.state_dict().items()
+    }
+    save_file(state, path)
 
 
 def _drawn(classes: Sequence[int], n: int, seed: int) -> list[int]:

@@ -1,18 +1,26 @@
 """How far descriptions move when a mesh is disturbed, or a body takes another pose."""
 
-from __future__ import annotations
-
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from igps._arrays import Singles
 from igps.analysis.comparison import check_descriptors, compare
+from igps.cli.reading import signatures, write_notes
+from igps.cli.report import check_report
+from igps.cli.report import report as write_report
 from igps.data.dataset import SignatureDataset
+from igps.data.sources import Bodies, find_bodies
+from igps.descriptors import NAMES
+from igps.descriptors import descriptor as descriptor_of
 from igps.nn.descriptor import Descriptor
+from igps.report.results import write_sources
+from igps.report.tables import write_rows
 from training.studies.altered import Answer, Way, describe_altered
 from training.studies.disturbances import DISTURBANCES
 
@@ -24,15 +32,10 @@ _AS_IT_IS = "as it is"
 
 @dataclass(frozen=True)
 class Movement:
-    """How far a description moves.
+    """How far a description moves."""
 
-    Args:
-        distances: of each mesh or pair by name, over the median distance between classes.
-        notes: why others are missing, by name.
-    """
-
-    distances: Mapping[str, float]
-    notes: Mapping[str, str]
+    distances: Mapping[str, float]  # of each mesh or pair by name, over the median distance between classes
+    notes: Mapping[str, str]  # why others are missing, by name
 
     @property
     def mean(self) -> float | None:
@@ -42,15 +45,10 @@ class Movement:
 
 @dataclass(frozen=True)
 class Robustness:
-    """How far each descriptor moves.
+    """How far each descriptor moves."""
 
-    Args:
-        movements: by descriptor, then by disturbance or `POSE`.
-        units: the median distance between classes of each descriptor; NaN where there is none.
-    """
-
-    movements: Mapping[str, Mapping[str, Movement]]
-    units: Mapping[str, float]
+    movements: Mapping[str, Mapping[str, Movement]]  # by descriptor, then by disturbance or `POSE`
+    units: Mapping[str, float]  # the median distance between classes of each descriptor; NaN where there is none
 
     def as_dict(self) -> dict[str, Any]:
         """For a JSON file."""
@@ -129,7 +127,7 @@ def _movements(
     return result
 
 
-def _distance(descriptor: Descriptor, one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+def _distance(descriptor: Descriptor, one: Singles, other: Singles) -> float:
     with torch.inference_mode():
         return float(descriptor.distances(torch.from_numpy(one)[None], torch.from_numpy(other)[None]))
 
@@ -177,3 +175,80 @@ def _movement(distances: Mapping[str, float], notes: Mapping[str, str], unit: fl
         reason = "there is no distance between classes to compare with."
         return Movement({}, {**dict.fromkeys(distances, reason), **notes})
     return Movement({name: distance / unit for name, distance in distances.items()}, notes)
+
+
+def robustness_table(table: Mapping[str, Mapping[str, Movement]]) -> str:
+    """The mean movements in percent, one line a descriptor and one column a disturbance, and what the columns mean."""
+    columns = list(next(iter(table.values())))
+    width = max(len(name) for name in table)
+    lines = [" " * width + "".join(f"{column:>9}" for column in columns)]
+    notes = []
+    for name, movements in table.items():
+        means = [movements[column].mean for column in columns]
+        lines.append(f"{name:<{width}}" + "".join(f"{'-' if x is None else f'{100 * x:.1f}':>9}" for x in means))
+        for column in columns:
+            missing = movements[column].notes
+            if missing:
+                first = next(iter(missing.values()))
+                n_all = len(movements[column].distances) + len(missing)
+                notes.append(f"{name}, {column}: {len(missing)} of {n_all} missing; {first}")
+    lines.append("mean movement in percent of the median distance between classes")
+    lines += [f"  {column}: {DISTURBANCES[column].description}" for column in columns if column in DISTURBANCES]
+    if POSE in columns:
+        lines.append(f"  {POSE}: from one pose of a body to another, over all pairs")
+    return "\n".join(lines + notes)
+
+
+def robustness_command(
+    meshes: list[Path],
+    descriptors: list[str] = [*NAMES],  # noqa: B006 (only read)
+    gallery: Path | None = None,
+    poses: Path | None = None,
+    out: Path | None = None,
+    report: bool = False,
+    n_workers: int | None = None,
+    **reading: Any,
+) -> dict[str, Any]:
+    """Measure how far the description of each descriptor moves when a mesh is disturbed, and print a table.
+
+    A movement is the distance between the descriptions of a mesh before and after, in percent of the descriptor's
+    median distance between meshes of different classes. It is 0 for what the descriptor does not notice, and 100 where
+    a mesh ends as far away as a typical mesh of another class.
+
+    Args:
+        meshes: the mesh files to disturb.
+        descriptors: names, or package.module:NAME of your own.
+        gallery: labelled folder that tells the distance between classes; if not given, each of the meshes is a class.
+        poses: folder with meshes of one body, for the movement between any two of them.
+        out: folder for robustness.json, meshes.json that tells where the meshes lie, notes.csv of what was done to
+            which mesh, and failures.csv if a mesh could not be used.
+        report: make a page of the results in that folder, report.html, see `igps report`
+        n_workers: processes that compute; all cores if not given.
+    """
+    check_report(report, out)
+    chosen = [descriptor_of(name) for name in descriptors]
+    reading["n_workers"] = n_workers
+    dataset, failures = signatures(meshes, chosen, **reading)
+    between, of_poses = None, None
+    if gallery is not None:
+        between, _ = signatures(find_bodies(gallery, labelled=True), chosen, **reading)
+    if poses is not None:
+        files = find_bodies(poses)
+        bodies = Bodies(files.paths, files.names, files.labels or ("body",) * len(files))
+        of_poses, unread = signatures(bodies, chosen, **reading)
+        failures = [*failures, *unread]
+    found = robustness(dataset, chosen, gallery=between, poses=of_poses, n_workers=n_workers)
+    print(robustness_table(found.movements))
+    for failure in failures:
+        print(f"not used: {failure.error}")
+    summary = {**found.as_dict(), "config": dataset.config.as_dict()}
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "robustness.json").write_text(json.dumps(summary, indent=2) + "\n")
+        write_notes(out / "notes.csv", dataset)
+        write_rows(out / "failures.csv", ("file", "error"), [(failure.id, failure.error) for failure in failures])
+        write_sources(out, dataset)
+        print(f"written to {out}")
+        if report:
+            write_report(out, n_workers=n_workers)
+    return summary

@@ -1,7 +1,5 @@
 """The scale of each descriptor: the median of its distances between generated bodies of one class."""
 
-from __future__ import annotations
-
 from functools import reduce
 from operator import or_
 

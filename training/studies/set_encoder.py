@@ -6,8 +6,6 @@ ROOT holds generated shapes (`GradedShapes(...).write(ROOT)`). Each split trains
 and scores those of the others. The whitened head of the histograms is fitted to the same classes.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from statistics import mean, stdev
 

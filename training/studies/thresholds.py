@@ -1,7 +1,5 @@
 """Quantiles of distances, and thresholds between pairs that are the same and others."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

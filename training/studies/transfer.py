@@ -1,9 +1,6 @@
 """How a metric that was fitted to generated shapes does on others: what pretrain.py prints."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from statistics import mean, stdev
 
 import torch
@@ -13,7 +10,6 @@ from igps.data.splits import split_seen
 from igps.nn.heads.base import Head
 from igps.nn.heads.closed_form import KernelHead
 from igps.retrieval import chi_square, retrieval_scores
-from training.studies.learned_figures import transfer_curve
 
 COLUMNS = ("nn", "ft", "st", "dcg")
 
@@ -24,27 +20,6 @@ def report(title: str, histograms: Tensor, labels: Tensor, head: Head) -> None:
     plain = retrieval_scores(chi_square(histograms, histograms), labels).mean()
     for name, found in (("plain", plain), ("pretrained", scores(head, histograms, labels))):
         print(f"{name:<12}" + "".join(f"{100 * found[column]:>7.1f}" for column in COLUMNS))
-
-
-def curve(
-    fit: Callable[[int, int], Head],
-    counts: Sequence[int],
-    histograms: Tensor,
-    labels: Tensor,
-    figure: Path,
-) -> None:
-    """Print and draw FT by the number of generated classes that a metric is fitted to, three draws of each.
-
-    Args:
-        fit: number of classes and seed of their draw to the metric.
-        counts: numbers of classes.
-        histograms, labels: of the shapes to measure on.
-        figure: path of the picture.
-    """
-    found = {n: [scores(fit(n, seed), histograms, labels)["ft"] for seed in range(3)] for n in counts}
-    for n, values in found.items():
-        print(f"{n:>4} generated classes: FT {' '.join(f'{100 * value:.1f}' for value in values)} (three draws)")
-    transfer_curve(found, retrieval_scores(chi_square(histograms, histograms), labels).mean()["ft"], figure)
 
 
 def scores(head: Head, histograms: Tensor, labels: Tensor) -> dict[str, float]:

@@ -1,16 +1,14 @@
 """A tube between two places of a body that face each other across a gap: what touching parts do to a scan."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from igps._arrays import Floats, Integers
 from igps.descriptors._geodesics import edge_graph, farthest_points
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import vertex_normals
@@ -48,7 +46,7 @@ def weld(mesh: Mesh, a: int, b: int) -> Mesh:
         if not 0 <= vertex < len(mesh.vertices):
             raise ValueError(f"{name}: expected a vertex index from 0 to {len(mesh.vertices) - 1}, got {vertex}.")
     neighbours = edge_graph(mesh)
-    best: tuple[float, int, int, NDArray[np.int64]] | None = None
+    best: tuple[float, int, int, Integers] | None = None
     faces_b = np.nonzero((mesh.faces == b).any(axis=1))[0]
     for i in np.nonzero((mesh.faces == a).any(axis=1))[0]:
         rim = mesh.faces[i]
@@ -152,7 +150,7 @@ class _GapSearch:
         points = (1 - along) * self._mesh.vertices[a] + along * self._mesh.vertices[b]
         return bool((winding_number(self._mesh.vertices, self._mesh.faces, points) < 0.5).all())
 
-    def _facing(self, largest_gap: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _facing(self, largest_gap: float) -> tuple[Integers, Floats]:
         pair = self._tree.query_pairs(largest_gap, output_type="ndarray").astype(np.int64).reshape(-1, 2)
         way = self._mesh.vertices[pair[:, 1]] - self._mesh.vertices[pair[:, 0]]
         gap = np.linalg.norm(way, axis=1)

@@ -91,7 +91,7 @@ def compare(
         for number, outcome in outcomes:
             bar.update()
             if isinstance(outcome, Failed):
-                found[number] = failure = dataset.failure(number % n, outcome)
+                found[number] = failure = Failure.of(dataset.bodies, number % n, outcome.reason)
                 named = f"{descriptors[number // n].name}: {failure.error}"
                 if strict:
                     raise MeshError(named)

@@ -40,11 +40,11 @@ class Explanation:
     # `igps.analysis.correspondence`; none is negative. None of two groups
     places: tuple[Shares, Shares] | None = None
 
-    def summary(self, most: int = 3) -> str:
-        """The largest shares in words."""
+    def summary(self) -> str:
+        """The three largest shares in words."""
         if self.distance < 1e-12:  # but for rounding
             return "no difference"
-        largest = sorted(self.parts.items(), key=lambda one: -abs(one[1]))[:most]
+        largest = sorted(self.parts.items(), key=lambda one: -abs(one[1]))[:3]
         return ", ".join(f"{share / self.distance:.0%} {name}" for name, share in largest)
 
 
@@ -73,19 +73,13 @@ def explain(descriptor: Descriptor, one: SignatureBatch, other: SignatureBatch) 
     if len(one) != 1 or len(other) != 1:
         raise ValueError(f"one, other: expected a body each, got {len(one)} and {len(other)}.")
     descriptor = copy.deepcopy(descriptor).double().eval()
-    histograms, contents = _histograms(descriptor), contents_of(descriptor)
-    pair = (_doubled(one), _doubled(other))
+    contents, pair = contents_of(descriptor), (_doubled(one), _doubled(other))
     first, second = torch.cat([contents(batch).detach().flatten(1) for batch in pair])
     units, distance = unit_shares(descriptor, first, second)
-    whole = _of_the_whole(descriptor, units * (first - second))
-    parts, samples = _shared(histograms, pair[0], units, whole)
-    others, samples_of_other = _shared(histograms, pair[1], -units, whole)
-    return Explanation(
-        distance,
-        {name: share + others[name] for name, share in parts.items()} | whole,
-        (samples, samples_of_other),
-        (_placed(one, other, samples, distance), _placed(other, one, samples_of_other, distance)),
-    )
+    shares = units * (first - second)
+    samples = _of_samples(descriptor, pair, units, shares)
+    places = _placed(one, other, samples[0], distance), _placed(other, one, samples[1], distance)
+    return Explanation(distance, _of_parts(descriptor, shares), samples, places)
 
 
 def _placed(body: SignatureBatch, other: SignatureBatch, samples: Shares, distance: float) -> Shares:
@@ -106,10 +100,9 @@ def unit_shares(descriptor: Descriptor, one: Tensor, other: Tensor) -> tuple[Ten
     The descriptor is in double precision, see `explain`; its contents are (cells,), see `contents_of`, whose numbers of
     side and size come apart as they are and not as roots.
     """
-    n, form = (
-        _n_cells(descriptor),
-        descriptor.descriptor if isinstance(descriptor, IndividualDescriptor) else descriptor,
-    )
+    n, form = _n_cells(descriptor), descriptor
+    if isinstance(descriptor, IndividualDescriptor):
+        form = descriptor.descriptor
     ends = torch.stack([one, other]).double()
     roots = torch.cat([ends[:, :n].sqrt(), ends[:, n:]], dim=1)
     middle, half = roots.mean(dim=0), (roots[0] - roots[1]) / 2
@@ -168,13 +161,17 @@ def _n_cells(descriptor: Descriptor) -> int:
     return sum(_histograms(descriptor).part_cells)
 
 
-def _of_the_whole(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
-    """The shares of side and size in the distance, where the descriptor keeps them, from those of all contents."""
+def _of_parts(descriptor: Descriptor, shares: Tensor) -> dict[str, float]:
+    """The share of each histogram in the distance, and of side and size where these are kept, from those of cells."""
+    parts = [part for group in _histograms(descriptor).parts for part in group]
+    own, found = shares[: _n_cells(descriptor)].split([part.n_cells for part in parts]), dict[str, float]()
+    for part, values in zip(parts, own, strict=True):
+        found[part_name(part)] = found.get(part_name(part), 0.0) + float(values.sum())
     form, side, size = (shares[None], *shares.new_empty(2, 1, 0))
     if isinstance(descriptor, IndividualDescriptor):
         form, side, size = descriptor.split(shares[None])
     told = {"side": side, "size": torch.cat([form[:, _n_cells(descriptor) :], size], dim=1)}
-    return {name: float(values.sum()) for name, values in told.items() if values.numel()}
+    return found | {name: float(values.sum()) for name, values in told.items() if values.numel()}
 
 
 def _doubled(batch: SignatureBatch) -> SignatureBatch:
@@ -188,30 +185,30 @@ def _doubled(batch: SignatureBatch) -> SignatureBatch:
     return replace(batch, interior=weighted(batch.interior), surface=weighted(batch.surface))
 
 
-def _shared(
-    histograms: HistogramDescriptor, batch: SignatureBatch, units: Tensor, whole: Mapping[str, float]
-) -> tuple[dict[str, float], Shares]:
-    """The shares of each histogram and of each sample of a body in the distance; half of `whole` is the body's."""
-    weights = [getattr(batch, kind).attributes[WEIGHT] for kind in SAMPLE_KINDS]
-    totals = [torch.zeros_like(one) for one in weights]
-    features, parts, first = BatchFeatures(batch, False), dict[str, float](), 0
-    for group in histograms.parts:
-        for part in group:
-            share = 1 / (len(histograms.parts) * len(group)) if len(histograms.histograms) > 1 else 1.0
-            values = share * part.of_features(features).flatten() @ units[first : first + part.n_cells]
-            first += part.n_cells
-            name = part_name(part)
-            parts[name] = parts.get(name, 0.0) + float(values.detach())
-            if not values.requires_grad:
-                raise ValueError(
-                    f"descriptor: {type(part).__name__} does not heed weights of samples, see DescriptionPart."
-                )
-            found = torch.autograd.grad(values, weights, allow_unused=True, retain_graph=True)
-            for total, gradient in zip(totals, found, strict=True):
-                total += 0 if gradient is None else gradient / part.degree
-    everywhere = sum(whole.values()) / 4  # half in each body, of that half in each kind of samples
-    samples = {kind: total[0].detach().numpy() for kind, total in zip(SAMPLE_KINDS, totals, strict=True)}
-    return parts, {kind: values + everywhere / len(values) for kind, values in samples.items()}
+def _of_samples(
+    descriptor: Descriptor, pair: Sequence[SignatureBatch], units: Tensor, shares: Tensor
+) -> tuple[Shares, Shares]:
+    """The share of each sample of two bodies in the distance, from those of the units and of all contents."""
+    # Those of side and size: half in each body, of that half in each kind of samples
+    everywhere = float(shares[_n_cells(descriptor) :].sum()) / 4
+    histograms, found = _histograms(descriptor), list[Shares]()
+    for batch, signed in zip(pair, (units, -units), strict=True):
+        weights = [getattr(batch, kind).attributes[WEIGHT] for kind in SAMPLE_KINDS]
+        features, total, first = BatchFeatures(batch, False), units.new_zeros(()), 0
+        for group in histograms.parts:
+            for part in group:
+                cells = part.of_features(features).flatten() / (len(histograms.parts) * len(group))
+                values = cells @ signed[first : first + part.n_cells]
+                first += part.n_cells
+                if not values.requires_grad:
+                    raise ValueError(
+                        f"descriptor: {type(part).__name__} does not heed weights of samples, see DescriptionPart."
+                    )
+                total = total + values / part.degree
+        gradients = torch.autograd.grad(total, weights, allow_unused=True, materialize_grads=True)
+        own = zip(SAMPLE_KINDS, (one[0].numpy() for one in gradients), strict=True)
+        found.append({kind: values + everywhere / len(values) for kind, values in own})
+    return found[0], found[1]
 
 
 _AXES = {
@@ -285,13 +282,7 @@ def explain_groups(
     kept = significant_cells(*(torch.cat([group[:, :n].sqrt(), group[:, n:]], dim=1) for group in rows), **test)
     means = [group.mean(dim=0) for group in rows]
     units = torch.where(kept, unit_shares(descriptor, *means)[0], 0)
-    shares, histograms = units * (means[0] - means[1]), _histograms(descriptor)
-    whole = _of_the_whole(descriptor, shares)
-    shared = [_shared(histograms, _doubled(b), sign * units, whole) for b, sign in zip(batches, (1, -1), strict=True)]
-    parts, first = dict[str, float](), 0
-    for part in (part for group in histograms.parts for part in group):
-        share = float(shares[first : first + part.n_cells].sum())
-        first += part.n_cells
-        parts[part_name(part)] = parts.get(part_name(part), 0.0) + share
-    parts |= whole
-    return Explanation(sum(parts.values()), parts, (shared[0][1], shared[1][1])), kept
+    shares = units * (means[0] - means[1])
+    parts = _of_parts(descriptor, shares)
+    samples = _of_samples(descriptor, [_doubled(batch) for batch in batches], units, shares)
+    return Explanation(sum(parts.values()), parts, samples), kept

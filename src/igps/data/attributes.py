@@ -88,10 +88,8 @@ def _takes_body(function: Callable[..., Any]) -> bool:
         given = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
         return False
-    return (
-        sum(one.default is one.empty and one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in given)
-        == 2
-    )
+    by_place = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
+    return sum(one.kind in by_place and one.default is one.empty for one in given) == 2
 
 
 def split_attributes(

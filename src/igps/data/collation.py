@@ -51,14 +51,14 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
     ]
     wanted += [[np.float64(getattr(s, name)) for s in signatures] for name in ("area", "volume")]
     wanted.append([np.int64(item.label) for item in labelled])
-    rooms = [[s.interior for s in signatures], [s.surface for s in signatures]]
-    for room in rooms:
-        wanted += _of_samples(room)
+    of_kinds = [[s.interior for s in signatures], [s.surface for s in signatures]]
+    for samples in of_kinds:
+        wanted += _of_samples(samples)
     eigenvalues, area, volume, labels, *tensors = _padded(wanted)
     rest = iter(tensors)
     interior, surface = (
-        SampleBatch(next(rest), next(rest), next(rest), {name: next(rest) for name in sorted(room[0].attributes)})
-        for room in rooms
+        SampleBatch(next(rest), next(rest), next(rest), {name: next(rest) for name in sorted(samples[0].attributes)})
+        for samples in of_kinds
     )
     ids, units = tuple(item.id for item in labelled), tuple(s.unit for s in signatures)
     given = None if meshes is None else tuple(meshes)

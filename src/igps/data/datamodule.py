@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
 import torch
 from pytorch_lightning import LightningDataModule
 from pytorch_lightning.core.mixins.hparams_mixin import _given_hyperparameters
 from torch.utils.data import DataLoader, Sampler
 
-from igps._parameters import check_at_least
+from igps._parameters import check_at_least, check_one_of
 from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.collation import collate
 from igps.data.dataset import SignatureDataset
@@ -80,8 +81,7 @@ class SignatureDataModule(LightningDataModule):
         evaluation_batch_size: int = 16,
     ) -> None:
         super().__init__()
-        if protocol not in ("seen", "unseen"):
-            raise ValueError(f"protocol: expected 'seen' or 'unseen', got {protocol!r}.")
+        check_one_of(get_args(SplitProtocol), protocol=protocol)
         if protocol == "seen" and n_test is not None:
             raise ValueError("n_test: expected None with protocol 'seen', which tests all shapes not trained on.")
         check_at_least(2, n_samples_in_memory=n_samples_in_memory)

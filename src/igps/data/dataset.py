@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from igps._parallel import Failed, Limits
+from igps._parallel import Limits
 from igps.data.attributes import AttributeSource, PointFunction, split_attributes, with_attribute
 from igps.data.batch import Indices, LabelledSignature, SignatureBatch, resolve_indices, scalar_index
 from igps.data.cache import SignatureCache, default_cache_dir
@@ -294,7 +294,3 @@ class SignatureDataset(Dataset[LabelledSignature]):
             return list(self._hits)
         found = find_cached(self.pipeline, self.bodies)
         return [known or hit for known, hit in zip(self._hits, found, strict=True)]
-
-    def failure(self, index: int, failed: Failed) -> Failure:
-        """What failed of a body, in a sentence that names its file."""
-        return Failure.of(self.bodies, index, failed)

@@ -39,9 +39,9 @@ class Failure:
     error: str
 
     @staticmethod
-    def of(bodies: Bodies, i: int, failed: Failed) -> Failure:
+    def of(bodies: Bodies, i: int, reason: str) -> Failure:
         """What failed of a body, in a sentence that names its file."""
-        path, reason = bodies.paths[i], failed.reason
+        path = bodies.paths[i]
         return Failure(bodies.names[i], path, reason if reason.startswith(str(path)) else f"{bodies[i]}: {reason}")
 
 
@@ -68,7 +68,7 @@ def fill(
             for i, outcome in outcomes:
                 bar.update()
                 if isinstance(outcome, Failed):
-                    failures[i] = Failure.of(bodies, i, outcome)
+                    failures[i] = Failure.of(bodies, i, outcome.reason)
                     if strict:
                         raise MeshError(failures[i].error)
                     logger.warning("skipped: %s", failures[i].error)

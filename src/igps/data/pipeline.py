@@ -273,7 +273,7 @@ def _parameters(
 
 @lru_cache
 def _serving(config: SignatureConfig) -> tuple[SignatureConfig, ...]:
-    """Those whose Signatures serve, for thousands of files the same."""
+    """The configurations whose Signatures hold those of this one; the same for thousands of files."""
     return (config, *config.larger())
 
 

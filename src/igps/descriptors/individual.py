@@ -103,8 +103,7 @@ class IndividualDescriptor(Descriptor):
     def distances(self, queries: Tensor, gallery: Tensor) -> Tensor:
         """(Q, D) and (G, D) descriptions to (Q, G) distances."""
         (form, side, size), (forms, sides, sizes) = self.split(queries), self.split(gallery)
-        shape = self.descriptor.description_shape
-        found = self.descriptor.distances(form.unflatten(1, shape), forms.unflatten(1, shape))
+        found = self.descriptor.distances(form, forms)
         if self.twists is not None:
             found = found + euclidean(side, sides)
         if self.keeps_size:
@@ -115,9 +114,7 @@ class IndividualDescriptor(Descriptor):
     def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
         """(N, D) descriptions to the coordinates of the descriptor, and the numbers of side and size."""
         form, *others = self.split(descriptions)
-        shape = self.descriptor.description_shape
-        form = self.descriptor.coordinates(form.unflatten(1, shape), of_one_kind=of_one_kind)
-        return torch.cat([form, *others], dim=1)
+        return torch.cat([self.descriptor.coordinates(form, of_one_kind=of_one_kind), *others], dim=1)
 
     def short(self, descriptions: Tensor) -> Tensor:
         """(N, D) descriptions to (N, ≤ 256 + 55): those of the descriptor, or a ValueError, and of side and size."""
@@ -132,12 +129,12 @@ class IndividualDescriptor(Descriptor):
         return found
 
     def split(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(N, D) descriptions split into the descriptor's own, and the numbers of side and of size, perhaps none."""
+        """(N, D) descriptions split into the descriptor's own, in its shape, and the numbers of side and of size."""
         n_volumes = math.comb(_N_VECTORS, 3)
         n_size, n_side = 2 * self.keeps_size, 0 if self.twists is None else n_volumes + self.twists.n_cells // 2
         n_form = descriptions.shape[1] - n_side - n_size
         form, side, size = descriptions.split([n_form, n_side, n_size], dim=1)
-        return form, side, size
+        return form.unflatten(1, self.descriptor.description_shape), side, size
 
 
 def signed_volumes(batch: SignatureBatch) -> Tensor:

@@ -14,9 +14,6 @@ from igps.nn.histograms.pairs import PairHistogram
 from igps.retrieval import chi_square
 from igps.signature.residue_attributes import RESIDUE_KINDS
 
-MOLECULAR_ATTRIBUTES = ("residue_shares", "charge", "screened_potential", "hydropathy")
-"""What `molecular` needs of the interior samples, see `igps.signature.residue_attributes`."""
-
 # Centres of classes: elementary charges, kT/e, and units of the scale of Kyte and Doolittle.
 _CENTRES = {
     "charge": (-0.2, -0.05, 0.05, 0.2),
@@ -66,9 +63,6 @@ class Shares(PointAxis):
         self.memberships(values[mask])
         return largest_members(values, mask)
 
-    def extra_repr(self) -> str:
-        return f"{self.name!r}, {self.n_classes}"
-
 
 class SizedHistograms(HistogramDescriptor):
     """Histograms and the size of a body: χ² distances d become d·s / (0.3 + s) by the difference s in size.
@@ -103,8 +97,7 @@ def molecular(*, size: bool = True) -> HistogramDescriptor:
     """Interior distances of pairs of samples by the kinds of the residues around them, their charges and hydropathy.
 
     Two parts of equal share: distances by the pairs of 25 kinds of residues; and distances by the classes of charge, of
-    screened potential, and of hydropathy. The layout was chosen on halves of 39 proteins; see the documentation. The
-    samples need `MOLECULAR_ATTRIBUTES`.
+    screened potential, and of hydropathy. The layout was chosen on halves of 39 proteins; see the documentation.
 
     Source: Rustamov 2010, section 4, for what is known inside as a further dimension; Kyte and Doolittle 1982.
 

@@ -14,9 +14,7 @@ _ELECTROSTATIC_POTENTIAL = (2.4, 2.8, 3.2, 3.6)
 _N_KNOTS = 12
 
 
-def rich(
-    *, learnable: bool = False, n_samples: int | None = None, n_training_samples: int | None = None
-) -> HistogramDescriptor:
+def rich(*, learnable: bool = False, n_training_samples: int | None = None) -> HistogramDescriptor:
     """Interior distances joined with all else there is, in three parts.
 
     The histograms with Euclidean distances, depth and electrostatic potential of the samples; how interior samples lie
@@ -25,18 +23,15 @@ def rich(
     Args:
         learnable: whether the centres of bins and classes and the spectral filters, one for each histogram, are
             parameters; the classes are soft ones then.
-        n_samples: of each histogram; by default as many as it needs.
         n_training_samples: of each histogram, see `PairHistogram`.
     """
     # Fixed embeddings are the same for all, and computed once; learned filters go their own way.
     fixed = {n: SpectralEmbedding(n_eigenpairs=n) for n in (50, 16)}
 
-    def embedding(n_eigenpairs: int) -> SpectralEmbedding:
-        return SpectralEmbedding(n_eigenpairs=n_eigenpairs, n_knots=_N_KNOTS) if learnable else fixed[n_eigenpairs]
-
-    def histogram(n_eigenpairs: int, *axes: PointAxis | PairAxis) -> PairHistogram:
-        n = n_samples or N_SAMPLES
-        return PairHistogram(axes, embedding(n_eigenpairs), n_samples=n, n_training_samples=n_training_samples)
+    def histogram(n_eigenpairs: int, *axes: PointAxis | PairAxis, n_samples: int = N_SAMPLES) -> PairHistogram:
+        learned = SpectralEmbedding(n_eigenpairs=n_eigenpairs, n_knots=_N_KNOTS) if learnable else None
+        embedding = learned or fixed[n_eigenpairs]
+        return PairHistogram(axes, embedding, n_samples=n_samples, n_training_samples=n_training_samples)
 
     potential = partial(Potential, learnable=learnable)
     distance = partial(InteriorDistance, learnable=learnable)
@@ -44,9 +39,11 @@ def rich(
     cosines = partial(PairCosines, 5, learnable=learnable)
     depth = partial(Attribute, "depth", _DEPTH, learnable=learnable)
     charge = Attribute("electrostatic_potential", _ELECTROSTATIC_POTENTIAL, learnable=learnable)
-    n, m = n_samples or N_ORIENTED_SAMPLES, n_training_samples
-    oriented = PairHistogram([distance(6, 3.0), cosines()], embedding(50), n_samples=n, n_training_samples=m)
-    on_surface = PairHistogram([euclidean(6, 1.0), cosines()], fixed[50], "surface", n_samples=n, n_training_samples=m)
+    n = N_ORIENTED_SAMPLES
+    oriented = histogram(50, distance(6, 3.0), cosines(), n_samples=n)
+    on_surface = PairHistogram(
+        [euclidean(6, 1.0), cosines()], fixed[50], "surface", n_samples=n, n_training_samples=n_training_samples
+    )
     return HistogramDescriptor(
         [
             [

@@ -30,17 +30,14 @@ class WithAttributes(Descriptor):
     Args:
         descriptor: any whose scale is known.
         attributes: names of scalars.
-        weights: of each attribute; 1 if None.
+        weights: of each attribute.
 
     Raises:
         ValueError: the descriptor's scale is not known, or a weight is not positive.
     """
 
-    def __init__(
-        self, descriptor: Descriptor, attributes: Sequence[str], weights: Sequence[float] | None = None
-    ) -> None:
+    def __init__(self, descriptor: Descriptor, attributes: Sequence[str], weights: Sequence[float]) -> None:
         super().__init__()
-        weights = [1.0] * len(attributes) if weights is None else weights
         scale = scale_of(descriptor)
         if scale is None or not all(0 < weight < float("inf") for weight in weights):
             raise ValueError(

@@ -21,7 +21,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from igps._arrays import Floats, Integers
-from igps._parallel import Failed, on_threads
+from igps._parallel import on_threads
 from igps.data.dataset import Failure, SignatureDataset
 from igps.gallery._alignment import SurfaceSamples, TriangleSurface, offset_in_place, surface_distance
 from igps.gallery._moments import moments
@@ -236,5 +236,5 @@ class Surfaces:
         try:
             yield
         except MeshError as error:
-            self.failures[i] = self._dataset.failure(i, Failed(str(error)))
+            self.failures[i] = Failure.of(self._dataset.bodies, i, str(error))
             raise

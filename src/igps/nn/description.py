@@ -167,7 +167,7 @@ def _on_threads(
             return list(describe_timed((descriptor, dataset.subset(indices), device))[0])
         except ValueError as error:
             if len(indices) == 1:
-                return [dataset.failure(indices[0], Failed(str(error)))]
+                return [Failure.of(dataset.bodies, indices[0], str(error))]
             return [outcome for i in indices for outcome in outcomes([i])]
 
     n_threads = (n_workers or n_cores()) if device.type == "cpu" else 1
@@ -181,7 +181,8 @@ def _on_processes(
     jobs = [(descriptor, dataset.subset([i]), torch.device("cpu")) for i in indices]
     for number, outcome in run(describe_timed, jobs, n_workers=n_workers):
         i = indices[number]
-        yield [i], [dataset.failure(i, outcome) if isinstance(outcome, Failed) else outcome[0][0]]
+        one = Failure.of(dataset.bodies, i, outcome.reason) if isinstance(outcome, Failed) else outcome[0][0]
+        yield [i], [one]
 
 
 def describe_timed(job: tuple[nn.Module, SignatureDataset, torch.device]) -> tuple[Singles, float]:

@@ -209,6 +209,7 @@ class HistogramDescriptor(Descriptor):
         if not groups or not all(groups):
             raise ValueError("histograms: expected at least one in each part, got none.")
         self.histograms = nn.ModuleList(histogram for group in groups for histogram in group)
+        # Histograms in each part; None where a single one is given, which keeps its shape in descriptions
         self._sizes = None if isinstance(histograms, DescriptionPart) else tuple(len(group) for group in groups)
         self.name, self.source, self.invariant_to = name, source, tuple(invariant_to)
         self.requirements = reduce(or_, (histogram.requirements for group in groups for histogram in group))

@@ -138,10 +138,6 @@ class SpectralEmbedding(Specified):
         weights = self.weights(eigenvalues[..., : self.n_eigenpairs], area)
         return _weigh(eigenfunctions[..., : self.n_eigenpairs], weights)
 
-    def extra_repr(self) -> str:
-        n_knots = 0 if self.log_gain is None else len(self.log_gain)
-        return f"kind={self.kind!r}, time={self.time}, n_eigenpairs={self.n_eigenpairs}, n_knots={n_knots}"
-
 
 def _weigh(eigenfunctions: Tensor, weights: Tensor) -> Tensor:
     dtype = torch.promote_types(eigenfunctions.dtype, torch.float32)

@@ -47,6 +47,17 @@ class Specified(nn.Module):
         made.__dict__["_made_with"] = arguments, options
         return made
 
+    def made_with(self) -> dict[str, Any]:
+        """The arguments that it was made with, by name."""
+        arguments, options = self.__dict__["_made_with"]
+        return inspect.signature(type(self)).bind(*arguments, **options).arguments
+
+    def extra_repr(self) -> str:
+        """Those that are numbers or words; PyTorch shows the modules."""
+        return ", ".join(
+            f"{name}={one!r}" for name, one in self.made_with().items() if isinstance(one, int | float | str)
+        )
+
 
 def specification(module: nn.Module) -> dict[str, Any]:
     """A module of the library as `class_path` and `init_args`, for JSON or YAML; parameters are not in it.
@@ -74,9 +85,7 @@ def specification(module: nn.Module) -> dict[str, Any]:
         if not isinstance(value, Specified) or not _CLASS.fullmatch(path):
             raise ValueError(f"descriptor: expected to be made of modules of igps and numbers, got {path} in it.")
         written.append(value)
-        arguments, options = value.__dict__["_made_with"]
-        given = inspect.signature(type(value)).bind(*arguments, **options).arguments
-        return {"class_path": path, "init_args": {name: words(one) for name, one in given.items()}}
+        return {"class_path": path, "init_args": {name: words(one) for name, one in value.made_with().items()}}
 
     found: dict[str, Any] = words(module)
     return found

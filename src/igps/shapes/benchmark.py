@@ -14,7 +14,7 @@ from igps._arrays import Floats, Integers
 from igps._files import whole_file
 from igps._parameters import check_at_least
 from igps.shapes.meshing import defect, mesh, roughen
-from igps.shapes.skeleton import Skeleton, pose
+from igps.shapes.skeleton import pose
 from igps.shapes.templates import TEMPLATES
 
 _VERSION = 1  # raised whenever the same arguments would give other meshes
@@ -53,16 +53,13 @@ class ArticulatedShapes:
         ValueError: an argument is out of range, or (on access) a shape cannot be made at this resolution.
     """
 
-    most_classes: int | None = len(TEMPLATES)
-
     def __init__(self, n_classes: int = 8, n_per_class: int = 10, seed: int = 0, n_vertices: int = 3000) -> None:
         check_at_least(1, n_classes=n_classes, n_per_class=n_per_class)
         check_at_least(0, seed=seed)
         check_at_least(500, n_vertices=n_vertices)
-        if self.most_classes is not None and n_classes > self.most_classes:
-            raise ValueError(f"n_classes must be at most {self.most_classes}, got {n_classes}")
+        if n_classes > len(TEMPLATES):
+            raise ValueError(f"n_classes must be at most {len(TEMPLATES)}, got {n_classes}")
         self.n_classes, self.n_per_class, self.seed, self.n_vertices = n_classes, n_per_class, seed, n_vertices
-        self._skeletons: dict[int, Skeleton] = {}
 
     def __len__(self) -> int:
         return self.n_classes * self.n_per_class
@@ -75,7 +72,7 @@ class ArticulatedShapes:
     @property
     def class_names(self) -> list[str]:
         """The unique names of the classes, in order."""
-        return [self._class_name(index) for index in range(self.n_classes)]
+        return list(TEMPLATES)[: self.n_classes]
 
     @property
     def labels(self) -> list[str]:
@@ -94,17 +91,9 @@ class ArticulatedShapes:
             raise IndexError(f"index must lie in [{-len(self)}, {len(self)}), got {index}")
         return self._generate(*divmod(position % len(self), self.n_per_class))
 
-    def _class_name(self, index: int) -> str:
-        return list(TEMPLATES)[index]
-
-    def _skeleton(self, index: int) -> Skeleton:
-        return list(TEMPLATES.values())[index]()
-
     def _generate(self, class_index: int, number: int) -> GeneratedShape:
-        if class_index not in self._skeletons:
-            self._skeletons[class_index] = self._skeleton(class_index)
-        skeleton = self._skeletons[class_index]
-        label = self._class_name(class_index)
+        label = list(TEMPLATES)[class_index]
+        skeleton = TEMPLATES[label]()
         name = f"{label}/{number:02d}"
         motion = np.random.default_rng([self.seed, _MOTION, class_index, number])
         rotation = np.asarray(Rotation.from_quat(motion.normal(size=4)).as_matrix())

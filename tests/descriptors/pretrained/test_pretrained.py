@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn.functional import normalize
 from training.graded import GradedShapes
+from training.studies.pretraining import save_pretrained
 
 import igps
 from igps import Mesh, collate
@@ -24,7 +25,6 @@ from igps.descriptors.pretrained.descriptor import (
     pretrained,
     pretrained_head,
     pretrained_parts,
-    save_pretrained,
 )
 from igps.descriptors.rich import rich
 from igps.nn.description import describe

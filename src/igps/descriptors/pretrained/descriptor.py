@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 from igps.descriptors.multiscale import N_ORIENTED_SAMPLES
 from igps.descriptors.pretrained.axial_histogram import AxialHistogram
@@ -79,8 +79,8 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
 
     It needs no label of the shapes that it compares: by the head's distance, other poses of a body come first, then
     other bodies of its class. The head's `short` makes vectors of 256 numbers of its 1,210. The model card is in the
-    documentation. The parameters are those of a file that `save_pretrained` wrote, a FileNotFoundError without one, and
-    a ValueError where it holds others.
+    documentation. The parameters are those of a file that training/pretrain.py wrote, a FileNotFoundError without one,
+    and a ValueError where it holds others.
     """
     module = EmbeddedDescriptor(
         pretrained_parts(),
@@ -94,12 +94,3 @@ def pretrained(path: str | Path = PRETRAINED) -> EmbeddedDescriptor:
     except RuntimeError as error:
         raise ValueError(f"{path}: expected the parameters of `pretrained` of this version, got others.") from error
     return module.eval()
-
-
-def save_pretrained(module: EmbeddedDescriptor, path: str | Path) -> None:
-    """Write a fitted `pretrained_parts` under `pretrained_head` to a safetensors file, the head in half precision."""
-    state = {
-        name: (tensor.half() if name.startswith("head.") and tensor.is_floating_point() else tensor).contiguous()
-        for name, tensor in module.state_dict().items()
-    }
-    save_file(state, path)

@@ -18,35 +18,24 @@ _VECTOR = 32
 
 
 class Axes(NamedTuple):
-    """K axes, of which R have values and 3 S are cosines.
+    """K axes, of which R have values and 3 S are cosines."""
 
-    kinds: in order, `VALUES`, `DISTANCES`, or `COSINES`, which are three axes.
-    norms: (R, P) squared lengths of the points of axes of distances.
-    oriented: (S, 2, D, P) for each three axes of cosines the points, and their directions of length 1.
-    centres: (K, B) ascending, of each axis its own number of them, and n_centres (K,) how many these are.
-    inverse: (K, B − 1) one over the gaps between centres; where these are equal (K,), the first is over their mean.
-    """
-
-    kinds: Integers
-    norms: Numbers
-    oriented: Numbers
-    centres: Numbers
-    n_centres: Integers
-    inverse: Numbers
-    equal: Booleans
+    kinds: Integers  # in order, `VALUES`, `DISTANCES`, or `COSINES`, which are three axes
+    norms: Numbers  # (R, P) squared lengths of the points of axes of distances
+    oriented: Numbers  # (S, 2, D, P) for each three axes of cosines the points, and their directions of length 1
+    centres: Numbers  # (K, B) ascending, of each axis its own number of them
+    n_centres: Integers  # (K,) how many these are
+    inverse: Numbers  # (K, B − 1) one over the gaps between centres; where they are equal, the first is over the mean
+    equal: Booleans  # (K,) whether these gaps are equal
 
 
 class Row(NamedTuple):
-    """What is found of the pairs of a row, a number for each of J columns.
+    """What is found of the pairs of a row, a number for each of J columns."""
 
-    cells: below their values. shares: (K, J), how far each value is on the way from the centre below to that above.
-    features: (S, 5, J), see `cosines`. interval: room.
-    """
-
-    cells: Places
-    shares: Numbers
-    features: Numbers
-    interval: Places
+    cells: Places  # (J,) below their values
+    shares: Numbers  # (K, J) how far each value is on the way from the centre below to that above
+    features: Numbers  # (S, 5, J) see `cosines`
+    interval: Places  # (J,) room
 
 
 @compiled()

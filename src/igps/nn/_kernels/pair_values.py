@@ -16,18 +16,13 @@ class PairValues:
     """One or several values of every pair of points, and the centres of the bins that each is sorted into.
 
     A value must be the same whichever point comes first.
-
-    Args:
-        inputs: (N, P, ...) or (P, ...) each, what the values are computed from; finite.
-        centres: (B,) ascending, one of each value.
-        between: the inputs of I points, (N, I, ...) each, and of J others to the values (N, k, I, J); differentiable.
-        kinds: how compiled loops get the values, see `pair_loops`; left out, they are what `between` gives.
     """
 
-    inputs: tuple[Tensor, ...]
-    centres: tuple[Tensor, ...]
+    inputs: tuple[Tensor, ...]  # (N, P, ...) or (P, ...) each, what the values are computed from; finite
+    centres: tuple[Tensor, ...]  # (B,) ascending, one of each value
+    # The inputs of I points, (N, I, ...) each, and of J others to the values (N, k, I, J); differentiable
     between: Callable[[Inputs, Inputs], Tensor]
-    kinds: tuple[int, ...] = ()
+    kinds: tuple[int, ...] = ()  # how compiled loops get the values, see `pair_loops`; if none, as `between` gives them
 
     def __post_init__(self) -> None:
         if not self.kinds:

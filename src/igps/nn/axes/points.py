@@ -141,9 +141,6 @@ class BallRadius(PointAxis):
             raise ValueError("samples: expected surface samples, which balls touch, got interior ones.")
         return features.ball_radii()[..., _SIDES.index(self.side)].log()
 
-    def extra_repr(self) -> str:
-        return repr(self.side)
-
 
 class Attribute(PointAxis):
     """Classes of a scalar attribute of the samples: "depth", "electrostatic_potential", or one of your own.
@@ -211,9 +208,6 @@ class Attribute(PointAxis):
         if values.ndim != 2:
             raise ValueError(f"attributes: expected a scalar to split by, but {self.name!r} is a direction.")
         return values
-
-    def extra_repr(self) -> str:
-        return repr(self.name)
 
 
 def attribute_requirements(name: str) -> Requirements:

@@ -61,12 +61,13 @@ class Head(Specified, ABC):
             if stored is not None and stored.shape != buffer.shape and stored.ndim == buffer.ndim:
                 setattr(self, name, buffer.new_zeros(stored.shape))
         super()._load_from_state_dict(state_dict, prefix, *arguments)
-        self._note_parts()
+        self._note_buffers()
 
-    def _note_parts(self) -> None:
-        """Keep as numbers what buffers say of shapes: on a device to read them waits, and what is traced cannot."""
-        cells = dict(self.named_buffers(recurse=False)).get("part_cells")
-        self._cells: list[int] = [] if cells is None else cells.tolist()  # a list: no part of a fingerprint
+    def _note_buffers(self) -> None:
+        """Keep as numbers what buffers say of sizes: on a device to read them waits, and what is traced cannot."""
+        buffers = self.named_buffers(recurse=False)
+        # In a dictionary, which is no part of a fingerprint
+        self._noted: dict[str, Any] = {name: one.tolist() for name, one in buffers if name in ("part_cells", "lengths")}
 
     def _not_fitted(self) -> RuntimeError:
         return RuntimeError(f"{type(self).__name__}: expected to be fitted first. Call fit(descriptions, labels).")

@@ -106,8 +106,8 @@ class WhitenedHead(Head):
         """Take the mean alone from histograms (N, ...), and damp nothing: for shapes without labels, or one a class."""
         roots = square_roots(descriptions)
         self.part_cells = checked_parts(roots, part_cells)
-        self._note_parts()
-        n_parts = len(self._cells)
+        self._note_buffers()
+        n_parts = len(self.part_cells)
         self.mean = roots.mean(dim=0)
         self.directions = roots.new_zeros(self.n_directions, roots.shape[1])
         self.gains = roots.new_ones(n_parts, self.n_directions)
@@ -145,7 +145,7 @@ class WhitenedHead(Head):
 
     def parts(self, cells: Tensor) -> tuple[Tensor, ...]:
         """Views of (N, D) values, one of each part."""
-        return cells.split(self._cells, dim=1)
+        return cells.split(self._noted["part_cells"], dim=1)
 
 
 class KernelHead(Head):
@@ -261,7 +261,7 @@ class KernelHead(Head):
 
     def _distances(self, vectors: Tensor) -> Tensor:
         """(kernels, N, n_shapes) distances to the training shapes: cosine's of the parts, and the prior's own."""
-        sizes, both = self.whitened._cells, (vectors, self.anchors.to(vectors.dtype))
+        sizes, both = self.whitened._noted["part_cells"], (vectors, self.anchors.to(vectors.dtype))
         split = [one.split([*sizes, one.shape[1] - sum(sizes)], dim=1) for one in both]
         found = [1 - one @ other.T for one, other in list(zip(*split, strict=True))[: len(sizes)]]
         if self.prior is not None:

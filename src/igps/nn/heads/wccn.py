@@ -68,7 +68,7 @@ class WCCNHead(Head):
         self.register_buffer("directions", torch.zeros(n_directions, 0))
         self.register_buffer("part_cells", torch.zeros(0, dtype=torch.long))
         self.register_buffer("lengths", torch.tensor(lengths))
-        self._note_parts()
+        self._note_buffers()
 
     @torch.no_grad()
     def fit(self, descriptions: Tensor, labels: Tensor, part_cells: Sequence[int] | None = None) -> Self:
@@ -76,7 +76,7 @@ class WCCNHead(Head):
         roots = square_roots(descriptions)
         members = class_members(roots, labels)
         self.part_cells = checked_parts(roots, part_cells)
-        self._note_parts()
+        self._note_buffers()
         n_parts = len(self.part_cells)
         if self._parts is not None and not set(self._parts) <= set(range(n_parts)):
             raise ValueError(f"parts: expected some of 0 to {n_parts - 1}, got {self._parts}.")
@@ -97,9 +97,9 @@ class WCCNHead(Head):
         roots = square_roots(descriptions)
         if not len(self.mean):
             raise self._not_fitted()
-        check_cells(roots, sum(self._cells))
+        check_cells(roots, sum(self._noted["part_cells"]))
         projected = [part @ directions[: part.shape[1]].T for part, directions in self._by_part(self._seen(roots))]
-        if not sum(self._n_heights):
+        if not self._noted["lengths"]:
             projected = [functional.normalize(part, dim=1) for part in projected]
             return functional.normalize(torch.cat(projected, dim=1), dim=1)
         vectors = torch.cat(projected, dim=1)
@@ -116,7 +116,7 @@ class WCCNHead(Head):
     @property
     def n_numbers(self) -> int:
         """D of the vectors, once fitted."""
-        return self.n_compared + sum(self._n_heights)
+        return self.n_compared + self._noted["lengths"]
 
     def _directions(self, part: Tensor, members: Tensor) -> Tensor:
         """(k, cells) that whiten a centred part (N, cells) and keep what tells classes apart."""
@@ -130,11 +130,8 @@ class WCCNHead(Head):
 
     def _sizes(self) -> list[int]:
         """Cells of each part that it looks at."""
-        return [self._cells[i] for i in self._parts or range(len(self._cells))]
-
-    def _note_parts(self) -> None:
-        super()._note_parts()
-        self._n_heights = [int(self.lengths)]
+        cells: list[int] = self._noted["part_cells"]
+        return cells if self._parts is None else [cells[i] for i in self._parts]
 
     def _by_part(self, seen: Tensor) -> list[tuple[Tensor, Tensor]]:
         """(N, cells) centred, and the (n_directions, cells) directions, of each part in `_seen` roots."""
@@ -146,5 +143,5 @@ class WCCNHead(Head):
         """(N, cells) of the parts that it looks at."""
         if self._parts is None:
             return roots
-        parts = roots.split(self._cells, dim=1)
+        parts = roots.split(self._noted["part_cells"], dim=1)
         return torch.cat([parts[i] for i in self._parts], dim=1)
