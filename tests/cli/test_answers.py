@@ -104,7 +104,7 @@ def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(
     assert found["permanova_p"] <= 3 / 128  # the swap of all pairs does as well, and one or two may be drawn more often
 
 
-@pytest.mark.parametrize("name", ["{group}{i}", "{i}"])
+@pytest.mark.parametrize("name", ["{group}{i}", "{i}", "case_{i}", "{word}"])
 def test_single_masks_in_a_folder_for_each_group_are_compared(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -115,7 +115,8 @@ def test_single_masks_in_a_folder_for_each_group_are_compared(
         (folder := tmp_path / "masks" / group).mkdir(parents=True)
         for i in range(5):
             inside = (place[0] / (side + 0.2 * i)) ** 2 + (place[1] / 7) ** 2 + (place[2] / 7) ** 2 <= 1
-            path = folder / f"{name.format(group=group, i=i)}.nii.gz"
+            word = ("ann", "bob", "cid", "dan", "eve")[i]  # before and after, of the same subjects
+            path = folder / f"{name.format(group=group, i=i, word=word)}.nii.gz"
             nibabel.save(nibabel.Nifti1Image(inside.astype(np.uint8), np.eye(4)), path)
     words = ["--size", "--out", tmp_path / "found"]
     igps(monkeypatch, tmp_path / "masks", "groups", tmp_path / "masks", *OWN, *words)
@@ -240,6 +241,19 @@ def test_explain_writes_shares_that_add_up(
         assert sum(shares) == pytest.approx(float(part["share"]), rel=1e-6)
         assert f"short0.off and {root}/long3.off: {float(part['share']):.4g}" in printed
     assert imread(tmp_path / "explain.png").std() > 0.02
+
+
+@pytest.mark.parametrize(
+    ("largest", "told"),
+    [(1, "half of its share lies on 0.31% of its surface"), (0, "has less than the other of what differs")],
+)
+def test_explain_tells_how_much_of_the_surface_differs(
+    largest: int, told: str, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One of 320 faces has all; or none has, as of a body that lacks what the other has. Both were 0 %."""
+    monkeypatch.setattr("igps.cli.answers.on_surface", lambda *_: np.append(np.full(319, -1.0), largest))
+    igps(monkeypatch, root, "explain", root / "short0.off", root / "long3.off", *OWN)
+    assert capsys.readouterr().out.splitlines()[-1] == f"{root}/long3.off: {told}"
 
 
 @pytest.mark.parametrize("is_group", [False, True])

@@ -573,6 +573,19 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         (["retrieve", "ROOT", "--descriptor", "d2", "--with", "ct"], "attributes: expected 'ct' of each body"),
         (["explain", "ROOT", "--level", "2"], "level: expected a number between 0 and 1, got 2.0"),
         (["groups", "ROOT", "--n_permutations", "0"], "n_permutations: expected at least 1, got 0"),
+        (["explain", "BALL"], "meshes: expected two files, or a folder of two classes, got 1 files."),
+        (["explain", "BALL", "BALL", "BALL"], "meshes: expected two files, or a folder of two classes, got 3 files."),
+        (["explain", "ROOT", "ROOT"], "ROOT: a folder; a file expected."),
+        (["distance", "BALL", "none.off"], "none.off: no such file."),
+        (["query", "none.off", "--gallery", "ROOT"], "none.off: no such file."),
+        (["clusters", "ROOT", "--n_clusters", "7"], "n_clusters: expected 1 to 6, the bodies of the folder, got 7."),
+        (["clusters", "ROOT", "--n_clusters", "0"], "n_clusters: expected 1 to 6, the bodies of the folder, got 0."),
+        (["clusters", "ROOT", "--n_resamples", "-1"], "n_resamples: expected at least 0, got -1."),
+        (["clusters", "TWO"], "root: expected three bodies or more, TWO has 2."),
+        (["figure", "map", "TWO"], "root: expected three bodies or more, TWO has 2."),
+        (["figure", "map", "ROOT", "--seed", "-1"], "seed: expected at least 0, got -1."),
+        (["figure", "map", "ROOT", "--layout", "umap"], "layout: umap needs umap-learn."),
+        (["retrieve", "ROOT", "--with", "ct=-1"], "descriptor: expected +NAME or +NAME=WEIGHT behind a descriptor"),
         (["duplicates", "ROOT", "--tolerance", "0.5"], "tolerance: expected 0 to 0.02, got 0.5."),
         (
             ["duplicates", "ROOT", "--poses", "--tolerance", "0.01"],
@@ -591,10 +604,14 @@ def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     descriptor("d2").save("plain.safetensors", {})
+    shutil.copytree(root / "egg", tmp_path / "TWO")
+    (tmp_path / "TWO" / "2.off").unlink()
+    places = {"ROOT": str(root), "BALL": str(root / "ball" / "0.off")}
+    monkeypatch.setitem(sys.modules, "umap", None)
     monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, *(root if word == "ROOT" else word for word in words))
-    assert capsys.readouterr().err.startswith(f"igps: {told}")
+        igps(monkeypatch, *(places.get(word, word) for word in words))
+    assert capsys.readouterr().err.startswith(f"igps: {told.replace('ROOT', str(root))}")
 
 
 def test_a_list_of_failures_is_no_folder(

@@ -72,10 +72,10 @@ A command that prints a table returns what it tells, for `--json`. Those of `fig
 
 
 ENDINGS: Mapping[Command, Sequence[str]] = {
-    extract: (*SUFFIXES, ".npz"), fit: (".safetensors",), cache_export: (".igps",), classify: (".csv",),
+    extract: (*SUFFIXES, ".npz"), fit: (".safetensors", ""), cache_export: (".igps",), classify: (".csv",),
     duplicates: (".csv",), doctor: (), report: (),
 }  # fmt: skip
-"""Of the files that commands write as `out`, none where any will do; that of the others is a folder."""
+"""Of the files that commands write as `out`, none where any will do; "" is a folder, as `out` of the others."""
 
 
 @contextlib.contextmanager
@@ -133,10 +133,12 @@ def check_place(name: str, place: Path | None, endings: Sequence[str] | None) ->
     if place is None:
         return
     if endings and place.suffix.lower() not in endings:
-        raise ValueError(f"{name}: expected a file ending in {', '.join(endings)}, got {place}.")
+        told = ", ".join(filter(None, endings)) + ", or a folder" * ("" in endings)
+        raise ValueError(f"{name}: expected a file ending in {told}, got {place}.")
+    is_file = endings is not None and (place.suffix != "" or "" not in endings)
     place = place.absolute()
     there = next(one for one in (place, *place.parents) if one.exists())
-    if there.is_dir() == (there == place and endings is not None):
+    if there.is_dir() == (there == place and is_file):
         kind, other = ("file", "folder") if there.is_dir() else ("folder", "file")
         raise ValueError(f"{name}: expected a {kind}, {there} is a {other}. Name another place.")
     if not os.access(there, os.W_OK):

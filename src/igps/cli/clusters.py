@@ -1,15 +1,17 @@
 """`igps clusters`, and the map of `igps figure map`."""
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from igps._arrays import Floats
+from igps._parameters import check_at_least
 from igps.analysis.clusters import STABLE, Linkage, clusters_of
 from igps.analysis.comparison import pair_distances
-from igps.analysis.map import Layout, body_map
+from igps.analysis.map import Layout, body_map, import_umap
 from igps.cli.reading import Folder, described, print_failures
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import LABELS_FILE, Bodies
@@ -41,7 +43,13 @@ def clusters(
         seed: of the random halves.
         out: folder for clusters.csv and clusters.json, and the tree as clusters.svg and clusters.png.
     """
-    dataset, distances, label_of = _compared(Folder(root), descriptor, **reading)
+    check_at_least(0, n_resamples=n_resamples, seed=seed)
+
+    def check_number(bodies: Bodies) -> None:
+        if n_clusters is not None and not 1 <= n_clusters <= len(bodies):
+            raise ValueError(f"n_clusters: expected 1 to {len(bodies)}, the bodies of the folder, got {n_clusters}.")
+
+    dataset, distances, label_of = _compared(root, check_number, descriptor, **reading)
     found = clusters_of(distances, n_clusters, linkage=linkage, n_resamples=n_resamples, seed=seed)
     names, told = dataset.bodies.names, list[dict[str, Any]]()
     print(f"{'cluster':>7}{'bodies':>8}{'stability':>11}  in the middle")
@@ -93,7 +101,10 @@ def map_bodies(
         except ValueError:  # words
             return list(bodies.column(colour))
 
-    dataset, distances, label_of = _compared(Folder(root, check=values_of), descriptor, **reading)
+    check_at_least(0, seed=seed)
+    if layout == "umap":
+        import_umap()
+    dataset, distances, label_of = _compared(root, values_of, descriptor, **reading)
     found, bodies = body_map(distances, layout, seed=seed), dataset.bodies
     values: list[str] | list[float]
     if colour == "class":
@@ -116,9 +127,17 @@ def map_bodies(
     return rows
 
 
-def _compared(folder: Folder, descriptor: str, **reading: Any) -> tuple[SignatureDataset, Floats, list[str]]:
-    """The bodies, their distances, and the class of each, "" where that is not known."""
-    found = described(folder, descriptor, **reading)
+def _compared(
+    root: Path, check: Callable[[Bodies], object], descriptor: str, **reading: Any
+) -> tuple[SignatureDataset, Floats, list[str]]:
+    """The bodies, their distances, and the class of each, "" where that is not known; for `check` see `Folder`."""
+
+    def check_all(bodies: Bodies) -> None:
+        if len(bodies) < 3:
+            raise ValueError(f"root: expected three bodies or more, {root} has {len(bodies)}. Name a larger folder.")
+        check(bodies)
+
+    found = described(Folder(root, check=check_all), descriptor, **reading)
     print_failures(found.failures, len(found.dataset))
     distances = pair_distances(found.descriptor, found.descriptions, progress=True).double().numpy()
     return found.dataset, distances, list(found.dataset.bodies.labels or [""] * len(found.dataset))

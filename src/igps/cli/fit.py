@@ -38,13 +38,13 @@ def fit(
     strict: bool = False,
     **reading: Any,
 ) -> dict[str, Any]:
-    """Fit a metric or a classifier to a labelled folder, for --descriptor of every command and igps classify.
+    """Fit a metric or a classifier to a labelled folder, for igps classify and the --descriptor of commands.
 
-    A card of it, with scores on bodies that were held out, is written beside it in Markdown.
+    A card of it, with scores on bodies that were held out, is written beside it, or into its folder, in Markdown.
 
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
-        out: the model, a file ending in .safetensors.
+        out: the model, a file ending in .safetensors, or a folder to share.
         descriptor: a name (a wrong one lists all), a file, or package.module:NAME of one of your own.
         goal: known for the classes of the folder; new for a metric of classes that come up later.
         head: classifier, whitened, or as_is for the descriptor itself; auto takes the best on held-out bodies.
@@ -61,7 +61,8 @@ def fit(
     )
     model.save(out, {**model.card, "descriptor": descriptor})
     card = _card(model, out)
-    out.with_suffix(".md").write_text(card, encoding="utf-8")
+    if out.suffix:  # a folder has one
+        out.with_suffix(".md").write_text(card, encoding="utf-8")
     print(card.partition("\n\n")[2])
     refused = [*unread, *(failures or ())]
     print_failures(refused, len(dataset) - len(failures or ()))

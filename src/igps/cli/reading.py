@@ -16,7 +16,7 @@ from igps.data.attribute_sources import attribute_sources
 from igps.data.collection import is_collection
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
-from igps.data.sources import Bodies, ClassRule, file_name_of, find_bodies
+from igps.data.sources import Bodies, ClassRule, file_and_part, file_name_of, find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
@@ -154,6 +154,14 @@ def files_or_folder(meshes: Sequence[Path]) -> Folder | Sequence[Path]:
     """What a list of words names: files, or one folder or file of signatures."""
     is_one = len(meshes) == 1 and (meshes[0].is_dir() or is_collection(meshes[0]))
     return Folder(meshes[0]) if is_one else meshes
+
+
+def check_files(paths: Sequence[Path]) -> None:
+    """Raise a FileNotFoundError of the first that is no file, where nothing is to be computed without it."""
+    for path in paths:
+        if not file_and_part(path)[0].is_file():
+            told = "a folder; a file expected" if path.is_dir() else "no such file. Check the path"
+            raise FileNotFoundError(f"{path}: {told}.")
 
 
 def is_called_by_file(name: str, part: str | None) -> bool:

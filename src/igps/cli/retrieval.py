@@ -16,6 +16,7 @@ from igps.cli.gallery import as_described
 from igps.cli.reading import (
     Described,
     Folder,
+    check_files,
     described,
     files_or_folder,
     print_failures,
@@ -151,6 +152,7 @@ def query(
             without labels); the distances listed are those of this order.
     """
     check_at_least(1, top=top)
+    check_files([mesh])
     if is_gallery(gallery):
         opened = Gallery(gallery, descriptor)
         wanted = _one(mesh, opened.descriptor, **as_described(opened, reading))

@@ -166,7 +166,10 @@ def _plain(which: str | Path | Descriptor) -> Descriptor:
     which = str(which)
     base, *words = re.split(r"(?=\+)", which)
     found = [_WITH.fullmatch(word) for word in words]
-    if words and all(found):
+    if words:
+        if not all(found):
+            told = "expected +NAME or +NAME=WEIGHT behind a descriptor, such as +ct=0.5, the weight above 0"
+            raise ValueError(f"descriptor: {told}, got {which!r}.")
         attributes, weights = zip(*((one[1], float(one[2] or 1)) for one in found if one), strict=True)
         return WithAttributes(_plain(base), attributes, weights).eval()
     if which in _MAKERS:
