@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import importlib.metadata
 import json
 import logging
 import re
@@ -425,6 +426,14 @@ def test_an_interruption_while_libraries_are_imported_is_quiet(module: str) -> N
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
+def test_the_version_is_that_of_the_distribution(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        igps(monkeypatch, "--version")
+    assert capsys.readouterr().out.startswith(f"igps {importlib.metadata.version('interior-gps')}, signatures ")
+
+
 def test_commands_may_be_grouped(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def pose(mesh: Path, classes: list[int] | None = None, exact: bool = False, size: float = 2.0) -> None:
         """Draw a pose.
@@ -573,6 +582,8 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         (["retrieve", "ROOT", "--descriptor", "d2", "--with", "ct"], "attributes: expected 'ct' of each body"),
         (["explain", "ROOT", "--level", "2"], "level: expected a number between 0 and 1, got 2.0"),
         (["groups", "ROOT", "--n_permutations", "0"], "n_permutations: expected at least 1, got 0"),
+        (["retrieve", "ROOT", "--memory_limit", "-1"], "memory_limit: expected a positive number, got -1.0."),
+        (["retrieve", "ROOT", "--memory_limit", "inf"], "memory_limit: expected a positive number, got inf."),
         (["explain", "BALL"], "meshes: expected two files, or a folder of two classes, got 1 files."),
         (["explain", "BALL", "BALL", "BALL"], "meshes: expected two files, or a folder of two classes, got 3 files."),
         (["explain", "ROOT", "ROOT"], "ROOT: a folder; a file expected."),

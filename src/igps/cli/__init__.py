@@ -28,6 +28,7 @@ from igps.cli.precompute import cache_export, precompute
 from igps.cli.reading import FLAGS, LISTS, MEANINGS, Verdict
 from igps.cli.report import report
 from igps.cli.retrieval import extract, query, retrieve
+from igps.data.pipeline import version
 from igps.report.page_data import finite
 
 Command = Callable[..., Any]
@@ -148,6 +149,7 @@ def check_place(name: str, place: Path | None, endings: Sequence[str] | None) ->
 def command_parser(commands: Commands | None = None, program: str = "igps") -> ArgumentParser:
     """The parser of all commands; for the arguments see `main`."""
     parser = ArgumentParser(prog=program, description="Volumetric shape retrieval by interior Global Point Signatures.")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {version()}", help="show it and exit")
     _add_commands(parser, COMMANDS if commands is None else commands)
     return parser
 

@@ -193,13 +193,7 @@ def explain(
     print(f"{' and '.join(names)}: {found.distance:.4g} by {module.name}: {found.summary()}")
     painted = [_painted(dataset, i, found, place) for place, i in enumerate(chosen)]
     for name, _, values in painted:
-        half = _half(values)
-        told = (
-            f"half of its share lies on {100 * half:.2g}% of its surface"
-            if half
-            else "has less than the other of what differs"
-        )
-        print(f"{name}: {told}")
+        print(f"{name}: {_extent(values)}")
     parts = [{"histogram": name, "share": share} for name, share in found.parts.items()]
     if out is not None:
         write_answer(out, "explain_samples", _sample_rows(dataset, chosen, found))
@@ -221,11 +215,13 @@ def _painted(dataset: SignatureDataset, i: int, found: Explanation, place: int) 
     return dataset.bodies.names[i], mesh, on_surface((found.places or found.samples)[place], samples, centres)
 
 
-def _half(values: Any) -> float:
-    """The smallest share of places that holds half of all that is positive; 0 where nothing is."""
-    positive = np.sort(np.maximum(values, 0))[::-1]
-    total = positive.sum()
-    return float((np.searchsorted(np.cumsum(positive), total / 2) + 1) / len(values)) if total else 0.0
+def _extent(values: Any) -> str:
+    """The smallest share of places that holds half of all that is positive, in words."""
+    summed = np.cumsum(np.sort(np.maximum(values, 0))[::-1])
+    if not summed[-1]:
+        return "has less than the other of what differs"
+    half = (np.searchsorted(summed, summed[-1] / 2) + 1) / len(values)
+    return f"half of its share lies on {100 * half:.2g}% of its surface"
 
 
 def _sample_rows(dataset: SignatureDataset, chosen: list[int], found: Explanation) -> list[dict[str, Any]]:

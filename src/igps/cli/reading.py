@@ -12,6 +12,7 @@ from torch import Tensor
 
 from igps._arrays import Floats
 from igps._parallel import Limits
+from igps._parameters import check_positive
 from igps.data.attribute_sources import attribute_sources
 from igps.data.collection import is_collection
 from igps.data.dataset import Failure, SignatureDataset
@@ -170,7 +171,9 @@ def is_called_by_file(name: str, part: str | None) -> bool:
 
 
 def limits_of(seconds: float | None, gigabytes: float | None) -> Limits:
-    """Of one body."""
+    """Of one body; a ValueError that names the option of a number that is none."""
+    given = {"time_limit": seconds, "memory_limit": gigabytes}
+    check_positive(**{name: value for name, value in given.items() if value is not None})
     return Limits(seconds, None if gigabytes is None else int(gigabytes * 1e9))
 
 
