@@ -170,6 +170,16 @@ def test_a_covariate_may_be_words_but_no_mistyped_number(
     assert "dose: expected numbers, got '5o'" in capsys.readouterr().err
 
 
+def test_covariates_that_are_named_one_by_one_all_count(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = []
+    for words in (["--covariate", "age", "scanner"], ["--covariate", "age", "--covariate", "scanner"]):
+        igps(monkeypatch, root, "groups", root, *OWN, *words, "--n_permutations", "99", "--json")
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[0] == found[1]
+
+
 def test_groups_refuses_three_of_a_group(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -245,7 +255,7 @@ def test_explain_writes_shares_that_add_up(
 
 @pytest.mark.parametrize(
     ("largest", "told"),
-    [(1, "half of its share lies on 0.31% of its surface"), (0, "has less than the other of what differs")],
+    [(1, "half of its share lies on 0.31% of its surface"), (0, "none of the difference lies on its surface")],
 )
 def test_explain_tells_how_much_of_the_surface_differs(
     largest: int, told: str, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -291,9 +301,16 @@ def test_clusters_are_the_two_kinds_of_eggs(
     assert [clusters[f"short{i}.off"] for i in range(6)] == [clusters["long6.off"]] * 6 == ["1"] * 6
     assert [clusters[f"long{i}.off"] for i in range(6)] == ["2"] * 6
     assert "(6 short, 1 long)" in printed
-    assert "2 of 2 clusters are stable" in printed
+    assert "2 of 2 clusters are stable (at least 0.75)\n" in printed
     assert imread(tmp_path / "figures" / "clusters.png").std() > 0.02
     assert "long6.off" in (tmp_path / "figures" / "clusters.json").read_text()
+
+
+def test_a_stability_that_was_not_measured_is_unknown(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    igps(monkeypatch, root, "clusters", root, *OWN, "--n_clusters", "2", "--n_resamples", "0")
+    assert "0 of 2 clusters are stable (at least 0.75), 2 unknown\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("colour", ["class", "cluster", "volume", "age", "scanner"])

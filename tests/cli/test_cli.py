@@ -296,6 +296,17 @@ def test_query_lists_the_nearest(
     assert [float(line.split()[1]) for line in lines] == pytest.approx(distances[nearest].tolist(), rel=5e-3)
 
 
+def test_what_asks_a_file_of_signatures_is_described_as_they_are(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, cache = tmp_path / "signatures.igps", ["--cache_dir", tmp_path / "cache"]
+    igps(monkeypatch, "cache", "export", root, "--out", file, "--descriptors", INTERIOR, *cache, *SMALL)
+    capsys.readouterr()
+    igps(monkeypatch, "query", root / "egg" / "1.off", "--gallery", file, "--descriptor", INTERIOR, "--json", *cache)
+    first = json.loads(capsys.readouterr().out)[0]
+    assert (first["mesh"], first["distance"]) == ("egg/1.off", 0)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -424,6 +435,19 @@ def test_an_interruption_while_libraries_are_imported_is_quiet(module: str) -> N
     )
     done = subprocess.run([sys.executable, "-c", interrupted], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_what_takes_more_memory_than_there_is_is_told_in_a_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ask() -> None:
+        """Ask for a pebibyte."""
+        np.empty(2**47)
+
+    monkeypatch.setattr(cli, "COMMANDS", {"ask": ask})
+    with pytest.raises(SystemExit, match="2"):
+        igps(monkeypatch, "ask")
+    assert re.fullmatch(r"igps: out of memory \(.*1.00 PiB.*\). Ask for less, .*\n", capsys.readouterr().err)
 
 
 def test_the_version_is_that_of_the_distribution(
@@ -582,8 +606,14 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         (["retrieve", "ROOT", "--descriptor", "d2", "--with", "ct"], "attributes: expected 'ct' of each body"),
         (["explain", "ROOT", "--level", "2"], "level: expected a number between 0 and 1, got 2.0"),
         (["groups", "ROOT", "--n_permutations", "0"], "n_permutations: expected at least 1, got 0"),
+        (["retrieve", "ROOT", "--classes", "file"], "root: expected a class of two bodies or more, got 6 of one."),
+        (["fit", "ROOT", "--out", "ROOT"], "out: expected a new folder, or that of a model, ROOT holds "),
+        (["report", "TWO", "--meshes", "none"], "meshes: none: no such folder."),
+        (["demo", "--n_workers", "0"], "n_workers: expected at least 1, got 0."),
+        (["retrieve", "ROOT", "--descriptor", ":"], "descriptor: expected package.module:NAME to be importable"),
+        (["retrieve", "ROOT", "--descriptor", "own_descriptors:write_egg"], "descriptor: expected own_descriptors:"),
         (["retrieve", "ROOT", "--memory_limit", "-1"], "memory_limit: expected a positive number, got -1.0."),
-        (["retrieve", "ROOT", "--memory_limit", "inf"], "memory_limit: expected a positive number, got inf."),
+        (["retrieve", "ROOT", "--memory_limit", "1e400"], "memory_limit: expected a positive number, got inf."),
         (["explain", "BALL"], "meshes: expected two files, or a folder of two classes, got 1 files."),
         (["explain", "BALL", "BALL", "BALL"], "meshes: expected two files, or a folder of two classes, got 3 files."),
         (["explain", "ROOT", "ROOT"], "ROOT: a folder; a file expected."),

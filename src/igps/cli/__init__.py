@@ -14,6 +14,7 @@ from docstring_parser import parse
 from jsonargparse import ArgumentParser, Namespace
 
 from igps._parallel import MachineError, is_machine_error, machine_error_text
+from igps._parameters import check_at_least
 from igps._threads import one_thread
 from igps.cli import gallery
 from igps.cli.answers import explain, groups, outliers
@@ -84,6 +85,9 @@ def faults_in_a_sentence() -> Iterator[None]:
     """Say what is expected of bad input without a traceback, which would bury it, and exit as `main` does."""
     try:
         yield
+    except MemoryError as error:
+        print(f"igps: out of memory ({error}). Ask for less, or set a memory limit for each body.", file=sys.stderr)
+        sys.exit(2)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         full = isinstance(error, OSError) and is_machine_error(error)
         print(f"igps: {machine_error_text(error) if full else error}", file=sys.stderr)  # type: ignore[arg-type]
@@ -117,6 +121,7 @@ def main(
                 options["descriptors"] = [one + taken_in for one in options["descriptors"]]
             else:
                 options["descriptor"] = (options["descriptor"] or "pretrained") + taken_in
+        check_at_least(1, n_workers=options.get("n_workers"))
         check_place("out", options.get("out"), endings.get(command))
         check_place("failures", options.get("failures"), ())
         # With --json, text for readers goes to standard error
@@ -188,7 +193,7 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
         switches = {**FLAGS, **switches}
         for several, told in LISTS.items():
             if several != "with" or {"descriptor", "descriptors"} & set(parameters):
-                parser.add_argument(f"--{several}", nargs="+", help=told)
+                parser.add_argument(f"--{several}", nargs="+", action="extend", help=told)
     if kinds["return"] is not type(None):
         switches[JSON] = "print the table as JSON, and everything else to standard error"
     by_hand: set[str | int] = {*switches, *LISTS}
@@ -199,6 +204,8 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
             option, how = (name, {}) if positional else (f"--{name}", {"default": parameter.default})
             if not positional and parameter.default is parameter.empty:
                 how = {"required": True}
+            if item is not None and how.get("default") is None:
+                how["action"] = "extend"  # what is named again comes beside the first
             parser.add_argument(option, nargs=item and "+", type=item or kinds[name], help=meanings[name], **how)
             by_hand.add(name)
     parser.add_function_arguments(command, skip=by_hand)

@@ -219,7 +219,7 @@ def _extent(values: Any) -> str:
     """The smallest share of places that holds half of all that is positive, in words."""
     summed = np.cumsum(np.sort(np.maximum(values, 0))[::-1])
     if not summed[-1]:
-        return "has less than the other of what differs"
+        return "none of the difference lies on its surface"
     half = (np.searchsorted(summed, summed[-1] / 2) + 1) / len(values)
     return f"half of its share lies on {100 * half:.2g}% of its surface"
 

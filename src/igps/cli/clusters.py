@@ -63,7 +63,8 @@ def clusters(
         shown = ", ".join(f"{count} {name}" for name, count in classes.most_common(3)) + ", …" * (len(classes) > 3)
         print(f"{number + 1:>7}{len(members):>8}{stability:>11.2f}  {names[middle]}" + f" ({shown})" * bool(shown))
     n_stable = sum(one >= STABLE for one in found.stability)
-    print(f"{n_stable} of {len(told)} clusters are stable (at least {STABLE})")
+    unknown = f", {n} unknown" if (n := np.isnan(found.stability).sum()) else ""
+    print(f"{n_stable} of {len(told)} clusters are stable (at least {STABLE}){unknown}")
     if out is not None:
         rows = [
             {"body": name, "class": label_of[i], "cluster": int(number) + 1, "stability": found.stability[number]}

@@ -14,7 +14,7 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors import load
 from igps.nn.description import check_centres
 from igps.nn.descriptor import Descriptor
-from igps.nn.specification import specification
+from igps.nn.specification import IN_FOLDER, specification
 from igps.report.tables import write_rows
 
 _TITLES = {
@@ -50,6 +50,8 @@ def fit(
         head: classifier, whitened, or as_is for the descriptor itself; auto takes the best on held-out bodies.
         no_prior: ignore the descriptor's own metric, and fit to its histograms alone
     """
+    if out.is_dir() and not (out / IN_FOLDER).is_file() and (found := next(out.iterdir(), None)):
+        raise ValueError(f"out: expected a new folder, or that of a model, {out} holds {found.name}. Name another.")
     chosen = descriptor_of(descriptor)
     specification(chosen)  # refuses what no file can hold before anything is computed
     check_centres(chosen)

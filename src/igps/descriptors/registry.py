@@ -182,12 +182,15 @@ def _plain(which: str | Path | Descriptor) -> Descriptor:
         )
     try:
         own = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(
             f"descriptor: expected package.module:NAME to be importable, got {which!r} ({error}). Check the spelling, "
             "and that its folder is on the Python path."
         ) from error
-    made = own if isinstance(own, Descriptor) or not callable(own) else own()
+    try:
+        made = own if isinstance(own, Descriptor) or not callable(own) else own()
+    except TypeError as error:
+        raise ValueError(f"descriptor: expected {which} to make one without arguments ({error}).") from error
     if not isinstance(made, Descriptor):
         raise ValueError(
             f"descriptor: expected {which} to be or to make an igps.Descriptor, got {type(made).__name__}."
