@@ -101,6 +101,27 @@ def test_workers_leave_an_interruption_to_their_parent(results: dict[int, object
     assert results[10] == 7
 
 
+@pytest.mark.skipif(os.name == "nt", reason="signals cannot be blocked")
+def test_workers_leave_it_to_their_parent_while_they_start(tmp_path: Path) -> None:
+    """They import what the script does, for seconds."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os, signal\n"
+        "from igps._workers import Worker\n"
+        "if __name__ == '__mp_main__':\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "if __name__ == '__main__':\n"
+        "    worker = Worker(None)\n"
+        "    print(worker.submit(abs, -7).result())\n"
+        "    worker.end()\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+    assert done.stdout == "7\n"
+    assert done.stderr.count("Traceback") == 1  # the script's own
+    assert "KeyboardInterrupt" in done.stderr
+
+
 def test_workers_have_one_thread(results: dict[int, tuple[int, str]]) -> None:
     assert {results[number][1] for number in (8, 9)} == {"1"}
 

@@ -51,7 +51,9 @@ class Worker:
             with workers_environment():
                 pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(self._memory,))
                 try:
-                    self._pid = pool.submit(os.getpid).result()
+                    with _uninterrupted():
+                        first = pool.submit(os.getpid)
+                    self._pid = first.result()
                     self._pool = pool
                 except BrokenExecutor as error:
                     pool.shutdown()
@@ -92,9 +94,22 @@ def workers_environment() -> Generator[None, None, None]:
                 os.environ[name] = value
 
 
+@contextlib.contextmanager
+def _uninterrupted() -> Generator[None, None, None]:
+    """Ctrl-C, which goes to all processes, is nothing to those that are started meanwhile: the parent ends them."""
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _begin(memory: int | None) -> None:
     """What a worker does first: bound its memory, and watch its parent, to end with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes; the parent ends this one, and tells it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # where it could not be blocked before
     if memory is not None:
         with contextlib.suppress(ImportError, ValueError):
             import resource

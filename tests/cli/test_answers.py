@@ -104,7 +104,7 @@ def test_bodies_of_other_names_are_compared_where_each_name_is_a_group(
     assert found["permanova_p"] <= 3 / 128  # the swap of all pairs does as well, and one or two may be drawn more often
 
 
-@pytest.mark.parametrize("name", ["{group}{i}", "{i}"])
+@pytest.mark.parametrize("name", ["{group}{i}", "{i}", "case_{i}", "{word}"])
 def test_single_masks_in_a_folder_for_each_group_are_compared(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -115,7 +115,8 @@ def test_single_masks_in_a_folder_for_each_group_are_compared(
         (folder := tmp_path / "masks" / group).mkdir(parents=True)
         for i in range(5):
             inside = (place[0] / (side + 0.2 * i)) ** 2 + (place[1] / 7) ** 2 + (place[2] / 7) ** 2 <= 1
-            path = folder / f"{name.format(group=group, i=i)}.nii.gz"
+            word = ("ann", "bob", "cid", "dan", "eve")[i]  # before and after, of the same subjects
+            path = folder / f"{name.format(group=group, i=i, word=word)}.nii.gz"
             nibabel.save(nibabel.Nifti1Image(inside.astype(np.uint8), np.eye(4)), path)
     words = ["--size", "--out", tmp_path / "found"]
     igps(monkeypatch, tmp_path / "masks", "groups", tmp_path / "masks", *OWN, *words)
@@ -167,6 +168,16 @@ def test_a_covariate_may_be_words_but_no_mistyped_number(
     with pytest.raises(SystemExit, match="1"):
         igps(monkeypatch, root, *words, "--covariate", "dose")
     assert "dose: expected numbers, got '5o'" in capsys.readouterr().err
+
+
+def test_covariates_that_are_named_one_by_one_all_count(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = []
+    for words in (["--covariate", "age", "scanner"], ["--covariate", "age", "--covariate", "scanner"]):
+        igps(monkeypatch, root, "groups", root, *OWN, *words, "--n_permutations", "99", "--json")
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[0] == found[1]
 
 
 def test_groups_refuses_three_of_a_group(
@@ -242,6 +253,19 @@ def test_explain_writes_shares_that_add_up(
     assert imread(tmp_path / "explain.png").std() > 0.02
 
 
+@pytest.mark.parametrize(
+    ("largest", "told"),
+    [(1, "half of its share lies on 0.31% of its surface"), (0, "none of the difference lies on its surface")],
+)
+def test_explain_tells_how_much_of_the_surface_differs(
+    largest: int, told: str, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One of 320 faces has all; or none has, as of a body that lacks what the other has. Both were 0 %."""
+    monkeypatch.setattr("igps.cli.answers.on_surface", lambda *_: np.append(np.full(319, -1.0), largest))
+    igps(monkeypatch, root, "explain", root / "short0.off", root / "long3.off", *OWN)
+    assert capsys.readouterr().out.splitlines()[-1] == f"{root}/long3.off: {told}"
+
+
 @pytest.mark.parametrize("is_group", [False, True])
 def test_explain_heeds_size_and_side(
     is_group: bool, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -277,9 +301,16 @@ def test_clusters_are_the_two_kinds_of_eggs(
     assert [clusters[f"short{i}.off"] for i in range(6)] == [clusters["long6.off"]] * 6 == ["1"] * 6
     assert [clusters[f"long{i}.off"] for i in range(6)] == ["2"] * 6
     assert "(6 short, 1 long)" in printed
-    assert "2 of 2 clusters are stable" in printed
+    assert "2 of 2 clusters are stable (at least 0.75)\n" in printed
     assert imread(tmp_path / "figures" / "clusters.png").std() > 0.02
     assert "long6.off" in (tmp_path / "figures" / "clusters.json").read_text()
+
+
+def test_a_stability_that_was_not_measured_is_unknown(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    igps(monkeypatch, root, "clusters", root, *OWN, "--n_clusters", "2", "--n_resamples", "0")
+    assert "0 of 2 clusters are stable (at least 0.75), 2 unknown\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("colour", ["class", "cluster", "volume", "age", "scanner"])

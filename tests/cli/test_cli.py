@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import importlib.metadata
 import json
 import logging
 import re
@@ -295,6 +296,17 @@ def test_query_lists_the_nearest(
     assert [float(line.split()[1]) for line in lines] == pytest.approx(distances[nearest].tolist(), rel=5e-3)
 
 
+def test_what_asks_a_file_of_signatures_is_described_as_they_are(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, cache = tmp_path / "signatures.igps", ["--cache_dir", tmp_path / "cache"]
+    igps(monkeypatch, "cache", "export", root, "--out", file, "--descriptors", INTERIOR, *cache, *SMALL)
+    capsys.readouterr()
+    igps(monkeypatch, "query", root / "egg" / "1.off", "--gallery", file, "--descriptor", INTERIOR, "--json", *cache)
+    first = json.loads(capsys.readouterr().out)[0]
+    assert (first["mesh"], first["distance"]) == ("egg/1.off", 0)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -406,6 +418,44 @@ def test_an_interruption_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch, caps
     with pytest.raises(SystemExit, match="130"):
         igps(monkeypatch, "wait")
     assert capsys.readouterr().err == "igps: interrupted. Run again to go on: what is done is kept.\n"
+
+
+@pytest.mark.parametrize("module", ["numpy", "torch"])
+def test_an_interruption_while_libraries_are_imported_is_quiet(module: str) -> None:
+    """NumPy takes an exception for one of its own libraries that fails, and goes on."""
+    interrupted = (
+        "import os, signal, sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, *_):\n"
+        f"        if name == '{module}.linalg': os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "from igps_command import main\n"
+        "sys.argv = ['igps', '--help']\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", interrupted], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_what_takes_more_memory_than_there_is_is_told_in_a_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ask() -> None:
+        """Ask for a pebibyte."""
+        np.empty(2**47)
+
+    monkeypatch.setattr(cli, "COMMANDS", {"ask": ask})
+    with pytest.raises(SystemExit, match="2"):
+        igps(monkeypatch, "ask")
+    assert re.fullmatch(r"igps: out of memory \(.*1.00 PiB.*\). Ask for less, .*\n", capsys.readouterr().err)
+
+
+def test_the_version_is_that_of_the_distribution(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        igps(monkeypatch, "--version")
+    assert capsys.readouterr().out.startswith(f"igps {importlib.metadata.version('interior-gps')}, signatures ")
 
 
 def test_commands_may_be_grouped(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -556,6 +606,27 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(
         (["retrieve", "ROOT", "--descriptor", "d2", "--with", "ct"], "attributes: expected 'ct' of each body"),
         (["explain", "ROOT", "--level", "2"], "level: expected a number between 0 and 1, got 2.0"),
         (["groups", "ROOT", "--n_permutations", "0"], "n_permutations: expected at least 1, got 0"),
+        (["retrieve", "ROOT", "--classes", "file"], "root: expected a class of two bodies or more, got 6 of one."),
+        (["fit", "ROOT", "--out", "ROOT"], "out: expected a new folder, or that of a model, ROOT holds "),
+        (["report", "TWO", "--meshes", "none"], "meshes: none: no such folder."),
+        (["demo", "--n_workers", "0"], "n_workers: expected at least 1, got 0."),
+        (["retrieve", "ROOT", "--descriptor", ":"], "descriptor: expected package.module:NAME to be importable"),
+        (["retrieve", "ROOT", "--descriptor", "own_descriptors:write_egg"], "descriptor: expected own_descriptors:"),
+        (["retrieve", "ROOT", "--memory_limit", "-1"], "memory_limit: expected a positive number, got -1.0."),
+        (["retrieve", "ROOT", "--memory_limit", "1e400"], "memory_limit: expected a positive number, got inf."),
+        (["explain", "BALL"], "meshes: expected two files, or a folder of two classes, got 1 files."),
+        (["explain", "BALL", "BALL", "BALL"], "meshes: expected two files, or a folder of two classes, got 3 files."),
+        (["explain", "ROOT", "ROOT"], "ROOT: a folder; a file expected."),
+        (["distance", "BALL", "none.off"], "none.off: no such file."),
+        (["query", "none.off", "--gallery", "ROOT"], "none.off: no such file."),
+        (["clusters", "ROOT", "--n_clusters", "7"], "n_clusters: expected 1 to 6, the bodies of the folder, got 7."),
+        (["clusters", "ROOT", "--n_clusters", "0"], "n_clusters: expected 1 to 6, the bodies of the folder, got 0."),
+        (["clusters", "ROOT", "--n_resamples", "-1"], "n_resamples: expected at least 0, got -1."),
+        (["clusters", "TWO"], "root: expected three bodies or more, TWO has 2."),
+        (["figure", "map", "TWO"], "root: expected three bodies or more, TWO has 2."),
+        (["figure", "map", "ROOT", "--seed", "-1"], "seed: expected at least 0, got -1."),
+        (["figure", "map", "ROOT", "--layout", "umap"], "layout: umap needs umap-learn."),
+        (["retrieve", "ROOT", "--with", "ct=-1"], "descriptor: expected +NAME or +NAME=WEIGHT behind a descriptor"),
         (["duplicates", "ROOT", "--tolerance", "0.5"], "tolerance: expected 0 to 0.02, got 0.5."),
         (
             ["duplicates", "ROOT", "--poses", "--tolerance", "0.01"],
@@ -574,10 +645,14 @@ def test_what_is_missing_or_out_of_range_is_told_before_anything_is_computed(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     descriptor("d2").save("plain.safetensors", {})
+    shutil.copytree(root / "egg", tmp_path / "TWO")
+    (tmp_path / "TWO" / "2.off").unlink()
+    places = {"ROOT": str(root), "BALL": str(root / "ball" / "0.off")}
+    monkeypatch.setitem(sys.modules, "umap", None)
     monkeypatch.setattr(SignatureDataset, "precompute", lambda *_, **__: pytest.fail("signatures are computed"))
     with pytest.raises(SystemExit, match="1"):
-        igps(monkeypatch, *(root if word == "ROOT" else word for word in words))
-    assert capsys.readouterr().err.startswith(f"igps: {told}")
+        igps(monkeypatch, *(places.get(word, word) for word in words))
+    assert capsys.readouterr().err.startswith(f"igps: {told.replace('ROOT', str(root))}")
 
 
 def test_a_list_of_failures_is_no_folder(

@@ -109,6 +109,21 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(
     np.testing.assert_allclose(one[["bar.volume", "cube.volume"]], [[375, 512]], rtol=1e-3)
 
 
+def test_masks_that_are_numbered_have_a_row_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two subjects of each class: a number is no organ's name."""
+    sides = {("ill", 0): 5, ("ill", 1): 6, ("well", 0): 7, ("well", 1): 8}
+    for (label, number), side in sides.items():
+        (folder := tmp_path / "masks" / label).mkdir(parents=True, exist_ok=True)
+        mask = np.zeros((12, 12, 12), dtype=np.uint8)
+        mask[2 : 2 + side, 2:9, 2:9] = 1
+        nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), folder / f"{number}.nii.gz")
+    extract(monkeypatch, tmp_path / "masks", tmp_path / "wide.csv", "--wide")
+    wide = pd.read_csv(tmp_path / "wide.csv")
+    assert wide.columns.tolist()[:5] == ["file", "label", "unit", "volume", "area"]
+    assert wide["file"].tolist() == [f"{label}/{number}.nii.gz" for label, number in sides]
+    np.testing.assert_allclose(wide["volume"], [49 * side for side in sides.values()], rtol=1e-3)
+
+
 @pytest.mark.parametrize("options", [[], ["--wide"]])
 def test_columns_that_are_called_as_ours_are_kept_beside_them(
     options: list[str], root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

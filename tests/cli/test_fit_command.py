@@ -67,6 +67,18 @@ def test_fit_writes_model_and_card(
     assert f"| FT | {100 * card['held_out_scores']['ft']:.1f} |" in page
 
 
+def test_fit_writes_a_folder_to_share(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["fit", root / "eggs", "--descriptor", "rich", "--head", "classifier", "--out", tmp_path / "mine"]
+    call(monkeypatch, root, *words, "--json")
+    told = json.loads(capsys.readouterr().out)
+    assert {path.name for path in (tmp_path / "mine").iterdir()} == {"model.safetensors", "README.md"}
+    assert json.dumps(told["held_out_scores"]) in (tmp_path / "mine" / "README.md").read_text()
+    call(monkeypatch, root, "classify", root / "eggs", "--model", tmp_path / "mine", "--json")
+    assert [row["class"] for row in json.loads(capsys.readouterr().out)] == ["flat"] * 3 + ["long"] * 3
+
+
 @pytest.mark.parametrize("cavities", ["fill", "keep"])
 def test_bodies_that_are_read_otherwise_than_those_of_the_fit_are_told(
     root: Path, model: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], cavities: str

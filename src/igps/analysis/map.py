@@ -2,7 +2,7 @@
 
 import warnings
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.linalg import eigh
@@ -79,11 +79,17 @@ def _classical(distances: Floats) -> Floats:
     return axes * np.sqrt(np.maximum(values, 0))
 
 
-def _umap(distances: Floats, seed: int) -> Floats:
+def import_umap() -> Any:
+    """The class of umap-learn; an ImportError that names it."""
     try:
         from umap import UMAP
     except ImportError as error:
         raise ImportError("layout: umap needs umap-learn. Install it, or take mds.") from error
+    return UMAP
+
+
+def _umap(distances: Floats, seed: int) -> Floats:
+    UMAP = import_umap()
     with warnings.catch_warnings():  # of what precomputed distances cannot do afterwards
         warnings.simplefilter("ignore", UserWarning)
         chosen = UMAP(n_neighbors=min(15, len(distances) - 1), metric="precomputed", random_state=seed, n_jobs=1)

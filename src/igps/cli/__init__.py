@@ -14,6 +14,7 @@ from docstring_parser import parse
 from jsonargparse import ArgumentParser, Namespace
 
 from igps._parallel import MachineError, is_machine_error, machine_error_text
+from igps._parameters import check_at_least
 from igps._threads import one_thread
 from igps.cli import gallery
 from igps.cli.answers import explain, groups, outliers
@@ -28,6 +29,7 @@ from igps.cli.precompute import cache_export, precompute
 from igps.cli.reading import FLAGS, LISTS, MEANINGS, Verdict
 from igps.cli.report import report
 from igps.cli.retrieval import extract, query, retrieve
+from igps.data.pipeline import version
 from igps.report.page_data import finite
 
 Command = Callable[..., Any]
@@ -72,10 +74,10 @@ A command that prints a table returns what it tells, for `--json`. Those of `fig
 
 
 ENDINGS: Mapping[Command, Sequence[str]] = {
-    extract: (*SUFFIXES, ".npz"), fit: (".safetensors",), cache_export: (".igps",), classify: (".csv",),
+    extract: (*SUFFIXES, ".npz"), fit: (".safetensors", ""), cache_export: (".igps",), classify: (".csv",),
     duplicates: (".csv",), doctor: (), report: (),
 }  # fmt: skip
-"""Of the files that commands write as `out`, none where any will do; that of the others is a folder."""
+"""Of the files that commands write as `out`, none where any will do; "" is a folder, as `out` of the others."""
 
 
 @contextlib.contextmanager
@@ -83,6 +85,9 @@ def faults_in_a_sentence() -> Iterator[None]:
     """Say what is expected of bad input without a traceback, which would bury it, and exit as `main` does."""
     try:
         yield
+    except MemoryError as error:
+        print(f"igps: out of memory ({error}). Ask for less, or set a memory limit for each body.", file=sys.stderr)
+        sys.exit(2)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         full = isinstance(error, OSError) and is_machine_error(error)
         print(f"igps: {machine_error_text(error) if full else error}", file=sys.stderr)  # type: ignore[arg-type]
@@ -104,8 +109,8 @@ def main(
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     commands = COMMANDS if commands is None else commands
-    parser = command_parser(commands, program)
     with faults_in_a_sentence():
+        parser = command_parser(commands, program)
         parsed = parser.instantiate(parser.parse_args())
         command, options = _chosen(parsed, commands)
         as_json = options.pop(JSON, False)
@@ -116,6 +121,7 @@ def main(
                 options["descriptors"] = [one + taken_in for one in options["descriptors"]]
             else:
                 options["descriptor"] = (options["descriptor"] or "pretrained") + taken_in
+        check_at_least(1, n_workers=options.get("n_workers"))
         check_place("out", options.get("out"), endings.get(command))
         check_place("failures", options.get("failures"), ())
         # With --json, text for readers goes to standard error
@@ -133,10 +139,12 @@ def check_place(name: str, place: Path | None, endings: Sequence[str] | None) ->
     if place is None:
         return
     if endings and place.suffix.lower() not in endings:
-        raise ValueError(f"{name}: expected a file ending in {', '.join(endings)}, got {place}.")
+        told = ", ".join(filter(None, endings)) + ", or a folder" * ("" in endings)
+        raise ValueError(f"{name}: expected a file ending in {told}, got {place}.")
+    is_file = endings is not None and (place.suffix != "" or "" not in endings)
     place = place.absolute()
     there = next(one for one in (place, *place.parents) if one.exists())
-    if there.is_dir() == (there == place and endings is not None):
+    if there.is_dir() == (there == place and is_file):
         kind, other = ("file", "folder") if there.is_dir() else ("folder", "file")
         raise ValueError(f"{name}: expected a {kind}, {there} is a {other}. Name another place.")
     if not os.access(there, os.W_OK):
@@ -146,6 +154,7 @@ def check_place(name: str, place: Path | None, endings: Sequence[str] | None) ->
 def command_parser(commands: Commands | None = None, program: str = "igps") -> ArgumentParser:
     """The parser of all commands; for the arguments see `main`."""
     parser = ArgumentParser(prog=program, description="Volumetric shape retrieval by interior Global Point Signatures.")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {version()}", help="show it and exit")
     _add_commands(parser, COMMANDS if commands is None else commands)
     return parser
 
@@ -184,7 +193,7 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
         switches = {**FLAGS, **switches}
         for several, told in LISTS.items():
             if several != "with" or {"descriptor", "descriptors"} & set(parameters):
-                parser.add_argument(f"--{several}", nargs="+", help=told)
+                parser.add_argument(f"--{several}", nargs="+", action="extend", help=told)
     if kinds["return"] is not type(None):
         switches[JSON] = "print the table as JSON, and everything else to standard error"
     by_hand: set[str | int] = {*switches, *LISTS}
@@ -195,6 +204,8 @@ def _add_options(parser: ArgumentParser, command: Command) -> None:
             option, how = (name, {}) if positional else (f"--{name}", {"default": parameter.default})
             if not positional and parameter.default is parameter.empty:
                 how = {"required": True}
+            if item is not None and how.get("default") is None:
+                how["action"] = "extend"  # what is named again comes beside the first
             parser.add_argument(option, nargs=item and "+", type=item or kinds[name], help=meanings[name], **how)
             by_hand.add(name)
     parser.add_function_arguments(command, skip=by_hand)

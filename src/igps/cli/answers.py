@@ -14,7 +14,7 @@ from igps.analysis.explanation import explain as explain_pair
 from igps.analysis.groups import group_test, squared_distances, with_discovery_rates
 from igps.analysis.outliers import LIMIT, measures_of
 from igps.analysis.outliers import outliers as find_outliers
-from igps.cli.reading import Folder, described, files_or_folder, is_called_by_file, print_failures
+from igps.cli.reading import Folder, check_files, described, files_or_folder, is_called_by_file, print_failures
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
@@ -74,10 +74,10 @@ def groups(
     members: dict[str, list[int]] = {}
     for i, part in enumerate(bodies.parts):
         members.setdefault(part or "all", []).append(i)
-    n_pairs, called = len(set(zip(bodies.parts, labels, strict=True))), zip(bodies.names, bodies.parts, strict=True)
-    numbered = all(part and part.isdigit() and is_called_by_file(name, part) for name, part in called)
-    if n_pairs == len(members) in (len(set(labels)), len(bodies)) or (numbered and n_pairs == len(bodies)):
-        # Names are those of the groups, or of the files of single masks, which may be numbered in each group
+    n_pairs = len(set(zip(bodies.parts, labels, strict=True)))
+    by_file = n_pairs == len(bodies) and all(map(is_called_by_file, bodies.names, bodies.parts))
+    if by_file or n_pairs == len(members) in (len(set(labels)), len(bodies)):
+        # Names are those of the groups, or of the files of single masks, which may come again in each group
         members = {"all": list(range(len(bodies)))}
     jobs = [(body + what, places, rows[places]) for body, places in members.items() for what, rows in vectors.items()]
     tests = with_discovery_rates([
@@ -163,6 +163,10 @@ def explain(
     """
     check_share(level=level)
     source = files_or_folder(meshes)
+    if not isinstance(source, Folder):
+        if len(source) != 2:
+            raise ValueError(f"meshes: expected two files, or a folder of two classes, got {len(source)} files.")
+        check_files(source)
     contents_of(descriptor_of(descriptor))  # refuses others before anything is computed
     if isinstance(source, Folder):
         folder = Folder(source.root, labelled=True, needs_meshes=True, check=_check_two_classes)
@@ -182,13 +186,14 @@ def explain(
         bodies, chosen = described(source, descriptor, **{**reading, "strict": True}), [0, 1]
         dataset, module = bodies.dataset, bodies.descriptor
         if len(dataset) != 2:
-            raise ValueError(f"meshes: expected two bodies, got {len(dataset)}. Name two files, or FILE#PART.")
+            told = ", ".join(dataset.bodies.names[:4])
+            raise ValueError(f"meshes: expected two bodies, got {len(dataset)}: {told}. Name each as FILE#PART.")
         found = explain_pair(module, *(dataset.batch([i]) for i in chosen))
     names = [dataset.bodies.names[i] for i in chosen]
     print(f"{' and '.join(names)}: {found.distance:.4g} by {module.name}: {found.summary()}")
     painted = [_painted(dataset, i, found, place) for place, i in enumerate(chosen)]
     for name, _, values in painted:
-        print(f"{name}: half of its share lies on {_half(values):.0%} of its surface")
+        print(f"{name}: {_extent(values)}")
     parts = [{"histogram": name, "share": share} for name, share in found.parts.items()]
     if out is not None:
         write_answer(out, "explain_samples", _sample_rows(dataset, chosen, found))
@@ -210,11 +215,13 @@ def _painted(dataset: SignatureDataset, i: int, found: Explanation, place: int) 
     return dataset.bodies.names[i], mesh, on_surface((found.places or found.samples)[place], samples, centres)
 
 
-def _half(values: Any) -> float:
-    """The smallest share of places that holds half of all that is positive."""
-    positive = np.sort(np.maximum(values, 0))[::-1]
-    total = positive.sum()
-    return float((np.searchsorted(np.cumsum(positive), total / 2) + 1) / len(values)) if total else 0.0
+def _extent(values: Any) -> str:
+    """The smallest share of places that holds half of all that is positive, in words."""
+    summed = np.cumsum(np.sort(np.maximum(values, 0))[::-1])
+    if not summed[-1]:
+        return "none of the difference lies on its surface"
+    half = (np.searchsorted(summed, summed[-1] / 2) + 1) / len(values)
+    return f"half of its share lies on {100 * half:.2g}% of its surface"
 
 
 def _sample_rows(dataset: SignatureDataset, chosen: list[int], found: Explanation) -> list[dict[str, Any]]:

@@ -1,15 +1,17 @@
 """`igps clusters`, and the map of `igps figure map`."""
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from igps._arrays import Floats
+from igps._parameters import check_at_least
 from igps.analysis.clusters import STABLE, Linkage, clusters_of
 from igps.analysis.comparison import pair_distances
-from igps.analysis.map import Layout, body_map
+from igps.analysis.map import Layout, body_map, import_umap
 from igps.cli.reading import Folder, described, print_failures
 from igps.data.dataset import SignatureDataset
 from igps.data.sources import LABELS_FILE, Bodies
@@ -41,7 +43,13 @@ def clusters(
         seed: of the random halves.
         out: folder for clusters.csv and clusters.json, and the tree as clusters.svg and clusters.png.
     """
-    dataset, distances, label_of = _compared(Folder(root), descriptor, **reading)
+    check_at_least(0, n_resamples=n_resamples, seed=seed)
+
+    def check_number(bodies: Bodies) -> None:
+        if n_clusters is not None and not 1 <= n_clusters <= len(bodies):
+            raise ValueError(f"n_clusters: expected 1 to {len(bodies)}, the bodies of the folder, got {n_clusters}.")
+
+    dataset, distances, label_of = _compared(root, check_number, descriptor, **reading)
     found = clusters_of(distances, n_clusters, linkage=linkage, n_resamples=n_resamples, seed=seed)
     names, told = dataset.bodies.names, list[dict[str, Any]]()
     print(f"{'cluster':>7}{'bodies':>8}{'stability':>11}  in the middle")
@@ -55,7 +63,8 @@ def clusters(
         shown = ", ".join(f"{count} {name}" for name, count in classes.most_common(3)) + ", …" * (len(classes) > 3)
         print(f"{number + 1:>7}{len(members):>8}{stability:>11.2f}  {names[middle]}" + f" ({shown})" * bool(shown))
     n_stable = sum(one >= STABLE for one in found.stability)
-    print(f"{n_stable} of {len(told)} clusters are stable (at least {STABLE})")
+    unknown = f", {n} unknown" if (n := np.isnan(found.stability).sum()) else ""
+    print(f"{n_stable} of {len(told)} clusters are stable (at least {STABLE}){unknown}")
     if out is not None:
         rows = [
             {"body": name, "class": label_of[i], "cluster": int(number) + 1, "stability": found.stability[number]}
@@ -93,7 +102,10 @@ def map_bodies(
         except ValueError:  # words
             return list(bodies.column(colour))
 
-    dataset, distances, label_of = _compared(Folder(root, check=values_of), descriptor, **reading)
+    check_at_least(0, seed=seed)
+    if layout == "umap":
+        import_umap()
+    dataset, distances, label_of = _compared(root, values_of, descriptor, **reading)
     found, bodies = body_map(distances, layout, seed=seed), dataset.bodies
     values: list[str] | list[float]
     if colour == "class":
@@ -116,9 +128,17 @@ def map_bodies(
     return rows
 
 
-def _compared(folder: Folder, descriptor: str, **reading: Any) -> tuple[SignatureDataset, Floats, list[str]]:
-    """The bodies, their distances, and the class of each, "" where that is not known."""
-    found = described(folder, descriptor, **reading)
+def _compared(
+    root: Path, check: Callable[[Bodies], object], descriptor: str, **reading: Any
+) -> tuple[SignatureDataset, Floats, list[str]]:
+    """The bodies, their distances, and the class of each, "" where that is not known; for `check` see `Folder`."""
+
+    def check_all(bodies: Bodies) -> None:
+        if len(bodies) < 3:
+            raise ValueError(f"root: expected three bodies or more, {root} has {len(bodies)}. Name a larger folder.")
+        check(bodies)
+
+    found = described(Folder(root, check=check_all), descriptor, **reading)
     print_failures(found.failures, len(found.dataset))
     distances = pair_distances(found.descriptor, found.descriptions, progress=True).double().numpy()
     return found.dataset, distances, list(found.dataset.bodies.labels or [""] * len(found.dataset))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from igps.cli.gallery import as_described
-from igps.cli.reading import Folder, signatures
+from igps.cli.reading import Folder, check_files, signatures
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import Size
@@ -72,13 +72,14 @@ def duplicates(
 
 
 def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
-    """Tell how far two bodies are from each other, and what that means.
+    """Tell how far two bodies are from each other by pretrained, and what that means.
 
     Args:
         meshes: two files.
     """
     if len(meshes) != 2:
         raise ValueError(f"meshes: expected two files, got {len(meshes)}.")
+    check_files(meshes)
     reading["strict"] = True  # within `**reading`, where the parser finds the options
     dataset, _ = signatures(meshes, [descriptor_of(DESCRIPTOR)], **reading)
     found = body_distance(dataset, DESCRIPTOR, progress=True)

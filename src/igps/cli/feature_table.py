@@ -43,12 +43,15 @@ def wide_table(known: Table, measured: Table) -> Table:
     """A row for each file: what its bodies share, and `PART.volume`, `PART.v0` and so on; see `feature_table`.
 
     Masks of one organ each, called by their files or with names that come again in other folders, have a row for each
-    folder. A body that a file or folder lacks, or that could not be used, has no values.
+    folder, unless they are only numbered. A body that a file or folder lacks, or that could not be used, has no values.
     """
     folders = [PurePath(file).parent.as_posix() for file in known["file"]]
     n, parts = len(folders), set(known["part"])
     one_each = len(set(known["file"])) == n == len(set(zip(folders, known["part"], strict=True)))
-    if one_each and len(parts) > 1 and (n > len(parts) or all(map(is_called_by_file, known["name"], known["part"]))):
+    called = all(map(is_called_by_file, known["name"], known["part"]))
+    if called and all(part and part.isdigit() for part in parts):
+        known = {**known, "part": [None] * n}
+    elif one_each and len(parts) > 1 and (n > len(parts) or called):
         known = {"folder": folders, **{name: known[name] for name in known if name != "file"}}
     rows: dict[str, dict[str | None, int]] = {}
     for i, (file, part) in enumerate(zip(next(iter(known.values())), known["part"], strict=True)):

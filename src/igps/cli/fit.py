@@ -14,7 +14,7 @@ from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors import load
 from igps.nn.description import check_centres
 from igps.nn.descriptor import Descriptor
-from igps.nn.specification import specification
+from igps.nn.specification import IN_FOLDER, specification
 from igps.report.tables import write_rows
 
 _TITLES = {
@@ -38,18 +38,20 @@ def fit(
     strict: bool = False,
     **reading: Any,
 ) -> dict[str, Any]:
-    """Fit a metric or a classifier to a labelled folder, for --descriptor of every command and igps classify.
+    """Fit a metric or a classifier to a labelled folder, for igps classify and the --descriptor of commands.
 
-    A card of it, with scores on bodies that were held out, is written beside it in Markdown.
+    A card of it, with scores on bodies that were held out, is written beside it, or into its folder, in Markdown.
 
     Args:
         root: folder with one subfolder per class, or with meshes and a labels.csv (columns file,label).
-        out: the model, a file ending in .safetensors.
+        out: the model, a file ending in .safetensors, or a folder to share.
         descriptor: a name (a wrong one lists all), a file, or package.module:NAME of one of your own.
         goal: known for the classes of the folder; new for a metric of classes that come up later.
         head: classifier, whitened, or as_is for the descriptor itself; auto takes the best on held-out bodies.
         no_prior: ignore the descriptor's own metric, and fit to its histograms alone
     """
+    if out.is_dir() and not (out / IN_FOLDER).is_file() and (found := next(out.iterdir(), None)):
+        raise ValueError(f"out: expected a new folder, or that of a model, {out} holds {found.name}. Name another.")
     chosen = descriptor_of(descriptor)
     specification(chosen)  # refuses what no file can hold before anything is computed
     check_centres(chosen)
@@ -61,7 +63,8 @@ def fit(
     )
     model.save(out, {**model.card, "descriptor": descriptor})
     card = _card(model, out)
-    out.with_suffix(".md").write_text(card, encoding="utf-8")
+    if out.suffix:  # a folder has one
+        out.with_suffix(".md").write_text(card, encoding="utf-8")
     print(card.partition("\n\n")[2])
     refused = [*unread, *(failures or ())]
     print_failures(refused, len(dataset) - len(failures or ()))

@@ -12,11 +12,12 @@ from torch import Tensor
 
 from igps._arrays import Floats
 from igps._parallel import Limits
+from igps._parameters import check_positive
 from igps.data.attribute_sources import attribute_sources
 from igps.data.collection import is_collection
 from igps.data.dataset import Failure, SignatureDataset
 from igps.data.requirements import Requirements
-from igps.data.sources import Bodies, ClassRule, file_name_of, find_bodies
+from igps.data.sources import Bodies, ClassRule, file_and_part, file_name_of, find_bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag, name_of
 from igps.descriptors.individual import SIDE, SIZE, Mirror, Size, keeps_size, scale_of
@@ -156,13 +157,23 @@ def files_or_folder(meshes: Sequence[Path]) -> Folder | Sequence[Path]:
     return Folder(meshes[0]) if is_one else meshes
 
 
+def check_files(paths: Sequence[Path]) -> None:
+    """Raise a FileNotFoundError of the first that is no file, where nothing is to be computed without it."""
+    for path in paths:
+        if not file_and_part(path)[0].is_file():
+            told = "a folder; a file expected" if path.is_dir() else "no such file. Check the path"
+            raise FileNotFoundError(f"{path}: {told}.")
+
+
 def is_called_by_file(name: str, part: str | None) -> bool:
     """Whether a body of this name has that of its file, as a mask without names has."""
     return Path(file_name_of(name, part)).name.startswith(f"{part}.")
 
 
 def limits_of(seconds: float | None, gigabytes: float | None) -> Limits:
-    """Of one body."""
+    """Of one body; a ValueError that names the option of a number that is none."""
+    given = {"time_limit": seconds, "memory_limit": gigabytes}
+    check_positive(**{name: value for name, value in given.items() if value is not None})
     return Limits(seconds, None if gigabytes is None else int(gigabytes * 1e9))
 
 

@@ -28,6 +28,8 @@ def report(
         explain: paint where each body differs from its nearest, kept in explanations.npz; takes seconds for each
         n_workers: processes that make the pictures; all cores if not given.
     """
+    if meshes is not None and not meshes.is_dir():
+        raise FileNotFoundError(f"meshes: {meshes}: no such folder. Check the path.")
     dataset, found = read_sources(results, meshes), read_results(results)
     kept = results / "surfaces.npz"
     surfaces = read_surfaces(kept) if dataset is None else keep_surfaces(kept, dataset, n_workers=n_workers)

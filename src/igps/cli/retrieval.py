@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from igps.cli.gallery import as_described
 from igps.cli.reading import (
     Described,
     Folder,
+    check_files,
     described,
     files_or_folder,
     print_failures,
@@ -24,6 +26,7 @@ from igps.cli.reading import (
 )
 from igps.cli.report import check_report
 from igps.cli.report import report as write_report
+from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.individual import IndividualDescriptor
 from igps.gallery.about import is_gallery
@@ -57,7 +60,7 @@ def retrieve(
             of their own; distances.npz has them as "reranked".
     """
     check_report(report, out)
-    found = described(Folder(root, labelled=True), descriptor, **reading)
+    found = described(Folder(root, labelled=True, check=_check_scored), descriptor, **reading)
     labels = found.dataset.bodies.labels or ()
     distances = {"distances": pair_distances(found.descriptor, found.descriptions, progress=True)}
     scores = retrieval_scores(distances["distances"], labels)
@@ -151,6 +154,7 @@ def query(
             without labels); the distances listed are those of this order.
     """
     check_at_least(1, top=top)
+    check_files([mesh])
     if is_gallery(gallery):
         opened = Gallery(gallery, descriptor)
         wanted = _one(mesh, opened.descriptor, **as_described(opened, reading))
@@ -161,7 +165,8 @@ def query(
         raise ValueError(f"where: expected a gallery, {gallery} is a folder of meshes. See igps gallery build.")
     else:
         known, n_missing = described(Folder(gallery), descriptor or "pretrained", **reading), 0
-        wanted = _one(mesh, known.descriptor, **reading)
+        as_known = {"paper": False, "signature": known.dataset.config, **asdict(known.dataset.reading)}
+        wanted = _one(mesh, known.descriptor, **{**reading, **as_known})  # a file of signatures tells how
         bodies, distance = known.dataset.bodies, known.descriptor.distances
         n_found = min(top, len(bodies))
         n_near = min(max(top, N_RERANKED), len(bodies)) if rerank else n_found
@@ -193,6 +198,11 @@ def _one(mesh: Path, descriptor: Descriptor, **reading: Any) -> Tensor:
             f"mesh: expected one body, {mesh} holds {len(found.dataset)}. Name one of them, such as {names}."
         )
     return found.descriptions
+
+
+def _check_scored(bodies: Bodies) -> None:
+    if len(set(bodies.labels or ())) == len(bodies):
+        raise ValueError(f"root: expected a class of two bodies or more, got {len(bodies)} of one. Put like together.")
 
 
 def _summary(found: Described, scores: RetrievalScores) -> dict[str, Any]:

@@ -166,7 +166,10 @@ def _plain(which: str | Path | Descriptor) -> Descriptor:
     which = str(which)
     base, *words = re.split(r"(?=\+)", which)
     found = [_WITH.fullmatch(word) for word in words]
-    if words and all(found):
+    if words:
+        if not all(found):
+            told = "expected +NAME or +NAME=WEIGHT behind a descriptor, such as +ct=0.5, the weight above 0"
+            raise ValueError(f"descriptor: {told}, got {which!r}.")
         attributes, weights = zip(*((one[1], float(one[2] or 1)) for one in found if one), strict=True)
         return WithAttributes(_plain(base), attributes, weights).eval()
     if which in _MAKERS:
@@ -179,12 +182,15 @@ def _plain(which: str | Path | Descriptor) -> Descriptor:
         )
     try:
         own = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(
             f"descriptor: expected package.module:NAME to be importable, got {which!r} ({error}). Check the spelling, "
             "and that its folder is on the Python path."
         ) from error
-    made = own if isinstance(own, Descriptor) or not callable(own) else own()
+    try:
+        made = own if isinstance(own, Descriptor) or not callable(own) else own()
+    except TypeError as error:
+        raise ValueError(f"descriptor: expected {which} to make one without arguments ({error}).") from error
     if not isinstance(made, Descriptor):
         raise ValueError(
             f"descriptor: expected {which} to be or to make an igps.Descriptor, got {type(made).__name__}."
