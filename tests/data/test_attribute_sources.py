@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import gzip
+import importlib
 import inspect
+import linecache
 import logging
 import os
 import pickle
+import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import MethodType, SimpleNamespace
@@ -639,6 +643,80 @@ def test_constants_that_a_function_uses_tell_it_from_itself(monkeypatch: pytest.
     monkeypatch.setitem(globals(), "FACTOR", np.ones(3))
     with pytest.raises(ValueError, match=r"attributes: scaled uses variables of what is around it"):
         tag()
+
+
+def doubled(x: np.ndarray) -> np.ndarray:
+    return np.array([FACTOR * one for one in x])
+
+
+class Shift:
+    by = 1.0
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        return doubled(x) + self.by
+
+
+def helped(body: BodyRef, points: np.ndarray) -> np.ndarray:
+    return Shift()(points[:, 0])
+
+
+def test_what_a_function_calls_and_what_that_uses_tell_it_from_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another helper gave the values of before, from the cache; so did a constant in a comprehension."""
+
+    def tag() -> str:
+        return FunctionAttribute(helped).cache_tag(None)
+
+    first, found = tag(), []
+    monkeypatch.setitem(globals(), "FACTOR", 3.0)
+    found.append(tag())
+    monkeypatch.undo()
+    monkeypatch.setitem(globals(), "doubled", times)
+    found.append(tag())
+    monkeypatch.undo()
+    monkeypatch.setitem(globals(), "Shift", times)
+    found.append(tag())
+    monkeypatch.undo()
+    assert len({first, *found}) == 4
+    assert tag() == first
+    monkeypatch.setitem(globals(), "doubled", SimpleNamespace(factor=2.0))
+    with pytest.raises(ValueError, match=r"attributes: Shift uses variables of what is around it"):
+        tag()
+
+
+def test_helpers_of_another_module_tell_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As functions by name, and as attributes of a module."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "user.py").write_text(
+        "import helpers\nfrom helpers import one\n\n"
+        "def by_name(body, points):\n    return one(points)\n\n"
+        "def by_module(body, points):\n    return helpers.two(points) * helpers.BY\n"
+    )
+    tags: list[tuple[str, str]] = []
+    for one, two, by in ((1, 1, 1), (2, 1, 1), (1, 2, 1), (1, 1, 2)):
+        text = f"BY = {by}\n\ndef one(x):\n    return {one} * x\n\ndef two(x):\n    return {two} * x\n"
+        (tmp_path / "helpers.py").write_text(text)
+        for name in ("helpers", "user"):
+            sys.modules.pop(name, None)
+        linecache.clearcache()
+        importlib.invalidate_caches()
+        shutil.rmtree(tmp_path / "__pycache__", ignore_errors=True)
+        user = importlib.import_module("user")
+        tags.append(tuple(FunctionAttribute(f).cache_tag(None) for f in (user.by_name, user.by_module)))
+    by_name, by_module = zip(*tags, strict=True)
+    assert len(set(by_name)) == 2
+    assert len(set(by_module)) == 3
+
+
+def test_functions_in_one_line_are_told_apart(tmp_path: Path) -> None:
+    """They have one name and one source; and that of a lambda may end before its body."""
+    write_body(tmp_path / "a.off", 0.8, 0.9)
+    # fmt: off
+    pair = (lambda body, points: points[:, 0], lambda body, points: points[:, 1])
+    # fmt: on
+    for axis, function in enumerate(pair):
+        (item,) = SignatureDataset(tmp_path, CONFIG, tmp_path / "cache", attributes={"along": function})
+        samples = item.signature.interior
+        np.testing.assert_allclose(samples.attributes["along"], samples.points[:, axis], atol=1e-5)
 
 
 def test_what_a_function_is_given_by_default_tells_it_from_others_of_the_same_code(tmp_path: Path) -> None:

@@ -41,6 +41,16 @@ def test_what_is_not_the_librarys_has_none() -> None:
     assert cache_tag(EmbeddedDescriptor(own_descriptors.Same(), WhitenedHead())) is None
 
 
+def test_a_hook_is_not_the_librarys() -> None:
+    """It changes descriptions, which came from the cache without it."""
+    for register in (torch.nn.Module.register_forward_hook, torch.nn.Module.register_forward_pre_hook):
+        hooked = descriptor("interior")
+        handle = register(next(hooked.children()), lambda *given: None)
+        assert cache_tag(hooked) is None
+        handle.remove()
+        assert cache_tag(hooked) == cache_tag(descriptor("interior"))
+
+
 def test_what_it_was_made_with_changes_the_words() -> None:
     one, other = (PairHistogram([EuclideanDistance(8), Attribute(name, [0.1, 0.2])]) for name in ("depth", "twist"))
     assert cache_tag(HistogramDescriptor(one)) != cache_tag(HistogramDescriptor(other))

@@ -104,6 +104,32 @@ def test_a_fitted_head_comes_back_with_its_sizes(tmp_path: Path) -> None:
     assert found.n_features == 4
 
 
+def test_a_model_saved_twice_is_the_same_file(tmp_path: Path) -> None:
+    for i in range(8):
+        learnable().save(tmp_path / f"{i}.safetensors", {"author": "me"})
+    assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
+
+
+def test_what_was_changed_since_it_was_made_is_not_saved_as_it_was(tmp_path: Path) -> None:
+    """It came back as another descriptor, under another name, or not at all."""
+
+    def named(one: HistogramDescriptor) -> None:
+        one.name = "other"
+
+    def fewer(one: HistogramDescriptor) -> None:
+        one.histograms[0].n_samples = 30  # type: ignore[assignment]
+
+    def replaced(one: HistogramDescriptor) -> None:
+        one.histograms[1].axes[0] = EuclideanDistance(64)  # type: ignore[index, operator]
+
+    for change, said in ((named, "name"), (fewer, r"histograms\.0\.n_samples"), (replaced, r"histograms\.1\.axes\.0")):
+        descriptor = learnable()
+        change(descriptor)
+        with pytest.raises(ValueError, match=f"^{said}: expected as it was made"):
+            descriptor.save(tmp_path / "mine.safetensors")
+        assert not (tmp_path / "mine.safetensors").exists()
+
+
 def test_what_is_of_others_is_not_saved(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"made of modules of igps and numbers, got own_descriptors\.Height"):
         own_descriptors.Height().save(tmp_path / "mine.safetensors")

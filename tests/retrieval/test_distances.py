@@ -145,15 +145,34 @@ def test_gradients_of_one_side_are_those_of_both(distance: Distance) -> None:
         torch.testing.assert_close(found, expected[side])
 
 
-@pytest.mark.usefixtures("either_device")
 @pytest.mark.parametrize("distance", ALL)
 @pytest.mark.parametrize("side", [0, 1])
-def test_forward_derivatives_are_refused_and_not_lost(distance: Distance, side: int) -> None:
-    both = [histograms(3, (4,), seed=25, filled=2), histograms(2, (4,), seed=26, filled=2)]
+def test_forward_derivatives_are_those_of_a_backward_pass_and_not_lost(distance: Distance, side: int) -> None:
+    both = [histograms(3, (40,), seed=25), histograms(2, (40,), seed=26)]
+    both[1][1] = both[0][2]  # at distance zero
+    along, upstream = histograms(len(both[side]), (40,), seed=29, filled=2), histograms(3, (2,), seed=30, filled=2)
+    leaf = both[side].requires_grad_()
+    expected = (torch.autograd.grad((distance(*both) * upstream).sum(), leaf)[0] * along).sum()
+
+    def of_side(rows: Tensor) -> Tensor:
+        return (distance(*(rows if i == side else one.detach() for i, one in enumerate(both))) * upstream).sum()
+
+    plain = leaf.detach()
     with forward_ad.dual_level():
-        both[side] = forward_ad.make_dual(both[side], torch.ones_like(both[side]))
-        with pytest.raises(NotImplementedError):
-            distance(*both)
+        found = [forward_ad.unpack_dual(of_side(forward_ad.make_dual(plain, along))).tangent]
+    found += [torch.func.jvp(of_side, (plain,), (along,))[1], (torch.func.grad(of_side)(plain) * along).sum()]
+    for one in found:
+        torch.testing.assert_close(one, expected, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("distance", ALL)
+def test_second_derivatives_by_transforms_of_functions_are_those_of_finite_differences(distance: Distance) -> None:
+    queries, gallery = histograms(3, (20,), seed=31, filled=2), histograms(4, (20,), seed=32, filled=2)
+    along = histograms(3, (20,), seed=33, filled=2)
+    gradient = torch.func.grad(lambda rows: distance(rows, gallery).square().sum())
+    found = torch.func.jvp(gradient, (queries,), (along,))[1]
+    expected = (gradient(queries + 1e-6 * along) - gradient(queries - 1e-6 * along)) / 2e-6
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_chi_square_gradients_over_several_tiles_agree_with_autograd_on_the_formula() -> None:

@@ -3,7 +3,10 @@
 import dis
 import hashlib
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+import logging
+import sys
+import sysconfig
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any, Protocol, get_args, runtime_checkable
@@ -45,6 +48,8 @@ class FromFiles(Protocol):
 class FunctionAttribute:
     """A function `(body, points)` as a source; name, code, defaults and constants stand for it in keys of the cache.
 
+    With it stand the functions and classes that it uses, but for those of libraries, which are taken not to change.
+
     A ValueError where its source code is not known, or does not tell what it does.
     """
 
@@ -54,32 +59,83 @@ class FunctionAttribute:
         self.cache_tag(None)
 
     def cache_tag(self, body: BodyRef | None) -> str:
-        """The function, and the body, whose name it is given."""
-        name = getattr(self.function, "__qualname__", repr(self.function))
-        remedy = "Give an object with this call and a method cache_tag(body), see igps.data.attributes.AttributeSource."
-        kept = getattr(self.function, "__defaults__", None), getattr(self.function, "__kwdefaults__", None)
-        used = [*(kept[0] or ()), *(kept[1] or {}).values(), *_constants(self.function)]
-        is_told = all(one is None or isinstance(one, _Keyable) for one in used)
-        if getattr(self.function, "__closure__", None) or inspect.ismethod(self.function) or not is_told:
-            raise ValueError(f"attributes: {name} uses variables of what is around it, which no key tells. {remedy}")
-        try:
-            source = inspect.getsource(self.function)
-        except (OSError, TypeError) as error:
-            raise ValueError(f"attributes: the source code of {name} is not known ({error}). {remedy}") from error
-        return f"function {name} {hashlib.sha256(source.encode()).hexdigest()} {used} {body}"
+        """The function with all of its own that it calls, and the body, whose name it is given."""
+        return f"function {' '.join(map(_told, [self.function, *_helpers(self.function)]))} {body}"
 
     def __call__(self, body: BodyRef, points: Floats) -> NDArray[np.floating[Any]]:
         """Its values."""
         return self.function(body, points)
 
 
-def _constants(function: Callable[..., Any]) -> list[Any]:
-    """The numbers, texts, arrays and the like that a function uses from its module."""
-    if not inspect.isfunction(function):
-        return []
-    names = sorted({one.argval for one in dis.get_instructions(function) if one.opname == "LOAD_GLOBAL"})
-    found = [function.__globals__[name] for name in names if name in function.__globals__]
-    return [one for one in found if isinstance(one, _Keyable | list | tuple | dict | set | np.ndarray)]
+def _told(function: Callable[..., Any]) -> str:
+    """Name, source code, defaults and constants of a function or class; a ValueError if they do not tell all."""
+    name = getattr(function, "__qualname__", repr(function))
+    remedy = "Give an object with this call and a method cache_tag(body), see igps.data.attributes.AttributeSource."
+    kept = getattr(function, "__defaults__", None), getattr(function, "__kwdefaults__", None)
+    used = [*(kept[0] or ()), *(kept[1] or {}).values(), *_used(function)[0]]
+    is_told = all(one is None or isinstance(one, _Keyable) for one in used)
+    if getattr(function, "__closure__", None) or inspect.ismethod(function) or not is_told:
+        raise ValueError(f"attributes: {name} uses variables of what is around it, which no key tells. {remedy}")
+    try:
+        source = inspect.getsource(function)
+    except (OSError, TypeError) as error:
+        raise ValueError(f"attributes: the source code of {name} is not known ({error}). {remedy}") from error
+    if name.endswith("<lambda>"):  # its source is that of one line, in which others may stand, and which it may leave
+        source += str([(step.opname, step.argrepr) for step in _steps(function) if not inspect.iscode(step.argval)])
+    return f"{name} {hashlib.sha256(source.encode()).hexdigest()} {used}"
+
+
+def _helpers(function: Callable[..., Any]) -> list[Callable[..., Any]]:
+    """The functions and classes, of no library, that a function uses, and those that they use."""
+    found, waiting = list[Callable[..., Any]](), _used(function)[1]
+    for one in waiting:  # which grows
+        if one is not function and one not in found:
+            found.append(one)
+            waiting += _used(one)[1]
+    return found
+
+
+def _used(given: Callable[..., Any]) -> tuple[list[Any], list[Callable[..., Any]]]:
+    """What a function, or a class and its methods, use of their modules: values; functions and classes of no library.
+
+    What these modules import of other modules of the user is among them.
+    """
+    constants, helpers, functions = list[Any](), list[Any](), [given]
+    if inspect.isclass(given):
+        helpers += [one for one in given.__mro__[1:] if _is_own(one.__module__)]
+        functions = [getattr(one, "__func__", getattr(one, "fget", one)) for one in vars(given).values()]
+    for function in filter(inspect.isfunction, functions):
+        steps = list(_steps(function))
+        names = sorted({step.argval for step in steps if step.opname == "LOAD_GLOBAL"})
+        found = [function.__globals__[name] for name in names if name in function.__globals__]
+        inside = sorted({step.argval for step in steps if step.opname in ("LOAD_ATTR", "LOAD_METHOD")})
+        for module in [one for one in found if inspect.ismodule(one) and _is_own(one.__name__)]:
+            found += [getattr(module, name) for name in inside if hasattr(module, name)]
+        for one in found:
+            if not hasattr(one, "__name__"):  # as modules, functions and classes have, compiled or not
+                constants += [] if one is None or isinstance(one, logging.Logger) else [one]
+                continue
+            code = one if inspect.isfunction(one) else inspect.unwrap(one)
+            if (inspect.isfunction(code) or inspect.isclass(code)) and _is_own(code.__module__):
+                helpers.append(code)
+    return constants, helpers
+
+
+def _steps(function: Callable[..., Any]) -> Iterator[dis.Instruction]:
+    """The code of a function, and of what is defined in it, such as comprehensions."""
+    codes = [function.__code__]
+    for code in codes:  # which grow
+        codes += filter(inspect.iscode, code.co_consts)
+        yield from dis.get_instructions(code)
+
+
+def _is_own(module: str) -> bool:
+    """Whether a module is of the user: its code may change from run to run, that of libraries only with a version."""
+    package = module.partition(".")[0]
+    if package == "igps" or package in sys.stdlib_module_names:
+        return False
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return file is None or not any(Path(file).is_relative_to(sysconfig.get_path(one)) for one in ("purelib", "platlib"))
 
 
 def _takes_body(function: Callable[..., Any]) -> bool:

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, overload
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from igps._arrays import Floats, Singles
+from igps.data.indices import Indices, resolve_indices, scalar_index
 from igps.mesh.mesh import Mesh
 from igps.signature.signature import Samples, Signature
-
-Indices = slice | Sequence[int] | Sequence[bool] | Sequence[str] | Tensor | NDArray[Any]
-"""Some of a batch or dataset: a slice, numbers, a mask, and of a dataset names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,20 +231,19 @@ class SignatureBatch:
         return Body(eigenvalues, interior, surface, float(self.area[i]), float(self.volume[i]), self.ids[i], mesh)
 
 
-def scalar_index(index: Any) -> Any:
-    """The number in an array without dimensions, as permutations give them one by one; any other index as it is."""
-    return operator.index(index) if isinstance(index, Tensor | np.ndarray) and index.ndim == 0 else index
+def _refuse(batch: Any, name: str, value: Any) -> None:
+    # Not the error of a frozen dataclass, which Lightning replaces by one that names neither batch nor remedy
+    raise AttributeError(
+        f"{name}: a batch is fixed. Make another by dataclasses.replace, or by batch.to(torch.float64). Of Lightning's "
+        'precisions only "32-true", "16-mixed" and "bf16-mixed" leave batches alone, of Fabric\'s only "32-true": take '
+        "one of these, in Fabric with torch.autocast around the module."
+    )
 
 
-def resolve_indices(index: Indices, n: int) -> list[int]:
-    """The numbers that a slice, numbers, or a mask choose among n; an IndexError where they do not fit."""
-    if isinstance(index, slice):
-        return list(range(n))[index]
-    given = index.cpu() if isinstance(index, Tensor) else torch.as_tensor(np.asarray(index), device="cpu")
-    if given.dtype == torch.bool and given.shape != (n,):
-        raise IndexError(f"mask: expected {n} entries, got an array of shape {tuple(given.shape)}.")
-    found: list[int] = torch.arange(n, device="cpu")[given if given.numel() else given.long()].tolist()
-    return found
+for _kind in (SampleBatch, SignatureBatch):
+    _kind.__setattr__ = _refuse  # type: ignore[method-assign]
+# They hold tensors and names alone, so that torch.load(weights_only=True) may make them
+torch.serialization.add_safe_globals([SampleBatch, SignatureBatch])
 
 
 def _joined(parts: Sequence[Tensor], padding: float = 0) -> Tensor:

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from igps._arrays import Singles
-from igps._files import PARTIAL, whole_file
+from igps._files import PARTIAL, whole_file, with_ordered_metadata
 from igps.signature.signature import SAMPLE_KINDS, SampleKind, Samples, Signature, SignatureConfig
 
 logger = logging.getLogger(__name__)
@@ -100,11 +100,11 @@ class FileCache(Generic[T]):
         path = self.path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
         tensors, metadata = self._encode(value)
-        metadata["checksum"] = checksum(tensors, metadata)
+        metadata |= {"format": self._format, "key": key, "checksum": checksum(tensors, metadata)}
         _remove_abandoned(path.parent.glob(f"*{PARTIAL}"))
         try:
             with whole_file(path) as file:
-                file.write(_ordered(save(tensors, metadata={"format": self._format, "key": key, **metadata})))
+                file.write(with_ordered_metadata(save(tensors, metadata=metadata)))
         except PermissionError:
             # Some file systems replace no file that another process holds open. Where that process was first with the
             # same value, its file serves as well.
@@ -203,16 +203,6 @@ def _remove_abandoned(partials: Iterable[Path]) -> None:
                 partial.unlink()
         except OSError:  # another process was first, or only another user may
             continue
-
-
-def _ordered(content: bytes) -> bytes:
-    """A safetensors file with its metadata by name: that library writes them in an order that differs each time."""
-    end = 8 + int.from_bytes(content[:8], "little")
-    header: dict[str, Any] = json.loads(content[8:end])
-    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
-    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-    text += b" " * (-len(text) % 8)
-    return b"".join((len(text).to_bytes(8, "little"), text, memoryview(content)[end:]))
 
 
 def checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:

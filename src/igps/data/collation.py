@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.utils.data._utils.collate import default_collate_fn_map
 
 from igps.data._shared_memory import empty_arrays
 from igps.data.batch import LabelledSignature, SampleBatch, SignatureBatch, attribute_names
@@ -15,7 +16,7 @@ from igps.signature.signature import Samples, Signature
 
 
 def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mesh] | None = None) -> SignatureBatch:
-    """Pad Signatures to a batch: the `collate_fn` of a `DataLoader` over a `SignatureDataset`.
+    """Pad Signatures to a batch, as a `DataLoader` does by itself, also where they are parts of its dataset's items.
 
     In a worker process of a DataLoader the batch lies in shared memory, from which its consumer reads it.
 
@@ -63,6 +64,10 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
     ids, units = tuple(item.id for item in labelled), tuple(s.unit for s in signatures)
     given = None if meshes is None else tuple(meshes)
     return SignatureBatch(eigenvalues, interior, surface, area, volume, labels, ids, given, units)
+
+
+for _kind in (LabelledSignature, Signature):
+    default_collate_fn_map[_kind] = lambda items, *, collate_fn_map: collate(items)
 
 
 def _of_samples(samples: Sequence[Samples]) -> list[list[NDArray[Any]]]:

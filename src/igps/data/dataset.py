@@ -14,12 +14,13 @@ from torch.utils.data import Dataset
 
 from igps._parallel import Limits
 from igps.data.attributes import AttributeSource, PointFunction, split_attributes, with_attribute
-from igps.data.batch import Indices, LabelledSignature, SignatureBatch, resolve_indices, scalar_index
+from igps.data.batch import LabelledSignature, SignatureBatch
 from igps.data.cache import SignatureCache, default_cache_dir
 from igps.data.collation import collate
 from igps.data.collection import CollectionFile, Contents, write_collection
 from igps.data.filling import Failure, fill, find_cached
 from igps.data.in_memory import bodies_in_memory
+from igps.data.indices import Indices, resolve_indices, scalar_index
 from igps.data.pipeline import CacheHit, PreTransform, SignaturePipeline
 from igps.data.requirements import AnyDescriptor, requirements_of
 from igps.data.sources import Bodies, ClassRule, bodies_of
@@ -147,8 +148,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         name = self.bodies.names[i]
         if self._loaded is not None:
             return replace(self._loaded[self._numbers[i]], name=name)
-        hit = self._hits[i]
-        found = None if hit is None else self.pipeline.read(hit)
+        found = None if (hit := self._hits[i]) is None else self.pipeline.read(hit)
         signature = replace(found or self.pipeline.signature(self.bodies[i]), name=name)
         for attribute, function in self._functions.items():
             values = {kind: function(getattr(signature, kind).points) for kind in SAMPLE_KINDS}

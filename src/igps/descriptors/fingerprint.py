@@ -42,8 +42,10 @@ def cache_tag(module: nn.Module) -> str | None:
     """All that descriptions depend on beside Signatures, in words, see `igps.nn.description.describe`.
 
     What the descriptor is made of, its parameters, the library's code, and the versions of what that computes with.
-    None for a descriptor that holds anything of others, whose code is not known.
+    None for a descriptor that holds anything of others, whose code is not known, such as a hook.
     """
+    if any(one._forward_hooks or one._forward_pre_hooks for one in module.modules()):
+        return None
     try:
         made_of = json.dumps(specification(module))
     except ValueError:

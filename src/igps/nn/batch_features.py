@@ -10,6 +10,7 @@ from igps.nn._kernels.blocks import of_bodies
 from igps.nn._kernels.nearest import smallest
 from igps.nn._precision import full_precision
 from igps.nn.embedding import barycentroid_potential
+from igps.retrieval.distances import row_distances
 from igps.signature.signature import SampleKind
 
 WEIGHT = "weight"
@@ -124,7 +125,8 @@ def nearest_directions(points: Tensor, targets: Tensor, mask: Tensor, n_nearest:
     Zero where the mean is the point itself; of all targets where there are fewer.
     """
     with full_precision():
-        distances = torch.cdist(points.detach(), targets.detach().masked_fill(~mask.unsqueeze(-1), _FAR))
+        real = targets.detach().masked_fill(~mask.unsqueeze(-1), _FAR)
+        distances = row_distances(points.detach(), real, "use_mm_for_euclid_dist_if_necessary")
     nearest, which = smallest(distances, min(n_nearest, mask.shape[-1]))
     found = (nearest < _FAR).unsqueeze(-1)
     rows = which.flatten(-2).unsqueeze(-1).expand(*which.shape[:-2], -1, points.shape[-1])
@@ -141,7 +143,7 @@ def nearest_neighbours(points: Tensor, n_nearest: int = N_NEIGHBOURS, mask: Tens
     if not (n_points := points.shape[-2]):
         raise ValueError("samples: expected at least one of each body, got none.")
     with full_precision():
-        squares = torch.cdist(points.detach(), points.detach(), compute_mode="use_mm_for_euclid_dist")
+        squares = row_distances(points.detach(), points.detach(), "use_mm_for_euclid_dist")
     squares.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
     if mask is not None:
         squares.masked_fill_(~mask.unsqueeze(-2), torch.inf)

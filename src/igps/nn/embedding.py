@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from igps._parameters import check_at_least
 from igps.nn.specification import Specified
+from igps.retrieval.distances import row_distances
 
 EmbeddingKind = Literal["commute_time", "diffusion", "biharmonic"]
 _KINDS = get_args(EmbeddingKind)  # here, as older compilers of PyTorch cannot trace it
@@ -69,7 +70,7 @@ def spectral_embedding(
 
 def interior_distance(p: Tensor, q: Tensor) -> Tensor:
     """(..., P, Q) interior distances: Euclidean of embeddings (..., P, K) and (..., Q, K) (Rustamov 2010, eq. 5)."""
-    return torch.cdist(p, q, compute_mode="donot_use_mm_for_euclid_dist")
+    return row_distances(p, q)
 
 
 def barycentroid_potential(embedding: Tensor) -> Tensor:

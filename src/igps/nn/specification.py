@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
-from igps._files import whole_file
+from igps._files import whole_file, with_ordered_metadata
 
 _FORMAT = "igps-descriptor-1"
 # Of a folder that is shared as a whole, beside its card
@@ -140,11 +140,30 @@ def save_module(module: nn.Module, path: str | Path, card: Mapping[str, Any]) ->
         text = _README.format(name=getattr(module, "name", type(module).__name__), rows="".join(rows))
         path.with_name("README.md").write_text(text, encoding="utf-8")
         return
-    words = {"format": _FORMAT, "specification": json.dumps(specification(module)), "card": json.dumps(card)}
+    made_with = specification(module)
+    _check_as_made(module, build_module(made_with, sum(one.nbytes for one in module.state_dict().values())))
+    words = {"format": _FORMAT, "specification": json.dumps(made_with), "card": json.dumps(card)}
     state = {name: value.detach().cpu().clone().contiguous() for name, value in module.state_dict().items()}
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with whole_file(Path(path)) as file:
-        file.write(save(state, metadata=words))
+        file.write(with_ordered_metadata(save(state, metadata=words)))
+
+
+def _check_as_made(module: nn.Module, made: nn.Module) -> None:
+    """Raise a ValueError where a module was changed in a way that no file keeps: it would come back as another."""
+    parts = dict(made.named_modules())
+    for place, one in module.named_modules():
+        other, changed = parts.get(place), [""]
+        if type(other) is type(one):
+            plain = {name: value for name, value in vars(other).items() if _is_plain(name, value)}
+            changed = [name for name, value in plain.items() if getattr(one, name, value) != value]
+        if changed:
+            what = ".".join(filter(None, (place, changed[0])))
+            raise ValueError(f"{what}: expected as it was made, got a changed one, which no file keeps. Make it anew.")
+
+
+def _is_plain(name: str, value: Any) -> bool:
+    return not name.startswith("_") and name != "training" and isinstance(value, bool | int | float | str | tuple)
 
 
 def load_module(path: str | Path) -> tuple[nn.Module, dict[str, Any]]:

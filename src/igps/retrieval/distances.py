@@ -1,10 +1,10 @@
 """Distances between every query and every gallery descriptor: tensors (Q, ...) and (G, ...) in, (Q, G) out.
 
 Smaller is closer, identical descriptors are at exactly zero, and a distance matrix of a set with itself is exactly
-symmetric. All dimensions after the first are cells, or entries of one vector. All functions are differentiable, χ² any
-number of times and the others once; they run on the device of their inputs, and compute half precision in float32. All
-raise a ValueError for shapes, dtypes or devices that do not fit, for NaN or infinite entries, and χ² for negative
-ones; to check that waits for the device once per argument.
+symmetric. All dimensions after the first are cells, or entries of one vector. All functions are differentiable, χ² and
+what `torch.func` follows any number of times, the others once; they run on the device of their inputs, and compute half
+precision in float32. All raise a ValueError for shapes, dtypes or devices that do not fit, for NaN or infinite entries,
+and χ² for negative ones; to check that waits for the device once per argument.
 """
 
 import math
@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.forward_ad import unpack_dual
+from torch.autograd import forward_ad
 
 from igps._threads import Team
 from igps.retrieval.distance_loops import fill
@@ -28,6 +28,8 @@ _DEVICE_TILE_BYTES = 48 * 2**20
 _CELLS_PER_TILE = 4096
 # Triples that a thread of the compiled loops computes at least: some milliseconds
 _TRIPLES_PER_THREAD = 2**24
+# Of the squares of lengths: what of their sum in double precision is rounding
+_CANCELLED = 1e-14
 
 
 def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
@@ -52,7 +54,8 @@ def chi_square(queries: Tensor, gallery: Tensor) -> Tensor:
     Returns:
         (Q, G) distances, without unit.
     """
-    return _ChiSquare.apply(*_as_rows(queries, gallery, non_negative=True))
+    a, b = _as_rows(queries, gallery, non_negative=True)
+    return _all_at_once(a, b) if in_transforms() else _ChiSquare.apply(a, b)
 
 
 def euclidean(queries: Tensor, gallery: Tensor) -> Tensor:
@@ -111,7 +114,12 @@ def _all_at_once(a: Tensor, b: Tensor) -> Tensor:
 
 def _is_for_loops(tensor: Tensor) -> bool:
     """Whether compiled loops can read it: those of a device, and what is traced, compute by PyTorch's tiles."""
-    return tensor.device.type == "cpu" and not torch.compiler.is_compiling()
+    return tensor.device.type == "cpu" and not torch.compiler.is_compiling() and not in_transforms()
+
+
+def in_transforms() -> bool:
+    """Whether `torch.func`, or forward mode, follows what is computed."""
+    return torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
 
 
 def _by_loops(a: Tensor, b: Tensor, *, chi_square: bool) -> Tensor:
@@ -155,15 +163,23 @@ def _tiles(a: Tensor, b: Tensor) -> Iterator[tuple[slice, slice, slice]]:
 
 
 def _row_distance(a: Tensor, b: Tensor) -> Tensor:
-    if _is_for_loops(a) and not (_is_derived(a) or _is_derived(b)):
+    if _is_for_loops(a) and not (torch.is_grad_enabled() and (a.requires_grad or b.requires_grad)):
         return _by_loops(a, b, chi_square=False).sqrt_()
-    # The faster form by a matrix product cancels: it leaves a diagonal that is not zero.
-    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+    return row_distances(a, b)
 
 
-def _is_derived(tensor: Tensor) -> bool:
-    """Whether a derivative by it is recorded, in reverse or forward mode, which NumPy's arrays cannot do."""
-    return (torch.is_grad_enabled() and tensor.requires_grad) or unpack_dual(tensor).tangent is not None
+# The faster form by a matrix product cancels: it leaves a diagonal that is not zero.
+def row_distances(a: Tensor, b: Tensor, compute_mode: str = "donot_use_mm_for_euclid_dist") -> Tensor:
+    """Euclidean distances (..., I, J) of rows (..., I, D) and (..., J, D), by `torch.cdist`, see there for the mode."""
+    if not in_transforms():
+        return torch.cdist(a, b, compute_mode=compute_mode)
+    # That has no forward derivatives, and no second ones. In double precision a product cancels less.
+    centre = a.detach().mean(dim=-2, keepdim=True)
+    x, y = (a - centre).double(), (b - centre).double()
+    sums = x.square().sum(dim=-1).unsqueeze(-1) + y.square().sum(dim=-1).unsqueeze(-2)
+    squares = sums - 2 * x @ y.mT
+    apart = squares > _CANCELLED * sums
+    return torch.where(apart, torch.where(apart, squares, 1).sqrt(), 0).to(a.dtype)
 
 
 def square_root(values: Tensor) -> Tensor:

@@ -178,6 +178,25 @@ def test_a_head_of_ones_own_is_stored_and_loaded(dataset: SignatureDataset, tmp_
     assert shipped.shape[1] != head(described).shape[1] or not torch.allclose(shipped, head(described), atol=0.1)
 
 
+def test_forward_derivatives_are_those_of_a_backward_pass_and_second_ones_are_numbers(
+    dataset: SignatureDataset,
+) -> None:
+    """By the places of samples; `torch.cdist` has none of them, and pieces of one sample have no spread."""
+    batch, pretrained = dataset.batch([0]).to(torch.float64), igps.descriptor("pretrained").double()
+    batch = replace(batch, interior=batch.interior.subset(200, 0), surface=batch.surface.subset(200, 0))
+    generator = torch.Generator().manual_seed(2)
+    places, along = batch.surface.points, torch.randn(1, 200, 3, generator=generator).double()
+    upstream = torch.randn(pretrained.n_features, generator=generator).double()
+
+    def loss(points: Tensor) -> Tensor:
+        return (pretrained(replace(batch, surface=replace(batch.surface, points=points))) * upstream).sum()
+
+    leaf = places.clone().requires_grad_()
+    expected = (torch.autograd.grad(loss(leaf), leaf)[0] * along).sum()
+    torch.testing.assert_close(torch.func.jvp(loss, (places,), (along,))[1], expected, rtol=1e-6, atol=0)
+    assert torch.isfinite(torch.func.jvp(torch.func.grad(loss), (places,), (along,))[1]).all()
+
+
 def test_shipped_file_is_small() -> None:
     assert PRETRAINED.stat().st_size < 5e6
 

@@ -1,7 +1,10 @@
 """How the samples of a body lie to its principal axes."""
 
+from contextlib import nullcontext
+
 import torch
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 from torch.nn.functional import normalize
 
 from igps.data.requirements import Requirements
@@ -9,6 +12,7 @@ from igps.nn.axes.points import soft_memberships
 from igps.nn.batch_features import SampleFeatures
 from igps.nn.embedding import SpectralEmbedding, barycentroid_potential
 from igps.nn.histograms.base import SampleHistogram, counted, joint
+from igps.retrieval.distances import in_transforms
 from igps.signature.signature import SampleKind
 
 # The weight of a sample is so great a power of its potential: the trunk decides where the axes lie, limbs hardly
@@ -82,7 +86,7 @@ class AxialHistogram(SampleHistogram):
         )  # fmt: skip
         if not torch.compiler.is_compiling() and not torch.isfinite(points.sum() + directions.sum() + potential.sum()):
             raise ValueError("AxialHistogram: expected finite values, got NaN or infinity.")
-        with torch.no_grad():
+        with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False) if in_transforms() else nullcontext():
             weights = potential.double().clamp_min(torch.finfo().tiny).pow(_POWER) * mask
             centre, axes = (one.to(points.dtype) for one in principal_axes(points, weights))
         n_points = mask.sum(dim=1)

@@ -94,9 +94,11 @@ class PieceHistogram(SampleHistogram):
         means = sums(points) / n_points
         places = points[:, None] - means.gather(2, piece[..., None].expand(*left.shape, 3))
         covariance = sums((places[..., :, None] * places[..., None, :]).flatten(3)) / n_points
+        few = n_points < _FEWEST  # eigenvalues that are equal have no second derivatives
+        covariance = torch.where(few, covariance.new_tensor([1, 0, 0, 0, 2, 0, 0, 0, 3]), covariance)
         spread = torch.linalg.eigvalsh(covariance.unflatten(3, (3, 3)))[..., -1]
         sizes = n_points[..., 0] / mask.sum(dim=1)[:, None, None]
-        lengths = 12 * torch.where(n_points[..., 0] < _FEWEST, 0, spread) / sizes
+        lengths = 12 * torch.where(few[..., 0], 0, spread) / sizes
         lengths = lengths.clamp_min(torch.finfo(points.dtype).tiny).log2() / 2
         of_sizes = soft_memberships(sizes.log2(), self.sizes) * sums(weights[..., None].to(points.dtype))
         counts = of_sizes.mT @ soft_memberships(lengths, self.lengths)

@@ -63,7 +63,8 @@ def _radii(points: Tensor, directions: Tensor, mask: Tensor) -> Tensor:
     dtype = points.dtype
     points, directions = (one.masked_fill(~mask[:, :, None], 0).double() for one in (points, directions))
     with full_precision():
-        squares = torch.cdist(points, points, compute_mode="use_mm_for_euclid_dist").square()
+        lengths = points.square().sum(dim=2)
+        squares = (lengths[:, :, None] + lengths[:, None] - 2 * points @ points.mT).clamp_min(0)
         # n·(x − y): how deep each point lies below the tangent plane of every other one
         depth = (directions * points).sum(dim=2, keepdim=True) - directions @ points.mT
     none = ~mask[:, None, :] | torch.eye(mask.shape[1], dtype=torch.bool, device=points.device)

@@ -5,6 +5,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from igps.retrieval.distances import in_transforms
+
 BLOCK = 2**25
 """Numbers of a block, which fill a device."""
 
@@ -12,11 +14,6 @@ BLOCK = 2**25
 def in_loops(device: torch.device) -> bool:
     """Whether compiled loops work on tensors of a device; where not, operations of PyTorch do, which can be traced."""
     return device.type == "cpu" and not torch.compiler.is_compiling() and not in_transforms()
-
-
-def in_transforms() -> bool:
-    """Whether `torch.func` follows what is computed."""
-    return torch._C._are_functorch_transforms_active()
 
 
 def of_bodies(function: Callable[..., Tensor], points: Tensor, others: Tensor, *more: Tensor) -> Tensor:

@@ -9,10 +9,10 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from igps.nn._kernels.blocks import BLOCK as _BLOCK
-from igps.nn._kernels.blocks import in_transforms
 from igps.nn._kernels.located import located
 from igps.nn._kernels.pair_values import PairValues, centres_of, with_tensors
 from igps.nn._precision import full_precision
+from igps.retrieval.distances import in_transforms
 
 # Shapes side by side have so many points at least, as a share of the most: each pays for as many as the largest
 _ALIKE = 0.8

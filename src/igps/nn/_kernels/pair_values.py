@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from igps.nn._kernels.pair_cells import COSINES, DISTANCES, VALUES
+from igps.retrieval.distances import row_distances
 
 Inputs = Sequence[Tensor]
 
@@ -124,8 +125,8 @@ def _twists(rows: Inputs, columns: Inputs) -> Tensor:
 
 def _inverse_distances(x: Tensor, y: Tensor) -> Tensor:
     """(N, I, J) one over the distances of points (N, I, D) and (N, J, D), 0 where they coincide."""
-    if x.shape[-1] > 3:  # one difference after the other would be slow; PyTorch has first derivatives of this alone
-        squares = torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist").square()
+    if x.shape[-1] > 3:  # one difference after the other would be slow
+        squares = row_distances(x, y).square()
     else:
         both = zip(x.unbind(-1), y.unbind(-1), strict=True)
         squares = sum(((a.unsqueeze(-1) - b.unsqueeze(-2)).square() for a, b in both), x.new_zeros(()))

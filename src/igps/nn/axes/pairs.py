@@ -152,7 +152,7 @@ class EmbeddedPairCosines(_CosineAxes):
     """`PairCosines` between the embedded samples: made of interior distances alone, they hardly change with pose.
 
     The direction of an interior sample is to the embedded surface samples nearest to it, that of a surface sample away
-    from the interior ones. They have first derivatives alone, as `torch.cdist` has.
+    from the interior ones. Second derivatives they have by `torch.func` alone.
     """
 
     def requirements(self, embedding: nn.Module) -> Requirements:
