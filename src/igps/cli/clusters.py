@@ -58,7 +58,7 @@ def clusters(
     print(f"{n_stable} of {len(told)} clusters are stable (at least {STABLE})")
     if out is not None:
         rows = [
-            {"body": name, "class": label_of[i], "cluster": int(number) + 1, "stability": found.stability[number]}
+            {"name": name, "class": label_of[i], "cluster": int(number) + 1, "stability": found.stability[number]}
             for i, (name, number) in enumerate(zip(names, found.labels, strict=True))
         ]
         write_answer(out, "clusters", rows, clusters_figure(found, names))
@@ -104,9 +104,9 @@ def map_bodies(
         values = [one.volume * millimetres(one.unit) ** 3 for one in dataset.signatures()]
     else:
         values = values_of(bodies)
-    column = colour if colour not in ("body", "x", "y") else f"{colour} of {LABELS_FILE}"
+    column = colour if colour not in ("name", "x", "y") else f"{colour} of {LABELS_FILE}"
     rows = [
-        {"body": name, "x": x, "y": y, "class": label, column: value}
+        {"name": name, "x": x, "y": y, "class": label, column: value}
         for name, (x, y), label, value in zip(bodies.names, found.points.tolist(), label_of, values, strict=True)
     ]
     print(f"{len(rows)} bodies; stress {found.stress:.2f}: 0 keeps every distance, above 0.2 the map distorts much")
