@@ -31,7 +31,7 @@ def clusters(
 
     Hierarchical clustering of the descriptor's distances. Of each cluster: its bodies, the one in its middle, its
     classes where they are known, and its stability, from 0 to 1: how much of it comes together again when half of the
-    bodies are clustered alone. Below 0.75 it is not to be relied on.
+    bodies are clustered alone; a single body has none. Below 0.75 it is not to be relied on.
 
     Args:
         n_clusters: how many; as many as have the largest mean silhouette if not given.
@@ -53,7 +53,8 @@ def clusters(
              "classes": dict(classes.most_common()), "bodies": [names[i] for i in members]}
         )  # fmt: skip
         shown = ", ".join(f"{count} {name}" for name, count in classes.most_common(3)) + ", …" * (len(classes) > 3)
-        print(f"{number + 1:>7}{len(members):>8}{stability:>11.2f}  {names[middle]}" + f" ({shown})" * bool(shown))
+        told_stability = "–" if np.isnan(stability) else f"{stability:.2f}"
+        print(f"{number + 1:>7}{len(members):>8}{told_stability:>11}  {names[middle]}" + f" ({shown})" * bool(shown))
     n_stable = sum(one >= STABLE for one in found.stability)
     print(f"{n_stable} of {len(told)} clusters are stable (at least {STABLE})")
     if out is not None:
