@@ -116,6 +116,19 @@ def test_clusters_of_one_cloud_are_told_unstable() -> None:
     assert np.mean(np.array(found) >= STABLE) < 0.05
 
 
+def test_a_body_alone_has_no_stability() -> None:
+    """Whatever halves are drawn, it is together with itself: of chance pairs, too, those drawn alone tell nothing."""
+    points = np.concatenate([blobs(20, [[0, 0, 0]], 0.4), [[50.0, 0, 0]]])
+    assert np.isnan(clusters_of(cdist(points, points), 2).stability[1])
+    pairs = []
+    for seed in range(3):
+        points = np.random.default_rng(seed).normal(size=(80, 5))
+        found = clusters_of(cdist(points, points), 22, linkage="complete")
+        pairs += [found.stability[k] >= STABLE for k in np.flatnonzero(np.bincount(found.labels) == 2)]
+    assert len(pairs) > 10
+    assert np.mean(pairs) < 0.7
+
+
 def test_stability_is_the_mean_largest_jaccard_index_of_halves() -> None:
     """Against a loop over sets, on the same halves."""
     from scipy.cluster.hierarchy import fcluster, linkage
@@ -130,7 +143,7 @@ def test_stability_is_the_mean_largest_jaccard_index_of_halves() -> None:
         cut = fcluster(linkage(pdist(points[drawn]), "average"), 3, "maxclust")
         again = [set(drawn[cut == one].tolist()) for one in set(cut)]
         for own, of in zip(first, shares, strict=True):
-            if left := own & set(drawn.tolist()):
+            if len(left := own & set(drawn.tolist())) > 1:
                 of.append(max(len(left & one) / len(left | one) for one in again))
     assert found.stability == pytest.approx([np.mean(of) for of in shares])
 

@@ -137,9 +137,10 @@ def test_volumes_are_compared_in_one_unit(
                 trimesh.load(path, process=False).apply_scale(1e-3).export(path.with_suffix(".glb"))
                 path.unlink()
     igps(monkeypatch, root, "groups", root, *OWN, "--size", "--out", tmp_path)
+    assert "6 of 10 bodies have no unit of length; their numbers count as millimetres" in capsys.readouterr().out
     assert float(table(tmp_path / "groups.csv")[1]["effect"]) > 0.9
     igps(monkeypatch, root, "figure", "map", root, *OWN, "--colour", "volume", "--out", tmp_path)
-    found = {row["body"][:-4]: float(row["volume"]) for row in table(tmp_path / "map.csv")}
+    found = {row["name"][:-4]: float(row["volume"]) for row in table(tmp_path / "map.csv")}
     for label, of_each in heights.items():
         for i, height in enumerate(of_each):
             assert found[f"{label}/{i}"] == pytest.approx(found["low/0"] * height, rel=1e-5)
@@ -199,7 +200,7 @@ def test_outliers_lists_the_short_egg_among_the_long_first(
     printed = capsys.readouterr().out
     rows = table(tmp_path / "outliers.csv")
     assert len(rows) == 13
-    assert rows[0]["body"] == "long6.off"
+    assert rows[0]["name"] == "long6.off"
     assert "lies among short" in rows[0]["reason"]
     assert "long6.off" in printed.splitlines()[1]
     svg = (tmp_path / "outliers.svg").read_text()
@@ -231,7 +232,7 @@ def test_outliers_lists_all_organs_of_a_subject_in_a_wrong_unit(
             nibabel.save(nibabel.Nifti1Image(voxels.astype(np.uint8), affine), path)
     igps(monkeypatch, tmp_path / "x", "outliers", tmp_path / "scans", *OWN, "--classes", "body", "--out", tmp_path)
     first = table(tmp_path / "outliers.csv")[:3]
-    assert [row["body"][:2] for row in first] == ["s4"] * 3
+    assert [row["name"][:2] for row in first] == ["s4"] * 3
     assert all(float(row["score"]) > LIMIT for row in first)
 
 
@@ -286,6 +287,27 @@ def test_explain_heeds_size_and_side(
     assert list(shares)[-2:] == ["side", "size"]
     assert shares["size"] > 0.5 * found["distance"]
     assert shares["size"] + shares["side"] == pytest.approx(found["distance"], rel=1e-3)
+    if is_group:  # painted is the middle of each, although some of its numbers are negative
+        assert {name[-5] for name in found["bodies"]} <= set("2345")
+
+
+def test_half_of_a_share_lies_on_a_part_of_the_area_however_small_its_faces_are(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A ball with even rings, and one with two thirds of its rings about a pole, against one long egg."""
+    rings = {
+        "even": np.linspace(0, np.pi, 31),
+        "crowded": np.r_[np.linspace(0, 0.4, 41), np.linspace(0.4, np.pi, 21)[1:]],
+    }
+    told = []
+    for name, angles in rings.items():
+        profile = np.column_stack([np.sin(angles), np.cos(angles)])
+        profile[[0, -1], 0] = 0
+        trimesh.creation.revolve(profile[::-1], sections=24).export(path := tmp_path / f"{name}.off")
+        igps(monkeypatch, root, "explain", path, root / "long3.off", *OWN)
+        (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith(f"{path}: half")]
+        told.append(float(line.partition("lies on ")[2].partition("%")[0]))
+    assert told[1] == pytest.approx(told[0], abs=6)
 
 
 @pytest.mark.parametrize("words", [["clusters"], ["figure", "clusters"]])
@@ -297,7 +319,7 @@ def test_clusters_are_the_two_kinds_of_eggs(
     igps(monkeypatch, root, *words, root, *OWN, "--n_clusters", "2", *out)
     printed = capsys.readouterr().out
     rows = table(tmp_path / "figures" / "clusters.csv")
-    clusters = {row["body"]: row["cluster"] for row in rows}
+    clusters = {row["name"]: row["cluster"] for row in rows}
     assert [clusters[f"short{i}.off"] for i in range(6)] == [clusters["long6.off"]] * 6 == ["1"] * 6
     assert [clusters[f"long{i}.off"] for i in range(6)] == ["2"] * 6
     assert "(6 short, 1 long)" in printed
@@ -330,7 +352,7 @@ def test_the_map_has_the_distances_of_the_descriptor_and_its_colours(
         "age": "50.0",
         "scanner": "x",
     }
-    assert rows[0]["body"] == "short0.off"
+    assert rows[0]["name"] == "short0.off"
     assert rows[0][colour] == first[colour]
     assert imread(tmp_path / "map.png").std() > 0.02
     assert (tmp_path / "map.svg").read_text().startswith("<?xml")

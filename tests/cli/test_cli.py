@@ -216,7 +216,7 @@ def test_bad_mesh_is_skipped_and_listed_or_stops_the_run(
     igps(monkeypatch, *arguments)
     assert "1 of 7 meshes could not be used" in capsys.readouterr().out
     (row,) = csv.DictReader((tmp_path / "out" / "failures.csv").open(newline=""))
-    assert row["file"] == "egg/bad.off"
+    assert row["name"] == "egg/bad.off"
     assert "a single triangle" in row["error"]
     scores = json.loads((tmp_path / "out" / "scores.json").read_text())
     assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [6, 7, 6, 1]
@@ -383,7 +383,7 @@ def test_a_mesh_that_cannot_be_described_is_a_failure(
         igps(monkeypatch, *arguments)
         assert "2 of 7 meshes could not be used" in capsys.readouterr().out
         rows = list(csv.DictReader((tmp_path / "out" / "failures.csv").open(newline="")))
-        assert [row["file"] for row in rows] == ["egg/bad.off", "egg/1.off"]
+        assert [row["name"] for row in rows] == ["egg/bad.off", "egg/1.off"]
         assert "too much" in rows[1]["error"]
         scores = json.loads((tmp_path / "out" / "scores.json").read_text())
         assert [scores[name] for name in ("n_queries", "n_given", "n_used", "n_refused")] == [5, 7, 5, 2]
@@ -498,9 +498,12 @@ def test_json_is_what_the_table_tells(
     histograms = describe(dataset, small_interior())
     distances = chi_square(histograms[1:2], histograms)[0]
     order = distances.argsort()[:3]
-    assert [row["mesh"] for row in rows] == [dataset.bodies.names[i] for i in order]
+    assert [row["name"] for row in rows] == [dataset.bodies.names[i] for i in order]
     assert [row["distance"] for row in rows] == pytest.approx(distances[order].tolist(), abs=1e-6)
     assert (rows[0]["rank"], rows[0]["class"]) == (1, "ball")
+    words = ["query", wanted, "--gallery", root / "ball", "--top", "1", "--descriptor", INTERIOR, "--json", *options]
+    igps(monkeypatch, *words)
+    assert json.loads(capsys.readouterr().out)[0]["class"] is None  # the folder tells none
 
     igps(monkeypatch, "compare", root, "--descriptors", INTERIOR, "--json", *options)
     (row,) = json.loads(capsys.readouterr().out)

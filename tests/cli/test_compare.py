@@ -106,7 +106,7 @@ def test_command_lists_failures_by_descriptor_and_of_signatures(
     try:
         igps(monkeypatch, *arguments, *chosen)
         rows = list(csv.reader((tmp_path / "failures.csv").open(newline="")))
-        assert rows[0] == ["descriptor", "file", "error"]
+        assert rows[0] == ["descriptor", "name", "error"]
         assert [row[:2] for row in rows[1:]] == [["all", "egg/bad.off"], ["picky", "egg/1.off"]]
         assert "a single triangle" in rows[1][2]
         assert "too much" in rows[2][2]

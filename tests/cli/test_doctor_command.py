@@ -46,7 +46,7 @@ def test_table_and_file_of_a_folder_that_can_be_used(
     assert total.startswith("3 bodies: 2 mended, 0 cannot be used; about ")
     assert written == f"written to {out}"
 
-    rows = {row["file"]: row for row in csv.DictReader(out.open(newline=""))}
+    rows = {row["name"]: row for row in csv.DictReader(out.open(newline=""))}
     assert list(rows) == ["a/clean.off", "a/soup.off", "b/box.off"]
     for name, row in rows.items():
         assert [row["vertices"], row["vertices_after"], row["seconds"], row["megabytes"]] == cells[name][:4]
@@ -78,7 +78,7 @@ def test_status_is_1_if_a_file_cannot_be_used(
         line.startswith(f"{1 + len(sentences)} bodies: 0 mended, {len(sentences)} cannot be used") for line in lines
     )
     assert "Traceback" not in printed.out + printed.err
-    rows = {row["file"]: row for row in csv.DictReader(out.open(newline=""))}
+    rows = {row["name"]: row for row in csv.DictReader(out.open(newline=""))}
     assert {name: row["usable"] for name, row in rows.items()} == {"clean.off": "yes", **dict.fromkeys(sentences, "no")}
     assert all(rows[name]["error"] == f"{root / name}: {sentence}" for name, sentence in sentences.items())
 

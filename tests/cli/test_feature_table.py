@@ -48,7 +48,7 @@ def test_a_row_for_each_body_tells_what_is_known_of_it(
     assert table["name"].tolist() == ["1.nii.gz#liver", "1.nii.gz#spleen", "2.nii.gz#liver", "2.nii.gz#spleen"]
     assert table["file"].tolist() == ["1.nii.gz"] * 2 + ["2.nii.gz"] * 2
     assert table["part"].tolist() == ["liver", "spleen"] * 2
-    assert table["label"].tolist() == ["well", "well", "ill", "ill"]
+    assert table["class"].tolist() == ["well", "well", "ill", "ill"]
     assert table["age"].tolist() == ["40", "40", "", ""]
     assert table["unit"].tolist() == ["mm"] * 4
     n_voxels = [nibabel.load(root / f"{i}.nii.gz").get_fdata() == label for i in (1, 2) for label in (1, 2)]
@@ -72,9 +72,10 @@ def test_a_wide_table_has_a_row_for_each_file(
     extract(monkeypatch, root, tmp_path / f"long.{suffix}")
     extract(monkeypatch, root, tmp_path / f"wide.{suffix}", "--wide")
     long, wide = read(tmp_path / f"long.{suffix}"), read(tmp_path / f"wide.{suffix}")
-    assert wide.columns.tolist()[:6] == ["file", "label", "age", "unit", "liver.volume", "liver.area"]
+    assert wide.columns.tolist()[:6] == ["file", "class", "age", "unit", "liver.volume", "liver.area"]
     assert len(wide.columns) == 4 + 2 * (2 + 642)
-    assert wide["label"].tolist() == ["well", "ill"]
+    assert wide["class"].tolist() == ["well", "ill"]
+    assert wide["age"].sum() == 40  # a number in Parquet, too
     for part in ("liver", "spleen"):
         rows = long[long["part"] == part]
         for column in ("volume", "area", "v17", "v300"):
@@ -102,7 +103,7 @@ def test_a_mask_for_each_organ_makes_a_row_for_each_folder(
     np.testing.assert_allclose(wide["bar.volume"], [375, 425, np.nan], rtol=1e-3)
     assert wide["folder of labels.csv"].tolist() == ["a", "a", "b"]  # a column of the user's takes no rows together
     assert "file" not in wide
-    assert wide["label"].tolist() == ["s0", "s1", "s2"]
+    assert wide["class"].tolist() == ["s0", "s1", "s2"]
     assert "wide.csv, rows: 3" in capsys.readouterr().out
     extract(monkeypatch, tmp_path / "masks/s0/segmentations", tmp_path / "one.csv", "--wide")  # of a single subject
     one = pd.read_csv(tmp_path / "one.csv")
@@ -148,8 +149,8 @@ def test_a_body_that_a_file_lacks_has_no_values(root: Path, tmp_path: Path, monk
     (tmp_path / "labels.csv").write_text("file,body,label\n1.nii.gz,liver,a\n2.nii.gz,liver,b\n2.nii.gz,spleen,c\n")
     extract(monkeypatch, tmp_path, tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
-    assert wide["liver.label"].tolist() == ["a", "b"]
-    assert wide.loc[:, "spleen.label":].isna().all(axis=1).tolist() == [True, False]
+    assert wide["liver.class"].tolist() == ["a", "b"]
+    assert wide.loc[:, "spleen.class":].isna().all(axis=1).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(

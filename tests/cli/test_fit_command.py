@@ -119,7 +119,7 @@ def test_every_command_takes_the_file(
         words = [*map(str, query), "--gallery", "eggs.igps", *options, "--cache_dir", str(root / "cache")]
         monkeypatch.setattr(sys, "argv", ["igps", *words])
         main()
-        assert [row["mesh"] for row in json.loads(capsys.readouterr().out)] == [row["mesh"] for row in nearest]
+        assert [row["name"] for row in json.loads(capsys.readouterr().out)] == [row["name"] for row in nearest]
 
 
 def test_classify_tells_what_python_computes(
@@ -129,14 +129,15 @@ def test_classify_tells_what_python_computes(
     call(monkeypatch, root, "classify", root / "eggs", "--model", model, "--out", out, "--json")
     told: list[dict[str, Any]] = json.loads(capsys.readouterr().out)
     expected = classify(dataset(root, model), str(model))
-    assert [one["mesh"] for one in told] == list(expected.names)
+    assert [one["name"] for one in told] == list(expected.names)
     assert [one["most_like"] for one in told] == ["flat"] * 3 + ["long"] * 3
     assert [one["probability"] for one in told] == pytest.approx(expected.probabilities.max(dim=1).values.tolist())
     with out.open(newline="") as file:
         header, *rows = csv.reader(file)
-    assert header == ["mesh", "unknown", "flat", "long"]
+    assert header == ["name", "class", "most_like", "flat", "long"]
+    assert [row[:3] for row in rows] == [[one["name"], one["class"] or "", one["most_like"]] for one in told]
     torch.testing.assert_close(
-        torch.tensor([[float(one) for one in row[2:]] for row in rows]), expected.probabilities, rtol=0, atol=1e-6
+        torch.tensor([[float(one) for one in row[3:]] for row in rows]), expected.probabilities, rtol=0, atol=1e-6
     )
 
 

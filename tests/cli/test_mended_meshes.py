@@ -51,7 +51,7 @@ def igps(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
 
 
 def notes(path: Path) -> list[tuple[str, str]]:
-    return [(row["file"], row["note"]) for row in csv.DictReader(path.open(newline=""))]
+    return [(row["name"], row["note"]) for row in csv.DictReader(path.open(newline=""))]
 
 
 def check_notes(path: Path) -> None:
@@ -106,7 +106,7 @@ def test_never_and_always(
         printed = capsys.readouterr().out
         assert "5 of 8 meshes could not be used." in printed
         assert "mended" not in printed
-        refused = {row["file"]: row["error"] for row in csv.DictReader((tmp_path / "out" / "failures.csv").open())}
+        refused = {row["name"]: row["error"] for row in csv.DictReader((tmp_path / "out" / "failures.csv").open())}
         assert set(refused) == {"ball/soup.off", "egg/soup.off", "ball/holed.off", "box/1.off", "box/2.off"}
         assert "6 boundary edges" in refused["ball/holed.off"]
         assert "too few for 20 eigenpairs" in refused["box/1.off"]
@@ -183,6 +183,6 @@ def test_what_cannot_be_used_is_named_and_costs_the_others_nothing(
     printed = capsys.readouterr()
     assert "Traceback" not in printed.out + printed.err
     if command == "retrieve":
-        rows = {row["file"]: row["error"] for row in csv.DictReader((out / "failures.csv").open(newline=""))}
+        rows = {row["name"]: row["error"] for row in csv.DictReader((out / "failures.csv").open(newline=""))}
         assert rows == {f"egg/{name}": f"{root / 'egg' / name}: {sentence}" for name, sentence in sentences.items()}
     assert f"{len(sentences)} of {4 + len(sentences)} meshes could not be used." in printed.out

@@ -15,6 +15,7 @@ import trimesh
 import igps
 from igps import Mesh, SignatureConfig, collate, compute_signature
 from igps.cli.compare import compare
+from igps.cli.duplicates import duplicates as list_duplicates
 from igps.cli.gallery import build
 from igps.cli.retrieval import query, retrieve
 from igps.descriptors.fingerprint import cache_tag
@@ -243,10 +244,12 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path: Path, caps
     assert dataset.units() == ["in", "mm", "mm", "cm"]
     Gallery.build(tmp_path / "index", dataset, "shape_dna+size", n_workers=1)
     found = query(root / "1/a.3mf", gallery=tmp_path / "index", top=2, cache_dir=tmp_path / "cache")
-    assert [row["mesh"] for row in found] == ["1/a.3mf", "1/b.3mf"]
+    assert [row["name"] for row in found] == ["1/a.3mf", "1/b.3mf"]
     with pytest.raises(ValueError, match=r"descriptor: .*shape_dna"):
         query(root / "1/a.3mf", gallery=tmp_path / "index", size="ignore", cache_dir=tmp_path / "cache")
     retrieve(root, "own_descriptors:Height", size="keep", **options)
+    assert "size is left to own_descriptors:Height" in capsys.readouterr().out
+    retrieve(root, "own_descriptors:Height", size="ignore", **options)
     assert "size is left to own_descriptors:Height" in capsys.readouterr().out
     SURFACE.export(root / "2/e.off")
     retrieve(root, "shape_dna", **options)
@@ -257,7 +260,9 @@ def test_balls_of_one_size_find_each_other_in_whatever_unit(tmp_path: Path, caps
     assert "no unit" not in capsys.readouterr().out
 
 
-def test_copies_of_another_size_are_no_duplicates_where_size_counts(tmp_path: Path) -> None:
+def test_copies_of_another_size_are_no_duplicates_where_size_counts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name, factor, unit in (("a", 1, "inch"), ("b", 25.4, "millimeter"), ("c", 30, "millimeter")):
         write_3mf(tmp_path / f"{name}.3mf", factor, unit, twisted(0.5))
     dataset = igps.SignatureDataset(tmp_path, cache_dir=tmp_path / "cache", descriptor="pretrained")
@@ -265,6 +270,10 @@ def test_copies_of_another_size_are_no_duplicates_where_size_counts(tmp_path: Pa
     assert [set(group) for group in duplicates(dataset, size="ignore", n_workers=1).groups] == [
         {"a.3mf", "b.3mf", "c.3mf"}
     ]
+    SURFACE.export(tmp_path / "ball.off")  # without a unit, so that no size counts
+    found = list_duplicates(tmp_path, cache_dir=tmp_path / "cache", n_workers=1)
+    assert found["groups"] == [["a.3mf", "b.3mf", "c.3mf"]]
+    assert "size is ignored: 1 of 4 bodies have no unit of length" in capsys.readouterr().out
 
 
 def test_a_head_is_fitted_to_form_with_size_beside_it_and_travels_in_a_file(tmp_path: Path) -> None:

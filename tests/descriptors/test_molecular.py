@@ -113,6 +113,17 @@ def test_size_is_a_factor_of_the_distance() -> None:
     assert float(molecular().distances(found[:1], found[:1])) == 0
 
 
+def test_statistics_compare_the_histograms_and_not_the_size() -> None:
+    """By Hellinger's distance; size alone would be all that counts, as its logarithms are no shares."""
+    one, other = signature(0, 0.0), signature(1, 2.0)
+    found = described(one, replace(one, area=2 * one.area), other)
+    rows = molecular().coordinates(found)
+    cells = described(one, other, size=False)
+    wanted = (cells[0].sqrt() - cells[1].sqrt()).square().sum()
+    np.testing.assert_allclose((rows[0] - rows[2]).square().sum(), wanted, rtol=1e-4)
+    assert float((rows[0] - rows[1]).norm()) < 1e-5
+
+
 def test_it_has_a_name_but_is_not_for_any_body() -> None:
     assert descriptor("molecular").name == "molecular"
     assert "molecular" not in NAMES

@@ -344,10 +344,11 @@ def test_the_commands(
     assert lines[-3:-1] == ["group 1: bar.obj  bar.off  bar.ply", "group 2: lump.off  lump.stl"]
     assert lines[-1].startswith("5 of 7 files in 2 groups; of generated bodies, ")
     rows = (tmp_path / "out" / "groups.csv").read_text().splitlines()
-    assert rows[0] == "group,file,path"
+    assert rows[0] == "group,name,path"
     assert rows[5] == f"2,lump.stl,{root / 'lump.stl'}"
     command(monkeypatch, "distance", root / "bar.off", root / "bar.ply", *options)
-    *_, by_descriptor, by_surfaces = capsys.readouterr().out.splitlines()
+    *_, by_descriptor, by_surfaces, by_lengths = capsys.readouterr().out.splitlines()
+    assert float(by_lengths.split()[5]) == pytest.approx(0.2, rel=0.01)
     assert "pairs of different classes" in by_descriptor
     assert ", the same shape (at their level of detail, the same up to " in by_surfaces
     command(monkeypatch, "distance", root / "bar.off", root / "bent.off", *options)

@@ -70,8 +70,8 @@ def retrieval_folder(folder: Path, labels: tuple[str, ...] = LABELS, seed: int =
     )
     config = {"descriptor": "interior", "n_eigenpairs": 20, "attributes": [], "max_vertices": None}
     (folder / "scores.json").write_text(json.dumps({"config": config}))
-    write_rows(folder / "failures.csv", [("file", "error"), ("bad<b>.off", "bad<b>.off: it is open.")])
-    write_rows(folder / "notes.csv", [("file", "note"), (NAMES[2], NOTE)])
+    write_rows(folder / "failures.csv", [("name", "error"), ("bad<b>.off", "bad<b>.off: it is open.")])
+    write_rows(folder / "notes.csv", [("name", "note"), (NAMES[2], NOTE)])
     return folder
 
 
@@ -90,8 +90,8 @@ def answers_folder(folder: Path) -> Path:
     ]
     (folder / "groups.json").write_text(json.dumps(groups))
     outliers = [
-        {"body": NAMES[5], "class": EVIL, "score": 7.25, "reason": "its shape is <b>unlike</b> its class"},
-        {"body": "gone.off", "class": "egg", "score": 1.0, "reason": "nothing unusual"},
+        {"name": NAMES[5], "class": EVIL, "score": 7.25, "reason": "its shape is <b>unlike</b> its class"},
+        {"name": "gone.off", "class": "egg", "score": 1.0, "reason": "nothing unusual"},
     ]
     (folder / "outliers.json").write_text(json.dumps(outliers))
     return folder
@@ -109,8 +109,8 @@ def comparison_folder(folder: Path) -> Path:
     rows.append({"descriptor": "broken", "n_models": 0, "seconds_per_mesh": None})
     (folder / "compare.json").write_text(json.dumps(rows))
     failed = [("gps", NAMES[-1], "it has no surface."), ("all", "bad.off", "it is open.")]
-    write_rows(folder / "failures.csv", [("descriptor", "file", "error"), *failed])
-    write_rows(folder / "notes.csv", [("file", "note"), (NAMES[2], NOTE)])
+    write_rows(folder / "failures.csv", [("descriptor", "name", "error"), *failed])
+    write_rows(folder / "notes.csv", [("name", "note"), (NAMES[2], NOTE)])
     return folder
 
 

@@ -246,7 +246,7 @@ def robustness_command(
         out.mkdir(parents=True, exist_ok=True)
         (out / "robustness.json").write_text(json.dumps(summary, indent=2) + "\n")
         write_notes(out / "notes.csv", dataset)
-        write_rows(out / "failures.csv", ("file", "error"), [(failure.id, failure.error) for failure in failures])
+        write_rows(out / "failures.csv", ("name", "error"), [(failure.id, failure.error) for failure in failures])
         write_sources(out, dataset)
         print(f"written to {out}")
         if report:

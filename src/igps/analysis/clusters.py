@@ -24,7 +24,7 @@ class Clusters:
     labels: Integers  # (N,) the cluster of each body, 0 for the largest
     medoids: tuple[int, ...]  # of each cluster, the body with the smallest sum of distances to its others
     # Of each cluster, how much of it comes together again when half of the bodies are clustered alone: mean largest
-    # Jaccard index with a cluster of them; NaN where too few were drawn
+    # Jaccard index with a cluster of them, where two of its bodies or more were drawn; NaN where that never was
     stability: tuple[float, ...]
     tree: Floats  # (N − 1, 4) as of `scipy.cluster.hierarchy.linkage`
 
@@ -73,9 +73,11 @@ def clusters_of(
         drawn = np.sort(random.choice(n, n // 2, replace=False))
         again = np.eye(n, dtype=np.int64)[_cut(_tree(found[np.ix_(drawn, drawn)], linkage), len(members))]
         first = np.eye(len(members), dtype=np.int64)[numbers[drawn]]
+        n_drawn = first.sum(axis=0)
         both = first.T @ again
-        either = first.sum(axis=0)[:, None] + again.sum(axis=0) - both
-        row[:] = np.where(first.any(axis=0), (both / np.maximum(either, 1)).max(axis=1), np.nan)
+        either = n_drawn[:, None] + again.sum(axis=0) - both
+        # A body alone is found again whatever the clusters are
+        row[:] = np.where(n_drawn > 1, (both / np.maximum(either, 1)).max(axis=1), np.nan)
     counted = np.isfinite(shares).sum(axis=0)
     stability = np.where(counted, np.nansum(shares, axis=0) / np.maximum(counted, 1), np.nan)
     return Clusters(numbers, medoids, tuple(stability.tolist()), tree)

@@ -19,8 +19,9 @@ from igps.data.dataset import SignatureDataset
 from igps.data.sources import Bodies
 from igps.descriptors import descriptor as descriptor_of
 from igps.descriptors.fingerprint import cache_tag
-from igps.descriptors.individual import SIZE, Size
+from igps.descriptors.individual import Size, keeps_size
 from igps.mesh.mesh import Mesh, millimetres
+from igps.mesh.surface import face_areas
 from igps.nn.description import describe
 from igps.report.answers import explanation_figure, groups_figure, outliers_figure, write_answer
 from igps.report.tables import groups_table
@@ -64,12 +65,14 @@ def groups(
         return labels, of_strata, np.hstack([_numbers(bodies, name) for name in covariate]) if covariate else None
 
     folder = Folder(root, labelled=group is None, check=columns)
-    how: Size = "auto" if SIZE in descriptor_of(descriptor).name else "ignore"  # as its name says
+    how: Size = "ignore" if "scale" in descriptor_of(descriptor).invariant_to else "auto"  # as its name says
     found = described(folder, descriptor, size=how, **reading)
     bodies = found.dataset.bodies
     labels, of_strata, of_covariates = columns(bodies)
     vectors = {"": found.coordinates(of_one_kind=True)}
     if size:
+        if told := keeps_size("keep", found.dataset.units())[1]:
+            print(told)
         vectors[", size"] = np.log([[one.volume * millimetres(one.unit) ** 3] for one in found.dataset.signatures()])
     members: dict[str, list[int]] = {}
     for i, part in enumerate(bodies.parts):
@@ -131,14 +134,14 @@ def outliers(
     subjects = files if len(set(files)) < len(files) else [file.parent for file in files]  # a mask for each organ
     found = find_outliers(distances, dataset.bodies.labels or (), measures, dataset.all_notes(), subjects)
     rows: list[dict[str, Any]] = [
-        {"body": dataset.bodies.names[one.body], "class": one.label, "score": round(one.score, 3), "reason": one.reason,
+        {"name": dataset.bodies.names[one.body], "class": one.label, "score": round(one.score, 3), "reason": one.reason,
          **{f"score_{name}": round(value, 3) for name, value in one.scores.items()}}
         for one in found
     ]  # fmt: skip
-    width = max((len(row["body"]) for row in rows[:top]), default=4)
+    width = max((len(row["name"]) for row in rows[:top]), default=4)
     print(f"{'score':>7}  {'body':<{width}}  class: why")
     for row in rows[:top]:
-        print(f"{row['score']:>7.1f}  {row['body']:<{width}}  {row['class']}: {row['reason']}")
+        print(f"{row['score']:>7.1f}  {row['name']:<{width}}  {row['class']}: {row['reason']}")
     print(f"{sum(one.is_outlier for one in found)} of {len(rows)} bodies are outliers, with a score above {LIMIT}")
     print_failures(bodies.failures, len(dataset))
     if out is not None:
@@ -177,7 +180,7 @@ def explain(
         descriptions = describe(dataset, inner, cache_tag=cache_tag(inner), n_workers=n_workers, progress=True)
         classes = sorted(set(labels))
         members = [np.flatnonzero(labels == name) for name in classes]
-        squares = squared_distances(descriptions.flatten(1).double().sqrt().numpy())
+        squares = squared_distances(inner.coordinates(descriptions).double().numpy())
         chosen = [int(own[squares[np.ix_(own, own)].sum(axis=1).argmin()]) for own in members]  # the medoids
         batches = [dataset.batch([i]) for i in chosen]
         found, kept = explain_groups(module, descriptions[members[0]], descriptions[members[1]], batches, level=level)
@@ -192,8 +195,8 @@ def explain(
     names = [dataset.bodies.names[i] for i in chosen]
     print(f"{' and '.join(names)}: {found.distance:.4g} by {module.name}: {found.summary()}")
     painted = [_painted(dataset, i, found, place) for place, i in enumerate(chosen)]
-    for name, _, values in painted:
-        print(f"{name}: {_extent(values)}")
+    for name, mesh, values in painted:
+        print(f"{name}: {_extent(values, face_areas(mesh.vertices, mesh.faces))}")
     parts = [{"histogram": name, "share": share} for name, share in found.parts.items()]
     if out is not None:
         write_answer(out, "explain_samples", _sample_rows(dataset, chosen, found))
@@ -215,18 +218,19 @@ def _painted(dataset: SignatureDataset, i: int, found: Explanation, place: int) 
     return dataset.bodies.names[i], mesh, on_surface((found.places or found.samples)[place], samples, centres)
 
 
-def _extent(values: Any) -> str:
-    """The smallest share of places that holds half of all that is positive, in words."""
-    summed = np.cumsum(np.sort(np.maximum(values, 0))[::-1])
-    if not summed[-1]:
+def _extent(values: Any, areas: Any) -> str:
+    """The smallest share of the surface that holds half of all that is positive, of (F,) faces, in words."""
+    order = np.argsort(-values)
+    held = np.cumsum(np.maximum(values, 0)[order] * areas[order])
+    if not held[-1]:
         return "none of the difference lies on its surface"
-    half = (np.searchsorted(summed, summed[-1] / 2) + 1) / len(values)
+    half = (np.cumsum(areas[order]) / areas.sum())[np.searchsorted(held, held[-1] / 2)]
     return f"half of its share lies on {100 * half:.2g}% of its surface"
 
 
 def _sample_rows(dataset: SignatureDataset, chosen: list[int], found: Explanation) -> list[dict[str, Any]]:
     return [
-        {"body": dataset.bodies.names[i], "samples": kind, **dict(zip("xyz", point, strict=True)),
+        {"name": dataset.bodies.names[i], "samples": kind, **dict(zip("xyz", point, strict=True)),
          "share": float(share), "share_by_place": float(placed)}
         for i, shares, places in zip(chosen, found.samples, found.places or found.samples, strict=True)
         for kind in SAMPLE_KINDS

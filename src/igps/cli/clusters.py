@@ -33,7 +33,7 @@ def clusters(
 
     Hierarchical clustering of the descriptor's distances. Of each cluster: its bodies, the one in its middle, its
     classes where they are known, and its stability, from 0 to 1: how much of it comes together again when half of the
-    bodies are clustered alone. Below 0.75 it is not to be relied on.
+    bodies are clustered alone; a single body has none. Below 0.75 it is not to be relied on.
 
     Args:
         n_clusters: how many; as many as have the largest mean silhouette if not given.
@@ -61,13 +61,14 @@ def clusters(
              "classes": dict(classes.most_common()), "bodies": [names[i] for i in members]}
         )  # fmt: skip
         shown = ", ".join(f"{count} {name}" for name, count in classes.most_common(3)) + ", …" * (len(classes) > 3)
-        print(f"{number + 1:>7}{len(members):>8}{stability:>11.2f}  {names[middle]}" + f" ({shown})" * bool(shown))
+        told_stability = "–" if np.isnan(stability) else f"{stability:.2f}"
+        print(f"{number + 1:>7}{len(members):>8}{told_stability:>11}  {names[middle]}" + f" ({shown})" * bool(shown))
     n_stable = sum(one >= STABLE for one in found.stability)
     unknown = f", {n} unknown" if (n := np.isnan(found.stability).sum()) else ""
     print(f"{n_stable} of {len(told)} clusters are stable (at least {STABLE}){unknown}")
     if out is not None:
         rows = [
-            {"body": name, "class": label_of[i], "cluster": int(number) + 1, "stability": found.stability[number]}
+            {"name": name, "class": label_of[i], "cluster": int(number) + 1, "stability": found.stability[number]}
             for i, (name, number) in enumerate(zip(names, found.labels, strict=True))
         ]
         write_answer(out, "clusters", rows, clusters_figure(found, names))
@@ -116,9 +117,9 @@ def map_bodies(
         values = [one.volume * millimetres(one.unit) ** 3 for one in dataset.signatures()]
     else:
         values = values_of(bodies)
-    column = colour if colour not in ("body", "x", "y") else f"{colour} of {LABELS_FILE}"
+    column = colour if colour not in ("name", "x", "y") else f"{colour} of {LABELS_FILE}"
     rows = [
-        {"body": name, "x": x, "y": y, "class": label, column: value}
+        {"name": name, "x": x, "y": y, "class": label, column: value}
         for name, (x, y), label, value in zip(bodies.names, found.points.tolist(), label_of, values, strict=True)
     ]
     print(f"{len(rows)} bodies; stress {found.stress:.2f}: 0 keeps every distance, above 0.2 the map distorts much")

@@ -96,4 +96,4 @@ def _write(out: Path, results: Sequence[Result], failures: Sequence[Failure]) ->
     rows = [("all", failure.id, failure.error) for failure in failures]
     for result in results:
         rows += [(result.descriptor.name, failure.id, failure.error) for failure in result.failures]
-    write_rows(out / "failures.csv", ("descriptor", "file", "error"), rows)
+    write_rows(out / "failures.csv", ("descriptor", "name", "error"), rows)

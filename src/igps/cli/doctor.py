@@ -48,7 +48,7 @@ def doctor(
 def _row(finding: Finding) -> dict[str, Any]:
     voxels = ("", "", "") if finding.voxels is None else astuple(finding.voxels)
     return {
-        "file": finding.id,
+        "name": finding.id,
         "usable": "no" if finding.error else "yes",
         "fault": finding.fault,
         "mended_by": " ".join(finding.steps),

@@ -9,13 +9,14 @@ from igps.cli.gallery import as_described
 from igps.cli.reading import Folder, check_files, signatures
 from igps.data.dataset import Failure
 from igps.descriptors import descriptor as descriptor_of
-from igps.descriptors.individual import Size
+from igps.descriptors.individual import Size, keeps_size
 from igps.gallery.about import is_gallery
 from igps.gallery.calibration import Calibration
 from igps.gallery.duplicates import Duplicates, body_distance
 from igps.gallery.duplicates import duplicates as find_duplicates
 from igps.gallery.gallery import Gallery
 from igps.gallery.surfaces import MOST_TOLERATED
+from igps.mesh.mesh import millimetres
 from igps.report.tables import write_rows
 
 DESCRIPTOR = "pretrained"
@@ -50,6 +51,9 @@ def duplicates(
         as_described(source, reading)
     else:
         source, unread = signatures(Folder(root, needs_meshes=True), [descriptor_of(DESCRIPTOR)], **reading)
+    units = [one["unit"] for one in source.rows("unit")] if isinstance(source, Gallery) else source.units()
+    if told := keeps_size(size, units)[1]:
+        print(told)
     kept = {name: reading.get(name) for name in ("cache_dir", "n_workers")}
     found = find_duplicates(source, DESCRIPTOR, poses=poses, size=size, tolerance=tolerance, progress=True, **kept)
     _print_groups(found, poses)
@@ -57,7 +61,7 @@ def duplicates(
         print(f"{len(failures)} files could not be compared; {failures[0].error}")
     if out is not None:
         rows = [(n, name, found.paths[name]) for n, group in enumerate(found.groups, 1) for name in group]
-        write_rows(out, ("group", "file", "path"), rows)
+        write_rows(out, ("group", "name", "path"), rows)
     pairs: list[dict[str, Any]] = []
     for pair, apart in found.pairs.items():
         largest = dict(zip(("largest", "largest_length", "unit"), found.largest.get(pair, ()), strict=False))
@@ -87,7 +91,9 @@ def distance(meshes: list[Path], **reading: Any) -> dict[str, Any]:
     told = "the same shape" if found.same else "not the same shape"
     why = f"at their level of detail, the same up to {found.limit:.3%}" if found.limit else "other handles or vertices"
     print(f"surfaces laid onto each other: {found.surfaces:.3%} of the root of the area apart, {told} ({why})")
-    return {"descriptor": DESCRIPTOR, **asdict(found)}
+    first, second = (one.area**0.5 * millimetres(one.unit) for one in dataset.signatures())
+    print(f"lengths of the second are {second / first:.4g} times those of the first")
+    return {"descriptor": DESCRIPTOR, **asdict(found), "lengths": second / first}
 
 
 def _print_groups(found: Duplicates, poses: bool) -> None:

@@ -8,10 +8,11 @@ import numpy as np
 
 from igps.cli.reading import is_called_by_file
 from igps.data.dataset import SignatureDataset
-from igps.data.sources import LABELS_FILE, file_name_of
+from igps.data.sources import LABELS_FILE, file_name_of, is_number
 from igps.report.tables import write_rows
 
 SUFFIXES = (".csv", ".parquet")
+_WORDS = ("file", "folder", "part", "name", "class", "unit")
 Table = Mapping[str, Sequence[Any]]
 """Columns by name, all of one length; None where a value is missing."""
 
@@ -24,14 +25,14 @@ def feature_table(dataset: SignatureDataset, features: np.ndarray) -> tuple[Tabl
         features: (N, ...) descriptions.
 
     Returns:
-        `file`, `part`, `name`, `label`, further columns of the table of labels, and the `unit` of length; and `volume`,
+        `file`, `part`, `name`, `class`, further columns of the table of labels, and the `unit` of length; and `volume`,
         `area`, and the description as `v0`, `v1` and so on. A further column of one of these names, or `folder`, is
         `NAME of labels.csv`.
     """
     bodies = dataset.bodies
     units, volumes, areas = zip(*((one.unit, one.volume, one.area) for one in dataset.signatures()), strict=True)
     files = list(map(file_name_of, bodies.names, bodies.parts))
-    own = {"file": files, "part": bodies.parts, "name": bodies.names, "label": bodies.labels or [None] * len(bodies)}
+    own = {"file": files, "part": bodies.parts, "name": bodies.names, "class": bodies.labels or [None] * len(bodies)}
     vectors = features.reshape(len(features), -1)
     measured = {"volume": volumes, "area": areas, **{f"v{i}": list(column) for i, column in enumerate(vectors.T)}}
     taken = {*own, "folder", "unit", *measured}
@@ -79,7 +80,14 @@ def write_table(path: Path, table: Table) -> None:
             import pyarrow.parquet
         except ImportError as error:
             raise ImportError('out: Parquet needs pyarrow: pip install "interior-gps[table]". Or write CSV.') from error
-        arrays = {name: pyarrow.array(list(values)) for name, values in table.items()}
+        arrays = {name: pyarrow.array(_typed(name, values)) for name, values in table.items()}
         pyarrow.parquet.write_table(pyarrow.table(arrays), path)
         return
     write_rows(path, table, zip(*table.values(), strict=True))
+
+
+def _typed(column: str, values: Sequence[Any]) -> list[Any]:
+    """Numbers of a further column, which labels.csv has as words; names stay words, though they may be digits."""
+    if column.rpartition(".")[2] not in _WORDS and all(map(is_number, values)):
+        return [None if one is None else float(one) for one in values]
+    return list(values)

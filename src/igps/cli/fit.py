@@ -78,7 +78,7 @@ def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading
     Args:
         meshes: mesh files, or one folder.
         model: a file that igps fit wrote.
-        out: a table of the probabilities of all classes, a file ending in .csv.
+        out: a table with the probabilities of all classes, a file ending in .csv; class is empty where none fits.
     """
     chosen = load(model)
     classifier_of(chosen)  # refuses others before anything is computed
@@ -94,12 +94,14 @@ def classify(meshes: list[Path], model: Path, out: Path | None = None, **reading
     for name, predicted, value, likely in zip(*columns, strict=True):
         told = f"unlike everything known, most like {found.classes[likely]}" if predicted is None else predicted
         print(f"{name:<{width}}  {value:>11.1%}  {told}")
-        rows.append({"mesh": name, "class": predicted, "most_like": found.classes[likely], "probability": value})
+        rows.append({"name": name, "class": predicted, "most_like": found.classes[likely], "probability": value})
     print_failures(failures, len(rows))
     if out is not None:
-        values = zip(found.names, found.unknown.tolist(), found.probabilities.tolist(), strict=True)
-        table = [(name, int(new), *(f"{p:.6f}" for p in of_each)) for name, new, of_each in values]
-        write_rows(out, ("mesh", "unknown", *found.classes), table)
+        values = zip(rows, found.probabilities.tolist(), strict=True)
+        table = [
+            (row["name"], row["class"], row["most_like"], *(f"{p:.6f}" for p in of_each)) for row, of_each in values
+        ]
+        write_rows(out, ("name", "class", "most_like", *found.classes), table)
     return rows
 
 

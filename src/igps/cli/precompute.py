@@ -57,7 +57,7 @@ def precompute(
         with dask_executor(cluster) as executor:
             failed = dataset.precompute(executor, strict=strict, limits=limits)
     if failures is not None:
-        write_rows(failures, ("file", "error"), [(failure.id, failure.error) for failure in failed])
+        write_rows(failures, ("name", "error"), [(failure.id, failure.error) for failure in failed])
     part = "" if shard is None else f" in shard {shard}"
     print(f"{len(dataset) - len(failed)} of {len(dataset)} signatures{part} are in the cache; {len(failed)} failed")
 

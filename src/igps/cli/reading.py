@@ -198,7 +198,7 @@ def sized(descriptor: str, size: Size, dataset: SignatureDataset) -> str:
     """The name with or without +size, as the option and the units of the bodies say; prints what they leave open."""
     module = descriptor_of(descriptor)
     if SIZE in module.name or "scale" not in module.invariant_to:
-        if size == "keep" and SIZE not in module.name:
+        if size != "auto" and SIZE not in module.name:
             print(f"size is left to {descriptor}, which does not say of itself that it ignores size (invariant_to)")
         return descriptor
     is_kept, told = keeps_size(size, () if size == "ignore" else dataset.units())
@@ -287,4 +287,4 @@ def mending_summary(dataset: SignatureDataset, n_given: int) -> str:
 def write_notes(path: Path, dataset: SignatureDataset) -> None:
     """Write a table of what was done to which mesh."""
     notes = zip(dataset.bodies.names, dataset.all_notes(), strict=True)
-    write_rows(path, ("file", "note"), [(name, note) for name, told in notes for note in told])
+    write_rows(path, ("name", "note"), [(name, note) for name, told in notes for note in told])

@@ -92,7 +92,7 @@ def extract(
 ) -> None:
     """Write the descriptions of meshes to a file, for use in any classifier, statistics package or vector database.
 
-    A table (.csv or .parquet) has a row for each body: file, part, name, label, further columns of labels.csv, unit of
+    A table (.csv or .parquet) has a row for each body: file, part, name, class, further columns of labels.csv, unit of
     length, volume, area, and the description as v0, v1 and so on. A NumPy archive (.npz) has `features` (N, ...) as the
     descriptor gives them, `names` (N,), and `labels` (N,) where the meshes come from a folder with classes.
 
@@ -176,13 +176,13 @@ def query(
         places = zip(near.indices[0].tolist(), near.distances[0].tolist(), strict=True)
         found = [(bodies.names[i], None if bodies.labels is None else bodies.labels[i], away) for i, away in places]
     rows: list[dict[str, Any]] = [
-        {"rank": place, "distance": away, "mesh": name, "class": "-" if label is None else label}
+        {"rank": place, "distance": away, "name": name, "class": label}
         for place, (name, label, away) in enumerate(found, 1)
     ]
-    width = max((len(row["mesh"]) for row in rows), default=4)
+    width = max((len(row["name"]) for row in rows), default=4)
     print(f"{'rank':>4}  {'distance':>9}  {'mesh':<{width}}  class")
     for row in rows:
-        print(f"{row['rank']:>4}  {row['distance']:>9.3g}  {row['mesh']:<{width}}  {row['class']}")
+        print(f"{row['rank']:>4}  {row['distance']:>9.3g}  {row['name']:<{width}}  {row['class'] or '-'}")
     if n_missing:
         print(f"{n_missing} of these {len(rows)} files are no longer where they were when they were described.")
     return rows
@@ -232,7 +232,7 @@ def _write_retrieval(out: Path, found: Described, summary: dict[str, Any], dista
                 yield names[i], place, names[j], f"{away[j]:.6g}", int(labels[i] == labels[j])
 
     write_rows(out / "ranking.csv", ("query", "rank", "model", "distance", "relevant"), ranking())
-    write_rows(out / "failures.csv", ("file", "error"), [(one.id, one.error) for one in found.failures])
+    write_rows(out / "failures.csv", ("name", "error"), [(one.id, one.error) for one in found.failures])
     write_notes(out / "notes.csv", found.dataset)
     write_sources(out, found.dataset)
     if found.name is None:  # its centres are the collection's

@@ -140,7 +140,9 @@ def find_bodies(
     bodies = _from_labels_file(root, options) if table else _from_folder(root, options, attributes)
     bodies = bodies.with_classes(classes)
     if labelled and bodies.labels is None:
-        raise ValueError(f"{root}: no classes found. Expected one folder per class, or a {LABELS_FILE} (file,label).")
+        other = f" Or call one of {', '.join(bodies.columns)} label." if bodies.columns else ""
+        expected = f"Expected one folder per class, or a {LABELS_FILE} (file,label)."
+        raise ValueError(f"{root}: no classes found. {expected}{other}")
     return bodies
 
 

@@ -92,6 +92,10 @@ class SizedHistograms(HistogramDescriptor):
         size = torch.cdist(queries[:, -2:], gallery[:, -2:], p=1)
         return chi_square(queries[:, :-2], gallery[:, :-2]) * size / (_SIZE + size)
 
+    def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
+        """(N, cells) roots of the histograms; beside them the logarithms would be all that counts."""
+        return descriptions[:, :-2].sqrt()
+
 
 def molecular(*, size: bool = True) -> HistogramDescriptor:
     """Interior distances of pairs of samples by the kinds of the residues around them, their charges and hydropathy.

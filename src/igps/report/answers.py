@@ -121,7 +121,8 @@ def clusters_figure(found: Clusters, names: Sequence[str]) -> Figure:
     leaves = dendrogram(found.tree, orientation="left", ax=axes, link_color_func=lambda _: _OTHER)["leaves"]
     clusters = found.labels[leaves]
     names = [shortened(names[i]) for i in leaves]
-    told = [f"{name}  {one + 1} ({found.stability[one]:.2f})" for name, one in zip(names, clusters, strict=True)]
+    stability = ["–" if np.isnan(one) else f"{one:.2f}" for one in found.stability]
+    told = [f"{name}  {one + 1} ({stability[one]})" for name, one in zip(names, clusters, strict=True)]
     axes.set_yticks(5 + 10 * np.arange(len(leaves)), told, fontsize=5)
     for label, one in zip(axes.get_yticklabels(), clusters, strict=True):
         label.set(color=PALETTE[one % len(PALETTE)], weight="bold" if found.stability[one] >= STABLE else "normal")

@@ -74,7 +74,7 @@ def page_of(
         plot=(_PLOT_WIDTH, _PLOT_HEIGHT),
         config=_flat(results.config),
         disturbances=(results.robustness or {}).get("disturbances", {}),
-        outliers=[{**one, "place": places.get(one["body"])} for one in results.outliers[:N_OUTLIERS]],
+        outliers=[{**one, "place": places.get(one["name"])} for one in results.outliers[:N_OUTLIERS]],
         n_repaired=sum(bool(shape["notes"]) for shape in data["shapes"]),
     )
 

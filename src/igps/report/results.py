@@ -79,11 +79,10 @@ def read_results(folder: Path) -> Results:
             "`python -m training.study robustness` write with --out."
         )
     about, notes, unused = _json(folder / MESHES_FILE), dict[str, list[str]](), list[Unused]()
-    for row in _rows(folder / "notes.csv"):
-        notes.setdefault(row["file"], []).append(row["note"])
-    for row in _rows(folder / "failures.csv"):
-        descriptor = row.get("descriptor")
-        unused.append(Unused(row["file"], row["error"], None if descriptor == "all" else descriptor))
+    for name, note in map(dict.values, _rows(folder / "notes.csv")):
+        notes.setdefault(name, []).append(note)
+    for *descriptor, name, error in map(dict.values, _rows(folder / "failures.csv")):
+        unused.append(Unused(name, error, None if descriptor in ([], ["all"]) else descriptor[0]))
     found = readers[max(written, key=lambda name: written[name])](folder)
     bodies = about.get("meshes", [])
     return replace(
