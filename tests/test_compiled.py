@@ -1,6 +1,8 @@
 import gc
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,3 +56,16 @@ def test_compiling_leaves_the_search_for_garbage_as_it_was(is_collected: bool) -
         assert gc.isenabled() is is_collected
     finally:
         (gc.enable if before else gc.disable)()
+
+
+def test_loops_of_an_earlier_version_are_compiled_anew(tmp_path: Path) -> None:
+    """Numba's index of what lies on disk names the types of arguments, and is read before it is found to be stale."""
+    for name, factor in (("Old", 2), ("New", 3)):
+        (tmp_path / "loops.py").write_text(
+            "from typing import NamedTuple\nfrom igps._compiled import compiled\n"
+            f"class {name}(NamedTuple):\n    x: float\n"
+            f"@compiled()\ndef times(pair):\n    return {factor} * pair.x\n"
+        )
+        code = f"import loops, sys; sys.exit(loops.times(loops.{name}(5.0)) != {5 * factor})"
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_CACHE_DIR": str(tmp_path)}
+        assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment).returncode == 0

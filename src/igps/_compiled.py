@@ -49,7 +49,12 @@ class Compiled(Lazy, Generic[Arguments, Result]):
         update_wrapper(self, function)
 
     def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        return self._entry.dispatcher(*args, **kwargs)
+        dispatcher: Any = self._entry.dispatcher
+        try:
+            return dispatcher(*args, **kwargs)
+        except AttributeError:  # what an earlier version has left on disk names a class that is gone; loops raise none
+            dispatcher._cache.flush()
+            return dispatcher(*args, **kwargs)
 
 
 def compiled(**options: Any) -> Callable[[Callable[Arguments, Result]], Compiled[Arguments, Result]]:
