@@ -114,6 +114,7 @@ def test_workers_leave_it_to_their_parent_while_they_start(tmp_path: Path) -> No
         "    worker = Worker(None)\n"
         "    print(worker.submit(abs, -7).result())\n"
         "    worker.end()\n"
+        "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in jobs in the background
         "    os.kill(os.getpid(), signal.SIGINT)\n"
     )
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)

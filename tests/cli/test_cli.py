@@ -429,6 +429,7 @@ def test_an_interruption_while_libraries_are_imported_is_quiet(module: str) -> N
         "    def find_spec(self, name, *_):\n"
         f"        if name == '{module}.linalg': os.kill(os.getpid(), signal.SIGINT)\n"
         "sys.meta_path.insert(0, Finder())\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in jobs in the background
         "from igps_command import main\n"
         "sys.argv = ['igps', '--help']\n"
         "main()\n"
