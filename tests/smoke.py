@@ -19,7 +19,7 @@ import torch
 import trimesh
 
 import igps
-from igps_command import main
+from igps.cli import main
 
 version, there = sys.argv[1:]
 assert importlib.metadata.version("interior-gps") == version

@@ -420,24 +420,6 @@ def test_an_interruption_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch, caps
     assert capsys.readouterr().err == "igps: interrupted. Run again to go on: what is done is kept.\n"
 
 
-@pytest.mark.parametrize("module", ["numpy", "torch"])
-def test_an_interruption_while_libraries_are_imported_is_quiet(module: str) -> None:
-    """NumPy takes an exception for one of its own libraries that fails, and goes on."""
-    interrupted = (
-        "import os, signal, sys\n"
-        "class Finder:\n"
-        "    def find_spec(self, name, *_):\n"
-        f"        if name == '{module}.linalg': os.kill(os.getpid(), signal.SIGINT)\n"
-        "sys.meta_path.insert(0, Finder())\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in jobs in the background
-        "from igps_command import main\n"
-        "sys.argv = ['igps', '--help']\n"
-        "main()\n"
-    )
-    done = subprocess.run([sys.executable, "-c", interrupted], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
-
-
 def test_what_takes_more_memory_than_there_is_is_told_in_a_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
