@@ -109,8 +109,8 @@ def main(
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     commands = COMMANDS if commands is None else commands
-    parser = command_parser(commands, program)
     with faults_in_a_sentence():
+        parser = command_parser(commands, program)
         parsed = parser.instantiate(parser.parse_args())
         command, options = _chosen(parsed, commands)
         as_json = options.pop(JSON, False)
