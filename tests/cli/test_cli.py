@@ -304,7 +304,7 @@ def test_what_asks_a_file_of_signatures_is_described_as_they_are(
     capsys.readouterr()
     igps(monkeypatch, "query", root / "egg" / "1.off", "--gallery", file, "--descriptor", INTERIOR, "--json", *cache)
     first = json.loads(capsys.readouterr().out)[0]
-    assert (first["mesh"], first["distance"]) == ("egg/1.off", 0)
+    assert (first["name"], first["distance"]) == ("egg/1.off", 0)
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,7 @@ def test_masks_that_are_numbered_have_a_row_each(tmp_path: Path, monkeypatch: py
         nibabel.save(nibabel.Nifti1Image(mask, np.eye(4)), folder / f"{number}.nii.gz")
     extract(monkeypatch, tmp_path / "masks", tmp_path / "wide.csv", "--wide")
     wide = pd.read_csv(tmp_path / "wide.csv")
-    assert wide.columns.tolist()[:5] == ["file", "label", "unit", "volume", "area"]
+    assert wide.columns.tolist()[:5] == ["file", "class", "unit", "volume", "area"]
     assert wide["file"].tolist() == [f"{label}/{number}.nii.gz" for label, number in sides]
     np.testing.assert_allclose(wide["volume"], [49 * side for side in sides.values()], rtol=1e-3)
 

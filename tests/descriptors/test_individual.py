@@ -182,9 +182,9 @@ def test_what_cannot_be_weighed_is_refused() -> None:
         igps.descriptor("gps", size=True)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="size: expected one of auto, keep, ignore, got 'kept'"):
         keeps_size("kept", ["mm"])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"expected one of interior, .*got 'gps\+colour=red'"):
+    with pytest.raises(ValueError, match=r"expected \+NAME or \+NAME=WEIGHT .*got 'gps\+colour=red'"):
         igps.descriptor("gps+colour=red")
-    with pytest.raises(ValueError, match=r"expected one of interior, .*got 'gps\+ct=1\.5\.2'"):
+    with pytest.raises(ValueError, match=r"expected \+NAME or \+NAME=WEIGHT .*got 'gps\+ct=1\.5\.2'"):
         igps.descriptor("gps+ct=1.5.2")
     with pytest.raises(ValueError, match="expected a descriptor that ignores size by itself, got 'molecular'"):
         igps.descriptor("molecular", size="keep")
