@@ -252,7 +252,8 @@ _ON_VOLUMES: dict[str, Callable[..., tuple[Array, Array, bool]] | None] = {
 def segmentation() -> bytes:
     """A DICOM SEG file of the ellipsoids."""
     with tempfile.NamedTemporaryFile(suffix=".dcm") as file:
-        test_volumes.write_segmentation(Path(file.name), labels(), list(LABELS.values()))
+        masks = test_volumes.masks_of(labels())
+        test_volumes.write_segmentation(Path(file.name), masks, list(LABELS.values()), "BINARY")
         return Path(file.name).read_bytes()
 
 
