@@ -388,7 +388,7 @@ def test_what_is_wrong_is_one_sentence(
     Gallery.build(tmp_path / "g.igps", dataset, "gps", n_workers=1)
     words = error_of(monkeypatch, capsys, "duplicates", tmp_path / "g.igps", *options)
     assert "descriptor: expected pretrained, whose distances are calibrated, got gps" in words
-    assert "built with --size ignore" in words
+    assert "build it with --size ignore" in words
 
 
 def test_other_lengths_are_no_candidates(tmp_path: Path) -> None:
