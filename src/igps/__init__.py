@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from igps.data.datamodule import SignatureDataModule
     from igps.nn.learner import RetrievalLearner
 
-# These bring Lightning, which takes seconds to import: on first use.
+# Imported on first use, because they import Lightning, which takes seconds.
 _LAZY = {"RetrievalLearner": "igps.nn.learner", "SignatureDataModule": "igps.data.datamodule"}
 
-# The Dataset lies below the descriptors, and still takes their names.
+# `igps.data` may not import `igps.descriptors`, but its Dataset accepts names of descriptors.
 register_descriptors(descriptor)
 del register_descriptors
 

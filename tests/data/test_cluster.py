@@ -181,7 +181,8 @@ class Nowhere:
 
 
 @pytest.mark.parametrize(
-    ("executor", "words"), [(Broken(1), "gave the work up"), (Elsewhere(1), "signatures do not appear there")]
+    ("executor", "words"),
+    [(Broken(1), "the executor cancelled a job"), (Elsewhere(1), "signatures do not appear there")],
 )
 def test_a_cluster_that_fails_is_told(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executor: Executor, words: str
