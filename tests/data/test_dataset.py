@@ -140,7 +140,9 @@ def test_key_covers_content_and_version_but_not_the_path(
 @pytest.mark.parametrize("cache", ["file", "file/cache"])
 def test_a_cache_that_cannot_be_made_is_no_fault_of_the_bodies(root: Path, tmp_path: Path, cache: str) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(MachineError, match=rf"cache_dir: {tmp_path / cache} cannot be made .*Choose a folder"):
+    with pytest.raises(
+        MachineError, match=rf"cache_dir: {tmp_path / cache} cannot be created .*Choose a writable folder"
+    ):
         SignatureDataset(root, CONFIG, tmp_path / cache).precompute(n_workers=1)
 
 
