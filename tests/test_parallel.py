@@ -174,10 +174,11 @@ def test_a_job_that_takes_too_long_is_ended(limited: dict[int, object]) -> None:
     ("job", "message"),
     [
         (partial(jobs.fail_with, errno.ENOSPC), "ENOSPC.*Free disk space.*run again"),
+        (partial(jobs.fail_with, errno.EMFILE), "EMFILE.*Raise the limit of open files.*run again"),
         (partial(jobs.fail_with, 0), "out of memory. Use fewer workers"),
         (partial(jobs.need_library, "no_such_library"), "No module named 'no_such_library'.*Install it and run again"),
     ],
-    ids=["disk", "memory", "library"],
+    ids=["disk", "files", "memory", "library"],
 )
 def test_the_machine_is_not_the_jobs_fault(where: str, job: Callable[[], None], message: str) -> None:
     """It is told once, and not of every job."""

@@ -38,12 +38,9 @@ class Compiled(Lazy, Generic[Arguments, Result]):
     """A function of arrays and numbers that is compiled when it is first called.
 
     The function may call other `Compiled` and `Lazy` functions of its module. These are compiled without a wrapper for
-    Python, which saves a tenth of the time. Division by 0 gives the result of NumPy, without an error.
-
-    Args:
-        function: the Python function.
-        options: see `numba.njit`. A function with `inline="always"` is compiled as part of its caller. This saves time
-            if it has one caller, and costs time otherwise, because LLVM compiles it again for each.
+    Python, which saves a tenth of the time. Division by 0 gives the result of NumPy, without an error. The options are
+    those of `numba.njit`. With `inline="always"`, the function is compiled as part of each caller, which saves time if
+    there is only one.
     """
 
     def __init__(self, function: Callable[Arguments, Result], **options: Any) -> None:
@@ -68,10 +65,7 @@ def compiled(**options: Any) -> Callable[[Callable[Arguments, Result]], Compiled
 
 
 def _compile(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """Return a Numba dispatcher for a function.
-
-    Numba looks names up in the globals of the function, so `Lazy` objects there are replaced by their dispatchers.
-    """
+    """Return the Numba dispatcher of a function, in whose globals dispatchers replace the `Lazy` objects."""
     assert isinstance(function, FunctionType)
     used = {name: function.__globals__.get(name) for name in function.__code__.co_names}
     dispatchers = {name: value.dispatcher for name, value in used.items() if isinstance(value, Lazy)}
@@ -83,10 +77,7 @@ def _compile(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
 
 @cache
 def _numba() -> ModuleType:
-    """Import Numba, with garbage collection off during compilation, and safe to fork.
-
-    A fork waits until no thread compiles, because the child would inherit the compiler's lock in its locked state.
-    """
+    """Import Numba. A fork waits until no thread compiles, because a lock that is held stays locked in the child."""
     import numba
     from numba.core import event
     from numba.core.compiler_lock import global_compiler_lock as lock

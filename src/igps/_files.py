@@ -27,10 +27,7 @@ def whole_file(path: Path) -> Iterator[IO[bytes]]:
 
 
 def with_ordered_metadata(content: bytes) -> bytes:
-    """Return the content of a safetensors file with its metadata sorted by name.
-
-    The safetensors library writes metadata in an order that differs from run to run.
-    """
+    """Return a safetensors file with sorted metadata. The library writes them in an order that differs each time."""
     end = 8 + int.from_bytes(content[:8], "little")
     header: dict[str, Any] = json.loads(content[8:end])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))

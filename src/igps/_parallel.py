@@ -29,21 +29,18 @@ from igps._workers import MachineError, Worker, workers_environment
 
 # A job whose process died is tried once more: an administrator or another program may be the cause.
 _MAX_ATTEMPTS = 2
-_KILLED = (
-    "its process was killed twice. It may need more memory than the machine has. Use fewer workers, or set a memory "
-    "limit, which stops and reports such bodies."
-)
-_KILLED_ON_CLUSTER = (
-    "several workers were killed while they worked on it. It may need more memory than they have. Start workers with "
-    "more memory."
-)
+_KILLED = "its process was killed twice. It may need more memory: use fewer workers, or set a memory limit to find out."
+_KILLED_ON_CLUSTER = "several workers that had it were killed. It may need more memory: start workers with more memory."
 # Jobs that an executor holds at a time: enough for the workers of a large cluster, and not too many for the memory.
 _MAX_SUBMITTED = 10_000
-_MACHINE_ERRNOS = frozenset(
-    getattr(errno, name, 0)
-    for name in ("ENOSPC", "EDQUOT", "EFBIG", "EIO", "EROFS", "EACCES", "EPERM", "EMFILE", "ENFILE", "ENOMEM")
-)
-_PERMISSION_ERRNOS = (errno.EROFS, errno.EACCES, errno.EPERM)
+_MACHINE_ERRORS = {
+    "Free disk space": ("ENOSPC", "EDQUOT", "EFBIG"),
+    "Choose a writable folder": ("EROFS", "EACCES", "EPERM"),
+    "Check the disk": ("EIO",),
+    "Raise the limit of open files": ("EMFILE", "ENFILE"),
+    "Free memory": ("ENOMEM",),
+}
+_REMEDIES = {getattr(errno, name, 0): remedy for remedy, names in _MACHINE_ERRORS.items() for name in names}
 
 
 @dataclass(frozen=True)
@@ -77,15 +74,14 @@ def run(
     """Run a function on many jobs, and yield the index and the result of each as it finishes.
 
     Args:
-        function: the picklable function. Its exceptions become `Failed`, except for those that the machine causes.
+        function: picklable. Its exceptions become `Failed`, except for those that the machine causes.
         jobs: picklable arguments of the function.
         n_workers: number of processes; the number of cores if None. With 1 and no limits, jobs run in this process.
         executor: runs the jobs instead of own processes.
         limits: limits of each job; not allowed with an executor.
 
     Raises:
-        MachineError: the disk is full, memory runs out without a limit, a library is missing, or no process can be
-            started.
+        MachineError: the disk is full, memory runs out without a limit, a library is missing, or no process starts.
     """
     check_at_least(1, n_workers=n_workers)
     limits = limits or Limits()
@@ -109,8 +105,7 @@ def on_threads(
     """Yield the result of every job in order. Each job computes on one thread.
 
     Splitting each small product over all cores instead would make every core wait for the slowest one. On a busy
-    machine the wait takes many times as long as the product itself. If `n_threads` is None, `igps._threads.n_threads()`
-    threads are used.
+    machine, the wait takes many times as long as the product. If None, `n_threads` is `igps._threads.n_threads()`.
     """
     n_threads = min(available_threads() if n_threads is None else n_threads, len(jobs))
     on_one_thread = one_thread()(function)
@@ -123,21 +118,16 @@ def on_threads(
 
 def is_machine_error(error: OSError) -> bool:
     """Return whether the machine is at fault, not a single file: a full or broken disk, a missing permission."""
-    return error.errno in _MACHINE_ERRNOS
+    return error.errno in _REMEDIES
 
 
 def machine_error_text(error: OSError) -> str:
     """Return the message of an error for which `is_machine_error` holds, with a remedy."""
-    remedy = "Choose a writable folder" if error.errno in _PERMISSION_ERRNOS else "Free disk space"
-    return f"{error}. {remedy} and run again: finished results are kept."
+    return f"{error}. {_REMEDIES[error.errno or 0]} and run again: finished results are kept."
 
 
 def attempt(function: Callable[[], Result], limits: Limits = Limits()) -> Result | Failed:
-    """Return the result of a job, or its failure.
-
-    Raises:
-        MachineError: the machine is at fault.
-    """
+    """Return the result or the failure of a job; raise a MachineError if the machine is at fault."""
     try:
         return function()
     except (BrokenExecutor, CancelledError, MachineError):
@@ -145,9 +135,7 @@ def attempt(function: Callable[[], Result], limits: Limits = Limits()) -> Result
     except MemoryError as error:
         if limits.memory is not None:
             return Failed(f"it needs more than the memory_limit of {limits.memory / 2**20:.0f} MiB.")
-        raise MachineError(
-            "out of memory. Use fewer workers or set a memory limit. Finished results are kept."
-        ) from error
+        raise MachineError("out of memory. Use fewer workers or a memory limit: finished results are kept.") from error
     except ImportError as error:
         raise MachineError(f"{str(error).rstrip('.')}. Install it and run again: finished results are kept.") from error
     except OSError as error:

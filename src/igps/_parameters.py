@@ -4,13 +4,13 @@ import math
 from collections.abc import Collection
 
 
-def check_at_least(least: int, **values: int | None) -> None:
-    """Raise a ValueError for the first value that is smaller than `least` or not a whole number."""
+def check_at_least(minimum: int, **values: int | None) -> None:
+    """Raise a ValueError for the first value that is smaller than `minimum` or not a whole number."""
     for name, value in values.items():
         if value is not None and not hasattr(value, "__index__"):
             raise ValueError(f"{name}: expected a whole number, got {value!r}.")
-        if value is not None and value < least:
-            raise ValueError(f"{name}: expected at least {least}, got {value}.")
+        if value is not None and value < minimum:
+            raise ValueError(f"{name}: expected at least {minimum}, got {value}.")
 
 
 def check_positive(**values: float) -> None:

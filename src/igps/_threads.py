@@ -55,9 +55,7 @@ def one_thread() -> Iterator[None]:
                 _set_torch_threads(1)
             yield
     finally:
-        # Not only if the number differs: torch may report the threads of MKL, which are restored already, and give new
-        # Python threads only one
-        if before > 1:
+        if before > 1:  # even if torch reports `before`, which may be MKL's threads while new Python threads get one
             _set_torch_threads(before)
         _state.max_threads = outside
 
@@ -74,10 +72,7 @@ class Team:
 
     The threads live as long as the context, because starting threads takes longer than a step. The thread that calls
     `each` takes jobs as well, and waits only for jobs that another thread has begun. So a thread without a core delays
-    nothing.
-
-    Args:
-        max_threads: maximum number of threads, including the calling thread; `n_threads()` if None.
+    nothing. `max_threads` includes the calling thread; it is `n_threads()` if None.
     """
 
     def __init__(self, max_threads: int | None = None) -> None:
@@ -185,10 +180,7 @@ _torch_threads = _fork_safe_lock()
 
 
 def _get_torch_threads() -> int:
-    """Return the number of torch threads of this Python thread.
-
-    The lock keeps a new thread from seeing the number that `_set_torch_threads` sets for another thread.
-    """
+    """Return the torch threads of this Python thread, but not while `_set_torch_threads` sets those of another."""
     with _torch_threads:
         return torch.get_num_threads()
 
@@ -214,18 +206,14 @@ def _in_new_thread(function: Callable[[], Result]) -> Result:
 
 @lru_cache(maxsize=1)
 def _libraries(n_modules: int) -> threadpoolctl.ThreadpoolController:
-    """Return the loaded thread pools, cached because finding them takes as long as a small product.
-
-    Only imports load libraries, so the number of modules is the cache key.
-    """
+    """Return the thread pools of the loaded libraries, cached until more modules are imported because it is slow."""
     return threadpoolctl.ThreadpoolController()
 
 
 def _blas_to_one_thread() -> Callable[[], None]:
     """Limit the BLAS libraries of NumPy and SciPy to one thread, and return a function that lifts the limit.
 
-    threadpoolctl lets no other thread lift a limit while the thread that set it is alive, so that thread gives up its
-    control.
+    While a thread is alive, threadpoolctl lets no other thread lift its limit, unless the thread gives up control.
     """
     limits = _libraries(len(sys.modules)).limit(limits=1, user_api="blas")
     _release_control()

@@ -24,10 +24,7 @@ _MAX_STARTS = 2
 
 
 class MachineError(RuntimeError):
-    """The machine is at fault, not a job: the disk is full, memory runs out, a library is missing.
-
-    Finished results are kept.
-    """
+    """The machine is at fault, not a job: for example, the disk is full. Finished results are kept."""
 
 
 class Worker:

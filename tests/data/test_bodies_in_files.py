@@ -153,7 +153,7 @@ def test_a_table_of_columns_alone_tells_no_classes(root: Path) -> None:
     (root / "labels.csv").write_text("file,age\n1.obj,30\n2.obj\n")
     bodies = find_bodies(root, OBJECTS)
     assert (bodies.labels, bodies.columns) == (None, {"age": ("30", "30", None, None)})
-    with pytest.raises(ValueError, match=r"no classes found\..* Or call one of age label"):
+    with pytest.raises(ValueError, match=r"no classes found\..* Or rename one of the columns age to label"):
         find_bodies(root, OBJECTS, labelled=True)
     assert find_bodies(root, OBJECTS, classes="body", labelled=True).labels == ("liver", "spleen", "liver", "spleen")
 

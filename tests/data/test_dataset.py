@@ -376,7 +376,10 @@ def test_a_pre_transform_is_kept_under_a_key_of_its_own(
     assert len({*keys, *dataset.cached_keys(), *changed(1).cached_keys()}) == 10  # of the last one is, and None
     assert changed(0).cached_keys() == keys
     assert [first.key(i) for i in range(len(first))] == keys
-    for wrong, message in ((Scale(), "expected a seed"), (lambda signature: signature, "expected a cache_tag")):
+    for wrong, message in (
+        (Scale(), "expected a seed"),
+        (lambda signature: signature, "expected an object with a cache_tag"),
+    ):
         with pytest.raises(ValueError, match=f"pre_transform: {message}"):
             SignatureDataset(root, CONFIG, dataset.pipeline.cache_dir, pre_transform=wrong)  # type: ignore[arg-type]
 

@@ -18,39 +18,30 @@ from typing import Any
 
 # Types whose representation is the same in every process, so that keys can hold them; None as well
 _PLAIN_TYPES = (bool, int, float, str, PurePath)
+_REMEDY = "Pass a callable object with a method cache_tag(body), see igps.data.attributes.AttributeSource."
 
 
 def function_key(function: Callable[..., Any]) -> str:
-    """Return a key that differs when the behaviour of a function may differ.
-
-    Raises:
-        ValueError: the function depends on values that a key cannot hold, or its source code is not available.
-    """
+    """Return a key of a function; raise a ValueError if it uses values or code that a key cannot hold."""
     used = [function]
     for item in used:  # which grows
-        for helper in _global_references(item)[1]:
-            if helper not in used:
-                used.append(helper)
+        used += [helper for helper in dict.fromkeys(_global_references(item)[1]) if helper not in used]
     return " ".join(map(_key_without_helpers, used))
 
 
 def _key_without_helpers(item: Callable[..., Any]) -> str:
-    """Return name, source code, and default and global values of a function or class."""
     name = getattr(item, "__qualname__", repr(item))
-    remedy = "Give an object with this call and a method cache_tag(body), see igps.data.attributes.AttributeSource."
     defaults = getattr(item, "__defaults__", None) or ()
     keyword_defaults = getattr(item, "__kwdefaults__", None) or {}
     values = [*defaults, *keyword_defaults.values(), *_global_references(item)[0]]
     is_plain = all(value is None or isinstance(value, _PLAIN_TYPES) for value in values)
     if getattr(item, "__closure__", None) or inspect.ismethod(item) or not is_plain:
-        raise ValueError(f"attributes: {name} uses variables that a cache key cannot hold. {remedy}")
+        raise ValueError(f"attributes: {name} uses variables that a cache key cannot hold. {_REMEDY}")
     try:
         source = inspect.getsource(item)
     except (OSError, TypeError) as error:
-        raise ValueError(f"attributes: the source code of {name} is not available ({error}). {remedy}") from error
-    if name.endswith(
-        "<lambda>"
-    ):  # `getsource` returns the line it begins on: perhaps several lambdas, or not all of it
+        raise ValueError(f"attributes: the source code of {name} is not available ({error}). {_REMEDY}") from error
+    if name.endswith("<lambda>"):  # its line may hold other lambdas, or end before the lambda does
         source += str([(step.opname, step.argrepr) for step in _instructions(item) if not inspect.iscode(step.argval)])
     return f"{name} {hashlib.sha256(source.encode()).hexdigest()} {values}"
 
@@ -61,12 +52,12 @@ def _global_references(item: Callable[..., Any]) -> tuple[list[Any], list[Callab
     if inspect.isclass(item):
         helpers += [base for base in item.__mro__[1:] if _is_own(base.__module__)]
     for value in (value for function in _functions(item) for value in _global_values(function)):
-        if not hasattr(value, "__name__"):  # which modules, functions and classes have, compiled or not
-            constants += [] if value is None or isinstance(value, logging.Logger) else [value]
-            continue
-        helper = value if inspect.isfunction(value) else inspect.unwrap(value)
-        if (inspect.isfunction(helper) or inspect.isclass(helper)) and _is_own(helper.__module__):
-            helpers.append(helper)
+        if hasattr(value, "__name__"):  # modules, functions and classes, compiled or not
+            helper = value if inspect.isfunction(value) else inspect.unwrap(value)
+            if (inspect.isfunction(helper) or inspect.isclass(helper)) and _is_own(helper.__module__):
+                helpers.append(helper)
+        elif value is not None and not isinstance(value, logging.Logger):
+            constants.append(value)
     return constants, helpers
 
 

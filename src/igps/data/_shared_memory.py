@@ -80,10 +80,7 @@ def _free_block(min_bytes: int) -> _Block:
 
 
 def _reduce(batch: SignatureBatch) -> Any:
-    """Reduce a batch to its block and the places of its tensors in it.
-
-    A batch that lies in no block, or was sent before, is pickled as usual.
-    """
+    """Reduce a batch to its block and the places of its tensors, or as usual if it has no block or was sent before."""
     address = batch.labels.data_ptr()
     block = next((b for b in _blocks if b.start <= address < b.start + b.n_bytes and not b.memory[0]), None)
     if block is None:

@@ -41,10 +41,8 @@ class FromFiles(Protocol):
 class FunctionAttribute:
     """A function `(body, points)` as an attribute source.
 
-    The cache key contains the function and the user's own functions and classes that it uses, see `function_key`.
-
-    Raises:
-        ValueError: the function uses variables that a key cannot hold, or its source code is not available.
+    The cache key contains the function and the user's functions and classes that it uses. A ValueError is raised if
+    they use variables that a key cannot hold, or if their source code is not available.
     """
 
     function: Callable[[BodyRef, Floats], NDArray[np.floating[Any]]]
@@ -57,7 +55,6 @@ class FunctionAttribute:
         return f"function {function_key(self.function)} {body}"
 
     def __call__(self, body: BodyRef, points: Floats) -> NDArray[np.floating[Any]]:
-        """Return the values of the function."""
         return self.function(body, points)
 
 
@@ -91,11 +88,7 @@ def split_attributes(
 
 
 def with_attribute(signature: Signature, name: str, values: Mapping[SampleKind, ArrayLike]) -> Signature:
-    """Return a Signature with an additional attribute, whose values are given by kind of sample.
-
-    Raises:
-        ValueError: the values are not one finite row for each sample.
-    """
+    """Return a Signature with an additional attribute; raise a ValueError if a sample lacks a finite row of values."""
     try:
         interior, surface = (getattr(signature, kind).with_attributes({name: values[kind]}) for kind in SAMPLE_KINDS)
     except ValueError as error:

@@ -1,7 +1,6 @@
 """Collation of Signatures to a padded batch."""
 
 from collections.abc import Sequence
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -23,8 +22,6 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
     worker process of a DataLoader, the batch lies in shared memory.
 
     Example:
-        Bodies with fewer samples than the largest one are padded.
-
         >>> import trimesh
         >>> from igps.signature.signature import SignatureConfig, compute_signature
         >>> config, ball = SignatureConfig(n_eigenpairs=20), trimesh.creation.icosphere(subdivisions=2)
@@ -58,14 +55,11 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
     for samples in samples_by_kind:
         columns += _sample_columns(samples)
     eigenvalues, area, volume, labels, *sample_tensors = _padded(columns)
-    tensors = iter(sample_tensors)
-
-    def sample_batch(samples: Sequence[Samples]) -> SampleBatch:
-        points, eigenfunctions, mask = islice(tensors, 3)
-        attributes = {name: next(tensors) for name in sorted(samples[0].attributes)}
-        return SampleBatch(points, eigenfunctions, mask, attributes)
-
-    interior, surface = map(sample_batch, samples_by_kind)
+    rest = iter(sample_tensors)
+    interior, surface = (
+        SampleBatch(next(rest), next(rest), next(rest), {name: next(rest) for name in sorted(samples[0].attributes)})
+        for samples in samples_by_kind
+    )
     ids, units = tuple(item.id for item in labelled), tuple(s.unit for s in signatures)
     surfaces = None if meshes is None else tuple(meshes)
     return SignatureBatch(eigenvalues, interior, surface, area, volume, labels, ids, surfaces, units)

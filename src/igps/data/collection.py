@@ -66,10 +66,8 @@ class Contents:
 def write_collection(path: Path, about: Contents, signature: Callable[[int], Signature]) -> None:
     """Write a collection atomically to a safetensors file, which is replaced if it exists.
 
-    To save memory, `signature` is called with each index up to three times.
-
-    Raises:
-        ValueError: names are not unique, or there are too many bodies for one file.
+    To save memory, `signature` is called with each index up to three times. A ValueError is raised if names are not
+    unique, or if there are too many bodies for one file.
     """
     n = len(about.bodies)
     if len(set(about.bodies.names)) < n:
@@ -114,11 +112,8 @@ def is_collection(path: Path) -> bool:
 class CollectionFile:
     """Memory-mapped file of `write_collection`; each Signature is checked when it is read.
 
-    Reading does not run code. A worker process that receives the object opens the file itself.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file has another format, or is damaged.
+    Reading does not run code. A worker process that receives the object opens the file itself. A FileNotFoundError is
+    raised if there is no such file, and a ValueError if it has another format or is damaged.
     """
 
     def __init__(self, path: str | Path) -> None:

@@ -21,10 +21,8 @@ from igps.signature.signature import SignatureConfig
 
 
 def has_configuration() -> bool:
-    """Return whether Lightning's command line is creating an object from a configuration, which checkpoints can store.
-
-    Arguments that are passed in Python would have to be pickled, and loading a pickle can run code.
-    """
+    """Return whether Lightning's command line creates an object from a configuration, which checkpoints can store."""
+    # Arguments that are passed in Python would have to be pickled, and loading a pickle can run code
     return _given_hyperparameters.get() is not None
 
 

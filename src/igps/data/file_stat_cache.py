@@ -41,8 +41,7 @@ class FileStatCache:
         self._path = pipeline.cache_dir / _FILE
         tag = pipeline.pre_transform.cache_tag if pipeline.pre_transform else None
         fields = [pipeline.reading.as_dict(), pipeline.config.as_dict(), MENDING_VERSION, tag]
-        # The table of names by its path, because another table may have the same time stamp
-        fields += [pipeline.reading.names] if pipeline.reading.names else []
+        fields += [pipeline.reading.names] if pipeline.reading.names else []  # another table may have the same stamp
         self._pipeline_id = hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[:32]
         # A transform may depend on attributes, whose sources can change while the file of the body does not
         self._is_enabled = not (pipeline.attributes and pipeline.pre_transform)

@@ -49,10 +49,7 @@ def fill(
     pipeline: SignaturePipeline, bodies: Bodies, executor: Executor | None, n_workers: int | None, strict: bool,
     progress: bool, limits: Limits | None,
 ) -> tuple[list[CacheHit | None], list[Failure]]:  # fmt: skip
-    """Compute missing Signatures, and return the cache entry of each body, and failures.
-
-    See `SignatureDataset.precompute` for the arguments.
-    """
+    """Compute missing Signatures; return all cache entries, and failures. See `SignatureDataset.precompute`."""
     try:  # here, so that it is reported once and not for every body
         pipeline.cache_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -119,13 +116,8 @@ def compute(
     """Compute Signatures into the cache, and yield the index and the cache entry or failure of each body.
 
     A job computes several bodies of one file, which it reads once. If the process of a job dies, each of its bodies is
-    tried again in a job of its own.
-
-    Args:
-        indices: of the bodies.
-        n_workers, executor: see `igps._parallel.run`.
-        limits: of one body; with limits, each job has one body.
-        max_per_job: maximum number of bodies of a job; if None, 64, or fewer so that all workers have a job.
+    tried again in a job of its own. With limits, which are those of one body, each job has one body. `max_per_job` is
+    64 if None, or less so that all workers have a job. See `igps._parallel.run` for the other arguments.
     """
     per_worker = -(-len(indices) // (n_workers or n_cores()))
     max_per_job = 1 if limits != Limits() else max_per_job or max(1, min(per_worker, _MAX_BODIES_PER_JOB))
@@ -134,7 +126,7 @@ def compute(
     function: Callable[[Sequence[BodyRef]], list[CacheHit | Failed]] = pipeline.fill
     if executor is not None:  # its workers may run in another folder, so all paths must be absolute
         function = partial(fill_elsewhere, replace(pipeline, cache_dir=pipeline.cache_dir.absolute()).fill, version())
-        in_memory = pipeline.meshes
+        in_memory = pipeline.meshes  # bodies without a file
         jobs = [[b if b in in_memory else replace(b, path=b.path.absolute()) for b in job] for job in jobs]
     lost: list[int] = []
     results = run(function, jobs, n_workers=n_workers, executor=executor, limits=limits)
@@ -157,10 +149,8 @@ def wait_until_visible(pipeline: SignaturePipeline, hit: CacheHit) -> None:
     deadline = time.monotonic() + _SHARED_WITHIN
     while not path.exists():
         if time.monotonic() > deadline:
-            raise MachineError(
-                f"{pipeline.cache_dir}: the signatures of the workers do not appear there. Choose a cache_dir that "
-                "this machine and all workers share under the same path."
-            )
+            cause = f"{pipeline.cache_dir}: the workers' signatures do not appear there"
+            raise MachineError(f"{cause}. Choose a cache_dir that this machine and all workers share by the same path.")
         time.sleep(0.1)
 
 

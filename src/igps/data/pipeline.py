@@ -108,11 +108,8 @@ class SignaturePipeline:
     def fill(self, bodies: Sequence[BodyRef]) -> list[CacheHit | Failed]:
         """Store the Signatures of bodies of one file in the cache, and return the cache entry or failure of each.
 
-        Signatures are not returned, because sending them from a worker would take time.
-
-        Raises:
-            MeshError: there is only one body, and it cannot be used.
-            MachineError: the machine is at fault, for example its disk is full.
+        Signatures are not returned, because sending them from a worker would take time. If the only body cannot be
+        used, a MeshError is raised; if the machine is at fault, a MachineError.
         """
         if len(bodies) == 1:
             return [self.hit(bodies[0])]

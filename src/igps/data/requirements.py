@@ -39,12 +39,9 @@ class Requirements:
         )
 
     def apply_to(self, config: SignatureConfig) -> SignatureConfig:
-        """Return the configuration with the required attributes, and with a number of eigenpairs if it has none.
+        """Return the configuration with the required attributes, and the required number of eigenpairs if it has none.
 
-        The number is the required one, or for a descriptor of the whole spectrum at least the default.
-
-        Raises:
-            ValueError: the number of eigenpairs in the configuration is too small.
+        For a whole spectrum, the number is at least the default. A ValueError is raised if the configuration has fewer.
         """
         default = SignatureConfig.DEFAULT_EIGENPAIRS if self.whole_spectrum else 0
         config = config.with_eigenpairs(max(default, self.n_eigenpairs))
