@@ -22,7 +22,7 @@ CONTRACTED = {"contract"}
 
 
 class Lazy:
-    """A function for compiled code, which is made when a function that calls it is compiled."""
+    """Placeholder for a function that compiled code calls; `make` creates it when a caller is compiled."""
 
     def __init__(self, make: Callable[[], Callable[..., Any]]) -> None:
         self._make = make
@@ -52,9 +52,7 @@ class Compiled(Lazy, Generic[Arguments, Result]):
         dispatcher: Any = self._entry.dispatcher
         try:
             return dispatcher(*args, **kwargs)
-        except (
-            AttributeError
-        ):  # never from the function: a file cached by an earlier version names a class that is gone
+        except AttributeError:  # a cached file names a class of an earlier version; compiled code raises none itself
             dispatcher._cache.flush()
             return dispatcher(*args, **kwargs)
 

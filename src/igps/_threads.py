@@ -206,7 +206,7 @@ def _in_new_thread(function: Callable[[], Result]) -> Result:
 
 @lru_cache(maxsize=1)
 def _libraries(n_modules: int) -> threadpoolctl.ThreadpoolController:
-    """Return the thread pools of the loaded libraries, cached until more modules are imported because it is slow."""
+    """Return the loaded thread pools, cached until an import, as finding them takes as long as a small product."""
     return threadpoolctl.ThreadpoolController()
 
 

@@ -198,7 +198,7 @@ class VertexAttribute(FileAttribute):
     def values(self, body: BodyRef, file: Path, name: str, points: Floats) -> Floats:
         import igl
 
-        if file.name.lower().endswith(images.SUFFIXES):  # as the pattern may end in {file}, whose suffix was not known
+        if file.name.lower().endswith(images.SUFFIXES):  # if the pattern ends in {file}, the suffix is known only here
             return ImageAttribute(self.path, self.root).values(body, file, name, points)
         raw = read_surface(body.path, self.reading, part=body.part)
         values = vertex_values.chosen(vertex_values.read(file), name, file)
@@ -233,7 +233,7 @@ class TetAttribute(FileAttribute):
         # Tetrahedron of each point, barycentric coordinates in it, and the smallest of them, which is negative outside
         n = len(points)
         owner, weights, smallest = np.zeros(n, int), np.zeros((n, 4)), np.full(n, -np.inf)
-        # Candidates are the tetrahedra whose centre is as near as the largest distance of a corner from its centre
+        # A point lies within the largest distance of a corner from the centre of its tetrahedron
         centres = corners.mean(axis=1)
         radius = np.linalg.norm(corners - centres[:, None], axis=2).max()
         for i, near in enumerate(cKDTree(centres).query_ball_point(points, radius * (1 + _TOLERANCE))):

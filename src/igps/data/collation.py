@@ -55,9 +55,9 @@ def collate(items: Sequence[LabelledSignature | Signature], meshes: Sequence[Mes
     for samples in samples_by_kind:
         columns += _sample_columns(samples)
     eigenvalues, area, volume, labels, *sample_tensors = _padded(columns)
-    rest = iter(sample_tensors)
+    data = iter(sample_tensors)
     interior, surface = (
-        SampleBatch(next(rest), next(rest), next(rest), {name: next(rest) for name in sorted(samples[0].attributes)})
+        SampleBatch(next(data), next(data), next(data), {name: next(data) for name in sorted(samples[0].attributes)})
         for samples in samples_by_kind
     )
     ids, units = tuple(item.id for item in labelled), tuple(s.unit for s in signatures)

@@ -44,21 +44,20 @@ class Contents:
     @staticmethod
     def from_json(text: str) -> Contents:
         """Parse the text of `to_json`; raise a ValueError, KeyError or TypeError if it is invalid."""
-        fields: dict[str, Any] = json.loads(text)
-        names, parts, columns = _strings(fields["names"]), tuple(fields["parts"]), dict(fields.get("columns", {}))
-        labels = None if fields["labels"] is None else _strings(fields["labels"])
+        data: dict[str, Any] = json.loads(text)
+        names, parts, columns = _strings(data["names"]), tuple(data["parts"]), dict(data.get("columns", {}))
+        labels = None if data["labels"] is None else _strings(data["labels"])
         columns = {name: tuple(values) for name, values in columns.items()}
         paths = tuple(Path(file_name_of(name, part)) for name, part in zip(names, parts, strict=True))
         bodies = Bodies(paths, names, labels, parts, columns)
-        classes, keys = _strings(fields["classes"]), _strings(fields["keys"])
+        classes, keys = _strings(data["classes"]), _strings(data["keys"])
         if len(keys) != len(names) or len(parts) != len(names) or len(set(names)) < len(names):
             raise ValueError("its names are not unique, or differ in number from its parts or keys")
         optional_strings = [*parts, *(value for values in columns.values() for value in values)]
         if not set(labels or ()) <= set(classes) or not all(s is None or isinstance(s, str) for s in optional_strings):
             raise ValueError("a label is not one of its classes, or a part or a value of a column is not a string")
-        reading, config = fields["reading"], fields["config"]
         try:
-            return Contents(bodies, classes, keys, LoadOptions(**reading), SignatureConfig(**config))
+            return Contents(bodies, classes, keys, LoadOptions(**data["reading"]), SignatureConfig(**data["config"]))
         except (TypeError, KeyError, ValueError) as error:
             raise ValueError(f"parameters of another version: {error}") from error
 
@@ -74,10 +73,10 @@ def write_collection(path: Path, about: Contents, signature: Callable[[int], Sig
         duplicate = next(name for name, count in Counter(about.bodies.names).items() if count > 1)
         raise ValueError(f"{path}: expected unique names, got {duplicate} twice. Give each body once.")
     arrays: list[dict[str, tuple[str, tuple[int, ...], int]]] = []  # dtype, shape, bytes of each Signature's arrays
-    metadata_of = []
+    all_metadata = []
     for i in range(n):
         tensors, metadata = encode(signature(i))
-        metadata_of.append({**metadata, "checksum": checksum(tensors, metadata)})
+        all_metadata.append({**metadata, "checksum": checksum(tensors, metadata)})
         arrays.append({name: (values.dtype.name, values.shape, values.nbytes) for name, values in tensors.items()})
     # Doubles come before singles, so that all arrays are aligned: the format allows no gaps
     order = [(i, name) for d in _DTYPES for i in range(n) for name, (dtype, *_) in arrays[i].items() if dtype == d]
@@ -87,7 +86,7 @@ def write_collection(path: Path, about: Contents, signature: Callable[[int], Sig
         dtype, shape, n_bytes = arrays[i][name]
         header[f"{i}.{name}"] = {"dtype": _DTYPES[dtype], "shape": shape, "data_offsets": (end, end + n_bytes)}
         end += n_bytes
-    words = {"format": _FORMAT, "about": about.to_json(), "signatures": json.dumps(metadata_of)}
+    words = {"format": _FORMAT, "about": about.to_json(), "signatures": json.dumps(all_metadata)}
     words["checksum"] = checksum({}, {"about": words["about"]})
     text = json.dumps({"__metadata__": words, **header}, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)

@@ -45,7 +45,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
 
     Args:
         root_or_paths: a folder (see `find_bodies`), files, or `Bodies`; or a mapping of names to objects in memory,
-            each of which `Mesh.of` accepts. Images give a body for each label, also arrays `(labels, spacing)`.
+            each of which `Mesh.of` accepts. Images and pairs `(labels, spacing)` of an array give a body per label.
         config: parameters of the Signatures. The default is 250 eigenpairs, unless the descriptor sets a number.
         cache_dir: directory of the cache; the user's cache directory if None. A cache key consists of the content of
             the file, the load options, all parameters, and the version of the algorithm. A cached Signature with more

@@ -33,7 +33,7 @@ class PreTransform(Protocol):
         """Text that identifies the transform with all its parameters."""
 
     def __call__(self, signature: Signature) -> Signature:
-        """Return the transformed Signature. The name of the argument is its cache key."""
+        """Return the transformed Signature. The name of the given Signature is its cache key."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class SignaturePipeline:
         if body in self.meshes:
             mesh = self.mesh(body)
             content = mesh.vertices.tobytes(), mesh.faces.tobytes(), repr((mesh.unit, mesh.notes)).encode()
-            return BodyFile((0, 0, 0), b"".join(hashlib.sha256(field).digest() for field in content))
+            return BodyFile((0, 0, 0), b"".join(hashlib.sha256(data).digest() for data in content))
         try:
             files = files_read(body.path, self.reading)
             return BodyFile(stamp_of(*files), content_digest(*files))

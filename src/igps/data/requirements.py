@@ -19,12 +19,10 @@ from igps.signature.signature import SignatureConfig
 class Requirements:
     """Requirements of a descriptor for a body, besides samples, area and volume."""
 
-    n_eigenpairs: int = 0  # minimum number
+    n_eigenpairs: int = 0  # minimum number; fewer would give another descriptor
     attributes: tuple[AttributeName, ...] = ()  # of the samples, see `SignatureConfig`
-    mesh: bool = False  # whether it uses the mesh
-    whole_spectrum: bool = (
-        False  # whether it uses all eigenpairs of a Signature, so that their number changes its result
-    )
+    mesh: bool = False  # whether the mesh is needed
+    whole_spectrum: bool = False  # whether all eigenpairs are used, so that more would give another descriptor
     # Sources of additional attributes by name, which the `attributes` of a SignatureDataset override
     sources: Mapping[str, AttributeSource] = field(default_factory=dict, hash=False)
 
