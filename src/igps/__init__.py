@@ -1,7 +1,7 @@
 """Interior Global Point Signatures as a PyTorch descriptor (Rustamov 2010).
 
-A mesh becomes a `Signature` (eigenfunctions sampled in its interior and on its surface), Signatures become histograms
-or embeddings, and those are compared.
+A mesh becomes a `Signature`: eigenfunctions sampled in its interior and on its surface. Signatures become histograms or
+embeddings, which are compared.
 
 Shape letters in all docstrings: V vertices, F faces, K eigenpairs, P samples, C potential classes, B distance bins,
 N shapes, Q queries, G gallery, D embedding width.

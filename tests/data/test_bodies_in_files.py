@@ -15,7 +15,7 @@ import igps.data.pipeline as pipeline_module
 from igps._parallel import Limits
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import compute
-from igps.data.sources import Bodies, find_bodies, given_bodies
+from igps.data.sources import Bodies, find_bodies, bodies_of_files
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions
@@ -75,7 +75,7 @@ def test_bodies_are_found_by_file_and_part(root: Path) -> None:
     assert bodies.labels is None
     assert bodies.subset([3]).parts == ("spleen",)
     assert find_bodies(root).names == ("1.obj", "2.obj")
-    given = given_bodies([root / "2.obj"], ["second"], OBJECTS)
+    given = bodies_of_files([root / "2.obj"], ["second"], OBJECTS)
     assert given.names == (f"{root / '2.obj'}#liver", f"{root / '2.obj'}#spleen")
     assert given.labels == ("second", "second")
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from igps.data.sources import bodies_of, file_and_part, find_bodies, given_bodies
+from igps.data.sources import bodies_of, file_and_part, find_bodies, bodies_of_files
 
 
 def touch(root: Path, *names: str) -> None:
@@ -120,7 +120,7 @@ def test_names_that_are_no_words_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"m\\xfcll': expected a name in UTF-8"):
         find_bodies(name)
     with pytest.raises(ValueError, match=r"paths: expected names in UTF-8, got b'.*m\\xfcll/1.off'"):
-        given_bodies([name / "1.off"])
+        bodies_of_files([name / "1.off"])
 
 
 def test_labels_may_be_an_array_and_are_of_files_alone(tmp_path: Path) -> None:
@@ -142,8 +142,8 @@ def test_nothing_there(tmp_path: Path) -> None:
 
 
 def test_given_files_need_one_label_each() -> None:
-    assert given_bodies(["b.off", "a.off"], ["x", "y"]).labels == ("x", "y")
+    assert bodies_of_files(["b.off", "a.off"], ["x", "y"]).labels == ("x", "y")
     with pytest.raises(ValueError, match="labels: expected one for each of 2"):
-        given_bodies(["b.off", "a.off"], ["x"])
+        bodies_of_files(["b.off", "a.off"], ["x"])
     with pytest.raises(ValueError, match="at least one"):
-        given_bodies([])
+        bodies_of_files([])

@@ -16,7 +16,7 @@ from pathlib import Path, PurePath
 from types import FunctionType
 from typing import Any
 
-# Types whose representation is the same in every process, so that keys can hold them; None as well
+# Types with the same representation in every process, which keys can hold, besides None
 _PLAIN_TYPES = (bool, int, float, str, PurePath)
 _REMEDY = "Pass a callable object with a method cache_tag(body), see igps.data.attributes.AttributeSource."
 

@@ -122,7 +122,7 @@ class FileAttribute(ABC):
         """Return values (P,) or (P, C) at points (P, 3), NaN where they are missing."""
 
     def files(self, paths: Iterable[Path]) -> set[Path]:
-        """Return the attribute files of bodies, see `FromFiles`, except for patterns with {part}."""
+        """Return the attribute files of bodies, see `FileSource`, except for patterns with {part}."""
         files = set()
         for path in paths:
             with contextlib.suppress(MeshError):

@@ -30,7 +30,7 @@ class AttributeSource(Protocol):
 
 
 @runtime_checkable
-class FromFiles(Protocol):
+class FileSource(Protocol):
     """An attribute source that reads files, which may lie in the folder of the bodies."""
 
     def files(self, paths: Iterable[Path]) -> set[Path]:

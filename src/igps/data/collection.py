@@ -38,8 +38,8 @@ class Contents:
         """Return the contents as JSON, without paths."""
         bodies = {name: value for name, value in vars(self.bodies).items() if name != "paths"}
         labels = None if self.bodies.labels is None else list(map(str, self.bodies.labels))  # users may give numbers
-        words = {"labels": labels, "classes": list(map(str, self.classes)), "keys": self.keys}
-        return json.dumps({**bodies, **words, "reading": asdict(self.reading), "config": asdict(self.config)})
+        names = {"labels": labels, "classes": list(map(str, self.classes)), "keys": self.keys}
+        return json.dumps({**bodies, **names, "reading": asdict(self.reading), "config": asdict(self.config)})
 
     @staticmethod
     def from_json(text: str) -> Contents:
@@ -86,9 +86,9 @@ def write_collection(path: Path, about: Contents, signature: Callable[[int], Sig
         dtype, shape, n_bytes = arrays[i][name]
         header[f"{i}.{name}"] = {"dtype": _DTYPES[dtype], "shape": shape, "data_offsets": (end, end + n_bytes)}
         end += n_bytes
-    words = {"format": _FORMAT, "about": about.to_json(), "signatures": json.dumps(all_metadata)}
-    words["checksum"] = checksum({}, {"about": words["about"]})
-    text = json.dumps({"__metadata__": words, **header}, separators=(",", ":")).encode()
+    file_metadata = {"format": _FORMAT, "about": about.to_json(), "signatures": json.dumps(all_metadata)}
+    file_metadata["checksum"] = checksum({}, {"about": file_metadata["about"]})
+    text = json.dumps({"__metadata__": file_metadata, **header}, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     if len(text) > _MAX_HEADER_BYTES:
         raise ValueError(f"{path}: {n} bodies are too many for one file. Export parts of the dataset.")
@@ -154,7 +154,7 @@ class CollectionFile:
             name = self.about.bodies.names[index]
             raise ValueError(f"{self.path}: {name} is not usable ({error}). Export the collection again.") from error
 
-    def check_serves(self, requirements: Requirements) -> None:
+    def check_requirements(self, requirements: Requirements) -> None:
         """Raise a ValueError that names the file if its Signatures do not meet the requirements."""
         try:
             requirements.check_config(self.about.config)

@@ -254,7 +254,7 @@ class SignatureDataset(Dataset[LabelledSignature]):
         file = CollectionFile(path)
         about = file.about
         if descriptor is not None:
-            file.check_serves(requirements_of(descriptor))
+            file.check_requirements(requirements_of(descriptor))
         dataset = cls.__new__(cls)
         SignatureDataset.__init__(dataset, about.bodies, about.config, cache_dir, reading=about.reading)
         dataset.classes, dataset._loaded = about.classes, file

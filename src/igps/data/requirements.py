@@ -85,7 +85,7 @@ def embedding_requirements(embedding: nn.Module) -> Requirements:
     return Requirements(n_eigenpairs) if isinstance(n_eigenpairs, int) else Requirements(whole_spectrum=True)
 
 
-class Requiring(Protocol):
+class HasRequirements(Protocol):
     """The part of a descriptor that a Dataset uses."""
 
     @property
@@ -93,13 +93,13 @@ class Requiring(Protocol):
         """Requirements of the descriptor."""
 
 
-AnyDescriptor = str | Requiring | Requirements
+AnyDescriptor = str | HasRequirements | Requirements
 """A descriptor, its name, or its requirements."""
 
-_find_by_name: list[Callable[[str], Requiring]] = []
+_find_by_name: list[Callable[[str], HasRequirements]] = []
 
 
-def register_descriptors(find_by_name: Callable[[str], Requiring]) -> None:
+def register_descriptors(find_by_name: Callable[[str], HasRequirements]) -> None:
     """Set the function that finds a descriptor by its name, because `igps.data` may not import `igps.descriptors`."""
     _find_by_name[:] = [find_by_name]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from igps.data.attributes import AttributeSource, FromFiles
+from igps.data.attributes import AttributeSource, FileSource
 from igps.mesh.formats import is_searched, searched_suffixes
 from igps.mesh.loading import BodyRef, list_bodies
 from igps.mesh.mesh import MeshError
@@ -146,7 +146,7 @@ def find_bodies(
 def _from_folder(root: Path, options: LoadOptions, attributes: Iterable[AttributeSource]) -> Bodies:
     links = [path for path in root.iterdir() if path.is_symlink() and path.is_dir() and not path.name.startswith(".")]
     files = sorted(path for folder in (root, *links) for path in _files_in(folder))
-    excluded = {file for source in attributes if isinstance(source, FromFiles) for file in source.files(files)}
+    excluded = {file for source in attributes if isinstance(source, FileSource) for file in source.files(files)}
     at_root = [path for path in files if path.parent == root and path not in excluded]
     nested = [path for path in files if path.parent != root and path not in excluded]
     if at_root and nested:
@@ -162,7 +162,7 @@ def _from_folder(root: Path, options: LoadOptions, attributes: Iterable[Attribut
     return _bodies_in_files(rows, options)
 
 
-def given_bodies(
+def bodies_of_files(
     paths: Sequence[str | Path], labels: Sequence[str] | None = None, options: LoadOptions | None = None
 ) -> Bodies:
     """Return the bodies of files in their order. ``FILE#PART`` selects one body of a file. Labels are given by file."""
@@ -184,19 +184,19 @@ def bodies_of(
     options: LoadOptions | None = None,
     attributes: Iterable[AttributeSource] = (),
 ) -> Bodies:
-    """Return the bodies of a folder or of files, see `find_bodies` and `given_bodies`; return `Bodies` unchanged."""
+    """Return the bodies of a folder or of files, see `find_bodies` and `bodies_of_files`; return `Bodies` unchanged."""
     has_labels = isinstance(source, Bodies) or (isinstance(source, str | Path) and Path(source).is_dir())
     if labels is not None and has_labels:
         raise ValueError(f"labels: expected None with a folder or bodies, which have labels, got {len(labels)}.")
     if isinstance(source, Bodies):
         return source
     if not isinstance(source, str | Path):
-        return given_bodies(source, labels, options)
+        return bodies_of_files(source, labels, options)
     if Path(source).is_dir():
         return find_bodies(source, options, attributes=attributes)
     if not file_and_part(Path(source))[0].exists():
         raise FileNotFoundError(f"{source}: no such file or folder. Check the path.")
-    return given_bodies([source], labels, options)
+    return bodies_of_files([source], labels, options)
 
 
 def file_and_part(path: Path) -> tuple[Path, str | None]:
