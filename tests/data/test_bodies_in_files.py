@@ -15,7 +15,7 @@ import igps.data.pipeline as pipeline_module
 from igps._parallel import Limits
 from igps.data.dataset import SignatureDataset
 from igps.data.filling import compute
-from igps.data.sources import Bodies, find_bodies, bodies_of_files
+from igps.data.sources import Bodies, bodies_of_files, find_bodies
 from igps.mesh.loading import BodyRef
 from igps.mesh.mesh import Mesh
 from igps.mesh.options import LoadOptions

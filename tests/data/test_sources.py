@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from igps.data.sources import bodies_of, file_and_part, find_bodies, bodies_of_files
+from igps.data.sources import bodies_of, bodies_of_files, file_and_part, find_bodies
 
 
 def touch(root: Path, *names: str) -> None:
