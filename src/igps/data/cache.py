@@ -22,8 +22,7 @@ logger = logging.getLogger(__name__)
 
 # Fields of a Signature besides arrays and configuration
 _SCALAR_FIELDS = ("area", "volume", "name", "notes", "residual", "unit")
-# Age in seconds of partial files that killed processes have left. Writing a file takes well below one second
-_ABANDONED_AGE = 24 * 3600
+_ABANDONED_AGE = 24 * 3600  # seconds until a partial file is removed; writing a file takes well below one second
 _CHECKSUM_ROW = 4096  # bytes
 T = TypeVar("T")
 Result = TypeVar("Result")

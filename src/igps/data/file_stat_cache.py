@@ -20,8 +20,7 @@ from igps.mesh.mesh import MeshError
 logger = logging.getLogger(__name__)
 
 _FILE = "known_files.sqlite"
-# Seconds to wait for a lock of the database, which a writer holds for milliseconds
-_LOCK_TIMEOUT = 30.0
+_LOCK_TIMEOUT = 30.0  # seconds; a writer holds the lock of the database for milliseconds
 # Nanoseconds. Younger files are not recorded, because they may change again without a change of their time stamps
 _YOUNG = 2 * 10**9
 _TABLE = (

@@ -26,8 +26,7 @@ logger = logging.getLogger(__name__)
 _RECORDS_PER_WRITE = 1000  # to the database of `FileStatCache`
 # Bodies of one job. The file is read again for each job, and the results of a job arrive together
 _MAX_BODIES_PER_JOB = 64
-# Seconds until a shared file system shows a file that another machine wrote
-_SHARED_WITHIN = 60.0
+_SHARED_WITHIN = 60.0  # seconds until a shared file system shows a file that another machine wrote
 
 
 @dataclass(frozen=True)

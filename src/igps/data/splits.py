@@ -92,5 +92,8 @@ def _check(n_validation: float, n_train: float) -> None:
     for name, value in (("n_train", n_train), ("n_validation", n_validation)):
         if not (0 <= value < 1 or value == int(value)):
             raise ValueError(f"{name}: expected a whole number, or a share below 1, got {value}.")
-    if not 0 <= n_validation < max(n_train, 1 if n_train > 0 else 0):
-        raise ValueError(f"n_validation: expected 0 to n_train - 1 = {n_train - 1}, got {n_validation}.")
+    if n_train <= 0:
+        raise ValueError(f"n_train: expected a number above 0, got {n_train}.")
+    if not 0 <= n_validation < max(n_train, 1):
+        expected = f"0 to n_train - 1 = {n_train - 1}" if n_train >= 1 else "a share below 1, as n_train is a share"
+        raise ValueError(f"n_validation: expected {expected}, got {n_validation}.")
