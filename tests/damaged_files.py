@@ -70,7 +70,7 @@ def write_unusable(folder: Path) -> dict[str, str]:
         "empty.off": "the file is empty (0 bytes). Export it again.",
         "empty.stl": "the file is empty (0 bytes). Export it again.",
         "nothing.off": "the file is empty: no vertices and no faces. Export it again.",
-        "triangle.off": "expected a closed surface, got a single triangle. Check that the export is complete.",
+        "triangle.off": "expected a closed surface, got a single triangle. Export it again.",
         "line.obj": "no triangle has an area; a surface was expected. If the file holds lines, give them thickness.",
         "five.xyz": "expected at least 10 points for a surface, got 5. "
         "Check that the file holds faces, or scan more points.",

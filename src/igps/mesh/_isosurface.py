@@ -12,10 +12,7 @@ _MIN_COSINE = 0.95
 
 
 def level_surface(field: Singles, name: str) -> Surface:
-    """Return the closed surface on which the field is zero.
-
-    Where the surface would touch itself, the grid points around are made part of the body, in `field` itself.
-    """
+    """Return the closed surface on which the field is zero; where it would touch itself, the field is filled."""
     from skimage.measure import marching_cubes
 
     for _ in range(20):
@@ -37,10 +34,7 @@ def level_surface(field: Singles, name: str) -> Surface:
 
 
 def simplify_surface(vertices: Floats, faces: Integers, max_vertices: int) -> Surface:
-    """Simplify a closed surface to about `max_vertices` vertices at its volume.
-
-    The surface is returned unchanged if the simplified one is not closed.
-    """
+    """Simplify a closed surface to about `max_vertices` vertices at its volume; unchanged if that gives no surface."""
     if len(vertices) <= max_vertices:
         return vertices, faces
     import igl

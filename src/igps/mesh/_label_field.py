@@ -4,8 +4,8 @@ A voxel belongs to the body if the body covers its centre or, for shares, at lea
 the right sign at every voxel, the one with small second derivatives is computed. It has no stairs, because its zero
 level is free between the last voxel inside and the first outside. It loses nothing thin, because no voxel changes
 sides. (Whitaker 2000 and Gibson 1998 use the same constraint; Lempitsky 2010 replaces area by second derivatives, which
-do not shrink the surface.) Where the solution bends more than around, at edges, the function is solved again with less
-weight on bending (creases: Blake and Zisserman 1987).
+do not shrink the surface.) Where the solution bends more than its surroundings, at edges, the function is solved again
+with less weight on bending (creases: Blake and Zisserman 1987).
 The zero level is later shifted as a whole to match the volume of the voxels: local shifts would restore the stairs.
 """
 
@@ -29,11 +29,9 @@ _WINDOW, _WIDE_WINDOW = 0.7, 3.0
 # Weight of the deviation from a signed distance to the voxels of the other side; the second derivatives have weight 1.
 _DISTANCE_WEIGHT = 0.01
 _RELAXATION = 1.4
-# Sweeps of each of the two solutions. With 15 for the first and 10 for the second, a ball keeps bumps that affect
-# descriptors.
+# Sweeps of either solution. With 15 and 10, a ball keeps bumps that affect descriptors.
 _N_SWEEPS = 20
-# The function is free up to this many voxels from the border.
-_BAND = 2
+_BAND = 2  # voxels from the border within which the function is free
 
 PAD = _BAND + 2
 """Empty voxels that the grid must have on every side."""
@@ -45,10 +43,8 @@ _MAX_VOXELS_AT_ONCE, _BLOCK, _OVERLAP = 1 << 22, 48, 12
 def smooth_field(share: Singles, sides: Floats) -> Floats | Singles:
     """Return the function at the centres of the voxels, near the surface about the signed distance, in shortest sides.
 
-    Args:
-        share: (X, Y, Z) share of each voxel that lies in the body, 0 to 1, with `PAD` empty layers around. The shares
-            of a mask are 0 or 1: whether the centre of the voxel lies in the body.
-        sides: (3,) sides of a voxel, in units of the shortest.
+    The shares (X, Y, Z) of the voxels that lie in the body, 0 to 1, have `PAD` empty layers around. For a mask they are
+    0 or 1, depending on the centre of the voxel. The sides (3,) of a voxel are in units of the shortest side.
     """
     if share.size <= _MAX_VOXELS_AT_ONCE:
         return _solve(share, sides)
@@ -96,12 +92,11 @@ def _solve(share: Singles, sides: Floats) -> Floats:
     certainty = np.abs(2 * share - 1).reshape(-1)[nodes]
 
     def relax(sharpness: Floats) -> None:
-        min_abs = np.interp(sharpness.reshape(-1)[nodes], (0, 1), _MIN_ABS_VALUES)
+        min_abs = certainty * np.interp(sharpness.reshape(-1)[nodes], (0, 1), _MIN_ABS_VALUES)
         _relax(
             field.reshape(-1), laplacian.reshape(-1), nodes, np.concatenate([[0], steps, -steps]),
             np.concatenate([[2 * (sides**-2).sum()], -(sides**-2), -(sides**-2)]),
-            np.interp(sharpness, (0, 1), _STIFFNESS).reshape(-1), target, inside.reshape(-1)[nodes],
-            min_abs * certainty,
+            np.interp(sharpness, (0, 1), _STIFFNESS).reshape(-1), target, inside.reshape(-1)[nodes], min_abs,
         )  # fmt: skip
 
     relax(np.zeros_like(field))

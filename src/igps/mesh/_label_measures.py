@@ -15,8 +15,7 @@ _MIN_COVERED = 0.95
 # Squared distance from a ball's centre, in squared radii, that counts as near: 3 reaches the corners of a box as thick.
 _NEAR = 3
 _MAX_DIAMETER = 10  # voxels
-# Smaller masks are measured in half voxels.
-_MIN_WHOLE_VOXELS = 1 << 20
+_MIN_WHOLE_VOXELS = 1 << 20  # smaller masks are measured in half voxels
 # Side of the blocks that are measured one by one, in voxels: their distances stay in the processor's cache.
 _BLOCK = 96
 

@@ -19,11 +19,9 @@ from igps.mesh.surface import face_areas, sums
 _BAND = 1.1
 # Half the thickness of a sheet. Above half a cell, because a sheet may lie midway between two layers of grid points.
 _HALF_SHEET = 0.55
-# Minimal absolute value: closer to zero marching cubes would make triangles without area.
-MIN_ABS_VALUE = 0.02
+MIN_ABS_VALUE = 0.02  # closer to zero, marching cubes would make triangles without area
 _MIN_BAR_RADIUS = 0.9
-# Pieces of less than this share of the volume are specks.
-SPECK_VOLUME = 2e-3
+SPECK_VOLUME = 2e-3  # pieces of less than this share of the volume are specks
 
 
 @dataclass(frozen=True)
@@ -50,11 +48,10 @@ class Grid:
 
 
 def cell_sizes(vertices: Floats, faces: Integers, resolution: int, spacing: float) -> tuple[float, float]:
-    """Return the default and the minimal size of a cell.
+    """Return the default and the minimal size of a cell, which differ only for long bodies.
 
-    With the minimal size, the grid has about as many cells, in all and on the surface, as a cube of side `resolution`;
-    it is at least `spacing`. The default size is larger for long bodies only: it allows at most 2 * `resolution` cells
-    along the longest side.
+    With the minimal size the grid has about as many cells, in all and on the surface, as a cube of side `resolution`.
+    With the default size it has at most 2 * `resolution` cells along the longest side.
     """
     corners = vertices[faces]
     sides = np.ptp(corners.reshape(-1, 3), axis=0)
@@ -77,10 +74,7 @@ def merge_near_vertices(vertices: Floats, faces: Integers) -> Surface:
 
 
 def distances(vertices: Floats, faces: Integers, shape: tuple[int, int, int]) -> tuple[Singles, Singles]:
-    """Return the distances (X, Y, Z) of the grid points to the surface, and the nearest surface points (X, Y, Z, 3).
-
-    Distances beyond the band around the surface are infinite.
-    """
+    """Return the distances (X, Y, Z), infinite beyond the band, and the nearest surface points (X, Y, Z, 3)."""
     import igl
 
     vertices, faces = np.asfortranarray(vertices), np.asfortranarray(faces)

@@ -13,13 +13,11 @@ _TURN = 2 * math.pi
 
 @compiled()
 def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: Integers) -> tuple[Floats, Integers]:
-    """Find the arcs in which two spheres intersect outside all other balls.
+    """Return the arcs in which two spheres intersect outside all other balls, and which balls (A,) are exposed.
 
     No ball lies inside another. The neighbours of ball i, which intersect it, are `neighbours[first[i]:first[i + 1]]`.
-
-    Returns:
-        Arcs (N, 12): centre of the circle (3), first axis (3), normal (3), radius, angle of the start from the first
-        axis, and angle from start to end, up to 2π. And (A,) 1 for balls with an arc or without neighbours, else 0.
+    Columns of the arcs (N, 12): centre of the circle (3), first axis (3), normal (3), radius, angle of the start from
+    the first axis, and angle from start to end, up to 2π. Exposed balls (1, else 0) have an arc or no neighbours.
     """
     capacity = 256
     arcs = np.empty((capacity, 12))
@@ -104,10 +102,9 @@ def exposed_arcs(centres: Floats, radii: Floats, first: Integers, neighbours: In
 def depths(
     centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, margin: float
 ) -> tuple[Singles, NDArray[np.int32]]:
-    """Return the largest depth of each grid point in any ball, and the index of that ball.
+    """Return the largest depth of each grid point in any ball, at least `-margin`, and that ball, or -1 for none.
 
-    Depths are negative outside all balls; beyond `margin` they are `-margin`, and the index is -1. The first grid point
-    is at the origin.
+    Depths are negative outside all balls. The first grid point is at the origin.
     """
     depth = np.full(shape, -margin, np.float32)
     owner = np.full(shape, -1, np.int32)
@@ -220,14 +217,9 @@ def _span(low: float, high: float, spacing: float, size: int) -> tuple[int, int]
 
 @compiled()
 def cubic_values(field: Singles, points: Floats) -> Floats:
-    """Interpolate a function on a grid, and its gradient, by cubic convolution (Keys 1981).
+    """Return the values and gradients (P, 4) of a function at points (P, 3) in cells, by cubic convolution (Keys 1981).
 
-    Args:
-        field: at least four grid points along each axis.
-        points: (P, 3) in cells.
-
-    Returns:
-        (P, 4) values and gradients.
+    The grid has at least four points along each axis.
     """
     values = np.empty((len(points), 4))
     weight, slope = np.empty((3, 4)), np.empty((3, 4))

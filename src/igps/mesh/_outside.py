@@ -1,15 +1,15 @@
 """Find the grid points outside a surface that may have holes. Lengths are in cells.
 
 **A hole, or the mouth of a cup?** If a surface is nearly closed, the winding number tells inside from outside (Jacobson
-et al. 2013). A surface counts as nearly closed if the winding numbers beside its faces deviate on average by less than
-1/20 from whole numbers: bodies with 2 % missing have 0.01 to 0.03, a cup as deep as wide has 0.10. The hidden faces of
+et al. 2013). A surface is nearly closed if the winding numbers beside its faces deviate on average by less than 1/20
+from whole numbers: bodies with 2 % missing have 0.01 to 0.03, a cup as deep as wide has 0.10. The hidden faces of
 overlapping solids are left out first; otherwise thin bodies would reach 0.10, too.
 
 In any other surface, an opening is a hole if the largest ball that passes through it has less than half the radius of
 the largest ball behind it; the space behind a hole is inside. A wider opening is the mouth of a cup, a trouser leg or a
-bell. It stays open, and its wall gets about a cell of thickness. A wall with two sides, such as that of a vase modelled
-as a solid, stays open at any width of the mouth, because the winding number behind is near zero. Openings narrower than
-a cell are always closed.
+bell. It stays open, and the wall gets about a cell of thickness. A vase modelled as a solid, with two sides of its
+wall, stays open at any width of the mouth: the winding number behind is near zero. Openings narrower than a cell are
+always closed.
 """
 
 from dataclasses import dataclass, replace
@@ -22,15 +22,12 @@ from scipy import ndimage
 from igps._arrays import Booleans, Floats, Integers, Singles
 from igps.mesh.surface import area_vectors, face_areas, signed_volume, unit
 
-# Cells around the surface's bounding box.
-MARGIN = 3
+MARGIN = 3  # cells around the bounding box of the surface
 # Grid points this close to a triangle are wall, which the flood does not enter. A grid line that crosses a triangle has
 # a point at most half a cell away from it, on one side or the other.
 WALL = 0.5 + 1e-6
-# An opening is a mouth if its radius is at least this share of that of the largest ball behind it.
-_MOUTH = 0.5
-# A wall has two sides if the winding number behind the opening is below this.
-_TWO_SIDED = 0.25
+_MOUTH = 0.5  # minimal radius of a mouth, over that of the largest ball behind it
+_TWO_SIDED = 0.25  # a wall has two sides if the winding number behind the opening is below this
 # A surface is nearly closed below this mean deviation of winding numbers from whole numbers, at this many faces.
 _NEARLY_CLOSED, _N_PROBES = 0.05, 1500
 # Number of parts that may be reversed to find the best orientation, and their minimal share of the area.
@@ -171,10 +168,9 @@ def _outside_by_winding(outside: Booleans, distance: Singles, surface: OrientedS
 
 
 def _cavities(outside: Booleans, surface: OrientedSurface) -> Booleans:
-    """Return the cores of the spaces behind holes.
+    """Return the cores of the spaces behind holes, found by balls of growing radius.
 
-    Balls of growing radius are tried. A space lies behind a hole if it is connected with the outside only by passages
-    of less than half its width.
+    A space lies behind a hole if only passages of less than half its width connect it with the outside.
     """
     depth = ndimage.distance_transform_edt(outside)
     cavities = np.zeros_like(outside)

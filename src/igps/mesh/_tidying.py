@@ -1,7 +1,4 @@
-"""Tidy the triangles of a surface: weld, orient, drop fins, specks and hidden parts, and fill small holes.
-
-Every step adds to `notes` what it did.
-"""
+"""Tidy the triangles of a surface: weld, orient, drop fins, specks and hidden parts, fill small holes; take notes."""
 
 from collections import defaultdict
 
@@ -16,16 +13,14 @@ from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import compact, diagonal, directed_edges, face_areas, face_parts, signed_volume, undirected_edges
 from igps.mesh.winding import winding_number
 
-# Vertices closer than this share of the bounding box's diagonal are welded.
-_WELD = 1e-8
+_WELD = 1e-8  # vertices closer than this share of the bounding box's diagonal are welded
 # Width of a crack, in diagonals: in single precision the corners on its two sides differ in the last digits.
 _CRACK = 1e-6
 # With more such neighbours per vertex on average, the surface is tiny in its bounding box, and there are no cracks.
 _MAX_CRACK_NEIGHBOURS = 50
 # Parts of less than this share of the area are specks, unless all of them together have ten times as much.
 SPECK = 2e-3
-# Fins are dropped if all of them together have at most this share of the area.
-_MAX_FINS = 0.05
+_MAX_FINS = 0.05  # fins are dropped if all of them together have at most this share of the area
 # A hole is small if a circle as long as its rim has at most this share of the area of its part of the surface.
 _SMALL_HOLE = 0.03
 

@@ -7,11 +7,9 @@ from igps.mesh._tidying import SPECK, fill_small_holes, orient, tidy, weld
 from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import area_vectors, compact, diagonal, face_areas, face_parts, face_patches, unit
 
-# A point of a surface is visible from outside if this share of the directions on one of its sides is free.
-_MIN_OPEN = 0.03
+_MIN_OPEN = 0.03  # a point of a surface is visible if this share of the directions on one of its sides is free
 _N_DIRECTIONS, _SAMPLES_PER_PATCH = 100, 30
-# Surfaces nearer than this, in units of the bounding box's diagonal, coincide.
-_COINCIDENT = 1e-6
+_COINCIDENT = 1e-6  # surfaces nearer than this coincide, in units of the bounding box's diagonal
 # Surfaces of more patches or parts are left to the grid, which is faster there.
 _MAX_PATCHES, _MAX_PARTS = 200, 200
 

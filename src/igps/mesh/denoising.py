@@ -22,9 +22,8 @@ from igps.mesh.surface import area_vectors, longest_side, undirected_edges, unit
 
 # Thresholds are calibrated on generated shapes and parts of thin triangles, clean and with noise of 0.1 to 0.4 % of the
 # diagonal. Values of thin triangles are in brackets.
-# Lower quartile of the residuals, over the mean edge length of each vertex. The lower quartile, because noise is
-# everywhere and details are not: up to 0.028 on clean shapes of 1,000 vertices and more (0.012), 0.034 to 0.092 with
-# noise (0.027 to 0.24).
+# Lower quartile (noise is everywhere, details are not) of the residuals over the mean edge length of each vertex: up to
+# 0.028 on clean shapes of 1,000 vertices and more (0.012), 0.034 to 0.092 with noise (0.027 to 0.24).
 _MIN_ROUGHNESS = 0.035
 # Share of neighbours whose residuals have the same sign: 0.50 to 0.57 on clean shapes (at least 0.53), 0.39 to 0.45
 # with noise (at most 0.37). 0.45 would miss no noise, but take some clean scans for noisy.
@@ -35,14 +34,12 @@ _MAX_FLAT, _FLAT_ANGLE = 0.1, np.radians(0.1)
 # Median stretch (see `Neighbours`) above which triangles are thin: 1.02 to 1.11 on generated bodies, 4.2 to 300 on
 # parts of thin triangles, the same with noise.
 _THIN = 2.0
-# Stretch at single vertices of other surfaces, such as on the rim of a fan of thousands of faces.
-_VERY_THIN = 8.0
+_VERY_THIN = 8.0  # stretch at single vertices of other surfaces, such as on the rim of a fan of thousands of faces
 # Shorter edges count as this long, in longest sides of the body, so that no weight is infinite.
 _MIN_LENGTH = 1e-9
 # Surfaces of fewer vertices are rough by design; those with a smaller share of edges at two faces lack clear normals.
 _MIN_VERTICES, _MIN_REGULAR = 1000, 0.97
-# Taubin's two steps.
-_SHRINK, _GROW = 0.5, -0.53
+_SHRINK, _GROW = 0.5, -0.53  # Taubin's two steps
 # Number of Taubin passes for noise as large as the edges, and its bounds. n passes leave noise of wavelengths above
 # about n^(1/4) edges, and an excess area proportional to (noise / edge)² / n. The number is chosen to leave the same
 # excess on every surface, 0.1 to 0.6 %, at which normals are closest to those of clean surfaces. Fewer passes leave
@@ -57,8 +54,7 @@ _WIDTH, _N_RUNS, _N_STEPS = 0.35, 3, 10
 # Faces filtered at a time, and the maximal number of faces at a vertex that count as neighbours of each other: those
 # around a hub of thousands would be millions of pairs.
 _FACES_AT_ONCE, _MAX_FACES_AT_VERTEX = 2**15, 64
-# Lower quartile of the absolute value of a standard normal variable.
-_QUARTILE = 0.3186
+_QUARTILE = 0.3186  # lower quartile of the absolute value of a standard normal variable
 
 
 def is_noisy(vertices: Floats, faces: Integers) -> bool:
@@ -118,11 +114,10 @@ class Neighbours:
 def remove_noise(vertices: Floats, faces: Integers) -> Floats:
     """Return the vertices (V, 3) of a smoother surface of the same size; boundary vertices stay in place.
 
-    The surface is smoothed by Taubin's λ|μ passes (1995); their number depends on the noise, see `noise_and_edge`. On
-    surfaces of thin triangles that is all. On others, the normals of the smooth surface guide a bilateral filter of the
-    noisy normals (Zheng, Fu, Au and Tai 2011; with such a guide Zhang, Deng, Zhang, Bouaziz and Liu 2015), and the
-    noisy vertices follow the filtered normals (Sun, Rosin, Martin and Langbein 2007). No vertex is moved farther than
-    noise may have moved it.
+    Taubin's λ|μ passes (1995) smooth the surface; their number depends on the noise, see `noise_and_edge`. If triangles
+    are not thin, the normals of the smooth surface then guide a bilateral filter of the noisy normals (Zheng, Fu, Au
+    and Tai 2011; with such a guide Zhang, Deng, Zhang, Bouaziz and Liu 2015), and the noisy vertices follow the
+    filtered normals (Sun, Rosin, Martin and Langbein 2007). No vertex moves farther than noise may have moved it.
     """
     unit_length = _unit_of_length(vertices)
     vertices = vertices / unit_length
@@ -146,10 +141,9 @@ def remove_noise(vertices: Floats, faces: Integers) -> Floats:
 
 
 def _filter_normals(vertices: Floats, faces: Integers, smooth: Floats) -> Floats:
-    """Return filtered unit normals (F, 3): means over the faces that share a vertex.
+    """Return unit normals (F, 3): means over the faces that share a vertex, by area and similarity of guide normals.
 
-    Faces are weighted by area and by the similarity of their guide normals, which are those of the smooth surface in
-    the first run, and the result of the previous run afterwards.
+    Guide normals are those of the smooth surface, and in later runs the result of the previous run.
     """
     n_around = np.bincount(faces.ravel(), minlength=len(vertices))
     incidence = _incidence(faces, len(vertices))[:, n_around <= _MAX_FACES_AT_VERTEX]

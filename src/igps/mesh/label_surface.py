@@ -36,8 +36,7 @@ _N_LEVELS = 3  # iterations for the level that gives the volume
 # Radius of the bars between pieces, over the square root of the area. It exceeds most cells, so that the thickness of
 # bars does not depend on the grid.
 _BAR = 0.02
-# Maximal share of a label that may be too thin for a coarser grid.
-_MAX_THIN = 0.005
+_MAX_THIN = 0.005  # maximal share of a label that may be too thin for a coarser grid
 
 
 def voxel_surface(

@@ -74,11 +74,7 @@ def load_mesh(
 
 
 def load_bodies(path: str | Path, options: LoadOptions = LoadOptions()) -> list[Mesh]:
-    """Return all usable bodies of a file; errors of the others are logged.
-
-    Raises:
-        MeshError: no body is usable.
-    """
+    """Return all usable bodies of a file, and log the errors of the others; a MeshError if no body is usable."""
     bodies, errors = [], []
     for _, body in each_body(path, options):
         if isinstance(body, MeshError):
@@ -95,10 +91,7 @@ def each_body(
     path: str | Path, options: LoadOptions = LoadOptions(), *, parts: Sequence[str | None] | None = None,
     least_vertices: int = 0,
 ) -> Iterator[tuple[BodyRef, Mesh | MeshError]]:  # fmt: skip
-    """Iterate over the bodies of a file, or over the given parts; an unusable body is replaced by its MeshError.
-
-    The file is read once.
-    """
+    """Iterate over the bodies of a file, or over the given parts; the MeshError of an unusable body takes its place."""
     for ref, raw in each_surface(path, options, parts=parts):
         with one_thread():
             try:
@@ -126,11 +119,7 @@ def each_surface(
 
 
 def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part: str | None = None) -> RawBody:
-    """Return the unchecked surface of a body as it is in the file; `part` is required if the file has several bodies.
-
-    Raises:
-        MeshError: as for `load_mesh`.
-    """
+    """Return the unchecked surface of a body as it is in the file; for `part` and the errors see `load_mesh`."""
     path = Path(path)
     bodies = _read(path, options, part)
     matching = [body for body in bodies if body.part == part] if part is not None else bodies
@@ -147,11 +136,7 @@ def read_surface(path: str | Path, options: LoadOptions = LoadOptions(), *, part
 
 
 def surface_body(raw: RawBody, ref: BodyRef, options: LoadOptions = LoadOptions(), *, least_vertices: int = 0) -> Mesh:
-    """Make a body of a surface, see `load_mesh`.
-
-    Raises:
-        MeshError: the surface is not usable.
-    """
+    """Make a body of a surface, see `load_mesh`; a MeshError if the surface is not usable."""
     if raw.fault is not None:
         raise raw.fault
     name = str(ref)
@@ -198,9 +183,9 @@ def _read(path: Path, options: LoadOptions, part: str | None = None) -> list[Raw
     kind = _body_kind(file_format, options)
     if file_format.bodies[0] == "whole":
         check_memory(path)
+    part = None if kind in ("whole", "pieces") else part
     with faults(path, file_format):
-        named = part if kind not in ("whole", "pieces") else None
-        bodies = list(file_format.read(path, replace(options, bodies=kind), named))
+        bodies = list(file_format.read(path, replace(options, bodies=kind), part))
         if kind == "whole":
             return [joined(bodies)]
         return pieces(joined(bodies)) if kind == "pieces" and kind not in file_format.bodies else bodies

@@ -31,8 +31,8 @@ MENDING_VERSION = 8
 """Part of the cache keys of mended bodies; incremented whenever mending a surface gives another body."""
 
 # First words of the notes of each step.
-_NOTE_STARTS: dict[str, Step] = {step: step for step in get_args(Step)}
-_NOTE_STARTS |= {"dropped": "welded", "turned": "welded", "made watertight": "watertight"}
+_STARTS: dict[str, Step] = {step: step for step in get_args(Step)}
+_STARTS |= {"dropped": "welded", "turned": "welded", "made watertight": "watertight"}
 # A mesh with too few vertices is subdivided to this multiple of the minimum: with just enough vertices the last
 # eigenfunctions would depend on the triangles.
 _SUBDIVISION_FACTOR = 4
@@ -80,13 +80,12 @@ def mend(
         check_arrays(vertices, faces, name)
         vertices, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
         if len(triangles) == 1:
-            raise MeshError(f"{name}: expected a closed surface, got a single triangle. Check that the export is complete.")
+            raise MeshError(f"{name}: expected a closed surface, got a single triangle. Export it again.")
         corners = vertices[triangles]
         if (corners == corners[:, :1]).all():
             raise MeshError(f"{name}: expected a surface, but all faces lie in one point. Check the file.")
         check_size(corners.reshape(-1, 3), name)  # before squares of lengths overflow or vanish
-        repair = _remake if how == "always" else _mend
-        mesh = repair(vertices, triangles, name, cavities == "keep", denoise)
+        mesh = (_remake if how == "always" else _mend)(vertices, triangles, name, cavities == "keep", denoise)
     n_outer = int(mesh.outer()[1].sum())
     if n_outer < least_vertices:
         mesh = subdivide(mesh, _SUBDIVISION_FACTOR * least_vertices + len(mesh.vertices) - n_outer)
@@ -97,12 +96,10 @@ def mend(
 
 def repair_steps(notes: Iterable[str]) -> tuple[Step, ...]:
     """Return the repairs that the notes of a `Mesh` or `Signature` record, in order and without repetition."""
-    starts = _NOTE_STARTS.items()
-    return tuple(dict.fromkeys(step for note in notes for start, step in starts if note.startswith(start)))
+    return tuple(dict.fromkeys(step for note in notes for start, step in _STARTS.items() if note.startswith(start)))
 
 
 def _mend(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
-    """Mend with `how="auto"`."""
     notes: list[str] = []
     original = vertices, faces
     drop_hidden = partial(drop_hidden_parts, cavities=cavities)
@@ -112,11 +109,8 @@ def _mend(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise:
         if body := _body(vertices, faces, notes, name, cavities, denoise):
             return body
     # These steps may give no body if there are many loose parts; their result is then discarded.
-    for step, surface, step_notes in (
-        (drop_inner_walls, (vertices, faces), list(notes)),
-        (unite_parts, original, list[str]()),
-    ):
-        if len(surface[1]) and (body := _body(*step(*surface, step_notes), step_notes, name, cavities, denoise)):
+    for step, surface, record in ((drop_inner_walls, (vertices, faces), list(notes)), (unite_parts, original, [])):
+        if len(surface[1]) and (body := _body(*step(*surface, record), record, name, cavities, denoise)):
             return body
     body = watertight(_smooth(vertices, faces, notes, denoise), faces, name=name)
     return body.annotated(notes=tuple(notes))
@@ -133,10 +127,9 @@ def _body(vertices: Floats, faces: Integers, notes: list[str], name: str, caviti
 
 
 def _remake(vertices: Floats, faces: Integers, name: str, cavities: bool, denoise: bool) -> Mesh:
-    """Mend with `how="always"`: weld and smooth; if that gives no body, or one that crosses itself, make it watertight.
+    """Weld and smooth a surface, and make it watertight only if that gives no body, or one that crosses itself.
 
-    Not every surface is made watertight, because a grid joins parts that are nearer than a cell, such as the coils of a
-    spring.
+    A grid would join parts that are nearer than a cell, such as the coils of a spring.
     """
     notes: list[str] = []
     surface = vertices, faces

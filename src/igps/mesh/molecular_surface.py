@@ -2,8 +2,7 @@
 
 The solvent-excluded surface (Lee and Richards 1971; Connolly 1983) lies at the probe's radius from the region where the
 centre of a probe can be. That region is bounded by spheres, by the arcs in which two spheres intersect, and by the ends
-of arcs, so that the distance to it is computed exactly at every grid point. The mesh is the level set of the distance
-at the probe's radius.
+of arcs, so the distance to it is exact at every grid point. The mesh is its level set at the probe's radius.
 """
 
 import math
@@ -108,10 +107,7 @@ def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
 
 
 def _field(centres: Floats, radii: Floats, shape: tuple[int, int, int], spacing: float, probe: float) -> Singles:
-    """Return the signed distance of each grid point to the surface, in cells, negative inside.
-
-    With a `probe` of 0, the surface is that of the balls.
-    """
+    """Return the signed distances of the grid points to the surface (of the balls, for a probe of 0), in cells."""
     margin = _MARGIN * spacing
     depth, owner = depths(centres, radii, shape, spacing, margin)
     if probe > 0:

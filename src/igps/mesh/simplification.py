@@ -14,10 +14,8 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     """Simplify a mesh to at most `max_vertices` vertices, by quadric edge collapse (Garland and Heckbert 1997).
 
     A mesh that is small enough is returned unchanged. No collapse changes the topology (libigl's `qslim` checks each),
-    so a closed manifold stays closed. The result is checked like any mesh.
-
-    Raises:
-        MeshError: `max_vertices` cannot be reached, or the simplified surface bounds no body.
+    so a closed manifold stays closed. A MeshError is raised if `max_vertices` cannot be reached, or the simplified
+    surface bounds no body.
     """
     check_at_least(4, max_vertices=max_vertices)
     surplus = len(mesh.vertices) - max_vertices
@@ -25,8 +23,7 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
         return mesh
     import igl
 
-    # Scaled to unit size, because quadrics are sums of squares. On a closed surface, each collapse removes one vertex
-    # and two faces.
+    # In unit size, because quadrics are sums of squares. Each collapse on a closed surface removes a vertex, two faces.
     centre, scale = mesh.vertices.mean(axis=0), longest_side(mesh.vertices)
     points = np.asfortranarray((mesh.vertices - centre) / scale)
     points, faces, *_ = igl.qslim(points, np.asfortranarray(mesh.faces), max(len(mesh.faces) - 2 * surplus, 4))

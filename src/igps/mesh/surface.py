@@ -103,8 +103,7 @@ def face_parts(vertices: Floats, faces: Integers) -> tuple[Integers, Floats]:
 def face_patches(faces: Integers, n_vertices: int) -> tuple[Integers, Booleans]:
     """Return the patch (F,) of each face, from 0, and which patches (P,) end only where two other faces meet.
 
-    Two faces belong to one patch if they share an edge with no other face. If a patch ends only where at least two
-    faces of other patches meet, dropping the patch opens no hole.
+    Two faces belong to one patch if they share an edge with no other face.
     """
     _, edge_of_side = undirected_edges(faces, n_vertices)
     by_edge = np.argsort(edge_of_side, kind="stable")
@@ -121,10 +120,7 @@ def face_patches(faces: Integers, n_vertices: int) -> tuple[Integers, Booleans]:
 
 
 def signed_volume(vertices: Floats, faces: Integers) -> float:
-    """Return the enclosed volume, length³, negative for a surface that is inside out.
-
-    For an open surface, this is the volume of its cone over the centre of the vertices.
-    """
+    """Return the enclosed volume, length³, negative if inside out; for an open surface, of its cone over the centre."""
     centred = vertices - vertices.mean(axis=0)
     return float(np.einsum("ij,ij->", centred[faces[:, 0]], area_vectors(centred, faces)) / 3)
 

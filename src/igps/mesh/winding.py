@@ -10,12 +10,9 @@ from igps.mesh.surface import has_area
 def winding_number(vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]) -> Floats:
     """Return the winding numbers (P,) of a mesh about points (P, 3): the solid angle of its faces over 4π.
 
-    The winding number is 1 inside and 0 outside a closed, outward oriented surface, and a fraction for an open one. On
-    the surface itself it lies between the values on both sides, inclusive. It is exact up to rounding, and computed by
-    libigl (Jacobson, Kavan and Sorkine-Hornung 2013).
-
-    Raises:
-        ValueError: an array has an invalid shape or value, or all faces are flat.
+    They are 1 inside and 0 outside a closed, outward oriented surface, and fractions for an open one; on the surface
+    itself they lie between the values on both sides. They are exact up to rounding, by libigl (Jacobson, Kavan and
+    Sorkine-Hornung 2013). A ValueError is raised for invalid arrays, and if all faces are flat.
     """
     import igl
 
@@ -30,11 +27,7 @@ def winding_number(vertices: NDArray[np.floating], faces: NDArray[np.integer], p
 def checked_places(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
 ) -> tuple[Floats, Integers, Floats]:
-    """Check the vertices and faces of a mesh, and points; return them as float64, int64 and float64.
-
-    Raises:
-        ValueError: an array has an invalid shape or value.
-    """
+    """Return the vertices and faces of a mesh, and points, as float64 and int64; a ValueError for invalid arrays."""
     v, f, p = np.asarray(vertices, np.float64), np.asarray(faces), np.asarray(points, np.float64)
     for name, array in (("vertices", v), ("faces", f), ("points", p)):
         if array.ndim != 2 or array.shape[1] != 3:
