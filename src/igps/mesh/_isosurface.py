@@ -7,8 +7,7 @@ from igps.mesh._level_set import MIN_ABS_VALUE, fill_bubbles
 from igps.mesh.mesh import MeshError
 from igps.mesh.surface import directed_edges, face_areas, largest, longest_side, signed_volume, vertex_normals
 
-# An edge is flipped only if the normals of its triangles, before and after, have this cosine with their mean or more.
-_MIN_COSINE = 0.95
+_MIN_COSINE = 0.95  # of the normals of two triangles, before and after a flip of their edge, with the mean normal
 
 
 def level_surface(field: Singles, name: str) -> Surface:
@@ -17,7 +16,7 @@ def level_surface(field: Singles, name: str) -> Surface:
 
     for _ in range(20):
         if not (field.min() < 0 < field.max()):
-            thin = "no grid point lies inside the body: it is everywhere too thin for its length"
+            thin = "no grid point lies inside the body, which is everywhere too thin for its length"
             raise MeshError(f"{name}: {thin}. Give it some thickness.")
         vertices, faces, _, _ = marching_cubes(field, 0.0, allow_degenerate=True)
         faces = faces.astype(np.int64)

@@ -15,7 +15,7 @@ from igps._arrays import Booleans, Floats, Integers, Singles, Surface
 from igps.mesh._outside import MARGIN, WALL, OrientedSurface
 from igps.mesh.surface import face_areas, sums
 
-# Exact distances are computed up to here: marching cubes need them at both ends of the grid edges that cross a surface.
+# Maximal exact distance: marching cubes need distances at both ends of the grid edges that cross the surface.
 _BAND = 1.1
 # Half the thickness of a sheet. Above half a cell, because a sheet may lie midway between two layers of grid points.
 _HALF_SHEET = 0.55
@@ -67,7 +67,7 @@ def merge_near_vertices(vertices: Floats, faces: Integers) -> Surface:
     lattice = np.round(vertices * 4).astype(np.int64)
     _, index, count = np.unique(lattice, axis=0, return_inverse=True, return_counts=True)
     index = index.ravel()
-    # Their mean, because lattice points would shift the surface.
+    # The mean of merged vertices, because lattice points would shift the surface.
     mean = sums(index, vertices, len(count)) / count[:, None]
     faces = np.sort(index[faces], axis=1)
     return mean, np.unique(faces[(np.diff(faces, axis=1) > 0).all(axis=1)], axis=0)
@@ -119,11 +119,11 @@ def level_set(distance: Singles, nearest: Singles, outside: Booleans, surface: O
     inside = markers == 2
     is_solid = _is_solid(inside, at, foot, normal)
     if surface.is_nearly_closed and not is_solid.all():
-        # The flood fills no walls that are too thin.
+        # A flood cannot find the inside of walls that are thinner than a cell; the winding number can.
         thin = np.stack([index[~is_solid] for index in at], axis=1)
         inside[tuple(thin[surface.winding(thin) > 0.5].T)] = True
         is_solid = _is_solid(inside, at, foot, normal)
-    # Zero would have no sign.
+    # At least MIN_ABS_VALUE, because zero would have no sign.
     field = np.where(inside, -1, 1) * np.clip(distance, np.float32(MIN_ABS_VALUE), np.float32(_BAND))
     sheet = tuple(index[~is_solid] for index in at)
     field[sheet] = distance[sheet] - _HALF_SHEET
@@ -168,7 +168,7 @@ def join_pieces(field: Singles, notes: list[str], radius: float = 0.0) -> Single
     pieces = np.unique(label)[1:]
     if len(pieces) < 2:
         return field
-    # Each gap is narrowest where the regions of grid points nearest to two pieces touch.
+    # The width of a gap is measured where the regions touch that are nearest to either piece.
     distance, index = ndimage.distance_transform_edt(label == 0, return_indices=True)
     owner = label[tuple(index)]
     contacts = []

@@ -28,7 +28,7 @@ MARGIN = 3  # cells around the bounding box of the surface
 WALL = 0.5 + 1e-6
 _MOUTH = 0.5  # minimal radius of a mouth, over that of the largest ball behind it
 _TWO_SIDED = 0.25  # a wall has two sides if the winding number behind the opening is below this
-# A surface is nearly closed below this mean deviation of winding numbers from whole numbers, at this many faces.
+# A surface is nearly closed below this mean deviation of winding numbers from whole numbers, beside this many faces.
 _NEARLY_CLOSED, _N_PROBES = 0.05, 1500
 # Number of parts that may be reversed to find the best orientation, and their minimal share of the area.
 _MAX_REVERSED, _MIN_REVERSED_AREA = 8, 0.01

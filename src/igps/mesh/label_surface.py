@@ -184,7 +184,7 @@ def _thicken_contacts(mask: Booleans) -> Booleans:
 
 
 def _n_vertices(mask: Booleans, sides: Floats) -> float:
-    """Estimate the number of vertices from marching cubes on a grid as fine as the shortest side."""
+    """Estimate how many vertices marching cubes make on a grid as fine as the shortest side."""
     masks = [np.moveaxis(mask, axis, 0) for axis in range(3)]
     n_cuts = np.array([np.count_nonzero(m[1:] != m[:-1]) + np.count_nonzero(m[[0, -1]]) for m in masks])
     return float((n_cuts * sides.prod() / sides).sum() / sides.min() ** 2)

@@ -9,8 +9,7 @@ from igps.mesh.mesh import MeshError
 _BYTES_PER_FACE = 1000
 # File size of a triangle in formats whose header has no number of triangles: OBJ, and text STL.
 _OBJ_BYTES, _TEXT_STL_BYTES = 35, 200
-# Memory per grid cell while the cells inside a body are found.
-_BYTES_PER_CELL = 40
+_BYTES_PER_CELL = 40  # memory per grid cell while the cells inside a body are found
 # Smaller files and grids are not checked, in bytes.
 _MIN_CHECKED_FILE, _MIN_CHECKED_GRID = 1 << 20, 1 << 26
 

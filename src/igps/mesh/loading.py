@@ -21,8 +21,7 @@ from igps.mesh.surface import compact, diagonal, face_parts
 
 logger = logging.getLogger(__name__)
 
-# Rounding step of coordinates, over the size of the body, that changes eigenvalues by about 1 %.
-_COARSE = 0.004
+_COARSE = 0.004  # rounding step of coordinates, over the size of the body, that changes eigenvalues by about 1 %
 
 
 @dataclass(frozen=True)

@@ -247,21 +247,21 @@ def _check_topology(faces: Integers, n_vertices: int, name: str, allow_open: boo
     start, end = directed_edges(faces)
     edge_of = undirected_edges(faces, n_vertices)[1]
     count = np.bincount(edge_of)
-    n_crowded, n_free = int((count > 2).sum()), int((count == 1).sum())
+    n_non_manifold, n_boundary = int((count > 2).sum()), int((count == 1).sum())
     balance = np.bincount(edge_of, weights=np.where(start < end, 1.0, -1.0), minlength=len(count))
-    n_twisted = int(((count == 2) & (balance != 0)).sum())
+    n_inconsistent = int(((count == 2) & (balance != 0)).sum())
     n_components, _ = components(faces, n_vertices)
     read = f"Read the file with {_REPAIR}"
     for is_wrong, message in (
         (n_repeated, f"{n_repeated} faces use a vertex twice. {read} to drop them."),
         (n_unused, f"{n_unused} vertices belong to no face. {read} to drop them."),
-        (n_crowded, f"{n_crowded} non-manifold edges (shared by more than two faces). {read} to drop duplicate faces; "
-                    "if edges remain, separate the sheets that meet there in a modelling tool."),
-        (n_free and not allow_open, f"open surface with {n_free} boundary edges. Close the holes; or read the file "
-         f"with {_REPAIR} if vertices are only duplicated there (as in every STL file); or with allow_open=True, "
+        (n_non_manifold, f"{n_non_manifold} non-manifold edges (shared by more than two faces). {read} to drop "
+         "duplicate faces; if edges remain, separate the sheets that meet there in a modelling tool."),
+        (n_boundary and not allow_open, f"open surface with {n_boundary} boundary edges. Close the holes; or read the "
+         f"file with {_REPAIR} if vertices are only duplicated there (as in every STL file); or with allow_open=True, "
          "--allow_open, to tell inside from outside by the winding number."),
-        (n_twisted, f"inconsistent orientation, {n_twisted} edges are traversed twice in the same direction. {read} "
-                    "to orient the faces."),
+        (n_inconsistent, f"inconsistent orientation, {n_inconsistent} edges are traversed twice in the same direction. "
+         f"{read} to orient the faces."),
         (n_components > 1 and not cavities, f"{n_components} connected components; the commute time between them is "
          "infinite. Read the file with LoadOptions(component='largest'), on the command line --component largest, to "
          f"keep one; with {_REPAIR} if coincident vertices are merely not welded; or join them."),

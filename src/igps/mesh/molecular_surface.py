@@ -29,7 +29,7 @@ SurfaceKind = Literal["excluded", "accessible", "van_der_waals"]
 _MARGIN = 2.5
 _MAX_CELLS = 2**28
 _MAX_STEP = 0.3  # maximal step of vertices towards the surface, in cells
-# Maximal share of the area that threads between pieces may add, and of a triangle's sides that the end of one takes.
+# Maximal share of the area that threads between pieces add, and maximal width of a thread's end over its triangle's.
 _MAX_THREADS, _MAX_THREAD_WIDTH = 0.003, 0.5
 _MAX_SPECKS = 0.05  # specks are dropped if they have at most this share of the volume together
 _N_ROUNDS = 2  # rounds in which vertices are spread evenly along the surface

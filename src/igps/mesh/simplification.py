@@ -14,8 +14,10 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     """Simplify a mesh to at most `max_vertices` vertices, by quadric edge collapse (Garland and Heckbert 1997).
 
     A mesh that is small enough is returned unchanged. No collapse changes the topology (libigl's `qslim` checks each),
-    so a closed manifold stays closed. A MeshError is raised if `max_vertices` cannot be reached, or the simplified
-    surface bounds no body.
+    so a closed manifold stays closed.
+
+    Raises:
+        MeshError: `max_vertices` cannot be reached, or the simplified surface bounds no body.
     """
     check_at_least(4, max_vertices=max_vertices)
     surplus = len(mesh.vertices) - max_vertices
@@ -23,7 +25,7 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
         return mesh
     import igl
 
-    # In unit size, because quadrics are sums of squares. Each collapse on a closed surface removes a vertex, two faces.
+    # In unit size, because quadrics are sums of squares. A collapse on a closed surface removes a vertex and two faces.
     centre, scale = mesh.vertices.mean(axis=0), longest_side(mesh.vertices)
     points = np.asfortranarray((mesh.vertices - centre) / scale)
     points, faces, *_ = igl.qslim(points, np.asfortranarray(mesh.faces), max(len(mesh.faces) - 2 * surplus, 4))
@@ -36,7 +38,7 @@ def simplify(mesh: Mesh, max_vertices: int) -> Mesh:
     try:
         return replace(mesh, vertices=points * scale + centre, faces=faces, notes=(*mesh.notes, note))
     except MeshError as error:
-        raise MeshError(f"{error} This is due to simplification: raise max_vertices={max_vertices}.") from error
+        raise MeshError(f"{error} Simplification caused this: raise max_vertices above {max_vertices}.") from error
 
 
 def subdivide(mesh: Mesh, n_vertices: int) -> Mesh:
@@ -48,7 +50,7 @@ def subdivide(mesh: Mesh, n_vertices: int) -> Mesh:
     while len(vertices) < n_vertices:
         edges, edge_of_side = undirected_edges(faces, len(vertices))
         length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-        # At a time only edges about as long as the longest, because halves of longer edges come before short edges.
+        # A pass cuts only edges about as long as the longest, so that edges are cut in the order of their lengths.
         cut = np.argsort(-length, kind="stable")[: n_vertices - len(vertices)]
         vertices, faces = _cut(vertices, faces, edges, edge_of_side, cut[length[cut] > 0.7 * length.max()])
     note = f"subdivided from {n_before} to {len(vertices)} vertices"
