@@ -71,7 +71,7 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
             "random_state=seed)",
         ),
         # A constant that was chosen, one off: directions to look into, bytes of a line that sizes are guessed from.
-        ("src/igps/mesh/_union.py", "_DIRECTIONS, _PLACES_PER_PATCH = 99, 30"),
+        ("src/igps/mesh/_union.py", "_N_DIRECTIONS, _SAMPLES_PER_PATCH = 99, 30"),
         ("src/igps/mesh/limits.py", "_OBJ_BYTES, _TEXT_STL_BYTES = 34, 200"),
         (
             "src/igps/nn/heads/closed_form.py",
