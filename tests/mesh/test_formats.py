@@ -278,7 +278,7 @@ FAULTY = {
         "7 axes",
     ),
     "map.gii": (b"<GIFTI><DataArray Intent='NIFTI_INTENT_SHAPE'/></GIFTI>", "expected points and triangles"),
-    "lh.white": (b"\xff\xff\xfemade\n\n" + b"\x7f\xff\xff\xff" * 2, "declares"),
+    "lh.white": (b"\xff\xff\xfemade\n\n" + b"\x7f\xff\xff\xff" * 2, "expected .* vertices"),
     "zero.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "counted from 1"),
     "entities.vtu": (b'<!DOCTYPE a [<!ENTITY b "bb"><!ENTITY c "&b;&b;">]><VTKFile>&c;</VTKFile>', "entity"),
     "file.gii": (b'<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]><GIFTI>&b;</GIFTI>', "entity"),

@@ -100,13 +100,9 @@ def circle(count: int, phase: float = 0.0) -> list[tuple[float, float]]:
 
 
 def limb(
-    group: str,
-    lengths: Sequence[float],
-    radii: Sequence[float],
-    bends: Sequence[tuple[float, float]],
-    tip: Sequence[Part] = (),
-    knee: Vector = UP,
-) -> Part:
+    group: str, lengths: Sequence[float], radii: Sequence[float], bends: Sequence[tuple[float, float]],
+    tip: Sequence[Part] = (), knee: Vector = UP,
+) -> Part:  # fmt: skip
     """Return a chain of tapered capsules with the parts ``tip`` at its end.
 
     Args:

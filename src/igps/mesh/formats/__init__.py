@@ -37,11 +37,7 @@ def format_of(path: str | Path) -> Format | None:
 
 
 def files_read(path: Path, options: LoadOptions = LoadOptions()) -> list[Path]:
-    """Return a file and the existing other files on which its bodies depend.
-
-    Raises:
-        MeshError: the file cannot be read far enough to list the others.
-    """
+    """Return a file and existing others on which its bodies depend; a MeshError if it is too damaged to list them."""
     kind = format_of(path)
     if kind is None or kind.beside is None or not path.is_file():
         return [path]

@@ -152,10 +152,9 @@ def _mark_unknown(block: gemmi.cif.Block) -> None:
 
 
 def _pqr(text: bytes, path: Path) -> gemmi.Structure:
-    """Parse a PQR file.
+    """Parse a PQR file: lines of type, serial number, atom, residue, [chain,] number, x, y, z, charge and radius.
 
-    Fields are separated by blanks: type, serial number, atom, residue, [chain,] number, x, y, z, charge, radius. If
-    numbers are long, some programs omit the blank between "HETATM" and serial number, or between chain and number.
+    Fields are separated by blanks, but some programs leave none before long numbers behind "HETATM" or the chain.
     """
     gemmi = gemmi_module()
     structure = gemmi.Structure()

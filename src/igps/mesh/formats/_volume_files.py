@@ -272,4 +272,3 @@ READERS: dict[str, Callable[[Path], RawVolume]] = {
     ".tif": _tifffile,
     ".tiff": _tifffile,
 }
-"""Readers of volume files by suffix."""

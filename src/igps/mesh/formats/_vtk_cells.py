@@ -20,11 +20,7 @@ _WITHOUT_AREA = (0, 1, 2, 3, 4)
 
 
 def surface(corners: Integers, n_corners: Integers, kinds: Integers, vertices: Floats) -> Integers:
-    """Return the triangles (F, 3) of the surface of cells, whose corners are laid end to end.
-
-    Raises:
-        ValueError: cells are curved, polyhedral or of an unknown type, or have a wrong number of corners.
-    """
+    """Return the surface (F, 3) of cells, whose corners are laid end to end; a ValueError for unsupported cells."""
     unknown = set(np.unique(kinds).tolist()) - {*_WITHOUT_AREA, TRIANGLE, STRIP, POLYGON, PIXEL, QUAD, *_SIDES}
     if unknown:
         raise ValueError(f"cells of type {min(unknown)}; expected flat polygons, or volumes with straight edges")

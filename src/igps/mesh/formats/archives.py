@@ -81,7 +81,6 @@ def _unpack(path: Path, folder: Path, options: LoadOptions) -> list[tuple[str, P
 
 @contextmanager
 def _members(path: Path, options: LoadOptions) -> Iterator[Iterator[tuple[str, IO[bytes]]]]:
-    """Iterate over the names and contents of the regular files of an archive."""
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             files = [info for info in archive.infolist() if not info.is_dir()]

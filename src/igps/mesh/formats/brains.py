@@ -77,8 +77,7 @@ def read_freesurfer(path: Path, options: LoadOptions, part: str | None) -> list[
     n_vertices, n_faces = (int(n) for n in np.frombuffer(content, ">i4", 2, at))
     n_expected, n_bytes = 12 * (n_vertices + n_faces), len(content) - at - 8
     if min(n_vertices, n_faces) < 0 or n_bytes < n_expected:
-        declared = f"its header declares {n_vertices} vertices and {n_faces} triangles"
-        raise ValueError(f"{declared}, expected {n_expected} bytes, got {n_bytes}")
+        raise ValueError(f"expected {n_vertices} vertices, {n_faces} triangles, {n_expected} bytes, got {n_bytes}")
     vertices = np.frombuffer(content, ">f4", 3 * n_vertices, at + 8).astype(np.float64)
     faces = np.frombuffer(content, ">i4", 3 * n_faces, at + 8 + 12 * n_vertices).astype(np.int64)
     return [RawBody(vertices.reshape(-1, 3), faces.reshape(-1, 3), unit="mm")]

@@ -88,8 +88,7 @@ def names_in_extensions(contents: Iterable[bytes]) -> dict[int, str]:
 def names_in_tags(content: bytes) -> dict[int, str]:
     """Return the names of labels of the colour table in the tags at the end of an MGH file, as FreeSurfer writes it.
 
-    Numbers are big-endian. Each tag is followed by its length in bytes and its content, except for the colour table,
-    which has no length.
+    Numbers are big-endian. Behind each tag stand the size and the content, behind the colour table's only the content.
     """
     stream = io.BytesIO(content)
 
