@@ -1,4 +1,4 @@
-"""The types of file formats and of bodies as read, and helpers of the readers."""
+"""The types `Format` and `RawBody`, and helpers for readers of files."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def pieces(whole: RawBody) -> list[RawBody]:
         return [whole]
     check_arrays(vertices, faces, "the whole")
     vertices, faces = compact(vertices, faces)  # unused vertices would widen the bounding box, which scales `places`
-    # Triangles may share no vertices, so that places connect them
+    # Triangles need not share vertices: they are connected by position
     owner, areas = face_parts(vertices, places(vertices)[faces])
     small = are_specks(areas)
     notes = (*whole.notes, f"left out {int(small.sum())} specks") if small.any() else whole.notes

@@ -68,7 +68,7 @@ def objects(path: Path, options: LoadOptions, content: bytes | None = None, **lo
             bodies.append(RawBody(vertices, part=part, normals=np.hstack(normals) if len(normals) == 3 else None))
             continue
         faces = np.asarray(geometry.faces, dtype=np.int64)
-        faces = faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces  # the matrix mirrors
+        faces = faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces  # turned back if mirrored
         bodies.append(RawBody(vertices, np.ascontiguousarray(faces), part))
     if not bodies:
         raise ValueError("it holds no surface")
