@@ -142,7 +142,7 @@ def _molecules(
 
 
 class _Builder:
-    """Collects the balls and residues of one molecule."""
+    """Builder of a molecule from its chains."""
 
     def __init__(self, ligands: bool, hydrogens: bool, is_pqr: bool) -> None:
         self.ligands, self.hydrogens, self.is_pqr = ligands, hydrogens, is_pqr
@@ -253,9 +253,8 @@ class _Builder:
             # If names begin in the wrong column, gemmi takes Cα for calcium
             if is_standard and atom.element.name not in _STANDARD_ELEMENTS:
                 atom.element = gemmi.Element("X")
-            if not self.hydrogens and (
-                atom.is_hydrogen() or (not atom.element.atomic_number and _first_letter(atom) == "H")
-            ):
+            is_hydrogen = atom.is_hydrogen() or (not atom.element.atomic_number and _first_letter(atom) == "H")
+            if is_hydrogen and not self.hydrogens:
                 continue
             if not np.isfinite(atom.pos.tolist()).all():
                 self._count["nowhere"] += 1
