@@ -133,7 +133,7 @@ class Signature:
         return replace(self, interior=change(self.interior), surface=change(self.surface))
 
     def truncated(self, config: SignatureConfig) -> Signature:
-        """Return the Signature of a smaller configuration, one whose `larger` includes the configuration of this one."""
+        """Return the Signature of a smaller configuration; the `larger` ones of that must include the present one."""
 
         def cut(samples: Samples) -> Samples:
             items = samples.attributes.items()
