@@ -144,9 +144,7 @@ def _entries(forms: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class HatClusters:
-    """Sums of functions over clusters of 32 consecutive hats; each further level merges four clusters of the one
-    before.
-    """
+    """Sums of functions over clusters of hats: of 32 hats, and on each further level of four clusters."""
 
     centres: Floats  # (C, 3), level by level
     radii: Floats  # (C,) of balls about the centres that contain the balls of the hats
@@ -183,8 +181,6 @@ class HatClusters:
         return cls(np.concatenate(centres), np.concatenate(radii), level_starts, sums, n_hats)
 
     def far_clusters(self, x: Floats, ratio: float) -> tuple[Integers, Integers]:
-        """Return the clusters that are `ratio` radii or more from the box of points x (3, n), and the hats in none of
-        them.
-        """
+        """Return the clusters that are `ratio` or more radii from the box of points x (3, n), and the other hats."""
         box = x.min(axis=1), x.max(axis=1)
         return find_far_clusters(*box, self.centres, self.radii, self.level_starts, ratio, _LEAF_SIZE, self.n_hats)

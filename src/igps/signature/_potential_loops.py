@@ -117,13 +117,12 @@ def add_face(patch: Floats, squared_limit: float, face: Floats, points: Floats, 
 
 @compiled()
 def near_potential(face: Floats, x: float, y: float, z: float) -> float:
-    """Return the closed-form potential of a face (25,) at a point: −|h Ω| + Σ p ln((r + r' + l)/(r + r' − l)) over its
-    sides.
+    """Return the potential of a face (25,) at a point, in closed form.
 
-    For a side of length l, p is the distance of the point's projection from the line of the side, positive inside, and
-    r, r' are the distances of the point from its ends. The height h is the distance of the point from the plane, and Ω
-    the solid angle of the face (Van Oosterom and Strackee 1983). On a side, p and the denominator both vanish: the term
-    is 0.
+    It is −|h Ω| + Σ p ln((r + r' + l)/(r + r' − l)), summed over the sides. For a side of length l, p is the distance
+    of the point's projection from the line of the side, positive inside, and r, r' are the distances of the point from
+    its ends. The height h is the distance of the point from the plane, and Ω the solid angle of the face (Van Oosterom
+    and Strackee 1983). On a side, p and the denominator both vanish: the term is 0.
 
     The entries of a face are its corners, its normal, the outward normals of its sides in its plane, the lengths of its
     sides, and twice its area.

@@ -30,7 +30,7 @@ _ARCTAN = tuple(
 def find_far_clusters(
     low: Floats, high: Floats, centres: Floats, radii: Floats, starts: Integers, ratio: float, leaf: int, n_hats: int
 ) -> tuple[Integers, Integers]:
-    """Return the clusters that are `ratio` radii or more from all of a box, and the hats in none of them, ascending."""
+    """Return the clusters that are `ratio` radii or more from a box, and the hats in none of these, both ascending."""
     clusters, hats = np.empty(len(radii), np.int64), np.empty(n_hats, np.int64)
     n_clusters, n_near, n_stacked = 0, 0, 0
     n_levels = len(starts) - 1

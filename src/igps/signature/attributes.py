@@ -14,9 +14,7 @@ AttributeName = Literal["depth", "electrostatic_potential", "surface_direction"]
 
 
 def interior_attributes(mesh: Mesh, points: Floats, names: Sequence[AttributeName]) -> Mapping[str, Singles]:
-    """Return the named attributes of interior points (P, 3): scalars (P,) or directions (P, 3), independent of scale
-    and place.
-    """
+    """Return attributes of interior points (P, 3), independent of scale and place: each (P,), or a direction (P, 3)."""
     functions = {function.__name__: function for function in (depth, electrostatic_potential, surface_direction)}
     return {name: functions[name](mesh, points).astype(np.float32) for name in names}
 
@@ -35,11 +33,10 @@ def depth(mesh: Mesh, points: Floats) -> Floats:
 
 
 def surface_direction(mesh: Mesh, points: Floats) -> Floats:
-    """Return unit vectors (P, 3) from interior points (P, 3) to the nearest surface point, or 0 for points on the
-    surface.
+    """Return unit vectors (P, 3) from interior points (P, 3) to the nearest surface points.
 
-    Near the surface this is the outward normal. If several surface points are nearest, as on the axis of a tube, one of
-    their directions is returned.
+    Near the surface this is the outward normal, on it 0. If several surface points are nearest, as on the axis of a
+    tube, one of their directions is returned.
     """
     return unit(_vectors_to_surface(mesh, points))
 

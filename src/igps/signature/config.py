@@ -97,7 +97,7 @@ class SignatureConfig:
         return replace(self, n_eigenpairs=self.n_kept)
 
     def with_eigenpairs(self, n_eigenpairs: int) -> Self:
-        """Return a configuration with at least the first n_eigenpairs, or this one if its number is already set.
+        """Return a configuration with at least n_eigenpairs, or this one if its own number is set.
 
         At least 64 are computed, and meshes are subdivided as for the default number, so that the Signature is the
         beginning of the default one.
@@ -110,8 +110,7 @@ class SignatureConfig:
         return replace(self, n_eigenpairs=n_computed, least_vertices=self.n_vertices_read)
 
     def larger(self) -> Iterator[Self]:
-        """Yield the configurations of Signatures that begin with this one's and that caches may hold, the smallest
-        first.
+        """Yield configurations that caches may hold and whose Signatures begin with this one's, the smallest first.
 
         For a mesh that is subdivided, this is true only of configurations with the same `n_vertices_read`.
         """
@@ -128,9 +127,7 @@ class SignatureConfig:
                     yield candidate
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the parameters by name with the algorithm's version; `least_vertices` only if it is not implied by the
-        others.
-        """
+        """Return the parameters and the algorithm's version by name; an implied `least_vertices` is left out."""
         parameters = {**asdict(self), "n_eigenpairs": self.n_kept, "algorithm_version": self.ALGORITHM_VERSION}
         if self.n_vertices_read == self.n_kept + 2:
             del parameters["least_vertices"]

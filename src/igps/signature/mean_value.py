@@ -1,11 +1,11 @@
 """Mean value coordinates of a triangle mesh, and the extension of surface functions into the volume.
 
-Mean value interpolation (Ju, Schaefer, Warren 2005) is a ratio of two surface integrals, ``f̂(x) = ∫ f·h/r⁴ dS ⁄ ∫ h/r⁴
-dS``, where ``r`` is the distance from ``x`` to the surface point, and ``h`` the distance from ``x`` to its tangent
-plane (positive on the inner side). For a piecewise linear ``f`` it is ``Σ_v w_v f_v ⁄ Σ_v w_v``. The weights ``w_v`` of
-vertices near a point come from the closed form of their faces. The weights of distant vertices are approximated by
-Taylor series of their hat functions, and of clusters of hat functions (see `igps.signature._far_field`). The weights
-are exact if all vertices count as near.
+Mean value interpolation (Ju, Schaefer, Warren 2005) is a ratio of two surface integrals,
+``f̂(x) = ∫ f·h/r⁴ dS ⁄ ∫ h/r⁴ dS``, where ``r`` is the distance from ``x`` to the surface point, and ``h`` the distance
+from ``x`` to its tangent plane (positive on the inner side). For a piecewise linear ``f`` it is
+``Σ_v w_v f_v ⁄ Σ_v w_v``. The weights ``w_v`` of vertices near a point come from the closed form of their faces. Those
+of distant vertices are approximated by Taylor series of their hat functions, and of clusters of hat functions (see
+`igps.signature._far_field`). The weights are exact if all vertices count as near.
 
 Coordinates are scaled to the mesh: its bounding box gets a half-diagonal of 1.
 """
@@ -36,14 +36,14 @@ _COPY_ROWS = 2**10  # rows of the functions copied at a time: source and copy th
 _REGISTER_SIZE = 16  # single-precision numbers in a register
 _MIN_TEAM_VERTICES = 2**14  # a second thread pays from here on
 _MIN_FAR_RATIO = 1.1  # smallest distance, in radii, at which a series is used
-_HAT_ERROR = 3.5e-3  # error of the hats' series one radius away; it falls with the third power
-_CLUSTER_ERROR = 2.2e-3  # error of the clusters' series one radius from the cluster's ball; it falls alike
-_MIN_FINE_VERTICES = 2000  # on coarser meshes errors were up to three times larger
-_COARSE_GAIN = 3  # accuracy is raised by this factor on such meshes
+_HAT_ERROR = 3.5e-3  # error of the hats' series one radius away; it falls with the third power of the distance
+_CLUSTER_ERROR = 2.2e-3  # error of the clusters' series one radius from the cluster's ball; it falls likewise
+_MIN_FINE_VERTICES = 2000  # on coarser meshes errors were up to three times larger,
+_COARSE_GAIN = 3  # so that they are evaluated more accurately by this factor
 _MIN_CLUSTER_VERTICES = 2**13  # clusters pay from here on; without them a value depends on its own point alone
 _MIN_FLOAT32_ACCURACY = 1e-4  # single precision is enough for the product with the functions from here on
 _N_CHECKED = 12  # points that are also evaluated exactly, to check the approximation
-_N_CHECK_PARTNERS = 64  # points whose distances from those are compared
+_N_CHECK_PARTNERS = 64  # points whose distances from the checked ones are compared
 _CHECK_LINE = (0.11, 0.37, 1.0)  # in principal axes, the longest last; oblique, so that points have distinct places
 _MAX_APPROXIMATIONS = 2  # then the closed form is used
 
@@ -55,10 +55,9 @@ def extend(
     points: NDArray[np.floating],
     **options: Any,
 ) -> Floats:
-    """Return surface functions (V, K), extended to points (P, 3), as (P, K); options and errors are those of
-    `Extension`.
+    """Extend surface functions (V, K) to points (P, 3); options and errors are those of `Extension`.
 
-    The identity (V, V) as functions gives the mean value coordinates (P, V), whose rows sum to 1.
+    The result is (P, K). For the identity (V, V) as functions it is the mean value coordinates, whose rows sum to 1.
     """
     return Extension(vertices, faces, functions, **options)(points)
 
@@ -117,7 +116,7 @@ class Extension:
         self._surface = HatSurface(scaled, scaled_faces)
         order = self._surface.order
         self._n_functions = values.shape[1]
-        # Columns of ones after the functions sum the weights. One would do, but whole registers are multiplied faster.
+        # Columns of ones sum the weights. One column would do, but whole registers are multiplied faster.
         n_columns = -(-(self._n_functions + 1) // _REGISTER_SIZE) * _REGISTER_SIZE
         self._columns = np.ones((len(order), n_columns), dtype)
         for start in range(0, len(order), _COPY_ROWS):
@@ -127,9 +126,7 @@ class Extension:
         self._vertices, self._faces, self._accuracy = vertices, faces, accuracy
 
     def __call__(self, points: NDArray[np.floating]) -> Floats:
-        """Return the functions (P, K) at points (P, 3); a ValueError if the shape is invalid, or a sum of weights is
-        zero.
-        """
+        """Return the values (P, K) at points (P, 3); a ValueError if a sum of weights is zero."""
         x = _scaled(self._vertices, self._faces, points)[2] @ self._surface.axes
         accuracy = self._accuracy
         target = accuracy
@@ -188,12 +185,12 @@ class Extension:
                 yield from results
 
     def _sampled_error(self, x: Floats, values: Floats) -> float:
-        """Estimate the relative error of 99 % of the distances between points, from their values (P, K).
+        """Estimate the relative error that 99 % of the distances between points have, from their values (P, K).
 
-        A few points are evaluated exactly, which gives the errors of their distances from many others. Errors of the
-        other points are of the same size but in other directions, so the errors of both ends of a distance add up in
+        A few points are also evaluated exactly, which gives the errors of their distances from many others. Errors of
+        the others are similar in size but not in direction, so the errors of the two ends of a distance add up in
         squares. In 95 of 100 draws of 12 points the estimate was at least 0.4 of the true error (median of 18 SHREC'07
-        models; 0.15 for the worst). The distances among 24 exact points give no better estimate at twice the cost.
+        models; 0.15 for the worst). The distances among 24 exact points give no better estimate, at twice the cost.
         """
         # Points at equal steps along a line that turns with the body: the choice must not depend on their order.
         order = np.argsort(x @ np.array(_CHECK_LINE))
@@ -213,7 +210,7 @@ class Extension:
 
 
 def _far_ratios(accuracy: float | None) -> tuple[float, float]:
-    """Return the radii from which on hats and clusters are far; a far cluster must contain no near hat."""
+    """Return the distances, in radii, from which on hats and clusters are far; a far cluster has no near hat."""
     if accuracy is None:
         return math.inf, math.inf
     hats = max(_MIN_FAR_RATIO, (_HAT_ERROR / accuracy) ** (1 / 3))
@@ -237,7 +234,7 @@ def _exact_weights(surface: HatSurface, points: Floats) -> Floats:
 def _scaled(
     vertices: NDArray[np.floating], faces: NDArray[np.integer], points: NDArray[np.floating]
 ) -> tuple[Floats, Integers, Floats]:
-    """Check the arguments; return vertices and points scaled to the mesh, and the faces: vertices, faces, points."""
+    """Check the arguments; return vertices, faces and points, with lengths scaled to the mesh."""
     vertices, faces, points = checked_places(vertices, faces, points)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     centre, scale = (low + high) / 2, np.linalg.norm(high - low) / 2

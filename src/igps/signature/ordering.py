@@ -30,8 +30,7 @@ _ANCHOR_WEIGHTS = 0.1 / np.sqrt([1.0, 2.0, 3.0, 5.0])
 def ordering_keys(
     eigenfunctions: NDArray[np.floating], eigenvalues: Floats, area: float, tie_breakers: Floats | float = 0.0
 ) -> Floats:
-    """Return a key (P,), dimensionless, for each point of a body: sorted by it, points are independent of their
-    numbering.
+    """Return a key (P,), dimensionless, for each point of a body, for an order independent of the numbering.
 
     The key is the barycentroid potential (Rustamov 2010) in a smooth low-pass embedding of eigenfunctions (P, K) at the
     points, plus multiples of the distances from four of the points, the anchors. The first anchor is the point of
@@ -49,10 +48,9 @@ def ordering_keys(
 
 
 def spatial_ordering_keys(mesh: Mesh) -> Floats:
-    """Return such keys (V,) for the vertices of a mesh, from Euclidean distances from the centroid of the surface and
-    anchors.
+    """Return keys (V,) as `ordering_keys` for the vertices of a mesh, from Euclidean distances.
 
-    They need no eigenfunctions, but change with pose.
+    These are the distances from the centroid of the surface and from anchors. The keys change with pose.
     """
     areas = face_areas(mesh.vertices, mesh.faces)
     centres = mesh.vertices[mesh.faces].mean(axis=1)
@@ -62,9 +60,7 @@ def spatial_ordering_keys(mesh: Mesh) -> Floats:
 
 
 def canonically_ordered(mesh: Mesh) -> Mesh:
-    """Return the mesh with vertices, faces and first corners of faces in an order that does not depend on the
-    numbering.
-    """
+    """Return the mesh with vertices, faces and first corners of faces in an order independent of their numbering."""
     order = np.argsort(spatial_ordering_keys(mesh), kind="stable")
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
@@ -111,8 +107,7 @@ def systematic_sample(sizes: Floats, n: int, generator: np.random.Generator) -> 
 
 
 def spatial_order(points: Floats, size: int) -> Integers:
-    """Return an order (n,) of points (n, 3) in which all runs of size·2ᵏ points, counted from the start, are compact in
-    space.
+    """Return an order (n,) of points (n, 3) in which all runs of size·2ᵏ points from the start are compact in space.
 
     It is found by median cuts: bounding boxes are repeatedly cut in half along their longest side.
     """
@@ -131,9 +126,7 @@ def spatial_order(points: Floats, size: int) -> Integers:
 
 
 def principal_axes(points: Floats) -> Floats:
-    """Return the principal axes of points (n, 3) as columns (3, 3), each towards the longer tail, so that they turn
-    with them.
-    """
+    """Return the principal axes of points (n, 3) as columns (3, 3); each points towards the longer tail."""
     centred = points - points.mean(axis=0)
     axes = np.linalg.eigh(centred.T @ centred).eigenvectors
     skewness = ((centred @ axes) ** 3).sum(axis=0)

@@ -1,7 +1,7 @@
 """Attributes of samples from the residues of a molecule around them: charge, hydropathy, kinds, ...
 
-Each is a mean over the residues, weighted by a Gaussian of their distance. It is therefore defined everywhere inside,
-and changes little when atoms move.
+All but the screened potential are means over the residues, weighted by a Gaussian of their distance. They are therefore
+defined everywhere inside, and change little when atoms move.
 """
 
 from collections.abc import Callable, Mapping
@@ -46,8 +46,7 @@ def screened_potential(molecule: Molecule, points: Floats) -> Floats:
 
 
 def residue_means(molecule: Molecule, points: Floats, values: Floats) -> Floats:
-    """Return the means (P, D) of the residues' values (R, D) at points (P, 3), Å, weighted by a Gaussian of the
-    distance.
+    """Return means (P, D) of the residues' values (R, D) at points (P, 3), Å, weighted by a Gaussian of the distance.
 
     Unknown values (NaN) are left out; the mean is NaN if no value is known near a point.
     """
@@ -56,7 +55,7 @@ def residue_means(molecule: Molecule, points: Floats, values: Floats) -> Floats:
     means = np.empty((len(points), values.shape[1]))
     for block in _blocks(len(points), len(values)):
         squares = cdist(points[block], molecule.residue_positions, "sqeuclidean")
-        # Relative to the nearest residue: far outside it alone has a weight, instead of all weights being zero.
+        # Relative to the nearest residue: far outside only this one has a weight, but not all weights vanish.
         weights = np.exp((squares.min(axis=1, keepdims=True) - squares) / (2 * WIDTH**2))
         total = weights @ known.astype(float)
         means[block] = np.where(total > 0, weights @ filled / np.where(total > 0, total, 1), np.nan)
@@ -64,9 +63,7 @@ def residue_means(molecule: Molecule, points: Floats, values: Floats) -> Floats:
 
 
 def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
-    """Return an attribute of points (P, 3), Å: (P,), or (P, 25) for "residue_shares"; a ValueError if the name is
-    unknown.
-    """
+    """Return a named attribute of points (P, 3), Å: (P,), or (P, 25) for "residue_shares"; a ValueError for others."""
     if name == "screened_potential":
         return screened_potential(molecule, points)
     if name not in _COLUMNS:
@@ -76,9 +73,7 @@ def residue_attribute(molecule: Molecule, points: Floats, name: str) -> Floats:
 
 
 def _by_name(table: Mapping[str, float], default: float = np.nan) -> Callable[[Molecule], Floats]:
-    """Return a function for values (R, 1) by residue name; amino acids that the table lacks get the default, others
-    NaN.
-    """
+    """Return a function for values (R, 1) by residue name: the default for amino acids not in the table, else NaN."""
 
     def column(molecule: Molecule) -> Floats:
         values = [table.get(name, default if name in VOLUMES else np.nan) for name in molecule.residue_names]

@@ -92,9 +92,7 @@ class _Patches:
         return _Patches(areas, centres, np.add.reduceat(moments, starts) / areas[:, None, None], radii)
 
     def min_distances(self, accuracy: float) -> Floats:
-        """Return the distances (n,) from the centroids from which on the relative error of the series is below
-        accuracy.
-        """
+        """Return the distances (n,) from the centroids beyond which the series has this relative accuracy."""
         variances = np.trace(self.covariances, axis1=1, axis2=2)
         # (g + R/2)² (g − R/2) ≥ g³ for g ≥ R.
         bounds = np.cbrt(self.radii * variances / accuracy)

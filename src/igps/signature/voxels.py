@@ -10,8 +10,8 @@ from igps.mesh.mesh import Mesh, MeshError
 from igps.mesh.surface import box_sides, directed_edges, longest_side
 from igps.mesh.winding import winding_number
 
-# Cell centres closer to the surface, in units of a cell, lie on it and are not inside. This is far above rounding, so
-# that a moved or turned mesh keeps its samples.
+# Distance from the surface, in units of a cell, within which a cell centre is on the surface and not inside. It is far
+# above rounding, so that a moved or turned mesh keeps its samples.
 _ON_SURFACE = 1e-6
 # Limits of a grid: cells along the longest side, and cells in all, which take about 40 bytes each during the scan.
 _MAX_RESOLUTION = 512
@@ -76,8 +76,7 @@ def grid_axes(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Floats]:
 
 
 def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
-    """Return whether the winding number of the mesh is above one half (X, Y, Z), at the points of the grid spanned by
-    `axes`.
+    """Return booleans (X, Y, Z): whether the winding number is above one half at the points of a grid.
 
     Along each axis, the signed crossings of every grid line are summed from both ends. On a closed mesh the six sums
     agree with the winding number. If a line passes through a hole, the other five sums outvote its sum; if more
@@ -105,8 +104,7 @@ def inside_grid(mesh: Mesh, axes: tuple[Floats, Floats, Floats]) -> Booleans:
 def _scan(
     vertices: Floats, faces: Integers, axes: tuple[Floats, ...]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], Booleans]:
-    """Sum signed crossings of the grid lines along the first axis, after and before each point; also return the points
-    on them.
+    """Return sums of signed crossings along the first axis, after and before each point, and points on the surface.
 
     Every comparison belongs to one edge and has the same result in both faces of the edge. A line through an edge or a
     vertex therefore crosses exactly one of the faces that meet there: ties are resolved as if the line were moved by an
@@ -133,22 +131,22 @@ def _scan(
     # Columns: the points of each such segment on the lines y = const, half-open in y.
     column_down, column_up = np.searchsorted(y_axis, y[down], "left"), np.searchsorted(y_axis, y[up], "left")
     segment, column = _ranges(np.minimum(column_down, column_up), np.maximum(column_down, column_up))
-    # The face is seen from its outside, looking along −x, where its upward edge lies on the larger y.
+    # +1 where the outward normal points towards +x: seen from there, the upward edge has the larger y.
     sign = np.where(column_up > column_down, 1, -1)[segment].astype(np.int32)
     y0, y1, x0, x1 = (values[segment] for values in (y[down], y[up], x[down], x[up]))
     crossing = x0 + (y_axis[column] - y0) / (y1 - y0) * (x1 - x0)
 
-    # A crossing counts for every point of its line on its left: enter it where the suffix sum starts.
+    # A crossing counts for all points of its line with smaller x: enter it where their suffix sum starts.
     position = np.searchsorted(x_axis, crossing, "left")
     size = (len(x_axis) + 1, len(y_axis), len(z_axis))
     flat = np.ravel_multi_index((position, column, row[segment]), size)
     crossings = np.bincount(flat, weights=sign, minlength=int(np.prod(size))).reshape(size).astype(np.int32)
-    # The points on the left of a crossing have indices below its position.
+    # The points with smaller x than a crossing have indices below its position.
     after = np.cumsum(crossings[::-1], axis=0)[::-1][1:]
     before = -np.cumsum(crossings, axis=0)[:-1]
 
     on_surface = np.zeros(size, dtype=bool)
-    # The spacing of the first axis with several points; across a flat body an axis may have only one.
+    # Use the first axis with several points: an axis across a flat body may have only one.
     cell = next((float(axis[1] - axis[0]) for axis in axes if len(axis) > 1), longest_side(vertices))
     for neighbour in (position - 1, position):
         clipped = np.clip(neighbour, 0, len(x_axis) - 1)

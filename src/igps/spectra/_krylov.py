@@ -40,7 +40,7 @@ class RitzPairs:
     below_shift: torch.Tensor  # (m,) whether θ < 0
 
     def leading(self, n_below: int, tolerance: float) -> torch.Tensor:
-        """Return the indices of the pairs before the first unconverged one; none if fewer than n_below lie below σ."""
+        """Return the indices of the pairs before the first unconverged one; none unless n_below of them lie below σ."""
         is_converged = (self.residuals <= tolerance * self.eigenvalues) & (self.eigenvalues > 0)
         below = torch.nonzero(is_converged & self.below_shift).flatten()
         if len(below) < n_below:
@@ -204,8 +204,7 @@ class Krylov(Basis):
     def _orthonormal(
         self, block: torch.Tensor, near: int, scale: float | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return rows Q, orthonormal and orthogonal to the basis, and R, with blockᵀ = Qᵀ R + combinations of the
-        basis.
+        """Return rows Q, orthonormal and orthogonal to the basis, and R; blockᵀ is Qᵀ R and a combination of the basis.
 
         According to the recurrence, only rows of the basis from ``near`` on contribute; the full pass after it removes
         rounding errors. Both together cost one product with the basis and one back. ``scale`` is the length of the
@@ -220,9 +219,7 @@ class Krylov(Basis):
         return block, coupling
 
     def _factor_rows(self, block: torch.Tensor, scale: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return orthonormal rows Q and R with blockᵀ = Qᵀ R; a direction lost in rounding gets a random row, and R =
-        0.
-        """
+        """Return orthonormal rows Q and R with blockᵀ = Qᵀ R; directions lost in rounding get random rows and no R."""
         factor, failed = torch.linalg.cholesky_ex(block @ block.T)
         if not failed and torch.diagonal(factor).min() > MIN_CHOLESKY_PIVOT * scale:
             return _inverse(factor) @ block, factor.T
@@ -237,8 +234,7 @@ class Krylov(Basis):
     def _factor_quickly(
         self, block: torch.Tensor, squares: torch.Tensor, scale: float
     ) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """Factor rows as `_factor_rows`, given their products, and write Q to the next rows of the basis; None if a
-        pivot is small.
+        """Factor rows as `_factor_rows`, given their products, into the next rows of the basis; None for a small pivot.
 
         The factorization is repeated if rounding requires it.
         """

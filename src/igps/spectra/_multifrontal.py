@@ -44,9 +44,9 @@ from igps.spectra._ordering import LEAF_SIZE, checked_graph, nested_dissection
 from igps.spectra._pivots import Scratch
 from igps.spectra._tree import Nodes, Structure, tree_structure
 
-# Largest number of own unknowns of a node for compiled loops. PyTorch, with a team, handles larger nodes,
+# Largest number of own unknowns of a node that compiled loops handle. PyTorch handles larger nodes, with a team.
 MAX_LOOP_SIZE = 127
-# in products of so many rows or columns.
+# Number of rows or columns of a larger node that are multiplied at a time.
 PIECE_SIZE = 256
 
 
@@ -73,9 +73,7 @@ class Tree:
         return Factors(self, blocks, self._eliminate(matrix, shift, team, blocks))
 
     def inertia(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> int:
-        """Return the number of negative eigenvalues of ``matrix − shift · I``; arguments and errors are those of
-        `factorize`.
-        """
+        """Return the number of negative eigenvalues of ``matrix − shift · I``, with the errors of `factorize`."""
         return self._eliminate(matrix, shift, team, None)
 
     def arranged(self, matrix: sparse.csr_array) -> tuple[Tree, sparse.csr_array, np.ndarray]:

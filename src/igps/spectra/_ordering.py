@@ -33,9 +33,7 @@ def hop_coordinates(graph: sparse.csr_array, n_landmarks: int = 3) -> np.ndarray
 
 
 def checked_graph(matrix: sparse.csr_array, coordinates: np.ndarray | None) -> tuple[sparse.csr_array, np.ndarray]:
-    """Return the matrix with sorted entries, and coordinates of its vertices; arguments and errors are those of
-    `analyse`.
-    """
+    """Return the matrix with sorted entries, and coordinates of its vertices, with the errors of `analyse`."""
     matrix = canonical(matrix)
     n_vertices = matrix.shape[0]
     transpose = matrix.tocsc()
@@ -52,8 +50,7 @@ def checked_graph(matrix: sparse.csr_array, coordinates: np.ndarray | None) -> t
 
 
 def nested_dissection(graph: sparse.csr_array, coordinates: np.ndarray, leaf_size: int) -> tuple[np.ndarray, int]:
-    """Return the tree node of each vertex, numbered as in a heap (root 0, children 2i+1 and 2i+2), and the number of
-    levels.
+    """Return the tree node of each vertex, numbered as in a heap (children 2i+1 and 2i+2), and the number of levels.
 
     Each part is cut across one coordinate, at a position in a window around the median. Coordinate and position are
     those of the smallest separator. For a cut along the sorted vertices, the separator on its left side consists of the

@@ -118,8 +118,7 @@ def residual_norm(matrix: np.ndarray, inverse: np.ndarray, n: int, width: int, s
 
 @compiled(inline="always")
 def invert_front(scratch: Scratch, n: int, front_width: int, width: int) -> int:
-    """Write the inverse (n, width) of a front's pivot block; return its number of negative eigenvalues, or -1 on
-    failure.
+    """Invert the pivot block (n, width) of a front; return its number of negative eigenvalues, or -1 on failure.
 
     A definite block is inverted accurately with its pivots in any order. An indefinite block may lose digits in one
     order, rarely also in the reverse order; the norm of I − A X measures the loss. Where it is small, the signs of the

@@ -1,5 +1,4 @@
-"""The elimination tree of a dissected matrix: the unknowns and the boundary of each node, and its rows in its parent's
-front.
+"""The elimination tree of a dissected matrix: own unknowns and boundary of each node, and the fronts they belong to.
 
 Nodes and unknowns are numbered depth first, each node after its children, which is the order of elimination.
 """
@@ -117,11 +116,10 @@ def parallel_subtrees(n_levels: int, n_unknowns: int) -> list[Nodes]:
 
 
 def stack_starts(children: np.ndarray, sizes: np.ndarray, ranges: list[Nodes]) -> np.ndarray:
-    """Return the start of each node's result on a stack, from the sizes of the results; each range of nodes has its own
-    stack.
+    """Return the start of each node's result on a stack, from the sizes of the results.
 
-    Within a range, a result stays on the stack until its parent is computed. The results of both children are then on
-    top, and the parent's result replaces them.
+    Each range of nodes has its own stack. A result stays there until its parent is computed: the results of both
+    children are then on top, and the parent's result replaces them.
     """
     starts, lengths, left_child = np.zeros(len(sizes), dtype=np.int64), sizes.tolist(), children[:, 0].tolist()
     end = 0

@@ -53,8 +53,7 @@ Solver = Callable[[], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class Spectrum:
-    """The low end of the spectrum of `L φ = λ M φ`, such as the Laplace–Beltrami spectrum of a shape, without the
-    constant.
+    """Smallest non-zero eigenpairs of `L φ = λ M φ`, such as the Laplace–Beltrami spectrum of a shape.
 
     Attributes:
         eigenvalues: (K,) float64, ascending, 1/length².
@@ -143,9 +142,7 @@ def eigenpairs(
 def _first_success(
     solvers: Sequence[Solver], matrix: sparse.csr_array, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return eigenvalues (K,), orthonormal eigenvectors (V, K) and the largest residual of the first solver that
-    succeeds.
-    """
+    """Return eigenvalues (K,), orthonormal eigenvectors (V, K) and largest residual of the first solver to succeed."""
     for solver in solvers:
         try:
             eigenvalues, vectors = solver()
