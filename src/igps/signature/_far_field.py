@@ -96,13 +96,9 @@ class HatSurface:
 
 
 def _hats(
-    vertices: Floats,
-    incidence: sparse.csr_matrix,
-    corners: Floats,
-    normals: Floats,
-    third_areas: Floats,
+    vertices: Floats, incidence: sparse.csr_matrix, corners: Floats, normals: Floats, third_areas: Floats,
     squared_sides: Floats,
-) -> Floats:
+) -> Floats:  # fmt: skip
     """Return `HatSurface.hats`, with `incidence` (V, 3 F) as the sum over corners and third_areas (F, 1).
 
     Over a face with corners v, a, b and t = v + a + b the hat of v has the mean (v + t)/4 and the second moment

@@ -12,16 +12,9 @@ _TINY = math.ulp(1.0) ** 2  # keeps the logarithm of a side finite on that side,
 
 @compiled()
 def fill_potentials(
-    points: Floats,
-    block: int,
-    patches: Floats,
-    min_distances: Floats,
-    level_starts: Integers,
-    branching: int,
-    squared_limits: Floats,
-    faces: Floats,
-    out: Floats,
-) -> None:
+    points: Floats, block: int, patches: Floats, min_distances: Floats, level_starts: Integers, branching: int,
+    squared_limits: Floats, faces: Floats, out: Floats,
+) -> None:  # fmt: skip
     """Fill `out` with the potentials at points, one block of neighbouring points at a time.
 
     Args:

@@ -169,7 +169,8 @@ class Extension:
                 far, hats = clusters.far_clusters(x[group].T, cluster_ratio)
                 values = np.concatenate([clusters.sums[far].reshape(-1, columns.shape[1]), columns[hats]])
             results = []
-            for rows in _pieces(group, len(values)):
+            size = max(1, min(_GROUP_SIZE, _BLOCK_BYTES // (8 * len(values))))
+            for rows in (group[i : i + size] for i in range(0, len(group), size)):
                 block_points = np.ascontiguousarray(x[rows].T)
                 weights = np.empty((len(values), len(rows)))
                 if clusters is not None:
@@ -199,7 +200,8 @@ class Extension:
             return order[np.linspace(0, len(order) - 1, min(count, len(order))).round().astype(np.int64)]
 
         chosen = at_steps(_N_CHECKED)
-        weights = _exact_weights(self._surface, x[chosen])
+        weights = np.empty((len(self._surface.order), len(chosen)))
+        self._surface.fill_weights(np.ascontiguousarray(x[chosen].T), np.arange(len(weights)), math.inf, weights)
         checked, others = values[chosen], values[at_steps(_N_CHECK_PARTNERS)]
         # To first order, a distance d changes by error · (checked − others) / d.
         errors = checked - self._values(weights.astype(self._columns.dtype, copy=False).T @ self._columns)
@@ -215,20 +217,6 @@ def _far_ratios(accuracy: float | None) -> tuple[float, float]:
         return math.inf, math.inf
     hats = max(_MIN_FAR_RATIO, (_HAT_ERROR / accuracy) ** (1 / 3))
     return hats, max(hats, 1 + (_CLUSTER_ERROR / accuracy) ** (1 / 3))
-
-
-def _pieces(rows: Integers, n_weights: int) -> list[Integers]:
-    """Split point indices into pieces of at most `_BLOCK_BYTES` of weights, with n_weights per point."""
-    size = max(1, min(_GROUP_SIZE, _BLOCK_BYTES // (8 * n_weights)))
-    return [rows[start : start + size] for start in range(0, len(rows), size)]
-
-
-def _exact_weights(surface: HatSurface, points: Floats) -> Floats:
-    """Return the exact weights (V, n) at points (n, 3)."""
-    hats = np.arange(len(surface.hats))
-    weights = np.empty((len(hats), len(points)))
-    surface.fill_weights(np.ascontiguousarray(points.T), hats, math.inf, weights)
-    return weights
 
 
 def _scaled(

@@ -31,12 +31,8 @@ class SurfacePoints:
 def surface_points(mesh: Mesh, n_points: int, seed: int, keys: Floats | None = None) -> SurfacePoints:
     """Draw random points, uniformly distributed over the surface.
 
-    Args:
-        mesh: V vertices.
-        n_points: number of points P.
-        seed: of the random numbers.
-        keys: (V,) keys of the vertices that do not depend on their numbering, see `igps.signature.ordering`. If given,
-            one point is drawn in each of P equal parts of the area; faces and points are in the order of the keys.
+    Keys (V,) of the vertices, see `igps.signature.ordering`, give faces and corners an order independent of their
+    numbering. One point is then drawn in each of `n_points` equal parts of the area, and the points are in that order.
     """
     generator = np.random.default_rng(seed)
     area = face_areas(mesh.vertices, mesh.faces)

@@ -203,17 +203,9 @@ def compute_signature(mesh: Mesh | trimesh.Trimesh, config: SignatureConfig | No
                 "triangles are too ill-shaped: pass backend='robust', or remesh."
             )
     return Signature(
-        eigenvalues=eigenvalues,
-        interior=interior,
-        surface=surface,
-        area=mesh.area,
-        volume=mesh.volume,
-        config=config,
-        name=mesh.name,
-        notes=(*mesh.notes, *notes),
-        residual=residual,
-        unit=mesh.unit,
-    )
+        eigenvalues, interior, surface, mesh.area, mesh.volume, config, mesh.name,
+        notes=(*mesh.notes, *notes), residual=residual, unit=mesh.unit,
+    )  # fmt: skip
 
 
 def _spectrum(mesh: Mesh, config: SignatureConfig) -> tuple[Spectrum, tuple[str, ...]]:

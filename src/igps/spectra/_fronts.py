@@ -44,15 +44,9 @@ def assemble(node: int, tree: Structure, values: Floats, shift: float, updates: 
 
 @compiled()
 def eliminate(
-    nodes: Nodes,
-    max_own: int,
-    tree: Structure,
-    values: Floats,
-    shift: float,
-    updates: Floats,
-    blocks: Floats,
+    nodes: Nodes, max_own: int, tree: Structure, values: Floats, shift: float, updates: Floats, blocks: Floats,
     scratch: Scratch,
-) -> tuple[int, int]:
+) -> tuple[int, int]:  # fmt: skip
     """Eliminate a range of nodes; return the number of negative pivots, and the node where the elimination stopped.
 
     It stops before the end of the range at a node with more than ``max_own`` own unknowns, or whose pivots must be

@@ -24,7 +24,7 @@ this is the number of eigenvalues of A below σ, which proves that an eigensolve
 Pivots stay in their blocks. This is stable for a positive definite matrix. It is also stable for an indefinite A − σI,
 unless σ is close to an eigenvalue of a leading block. That is rare but possible: check a residual.
 
-`_fronts` contains the compiled loops. PyTorch handles pivot blocks of more than MAX_LOOP_SIZE unknowns, and
+`_fronts` contains the compiled loops. PyTorch handles pivot blocks of more than MAX_COMPILED unknowns, and
 indefinite ones that need another order of pivots.
 """
 
@@ -45,7 +45,7 @@ from igps.spectra._pivots import Scratch
 from igps.spectra._tree import Nodes, Structure, tree_structure
 
 # Largest number of own unknowns of a node that compiled loops handle. PyTorch handles larger nodes, with a team.
-MAX_LOOP_SIZE = 127
+MAX_COMPILED = 127
 # Number of rows or columns of a larger node that are multiplied at a time.
 PIECE_SIZE = 256
 
@@ -65,9 +65,8 @@ class Tree:
     def factorize(self, matrix: sparse.csr_array, shift: float = 0.0, team: Team = ALONE) -> Factors:
         """Factorize ``matrix − shift · I``, of which both triangles are read; every team gives the same bits.
 
-        Raises:
-            ValueError: the stored entries of the matrix differ from those of the analysed matrix.
-            SingularMatrixError: a pivot block is singular, as for a shift at an eigenvalue.
+        A ValueError is raised if the matrix stores other entries than the analysed one, a SingularMatrixError if a
+        pivot block is singular, as for a shift at an eigenvalue.
         """
         blocks = np.empty(self.structure.block_start[-1])
         return Factors(self, blocks, self._eliminate(matrix, shift, team, blocks))
@@ -77,7 +76,7 @@ class Tree:
         return self._eliminate(matrix, shift, team, None)
 
     def arranged(self, matrix: sparse.csr_array) -> tuple[Tree, sparse.csr_array, np.ndarray]:
-        """Return the tree and the matrix with unknowns in elimination order, and the index (V,) of each before."""
+        """Return the tree and the matrix with unknowns in elimination order, and the former index (V,) of each."""
         order = self.structure.order
         matrix = checked_entries(matrix, self.structure.indptr, self.structure.indices)[order][:, order]
         matrix.sort_indices()
@@ -108,24 +107,23 @@ class Tree:
         if blocks is None:  # each block overwrites the previous one
             blocks = np.empty(int((own_sizes * (own_sizes + boundary_sizes)).max()))
             structure = structure._replace(block_start=np.zeros_like(structure.block_start))
-        padded = min(MAX_LOOP_SIZE, int(own_sizes.max())) + loops.STEP
+        padded = min(MAX_COMPILED, int(own_sizes.max())) + loops.STEP
         squares = [np.empty(padded**2) for _ in range(3)]
         strips = [np.empty(loops.STEP * (padded + loops.STEP)) for _ in range(2)]
         scratch = Scratch(np.empty(len(structure.order), dtype=np.int64), front, *squares, *strips)
         n_negative, node = 0, begin
         while True:
-            n_new, node = loops.eliminate(
-                (node, end), MAX_LOOP_SIZE, structure, values, shift, updates, blocks, scratch
-            )
+            n_new, node = loops.eliminate((node, end), MAX_COMPILED, structure, values, shift, updates, blocks, scratch)
             n_negative += n_new
             if node == end:
                 return n_negative
             n_own, n_boundary = int(own_sizes[node - begin]), int(boundary_sizes[node - begin])
-            width, block, update = n_own + n_boundary, structure.block_start[node], structure.update_start[node]
+            width = n_own + n_boundary
+            block, update = blocks[structure.block_start[node] :], updates[structure.update_start[node] :]
             n_negative += _eliminate_node(
                 torch.from_numpy(front[: width**2].reshape(width, width)),
-                torch.from_numpy(blocks[block:][: n_own * width].reshape(n_own, width)),
-                torch.from_numpy(updates[update:][: n_boundary**2].reshape(n_boundary, n_boundary)),
+                torch.from_numpy(block[: n_own * width].reshape(n_own, width)),
+                torch.from_numpy(update[: n_boundary**2].reshape(n_boundary, n_boundary)),
                 team,
             )
             node += 1
@@ -183,7 +181,7 @@ def analyse(matrix: sparse.csr_array, coordinates: np.ndarray | None = None, *, 
 
 
 def _eliminate_node(front: torch.Tensor, block: torch.Tensor, update: torch.Tensor, team: Team) -> int:
-    """Write D, E and the complement of a front, given by its upper triangle; return its number of negative pivots."""
+    """Write D, E and the complement, from a front: both upper triangles. Return the number of negative pivots."""
     n_own, n_boundary = len(block), len(update)
     pivot, coupling = front[:n_own, :n_own].triu(), front[:n_own, n_own:]
     inverse, n_negative = _invert(pivot + pivot.triu(1).T)
@@ -195,13 +193,8 @@ def _eliminate_node(front: torch.Tensor, block: torch.Tensor, update: torch.Tens
         elimination[:, piece] = -(inverse @ coupling[:, piece])
 
     def complement(piece: slice) -> None:
-        right = slice(piece.start, None)
-        torch.addmm(
-            trailing[piece, right],
-            coupling[:, piece].T,
-            elimination[:, right],
-            out=update[piece, right],
-        )
+        cols = slice(piece.start, None)
+        torch.addmm(trailing[piece, cols], coupling[:, piece].T, elimination[:, cols], out=update[piece, cols])
 
     team.each(eliminate, pieces)
     team.each(complement, pieces)
@@ -215,9 +208,7 @@ def _invert(pivot: torch.Tensor) -> tuple[torch.Tensor, int]:
         return torch.cholesky_inverse(factor), 0
     factor, order, failed = torch.linalg.ldl_factor_ex(pivot)
     if failed:
-        raise SingularMatrixError(
-            "shift: expected regular pivot blocks, got a singular one. Use a slightly different shift."
-        )
+        raise SingularMatrixError("shift: expected regular pivot blocks, got a singular one. Change it slightly.")
     inverse = torch.linalg.ldl_solve(factor, order, torch.eye(len(pivot), dtype=pivot.dtype, device="cpu"))
     # Bunch–Kaufman pivots: a 1×1 pivot counts by its sign; a 2×2 pivot, marked by negative indices, has one eigenvalue
     # of each sign.
