@@ -31,7 +31,7 @@ from igps.signature.ordering import principal_axes, spatial_order
 
 _LEAF_SIZE = 32  # hats in the smallest clusters; a cluster costs as much as 19 hats
 _N_TERMS = 19
-_HALF_DIAGONAL = 1 - np.eye(3) / 2
+_HALF_DIAGONAL = 1 - np.eye(3) / 2  # halves the diagonal of a matrix plus its transpose
 
 
 class HatSurface:

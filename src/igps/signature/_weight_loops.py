@@ -30,7 +30,7 @@ _ARCTAN = tuple(
 def find_far_clusters(
     low: Floats, high: Floats, centres: Floats, radii: Floats, starts: Integers, ratio: float, leaf: int, n_hats: int
 ) -> tuple[Integers, Integers]:
-    """Return the clusters that are `ratio` radii or more from a box, and the hats in none of these, both ascending."""
+    """Return the clusters that are `ratio` radii or more from a box, and, ascending, the hats in none of these."""
     clusters, hats = np.empty(len(radii), np.int64), np.empty(n_hats, np.int64)
     n_clusters, n_near, n_stacked = 0, 0, 0
     n_levels = len(starts) - 1
@@ -161,14 +161,14 @@ def add_faces(
 ) -> None:  # fmt: skip
     """Add the closed form for pairs (2, m) of a face and a point, accurate up to the surface.
 
-    For a point on the surface, face_at (n,) records the first face that contains it, and barycentric (n, 3) its
+    For a point on the surface, face_at (n,) records the first face that contains it, and barycentric (n, 3) the
     coordinates.
 
     Let λ be the barycentric coordinates of the projection of x, h its distance to the plane, e_l the sides, N_l the
     cross product of the vectors from x to the ends of side l, and θ_l the angle between these. The published
     N_i·m / (N_i·v_i) becomes ½ [λ_i s/h + h Σ_l g_l e_l·e_i / |n|²] |n|, with g_l = θ_l/|N_l| and s = Σ_l g_l λ_l,
-    because N_l = λ_l n + h n̂×e_l. Since the length of N_l is also taken from this identity, all terms agree near side
-    l.
+    because N_l = λ_l n + h n̂×e_l. The length of N_l is also taken from this identity, so that all terms agree near a
+    side.
     """
     n_pairs = pairs.shape[1]
     projections, squares, cosines = np.empty((n_pairs, 4)), np.empty(3 * n_pairs), np.empty(3 * n_pairs)

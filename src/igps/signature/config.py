@@ -30,7 +30,7 @@ class SignatureConfig:
         n_eigenpairs: number of eigenpairs, without the constant one; None for the number that the descriptor requires
             (see `Requirements.apply_to`), or 250 without a descriptor.
         resolution: voxels along the longest side of the bounding box.
-        min_samples: the grid is refined until at least so many voxels lie inside; 0 keeps `resolution`.
+        min_samples: the grid is refined until at least this many voxels lie inside; 0 keeps `resolution`.
         n_surface_samples: number of area-weighted random samples of the surface.
         backend: "cotangent" or "robust", see `laplacian`. If the eigenpairs of the cotangent matrices do not reach the
             tolerance, the robust matrices are used, and a note of the Signature says so.

@@ -54,7 +54,7 @@ def lanczos(
     seed: int,
     inside: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return eigenvalues (K,) and orthonormal eigenvectors (V, K) of a matrix whose one zero mode (V,) has length 1.
+    """Return eigenvalues (K,) and orthonormal eigenvectors (V, K) of a matrix; its single zero mode (V,) has length 1.
 
     A shift inside the spectrum is fast. With a shift below it, A − σI is definite, and its factors are accurate.
     """

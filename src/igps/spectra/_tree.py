@@ -1,4 +1,4 @@
-"""The elimination tree of a dissected matrix: own unknowns and boundary of each node, and the fronts they belong to.
+"""The elimination tree of a dissected matrix: own unknowns, boundary and children of each node.
 
 Nodes and unknowns are numbered depth first, each node after its children, which is the order of elimination.
 """
