@@ -67,8 +67,7 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         # Exact principal components in place of approximate ones, which are only faster; of all, either is exact.
         (
             "src/igps/retrieval/vectors.py",
-            'found = PCA(n_kept, svd_solver="randomized" if not n_kept < min(features.shape) else "full", '
-            "random_state=seed)",
+            'solver = "randomized" if not n_components < min(features.shape) else "full"',
         ),
         # A constant that was chosen, one off: directions to look into, bytes of a line that sizes are guessed from.
         ("src/igps/mesh/_union.py", "_DIRECTIONS, _PLACES_PER_PATCH = 99, 30"),
@@ -90,9 +89,9 @@ EQUIVALENT: frozenset[tuple[str, str]] = frozenset(
         # Below zero there is only rounding.
         (
             "src/igps/retrieval/graph_reranking.py",
-            "return (1 - length[:, None] * alike[:, 1:] * length[lists]).clip( -1)",
+            "return (1 - factor[:, None] * sums[:, 1:] * factor[neighbours]).clip( -1)",
         ),
-        ("src/igps/retrieval/graph_reranking.py", "return (1 - smaller / (2 - smaller)).clip( -1)"),
+        ("src/igps/retrieval/graph_reranking.py", "return (1 - common / (2 - common)).clip( -1)"),
     }
 )
 
