@@ -98,7 +98,7 @@ def least_squares_scaling(distances: Floats, start: Floats) -> Floats:
 
 
 def exponents(max_order: int) -> Integers:
-    """(M, 3) exponents of the moments of orders 2 to `max_order`, but for xy, xz, yz, which vanish in principal axes."""
+    """(M, 3) exponents of the moments of orders 2 to `max_order` except xy, xz, yz, which vanish in principal axes."""
     candidates = np.array(list(product(range(max_order + 1), repeat=_DIMENSION)))
     order = candidates.sum(axis=1)
     mixed = (order == 2) & (candidates.max(axis=1) == 1)

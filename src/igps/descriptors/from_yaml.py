@@ -28,7 +28,7 @@ HISTOGRAMS: Mapping[str, type[DescriptionPart]] = {
 """Classes of histograms by their names in YAML files."""
 
 _MAX_BYTES = 100_000  # of a file
-_MAX_INTEGER = 10_000  # of any count in a file, so that no file can ask for tensors that do not fit into memory
+_MAX_INTEGER = 10_000  # of any number in a file: files are untrusted, and must not ask for huge histograms
 _METADATA_KEYS = ("name", "source", "invariant_to", "scale")
 
 
@@ -39,7 +39,8 @@ def load_yaml(path: str | Path) -> HistogramDescriptor:
     has the key `histogram`, its kind ("pairs" by default), and the arguments of its class, such as `axes`, `samples`
     and `n_samples`. In place of the argument `embedding`, the key `eigenpairs` is a number of eigenpairs; an axis may
     have its own. An axis is a name, or a name with options. A name that is not among the library's axes is that of an
-    attribute, with the option `centres` or `quantiles`.
+    attribute, with the option `centres` or `quantiles`. Optional keys of the descriptor are `name`, `source`,
+    `invariant_to` and `scale`, see `Descriptor`.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -45,16 +45,16 @@ _N_VECTORS, _TIMES = 7, (0.01, 0.04, 0.15)
 class IndividualDescriptor(Descriptor):
     """A descriptor that also compares size, or distinguishes mirror images, or both: `NAME+side+size`.
 
-    A description has up to three blocks. The first is the description by the wrapped descriptor. The block of the side
-    holds `signed_volumes` and the odd part of a histogram of `PairTwist`; a mirror image has the same numbers with
-    opposite signs. The block of the size holds log √area and log ∛volume, in millimetres if the unit is known.
+    A description has up to three blocks: the description by the wrapped descriptor, a side block and a size block. The
+    side block holds `signed_volumes` and the odd part of a histogram of `PairTwist`; a mirror image has the same
+    numbers with opposite signs. The size block holds log √area and log ∛volume, in millimetres if the unit is known.
 
-    Let d be the distance by the descriptor, t the Euclidean distance of the blocks of the side, s the sum of the
-    differences of the two logarithms, and n the usual distance between individuals of one body (a quarter of the scale
-    of the descriptor, if not known). The distance of two bodies is e + 2 (e + n) s / (0.3 + s) with e = d + t. So size
-    adds to the distance of bodies of nearly the same form, and multiplies other distances by up to 3. The distance does
-    not depend on the collection. Both blocks are scaled so that they count alike in Euclidean distances of whole
-    descriptions.
+    Let d be the distance by the descriptor, t the Euclidean distance of the side blocks, and s the sum of the
+    differences of the two logarithms. Let n be the usual distance between individuals of one body; if it is not known,
+    it is taken as a quarter of the descriptor's scale. The distance of two bodies is e + 2 (e + n) s / (0.3 + s) with
+    e = d + t. So size adds to the distance of bodies of nearly the same form, and multiplies other distances by up
+    to 3. The distance does not depend on the collection. Both blocks are scaled so that they count alike in Euclidean
+    distances of whole descriptions.
 
     Args:
         descriptor: any descriptor.
@@ -92,7 +92,7 @@ class IndividualDescriptor(Descriptor):
             self.requirements |= self.twists.requirements
 
     def describe(self, batch: SignatureBatch) -> Tensor:
-        """(N, D + 53 + 2) descriptions; without the block of the side or of the size if it is not compared."""
+        """(N, D + 53 + 2) descriptions; without the side or the size block if it is not compared."""
         parts = [self.descriptor(batch).flatten(1)]
         if self.twists is not None:
             counts = self.twists(BatchFeatures(batch, self.training))
@@ -100,9 +100,9 @@ class IndividualDescriptor(Descriptor):
             volumes = signed_volumes(batch).to(odd)
             parts += [self._unit / _USUAL_VOLUME * volumes, self._unit / _USUAL_TWIST * odd.flatten(1)]
         if self.keeps_size:
-            lengths = [millimetres(unit) for unit in batch.units or [None] * len(batch)]
+            factors = [millimetres(unit) for unit in batch.units or [None] * len(batch)]
             size = torch.stack([batch.area.log() / 2, batch.volume.log() / 3], dim=1)
-            size = size + torch.tensor(lengths, dtype=size.dtype, device=size.device).log()[:, None]
+            size = size + torch.tensor(factors, dtype=size.dtype, device=size.device).log()[:, None]
             parts.append(self._unit * _MAX_GAIN / _HALF_SIZE * size.to(parts[0].dtype))
         return torch.cat(parts, dim=1)
 
@@ -118,12 +118,12 @@ class IndividualDescriptor(Descriptor):
         return distances
 
     def coordinates(self, descriptions: Tensor, *, of_one_kind: bool = False) -> Tensor:
-        """(N, D) descriptions to the coordinates of the descriptor, then the blocks of the side and the size."""
+        """(N, D) descriptions to the coordinates of the descriptor, then the side and size blocks."""
         form, *others = self.split(descriptions)
         return torch.cat([self.descriptor.coordinates(form, of_one_kind=of_one_kind), *others], dim=1)
 
     def short(self, descriptions: Tensor) -> Tensor:
-        """(N, D) descriptions to (N, ≤ 256 + 55): `short` of the descriptor, or its ValueError, then the blocks."""
+        """(N, D) descriptions to (N, ≤ 256 + 55): `short` of the descriptor (or its ValueError), then other blocks."""
         form, *others = self.split(descriptions)
         return torch.cat([self.descriptor.short(form), *others], dim=1)
 
@@ -135,7 +135,7 @@ class IndividualDescriptor(Descriptor):
         return wrapped
 
     def split(self, descriptions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Split descriptions (N, D) into the descriptor's own, in its shape, the block of the side and of the size."""
+        """Split descriptions (N, D) into the descriptor's own, in its shape, the side block and the size block."""
         n_volumes = math.comb(_N_VECTORS, 3)
         n_size, n_side = 2 * self.keeps_size, 0 if self.twists is None else n_volumes + self.twists.n_cells // 2
         n_form = descriptions.shape[1] - n_side - n_size

@@ -43,8 +43,9 @@ def rerank(
 
     The result of each step is mixed with the distances before it. It depends on the whole collection: without one of
     the shapes, the others may rank differently. Common neighbours indicate the class of a shape rather than its body,
-    so each shape keeps its nearest one. In collections of more than 2,000 shapes, each shape is linked to its nearest
-    1,000 only, and of more than 10,000 to its nearest 300, by `rerank_graph`; others count as without common neighbour.
+    so each shape keeps its nearest one. In collections of more than 2,000 shapes, each shape has a list of its nearest
+    1,000 shapes, of more than 10,000 of its nearest 300, see `rerank_graph`. Two shapes of which neither is in the list
+    of the other count as having no common neighbours.
 
     Args:
         distances: (N, N) of a collection to itself, symmetric, ≥ 0.

@@ -26,8 +26,8 @@ class AxialHistogram(SampleHistogram):
 
     The coordinates of a sample are its height along the axis, its distance from the axis, and the cosines of its
     direction with the axis and with the radial line from the axis. Unlike histograms of pairs, they tell where in the
-    body a sample lies. There is no angle about the axis: if a body is round about one axis, so that the other two are
-    arbitrary, this affects only the cells of the other two.
+    body a sample lies. There is no angle about the axis. In a body that is round about one axis, the other two axes are
+    arbitrary, but this affects only their own cells.
 
     The axes are those of the covariance of the samples, with the weights U⁻⁴, where U is the barycentroid potential. So
     the trunk determines the axes, and moving limbs hardly rotate them. Each axis points to the side where the third
